@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tyro.conf import Positional
 
+import lw_torchrl as lw
 from lw_torchrl._checks import counted, nearest
+from lw_torchrl._files import read_text, read_toml
 from lw_torchrl.cli.options import File, Json, SkillFile, TaskFile, is_suite, read_skills, read_suite, read_tasks
 from lw_torchrl.cli.output import Output
-
-if TYPE_CHECKING:
-    from lw_torchrl.language.skills import ScriptedSkill
-    from lw_torchrl.language.tasks import Task
+from lw_torchrl.language.nearest import nearest_skill
+from lw_torchrl.language.plan_text import PLAN_LIMIT
+from lw_torchrl.language.plans import check_plan
+from lw_torchrl.language.skills import ScriptedSkill, skills_for
+from lw_torchrl.language.tasks import Task
 
 
 def check(
@@ -33,10 +36,6 @@ def check(
     Example: lw-torchrl check my-plans/push.plan
     Example: lw-torchrl check my_module:suite
     """
-    import lw_torchrl as lw
-    from lw_torchrl._files import read_text
-    from lw_torchrl.language.plan_text import PLAN_LIMIT
-
     if not file.exists() and is_suite(str(file)):
         return _check_suite(str(file), json)
     if not file.exists():
@@ -91,9 +90,6 @@ def _check_suite(name: str, json: bool) -> Output:
 
 def _check_table(file: Path, known: Mapping[str, Task], hint: str) -> tuple[str, int, list[str]]:
     """What a file is a table of, of how many, and what is noted of them."""
-    import lw_torchrl as lw
-    from lw_torchrl._files import read_toml
-
     rows = read_toml(file, ValueError)
     notes = []
     if any(isinstance(row, dict) and ("description" in row or "objects" in row) for row in rows.values()):
@@ -114,10 +110,6 @@ def _check_plan(
     text: str, task: str | None, source: str, skills: Mapping[str, ScriptedSkill], tasks: Mapping[str, Task]
 ) -> tuple[list[str], int, list[str]]:
     """Every fault of a plan, the steps it has if there is none, and what the scripted skills make of it."""
-    from lw_torchrl.language.nearest import nearest_skill
-    from lw_torchrl.language.plans import check_plan
-    from lw_torchrl.language.skills import skills_for
-
     plan, faults = check_plan(text, task, source, tasks)
     if plan is None:
         return faults, 0, []

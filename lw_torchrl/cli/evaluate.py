@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+import lw_torchrl as lw
 from lw_torchrl._checks import counted
+from lw_torchrl._files import held, write_json
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import Task
 
 if TYPE_CHECKING:
-    from lw_torchrl.language.tasks import Task
     from lw_torchrl.modules.policy import Policy
     from lw_torchrl.suites.suite import Suite
 
@@ -64,9 +67,7 @@ def evaluate(
     known = dict(options.read_tasks(task_file)) | dict({} if elsewhere is None else elsewhere.tasks)
     chosen = options.simulated("tasks", options.one_or_many(tasks), known, elsewhere) if tasks else ()
     given = options.read_plans(plans, known) if plans else None
-    import lw_torchrl as lw
     from lw_torchrl._devices import check_device
-    from lw_torchrl._files import held
     from lw_torchrl.data.missing_episodes import suite_expert
     from lw_torchrl.record.rollouts import run_recorded, write_recording
     from lw_torchrl.training.files import demonstrated_tasks
@@ -162,13 +163,9 @@ def scripted(
     chosen = options.simulated("tasks", options.one_or_many(names), known)
     loaded = options.read_plans(plans, known)
     loaded.require(chosen)
-    loaded = type(loaded)({task: loaded[task] for task in chosen})
+    loaded = Plans({task: loaded[task] for task in chosen})
     skills = options.read_skills(skill_file, known)
-    import lw_torchrl as lw
-    from lw_torchrl._files import held, write_json
-    from lw_torchrl.evaluation.plan_use import PlanUse
-
-    use = PlanUse(loaded)
+    use = lw.evaluation.PlanUse(loaded)
     actor = lw.ScriptedSkillActor(loaded, select, skills=skills)
     how: dict[str, Any] = {"tasks": chosen, "episodes_per_task": episodes, "seed": seed, "noise_scale": noise}
     how |= {"stop_at_success": not full, "also_record": ["qaf", "skill_weights"], "on_episode": use}

@@ -7,9 +7,14 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from lw_torchrl._checks import counted
+import lw_torchrl as lw
+from lw_torchrl._checks import check_int, counted
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Columns, Output, Row
+from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.nearest import nearest_query, nearest_skill
+from lw_torchrl.language.roles import plan_roles
+from lw_torchrl.language.tasks import check_task, resolve_tasks
 
 
 def tasks(
@@ -22,13 +27,11 @@ def tasks(
 
     Example: lw-torchrl tasks MT10
     """
-    import lw_torchrl as lw
-
     known = options.read_tasks(task_file, names)
     rows = [
         {"task": name, "mt10": name in lw.MT10, "description": known[name].description}
         | {"objects": [{"name": one.name, "ours": one.ours} for one in known[name].objects[1:]]}
-        for name in lw.language.tasks.resolve_tasks(options.one_or_many(names) or list(known), tasks=known)
+        for name in resolve_tasks(options.one_or_many(names) or list(known), tasks=known)
     ]
 
     def objects(row: Row) -> str:
@@ -51,10 +54,6 @@ def skills(
 
     Example: lw-torchrl skills push --nearest "grab the puck"
     """
-    from lw_torchrl.language.named_objects import GRIPPER
-    from lw_torchrl.language.nearest import nearest_skill
-    from lw_torchrl.language.tasks import check_task
-
     known = options.read_tasks(task_file, () if task is None else (task,))
     table = options.read_skills(skill_file, known)
     definition = None if task is None else known[check_task(task, known)]
@@ -102,16 +101,12 @@ def plans(
         roles: a table of the steps, what each moves and what it goes to, and what told: "skill", the text is a scripted
             skill's; "words", the text's; "condition", the things that it compares; "nothing".
     """
-    from lw_torchrl.language.tasks import resolve_tasks
-
     known = options.read_tasks(task_file, names)
     loaded = options.read_plans(plans, known, skill_set)
     chosen = resolve_tasks(options.one_or_many(names), tasks=known) if names else tuple(loaded)
     loaded.require(chosen)
     output = Output(json)
     if roles:
-        from lw_torchrl.language.roles import plan_roles
-
         told = [
             {"task": name, "step": number, "skill": step.skill}
             | {"moved": one.moved or None, "target": one.target or None, "told_by": one.source}
@@ -147,10 +142,6 @@ def queries(
 
     Example: lw-torchrl queries push "the gripper touches the puck"
     """
-    import lw_torchrl as lw
-    from lw_torchrl.language.nearest import nearest_query
-    from lw_torchrl.language.tasks import check_task
-
     known = options.read_tasks(task_file, (task,))
     definition = known[check_task(task, known)]
     if text is not None:
@@ -178,12 +169,6 @@ def query(
 
     Example: lw-torchrl query pick-place "Is the gripper open and not above the puck?" --step 40
     """
-    from torchrl.envs import EnvBase, TransformedEnv
-
-    import lw_torchrl as lw
-    from lw_torchrl._checks import check_int
-    from lw_torchrl.data.missing_episodes import suite_expert
-    from lw_torchrl.language.tasks import check_task
     from lw_torchrl.suites.suite import find_suite
 
     known = options.read_tasks(task_file, (task,))
@@ -194,6 +179,10 @@ def query(
     suite = find_suite(name)
     if check_int("step", step, minimum=0) > suite.max_steps:
         raise ValueError(f"step must be at most {suite.max_steps}, got {step}")
+    from torchrl.envs import EnvBase, TransformedEnv
+
+    from lw_torchrl.data.missing_episodes import suite_expert
+
     env: EnvBase = lw.LanguageWorldEnv(name, seed=seed)
     expert = suite_expert(suite, (name,)) if step else None
     if isinstance(expert, lw.ScriptedSkillActor):

@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from tyro.conf import Positional
 
+import lw_torchrl as lw
 from lw_torchrl._checks import counted, shown
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled
+from lw_torchrl.language.plans import Plans
 
 if TYPE_CHECKING:
     from lw_torchrl.evaluation import EvaluationResult
-    from lw_torchrl.language.plans import Plans
     from lw_torchrl.paper.online import OnlineRun
 
 OnlineMethod = Literal["advantage", "td3", "sac", "residual", "ppo", "expert-iteration", "start"]
@@ -118,13 +119,12 @@ def _read_step(given: str) -> int | str:
 
 def _told_of_step(result: EvaluationResult) -> str:
     """Of a run of one step: where failed episodes got stuck, which step was tuned, and what changed elsewhere."""
-    from lw_torchrl.evaluation import StuckStep, stuck_table
-
     config = result.config
     if "tuned" not in config:
         return ""
     tuned, elsewhere = config["tuned"], config["elsewhere"]
-    lines = [stuck_table([StuckStep(**step) for step in tuned["stuck"]])] if "stuck" in tuned else []
+    stuck = [lw.evaluation.StuckStep(**step) for step in tuned.get("stuck", ())]
+    lines = [lw.evaluation.stuck_table(stuck)] if stuck else []
     lines.append(f"tuned: step {tuned['step'] + 1}, {tuned['skill']}; success before {config['before']:.3f}")
     share = f"{elsewhere['outside']} of {elsewhere['states']} states are outside of it"
     return "\n".join([*lines, f"{share}: in {elsewhere['changed']} of them the action has changed"])
@@ -132,7 +132,6 @@ def _told_of_step(result: EvaluationResult) -> str:
 
 def _summarize(runs: Sequence[OnlineRun], plans: Plans, out: Path) -> dict[str, Any]:
     """A summary, tables and a figure, from the results on disk; returns what summary.json holds, by its group."""
-    from lw_torchrl.evaluation import plot_learning_curves
     from lw_torchrl.paper.online import START
     from lw_torchrl.paper.runs import compare, load_result, write_summary
 
@@ -162,6 +161,6 @@ def _summarize(runs: Sequence[OnlineRun], plans: Plans, out: Path) -> dict[str, 
     print(f"\n{folder}\n{text}")
     summary = comparison.to_json() | {"curves": curves}
     write_summary(folder / "summary", text, summary)
-    plot_learning_curves(curves, folder / "curves.png", starts=starts)
+    lw.evaluation.plot_learning_curves(curves, folder / "curves.png", starts=starts)
     print(f"summary.md, summary.json and curves.png are in {folder}")
     return {str(runs[0].group): summary}

@@ -16,12 +16,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from tyro.conf import arg
 
+import lw_torchrl as lw
 from lw_torchrl._checks import unknown_name
+from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
+from lw_torchrl.language.skills import ScriptedSkill, load_skills
+from lw_torchrl.language.tasks import TASKS, Task, load_tasks, resolve_tasks
 
 if TYPE_CHECKING:
-    from lw_torchrl.language.plans import Plans
-    from lw_torchrl.language.skills import ScriptedSkill
-    from lw_torchrl.language.tasks import Task
     from lw_torchrl.language.text import TextEncoder
     from lw_torchrl.modules.policy import Policy
     from lw_torchrl.suites.suite import Suite
@@ -62,8 +64,6 @@ def one_or_many(names: tuple[str, ...]) -> str | tuple[str, ...]:
 
 def read_tasks(task_file: Path | None, names: Sequence[str] = ()) -> Mapping[str, Task]:
     """The tasks of the suite that ``names`` are of, or the 50, which those of --task-file replace or join."""
-    from lw_torchrl.language.tasks import TASKS, load_tasks
-
     if (suite := read_suite(None, names)) is None:
         return TASKS if task_file is None else _load("--task-file", task_file, load_tasks)
     if task_file is not None:
@@ -73,8 +73,6 @@ def read_tasks(task_file: Path | None, names: Sequence[str] = ()) -> Mapping[str
 
 def read_skills(skill_file: Path | None, tasks: Mapping[str, Task]) -> Mapping[str, ScriptedSkill]:
     """The scripted skills of the suite that ``tasks`` are of, with those of --skill-file."""
-    from lw_torchrl.language.skills import load_skills
-
     own = {} if skill_file is None else _load("--skill-file", skill_file, partial(load_skills, tasks=tasks))
     if (suite := _suite_of(tasks)) is None:
         return own or load_skills()
@@ -96,8 +94,6 @@ def simulated(
     argument: str, names: str | Sequence[str], known: Mapping[str, Task], suite: Suite | None = None
 ) -> tuple[str, ...]:
     """The tasks behind ``names``, sorted; a task of the user's that the simulator lacks is refused."""
-    from lw_torchrl.language.tasks import TASKS, resolve_tasks
-
     given = [names] if isinstance(names, str) else names
     if (there := suite or read_suite(None, given)) is not None:
         return tuple(there.named_tasks(names))
@@ -114,9 +110,6 @@ def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Litera
 
     Where these are of a suite, MT10 and MT50 stand for the plans that the suite ships.
     """
-    from lw_torchrl.language.plan_files import load_plans
-    from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
-
     suite = _suite_of(tasks)
     found: dict[str, ConditionalPlan] = {}
     for source in sources:
@@ -274,7 +267,6 @@ def load_policy(
 ) -> Policy:
     """The policy of a file, with the plans that are given; none that has seen the seed's states. Where it was trained
     with another robot than a suite's, it is turned into that one's actions."""
-    import lw_torchrl as lw
     from lw_torchrl.modules.composed_actors import TransferredActor
     from lw_torchrl.training.files import demonstration_seeds
 

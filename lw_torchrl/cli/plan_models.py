@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional
 
+import lw_torchrl as lw
 from lw_torchrl._checks import check_choice, counted
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Columns, Output, Row
+from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.language.tasks import Task, named_tasks
 
 if TYPE_CHECKING:
-    from lw_torchrl.language.tasks import Task
     from lw_torchrl.planners import Answer, OpenAIPlanner
 
 
@@ -45,9 +47,6 @@ class Asking:
         """The model, the tasks that are named, and all tasks."""
         options.check_folder("--out", self.out)
         options.check_folder("--cache", self.cache)
-        import lw_torchrl as lw
-        from lw_torchrl.language.tasks import named_tasks
-
         known = options.read_tasks(self.task_file, names)
         chosen = dict(named_tasks(options.one_or_many(names), known=known))
         ours = ("attempts", "out", "plans", "skill_file", "task_file")
@@ -74,8 +73,6 @@ def generate(
     Example: lw-torchrl plan generate MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --attempts 4
     """
     planner, chosen, _ = asking.begin(tasks)
-    from lw_torchrl.language.formats import PLAN_FORMATS
-
     formats = [*PLAN_FORMATS] if format == ("all",) else list(dict.fromkeys(format))
     for one in formats:
         if one == "all":
@@ -132,8 +129,6 @@ def repair(
     Example: lw-torchrl plan repair MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --rounds 3
     """
     planner, chosen, known = asking.begin(tasks)
-    from lw_torchrl.language.formats import PLAN_FORMATS
-
     check_choice("format", format, PLAN_FORMATS)
     from lw_torchrl.planners.repairing import repair_plans
 

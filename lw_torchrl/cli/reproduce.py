@@ -13,10 +13,11 @@ from tyro.conf import Positional
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled
+from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import MT50, Task
 
 if TYPE_CHECKING:
-    from lw_torchrl.language.plans import Plans
-    from lw_torchrl.language.tasks import Task
     from lw_torchrl.paper.imitation import ImitationRun
 
 Experiment = Literal["zero-shot", "few-shot", "one-shot", "scripted", "all"]
@@ -131,16 +132,12 @@ def reproduce(
 
 def _plans_name(source: str) -> str:
     """What plans are called in a run's folder: their file or folder, and of a format's folder the model too."""
-    from lw_torchrl.language.formats import PLAN_FORMATS
-
     path = Path(source)
     return f"{path.parent.name}-{path.name}" if path.name in PLAN_FORMATS and path.parent.name else path.stem
 
 
 def _all_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Literal["own", "MT10"]) -> Plans:
     """The plans of these sources, shipped ones with these skills; each of the 50 tasks must have one."""
-    from lw_torchrl.language.tasks import MT50
-
     found = options.read_plans(sources, tasks, skills)
     if missing := [task for task in MT50 if task not in found]:
         lack = f"{len(missing)}: {', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes
 
-from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._checks import check_choice
 from lw_torchrl.cli.options import check_folder, use_one_thread
 from lw_torchrl.cli.output import Output
 
@@ -42,7 +42,6 @@ class Schedule:
             check_folder("--out", out)
         elif self.run is not None:
             raise ValueError("--list names the runs and does none, --run does one: give one of them")
-        check_int("jobs", self.jobs, minimum=1)
 
     def execute(
         self,

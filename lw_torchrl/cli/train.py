@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict
 from inspect import signature
 from pathlib import Path
@@ -9,12 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+import lw_torchrl as lw
 from lw_torchrl._checks import check_choice
+from lw_torchrl._files import read_json
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import resolve_tasks
 
 if TYPE_CHECKING:
-    from lw_torchrl.language.plans import Plans
     from lw_torchrl.language.text import TextEncoder
     from lw_torchrl.modules.query_evaluator import QueryEvaluator
 
@@ -75,11 +79,7 @@ def train(
         )
     options.check_dataset("data", data)
     options.check_encoder(text_encoder)
-    from lw_torchrl.data.dataset import read_metadata
-    from lw_torchrl.language.tasks import resolve_tasks
-
-    held = read_metadata(data).config
-    known = options.read_tasks(task_file, held.tasks)
+    known = options.read_tasks(task_file, _told_tasks(data))
     chosen = resolve_tasks(options.one_or_many(tasks), tasks=known) if tasks else ()
     if begin is not None:
         options.check_saved("--begin", begin)
@@ -92,20 +92,20 @@ def train(
     loaded = options.read_plans(plans, known)
     import torch
 
-    import lw_torchrl as lw
     from lw_torchrl._devices import check_device
+    from lw_torchrl.data.dataset import read_metadata
     from lw_torchrl.modules.policy import METHODS, make_policy, policy_class
 
     options.use_one_thread()
-    there = check_device("device", device)
+    there, held = check_device("device", device), read_metadata(data).config
     encoder = options.read_encoder(text_encoder)
     actor_options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
     reads_plans = policy_class(METHODS[method].policy).plan_options
     if reads_plans:
         actor_options["mix"] = mix or "latents"
-    for name, one in {"mix": mix, "latent-consistency": latent_consistency, "evaluator": evaluator}.items():
-        if one and not reads_plans:
-            raise ValueError(f"--{name} is for a method that reads plans, --method {method} does not")
+    for option, value in (("mix", mix), ("latent-consistency", latent_consistency), ("evaluator", evaluator)):
+        if value and not reads_plans:
+            raise ValueError(f"--{option} is for a method that reads plans, --method {method} does not")
     numbers: dict[str, Any] = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed}
     numbers |= {"latent_consistency": latent_consistency, "qaf_anchor": qaf_anchor}
     config = lw.BehavioralCloningConfig(normalize=begin is None, **numbers)
@@ -149,17 +149,21 @@ def train(
     output.show("steps", steps)
     output.show("loss", loss, f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}") + f": {out}")
     if inside is not None:
-        from lw_torchrl.evaluation import condition_drift, drift_table
-
-        drifts = condition_drift(actor, replay[:])
+        drifts = lw.evaluation.condition_drift(actor, replay[:])
         heading = "conditions that drifted most from their words, in the demonstrations' states:"
-        output.show("drift", [asdict(one) for one in drifts], f"{heading}\n{drift_table(drifts, most=5)}")
+        table = lw.evaluation.drift_table(drifts, most=5)
+        output.show("drift", [asdict(one) for one in drifts], f"{heading}\n{table}")
     return output
 
 
-def _evaluator(named: str, plans: Plans, encoder: TextEncoder | None) -> QueryEvaluator:
-    import lw_torchrl as lw
+def _told_tasks(folder: Path) -> tuple[str, ...]:
+    """A dataset's tasks, read without torch; none where its metadata are no such, which is an error later."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        return tuple(map(str, read_json(folder / "metadata.json", "data")["config"]["tasks"]))
+    return ()
 
+
+def _evaluator(named: str, plans: Plans, encoder: TextEncoder | None) -> QueryEvaluator:
     if named == "new":
         return lw.StateQueryEvaluator(plans)
     return lw.training.load_evaluator(named, plans, text_encoder=encoder)

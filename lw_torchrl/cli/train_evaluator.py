@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
+import lw_torchrl as lw
 from lw_torchrl._checks import check_choice
+from lw_torchrl._rendering import CAMERAS
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 
@@ -59,8 +61,6 @@ def train_evaluator(
     options.check_folder("--out", out)
     if text_encoder is not None and structure:
         raise ValueError("--text-encoder is for --no-structure; with structure no text is read")
-    from lw_torchrl._rendering import CAMERAS
-
     known = options.read_tasks(None, tasks)
     names = options.simulated("tasks", options.one_or_many(tasks), known)
     drawn = len(held_out_tasks) == 1 and held_out_tasks[0].isdigit()
@@ -76,10 +76,8 @@ def train_evaluator(
     options.check_encoder(text_encoder)
     import torch
 
-    import lw_torchrl as lw
     from lw_torchrl.data.dataset import read_metadata
-    from lw_torchrl.evaluation.evaluator_figures import plot_reliability, plot_wrong_answers
-    from lw_torchrl.evaluation.evaluator_report import score_evaluator
+    from lw_torchrl.evaluation import plot_reliability, plot_wrong_answers, score_evaluator
 
     options.use_one_thread()
     numbers: dict[str, Any] = {"learning_rate": 2e-3} if cameras else {"steps": 6000}
