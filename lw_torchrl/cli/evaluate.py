@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -15,10 +15,6 @@ from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import Task
-
-if TYPE_CHECKING:
-    from lw_torchrl.modules.policy import Policy
-    from lw_torchrl.suites.suite import Suite
 
 
 def evaluate(
@@ -74,8 +70,10 @@ def evaluate(
 
     options.use_one_thread()
     there = check_device("device", device)
-    policy = None
-    if str(checkpoint) != "expert":
+    if str(checkpoint) == "expert":
+        chosen = chosen or (lw.MT10 if elsewhere is None else tuple(elsewhere.plans or elsewhere.tasks))
+        policy = None if elsewhere is None else suite_expert(elsewhere, chosen)
+    else:
         policy = options.load_policy(checkpoint, seed, given, text_encoder, elsewhere, speed)
         if evaluator is not None:
             if policy.plans is None:
@@ -84,19 +82,15 @@ def evaluate(
             inside = lw.training.load_evaluator(evaluator, policy.plans, text_encoder=encoder)
             policy = policy.with_evaluator(inside)
         known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
-    if not chosen and policy is not None:
-        chosen = _default_tasks(policy, set() if plans else demonstrated_tasks(checkpoint), elsewhere)
-    if policy is None:
-        chosen = chosen or (lw.MT10 if elsewhere is None else tuple(elsewhere.plans or elsewhere.tasks))
-        policy = None if elsewhere is None else suite_expert(elsewhere, chosen)
+        chosen = chosen or _default_tasks(policy, set() if plans else demonstrated_tasks(checkpoint), elsewhere)
     if policy is None and there.type != "cpu":
         raise ValueError("--device is for a policy; the scripted experts work on the CPU")
-    if attribute and (policy is None or policy.plans is None):
+    own = getattr(policy, "plans", None)
+    if attribute and own is None:
         raise ValueError(f"--attribute is for a policy with plans, {checkpoint} has none")
     how: dict[str, Any] = {"tasks": chosen, "episodes_per_task": episodes, "seed": seed, "noise_scale": noise}
     how |= {"stop_at_success": stop_at_success, "num_envs": num_envs, "device": there, "attribute": attribute}
-    where: dict[str, Any] = {} if elsewhere is None else {"suite": elsewhere}
-    where |= {} if max_steps is None else {"max_steps": max_steps}
+    where: dict[str, Any] = {"suite": elsewhere, "max_steps": max_steps}
     trusted = options.read_plans(reference, known) if reference else None
     result = lw.evaluate(policy or lw.ExpertActor(chosen), reference=trusted, **how, **where)
     output = Output(json).result(result)
@@ -105,9 +99,8 @@ def evaluate(
         output.show("failures", failures, f"\n{result.failure_table()}")
     if out is not None:
         with held(out, "out", folder=True, wait=True):
-            told: dict[str, Any] = {} if str(checkpoint) == "expert" else {"checkpoint": checkpoint}
-            told |= {} if policy is None or policy.plans is None else {"plans": policy.plans.fingerprint}
-            told |= {} if evaluator is None else {"evaluator": evaluator}
+            told: dict[str, Any] = {"plans": None if own is None else own.fingerprint, "evaluator": evaluator}
+            told["checkpoint"] = None if str(checkpoint) == "expert" else checkpoint
             result.save(out / "results.json", **told)
             lw.plot_success(result, out / "success.png", title=f"{checkpoint}, {episodes} episodes a task")
             if attribute:
@@ -116,12 +109,12 @@ def evaluate(
                 shown: list[str | Task] = list(result.config["tasks"][:3])
                 recorded = run_recorded(policy, shown, seed=seed, noise_scale=noise, **where)
                 said: dict[str, Any] = {"seed": seed, "policy": checkpoint.stem, "suite": elsewhere}
-                write_recording(out / "rollout.rrd", recorded, policy.plans, **said)
+                write_recording(out / "rollout.rrd", recorded, own, **said)
         print(f"written to {out}")
     return output
 
 
-def _default_tasks(policy: Policy, shown: set[str], suite: Suite | None) -> tuple[str, ...]:
+def _default_tasks(policy: lw.Policy, shown: set[str], suite: lw.suites.Suite | None) -> tuple[str, ...]:
     """The tasks that a policy was ``shown``, or all it has, if the suite, or any, has them; prints what is left out."""
     from lw_torchrl.suites.suite import known_suite
 

@@ -18,7 +18,6 @@ from lw_torchrl.cli.runs import Job, Scheduled
 from lw_torchrl.language.plans import Plans
 
 if TYPE_CHECKING:
-    from lw_torchrl.evaluation import EvaluationResult
     from lw_torchrl.paper.online import OnlineRun
 
 OnlineMethod = Literal["advantage", "td3", "sac", "residual", "ppo", "expert-iteration", "start"]
@@ -117,7 +116,7 @@ def _read_step(given: str) -> int | str:
     return int(given) - 1
 
 
-def _told_of_step(result: EvaluationResult) -> str:
+def _told_of_step(result: lw.EvaluationResult) -> str:
     """Of a run of one step: where failed episodes got stuck, which step was tuned, and what changed elsewhere."""
     config = result.config
     if "tuned" not in config:
@@ -135,7 +134,7 @@ def _summarize(runs: Sequence[OnlineRun], plans: Plans, out: Path) -> dict[str, 
     from lw_torchrl.paper.online import START
     from lw_torchrl.paper.runs import compare, load_result, write_summary
 
-    found: dict[OnlineRun, EvaluationResult] = {}
+    found: dict[OnlineRun, lw.EvaluationResult] = {}
     for one in runs:
         result = load_result(one, plans, out)
         assert result is not None

@@ -25,8 +25,6 @@ from lw_torchrl.language.tasks import TASKS, Task, load_tasks, resolve_tasks
 
 if TYPE_CHECKING:
     from lw_torchrl.language.text import TextEncoder
-    from lw_torchrl.modules.policy import Policy
-    from lw_torchrl.suites.suite import Suite
 
 Loaded = TypeVar("Loaded")
 SETS = ("MT10", "MT50")
@@ -91,7 +89,7 @@ def _load(option: str, file: Path, load: Callable[[Path], Loaded]) -> Loaded:
 
 
 def simulated(
-    argument: str, names: str | Sequence[str], known: Mapping[str, Task], suite: Suite | None = None
+    argument: str, names: str | Sequence[str], known: Mapping[str, Task], suite: lw.suites.Suite | None = None
 ) -> tuple[str, ...]:
     """The tasks behind ``names``, sorted; a task of the user's that the simulator lacks is refused."""
     given = [names] if isinstance(names, str) else names
@@ -229,7 +227,7 @@ def is_suite(name: str) -> bool:
     return name in SUITES or (attribute.isidentifier() and all(part.isidentifier() for part in module.split(".")))
 
 
-def read_suite(name: str | None, tasks: Sequence[str] = ()) -> Suite | None:
+def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite | None:
     """The suite of --suite: a name, or "package.module:object", for which the working folder is searched first; without
     one that of ``tasks``, fetch or fetch/push. None for Meta-World."""
     from lw_torchrl.suites.suite import SUITES, Suite, find_suite, load_suite
@@ -244,7 +242,7 @@ def read_suite(name: str | None, tasks: Sequence[str] = ()) -> Suite | None:
     return found
 
 
-def _suite_of(tasks: Mapping[str, Task]) -> Suite | None:
+def _suite_of(tasks: Mapping[str, Task]) -> lw.suites.Suite | None:
     """The suite that :func:`read_tasks` took all of ``tasks`` from; None for Meta-World."""
     from lw_torchrl.suites.suite import known_suite
 
@@ -263,16 +261,16 @@ def make_logger(kind: Literal["csv", "tensorboard", "wandb"], out: Path) -> Any:
 
 
 def load_policy(
-    checkpoint: Path, seed: int, plans: Plans | None, text_encoder: str | None, suite: Suite | None, speed: float
-) -> Policy:
+    file: Path, seed: int, plans: Plans | None, text_encoder: str | None, suite: lw.suites.Suite | None, speed: float
+) -> lw.Policy:
     """The policy of a file, with the plans that are given; none that has seen the seed's states. Where it was trained
     with another robot than a suite's, it is turned into that one's actions."""
     from lw_torchrl.modules.composed_actors import TransferredActor
     from lw_torchrl.training.files import demonstration_seeds
 
-    if seed in demonstration_seeds(checkpoint):
+    if seed in demonstration_seeds(file):
         raise ValueError(f"seed must differ from the demonstrations' seed, {seed}; an evaluation wants fresh states")
-    policy = lw.load_actor(checkpoint, text_encoder=read_encoder(text_encoder))
+    policy = lw.load_actor(file, text_encoder=read_encoder(text_encoder))
     if suite is None or policy.layout == suite.layout:
         return policy if plans is None else policy.with_plans(plans)
     if (there := plans or suite.plans) is None:

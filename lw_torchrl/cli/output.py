@@ -10,12 +10,10 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import lw_torchrl as lw
 from lw_torchrl._checks import counted
-
-if TYPE_CHECKING:
-    from lw_torchrl.evaluation import EvaluationResult
 
 BROKEN_PIPE = 141  # what a shell reports of a program that a closed pipe ended
 Row = Mapping[str, Any]
@@ -55,7 +53,7 @@ class Output:
         (_on_terminal if sys.stdout.isatty() else _in_pipe)(title, [*columns], cells)
         return self
 
-    def result(self, found: EvaluationResult, **more: Mapping[str, Any]) -> Output:
+    def result(self, found: lw.EvaluationResult, **more: Mapping[str, Any]) -> Output:
         """Print an evaluation's table, or keep its numbers under "tasks", with more of each, and its configuration."""
         rates = ("success_once", "success_at_end", "first_success", "mean_return")
         columns = {name: getattr(found, name) for name in rates} | more
@@ -86,9 +84,7 @@ def _plain(value: Any) -> Any:
 
 
 def _cell(value: Any) -> str:
-    if value is None or value is False:
-        return ""
-    return "yes" if value is True else str(value)
+    return "" if value is None or value is False else "yes" if value is True else str(value)
 
 
 def _in_pipe(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -134,7 +130,9 @@ def nobody_reads() -> bool:
     return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
 
 
-def _replace_absent() -> None:
+@contextmanager
+def sound_streams() -> Iterator[None]:
+    """Within the block there are streams to print to; where nobody reads, the program ends quietly, with 141."""
     # In this order, since an opened file gets the lowest free number: nothing of ours is opened as 1 or 2.
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
@@ -142,12 +140,6 @@ def _replace_absent() -> None:
     for stream in (sys.stdout, sys.stderr):
         if getattr(stream, "errors", None) in ("strict", "surrogateescape"):  # the latter in the C locale
             stream.reconfigure(errors="replace")  # type: ignore[union-attr]
-
-
-@contextmanager
-def sound_streams() -> Iterator[None]:
-    """Within the block there are streams to print to; where nobody reads, the program ends quietly, with 141."""
-    _replace_absent()
     try:
         yield
     except BrokenPipeError:

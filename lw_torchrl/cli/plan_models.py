@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional
 
@@ -15,9 +15,6 @@ from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Columns, Output, Row
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.tasks import Task, named_tasks
-
-if TYPE_CHECKING:
-    from lw_torchrl.planners import Answer, OpenAIPlanner
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,7 @@ class Asking:
     cache: Path = Path("runs/answers")  # folder where answers are kept, each under a key of all that determines it.
     out: Path = Path("runs/plans")  # folder for the answers as texts, OUT/<name>/<format>/<task>-<attempt>.py or .md.
 
-    def begin(self, names: tuple[str, ...]) -> tuple[OpenAIPlanner, dict[str, Task], Mapping[str, Task]]:
+    def begin(self, names: tuple[str, ...]) -> tuple[lw.OpenAIPlanner, dict[str, Task], Mapping[str, Task]]:
         """The model, the tasks that are named, and all tasks."""
         options.check_folder("--out", self.out)
         options.check_folder("--cache", self.cache)
@@ -94,7 +91,7 @@ def generate(
     return output.show("folder", folder, f"{total} tokens; written to {folder}")
 
 
-def _counts(answers: Sequence[Answer]) -> dict[str, int]:
+def _counts(answers: Sequence[lw.planners.Answer]) -> dict[str, int]:
     """What a row of the table says of the answers to one question."""
     plans = [answer.decoded for answer in answers if answer.decoded.plan is not None]
     return {

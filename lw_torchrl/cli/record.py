@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -17,9 +17,6 @@ from lw_torchrl._files import replacing
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.language.plans import Plans
-
-if TYPE_CHECKING:
-    from lw_torchrl.evaluation.failure_records import Failure
 
 
 def record(
@@ -74,7 +71,7 @@ def record(
     with replacing(out) as file, lw.RerunLogger(file, exp_name=out.stem) as logger:
         for actor, shown, who in cast:
             found = run_recorded(actor, tasks, plans=shown, episodes=episodes, progress=True, **episode_options)
-            why: Mapping[tuple[str, int], Failure] = {}
+            why: Mapping[tuple[str, int], lw.evaluation.Failure] = {}
             if attribute and shown is not None and hasattr(actor, "with_plans"):
                 failures = lw.attribute_failures(found, shown, actor=actor, reference=trusted, **episode_options)
                 why = {(one.task, one.episode): one for one in failures}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from tyro.conf import Positional
 
+import lw_torchrl as lw
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled
@@ -89,7 +90,6 @@ def reproduce(
     if plans:
         load("own")
     from lw_torchrl._devices import check_device
-    from lw_torchrl.modules import METHODS
     from lw_torchrl.paper.imitation import SCRIPTED, ImitationRun
     from lw_torchrl.paper.recipes import PRESETS, SETTINGS
     from lw_torchrl.paper.runs import execute_run
@@ -104,7 +104,7 @@ def reproduce(
     if passes is not None:
         recipes = {name: replace(recipe, passes=passes) for name, recipe in recipes.items()}
     if methods is None:
-        methods = cast("tuple[Method, ...]", (*METHODS, *([] if plans else [SCRIPTED])))
+        methods = cast("tuple[Method, ...]", (*lw.modules.METHODS, *([] if plans else [SCRIPTED])))
     if experiment == SCRIPTED:
         methods = ("scripted",)
     plans_name = "+".join(map(_plans_name, plans))

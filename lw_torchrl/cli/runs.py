@@ -11,16 +11,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes
 
+import lw_torchrl as lw
 from lw_torchrl._checks import check_choice
 from lw_torchrl.cli.options import check_folder, use_one_thread
 from lw_torchrl.cli.output import Output
-
-if TYPE_CHECKING:
-    from lw_torchrl.evaluation import EvaluationResult
 
 Job = Callable[[], Any]
 """Does a run, whose :class:`EvaluationResult` it returns, or makes what several runs share."""
@@ -50,7 +48,7 @@ class Schedule:
         runs: Sequence[Mapping[str, Job]],
         command: Sequence[object],
         summarize: Callable[[], Mapping[str, Any]],
-        told: Callable[[EvaluationResult], str] = lambda result: "",
+        told: Callable[[lw.EvaluationResult], str] = lambda result: "",
     ) -> Output:
         """Do what is asked for; the summary is written when all runs are done.
 
@@ -63,7 +61,7 @@ class Schedule:
             return output.show("runs", [*every], "\n".join(every))
         use_one_thread()
 
-        def line(name: str) -> tuple[EvaluationResult | None, str]:
+        def line(name: str) -> tuple[lw.EvaluationResult | None, str]:
             result = every[name]()
             if name not in names:
                 return None, name

@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import asdict
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -17,10 +17,6 @@ from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import resolve_tasks
-
-if TYPE_CHECKING:
-    from lw_torchrl.language.text import TextEncoder
-    from lw_torchrl.modules.query_evaluator import QueryEvaluator
 
 
 def train(
@@ -163,7 +159,7 @@ def _told_tasks(folder: Path) -> tuple[str, ...]:
     return ()
 
 
-def _evaluator(named: str, plans: Plans, encoder: TextEncoder | None) -> QueryEvaluator:
+def _evaluator(named: str, plans: Plans, encoder: Any) -> lw.QueryEvaluator:
     if named == "new":
         return lw.StateQueryEvaluator(plans)
     return lw.training.load_evaluator(named, plans, text_encoder=encoder)

@@ -16,18 +16,10 @@ from numpy.typing import NDArray
 from lw_torchrl._checks import check_choice
 from lw_torchrl._rendering import naming_absent_renderer
 from lw_torchrl.suites.engine import BodyPoses, RowModel
-from lw_torchrl.suites.fetch.frame import (
-    HAND_HEIGHT,
-    OPEN,
-    Array,
-    fetch_actions,
-    our_positions,
-    our_quaternions,
-    turned_quaternions,
-)
+from lw_torchrl.suites.fetch import frame
 from lw_torchrl.suites.fetch.words import FETCH
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
-from lw_torchrl.suites.metaworld.vectorized.observation import Index, Mask
+from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask
 from lw_torchrl.suites.metaworld.vectorized.simulated_rows import ThreadedEngine
 from lw_torchrl.suites.metaworld.vectorized.task_programs import WARNED_ALREADY
 
@@ -183,13 +175,13 @@ class FetchEngine(ThreadedEngine):
 
     def _observe_first(self, rows: Index) -> None:
         now = self._now(rows)
-        goal = our_positions(self._goal[rows], self._origin[rows])
-        goal[:, 2] += np.where(self._has_thing[rows], 0.0, HAND_HEIGHT)
+        goal = frame.our_positions(self._goal[rows], self._origin[rows])
+        goal[:, 2] += np.where(self._has_thing[rows], 0.0, frame.HAND_HEIGHT)
         self._observation[rows] = np.concatenate((now, now, goal), axis=1)
 
     def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
         warnings = np.full((len(action), 3), WARNED_ALREADY, dtype=np.int32)
-        theirs = fetch_actions(np.clip(action, -1, 1))
+        theirs = frame.fetch_actions(np.clip(action, -1, 1))
         displacement = (theirs[:, :3] * _METRES).astype(np.float64)  # multiplied in the action's own precision
         effort = theirs[:, 3].astype(np.float64)
 
@@ -213,18 +205,18 @@ class FetchEngine(ThreadedEngine):
         """The first 11 numbers of the rows' observations."""
         read, origin = self._read[rows], self._origin[rows]
         now = np.zeros((len(rows), _NOW))
-        now[:, :3] = our_positions(read[:, :3], origin)
-        now[:, 2] += HAND_HEIGHT
-        now[:, 3] = np.clip((read[:, 3] + read[:, 4]) / OPEN, 0.0, 1.0)
+        now[:, :3] = frame.our_positions(read[:, :3], origin)
+        now[:, 2] += frame.HAND_HEIGHT
+        now[:, 3] = np.clip((read[:, 3] + read[:, 4]) / frame.OPEN, 0.0, 1.0)
         thing = self._has_thing[rows]
-        now[thing, 4:7] = our_positions(read[thing, 5:8], origin[thing])
-        now[thing, 7:] = our_quaternions(read[thing, 8:])
+        now[thing, 4:7] = frame.our_positions(read[thing, 5:8], origin[thing])
+        now[thing, 7:] = frame.our_quaternions(read[thing, 8:])
         return now
 
     def poses(self, row: int) -> BodyPoses:
         """Where all bodies of a row are now, in our axes."""
-        found = super().poses(row)
-        return BodyPoses(our_positions(found.position, self._origin[row]), turned_quaternions(found.quaternion))
+        position, quaternion = super().poses(row)
+        return BodyPoses(frame.our_positions(position, self._origin[row]), frame.turned_quaternions(quaternion))
 
     def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
         """As :meth:`SeenRows.render`, by one of Fetch's own cameras."""
