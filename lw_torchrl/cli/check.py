@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tyro.conf import Positional
 
+import lw_torchrl as lw
 from lw_torchrl._checks import counted, nearest
+from lw_torchrl._files import read_text, read_toml
 from lw_torchrl.cli.options import File, Json, SkillFile, TaskFile, is_suite, read_skills, read_suite, read_tasks
 from lw_torchrl.cli.output import Output
-
-if TYPE_CHECKING:
-    from lw_torchrl.language.skills import ScriptedSkill
-    from lw_torchrl.language.tasks import Task
+from lw_torchrl.language.nearest import nearest_skill
+from lw_torchrl.language.plan_text import PLAN_LIMIT
+from lw_torchrl.language.plans import check_plan
+from lw_torchrl.language.skills import ScriptedSkill, skills_for
+from lw_torchrl.language.tasks import Task
 
 
 def check(
@@ -33,10 +36,6 @@ def check(
     Example: lw-torchrl check my-plans/push.plan
     Example: lw-torchrl check my_module:suite
     """
-    import lw_torchrl as lw
-    from lw_torchrl._files import read_text
-    from lw_torchrl.language.plan_text import PLAN_LIMIT
-
     if not file.exists() and is_suite(str(file)):
         return _check_suite(str(file), json)
     if not file.exists():
@@ -47,13 +46,11 @@ def check(
         try:
             kind, number, notes = _check_table(file, known, "" if task_file else "; tasks of yours come by --task-file")
         except ValueError as error:
-            output.show("files", [{"file": file, "steps": 0, "faults": [str(error)], "notes": []}])
             output.fault = str(error)
-            return output
+            return output.show("files", [{"file": file, "steps": 0, "faults": [str(error)], "notes": []}])
         lines = [*(f"{file.name}: note: {note}" for note in notes), f"{file.name}: {counted(number, kind)}, valid"]
         row = {"file": file, f"{kind}s": number, "faults": [], "notes": notes}
-        output.show("files", [row], "\n".join(lines))
-        return output
+        return output.show("files", [row], "\n".join(lines))
     paths = sorted(file.glob("*.plan")) if file.is_dir() else [file]
     if not paths:
         raise ValueError(f"file: the folder {str(file)!r} holds no .plan files")
@@ -66,13 +63,11 @@ def check(
         found = counted(len(faults), "fault") if faults else f"{counted(steps, 'step')}, valid"
         if not json:
             print("\n".join([*faults, *(f"{path.name}: note: {note}" for note in notes), f"{path.name}: {found}"]))
-    output.show("files", rows)
-    faults = [fault for row in rows for fault in row["faults"]]
-    if faults:
+    if faults := [fault for row in rows for fault in row["faults"]]:
         unknown = any(" is no task" in fault for fault in faults)
         hint = "; tasks of yours come by --task-file" if unknown and task_file is None else ""
         output.fault = f"{counted(len(faults), 'fault')} in {counted(len(paths), 'file')}{hint}"
-    return output
+    return output.show("files", rows)
 
 
 def _check_suite(name: str, json: bool) -> Output:
@@ -81,25 +76,20 @@ def _check_suite(name: str, json: bool) -> Output:
 
     suite = read_suite(name)
     assert suite is not None
-    rows = check_suite(suite)
-    output = Output(json)
+    rows, output = check_suite(suite), Output(json)
     width = [max(len(getattr(row, key)) for row in rows) for key in ("task", "what", "measured")]
     lines = [
         f"{'ok ' if row.right else 'OFF'}  {row.task:{width[0]}}  {row.what:{width[1]}}  {row.measured:{width[2]}}  "
         f"{'' if row.right else f'wanted: {row.wanted}'}".rstrip()
         for row in rows
     ]
-    output.show("suite", [vars(row) for row in rows], "\n".join(lines))
     if off := sum(not row.right for row in rows):
         output.fault = f"{counted(off, 'number')} of suite {suite.name!r} {'is' if off == 1 else 'are'} off"
-    return output
+    return output.show("suite", [vars(row) for row in rows], "\n".join(lines))
 
 
 def _check_table(file: Path, known: Mapping[str, Task], hint: str) -> tuple[str, int, list[str]]:
     """What a file is a table of, of how many, and what is noted of them."""
-    import lw_torchrl as lw
-    from lw_torchrl._files import read_toml
-
     rows = read_toml(file, ValueError)
     notes = []
     if any(isinstance(row, dict) and ("description" in row or "objects" in row) for row in rows.values()):
@@ -120,10 +110,6 @@ def _check_plan(
     text: str, task: str | None, source: str, skills: Mapping[str, ScriptedSkill], tasks: Mapping[str, Task]
 ) -> tuple[list[str], int, list[str]]:
     """Every fault of a plan, the steps it has if there is none, and what the scripted skills make of it."""
-    from lw_torchrl.language.nearest import nearest_skill
-    from lw_torchrl.language.plans import check_plan
-    from lw_torchrl.language.skills import skills_for
-
     plan, faults = check_plan(text, task, source, tasks)
     if plan is None:
         return faults, 0, []
@@ -136,6 +122,5 @@ def _check_plan(
                 hint = f"the nearest is {found.text!r} ({score:.2f})"
             except ValueError:
                 hint = "nor does another; yours come by --skill-file"
-            note = f"no scripted skill {step.skill!r} suits {plan.task}; {hint}. A learned policy needs none"
-            notes.append(note)
+            notes.append(f"no scripted skill {step.skill!r} suits {plan.task}; {hint}. A learned policy needs none")
     return [], len(plan.steps), notes

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from tyro.conf import Positional, arg
 
+import lw_torchrl as lw
 from lw_torchrl._checks import counted
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Columns, Output, Row
@@ -18,7 +19,6 @@ from lw_torchrl.cli.output import Columns, Output, Row
 if TYPE_CHECKING:
     from lw_torchrl.data.behaviours import Behaviour
     from lw_torchrl.data.dataset import Demonstrations, EpisodeInfo
-    from lw_torchrl.modules.policy import Policy
 
 
 class _Episode(NamedTuple):
@@ -54,25 +54,18 @@ def collect(
     options.check_folder("--out", out)
     options.check_actor("policy", policy)
     chosen = options.simulated("tasks", options.one_or_many(tasks), options.read_tasks(None, tasks))
-    from lw_torchrl.data import collect_demonstrations
-
-    acts: str | Policy = policy
+    acts: Any = policy
     if policy not in options.ACTORS:
-        from lw_torchrl.training.files import load_actor
-
         options.use_one_thread()
-        acts, behaviour = load_actor(policy), behaviour or Path(policy).stem
+        acts, behaviour = lw.load_actor(policy), behaviour or Path(policy).stem
     how: dict[str, Any] = {"policy": acts, "behaviour": behaviour, "redraw_failures": redraw_failures, "seed": seed}
     how |= {"noise_scale": noise, "noise_hold": noise_hold, "gripper_noise_factor": gripper_noise}
-    made = collect_demonstrations(chosen, episodes_per_task=episodes, root=out, num_envs=num_envs, **how)
-    output = Output(json)
+    made = lw.data.collect_demonstrations(chosen, episodes_per_task=episodes, root=out, num_envs=num_envs, **how)
     rates, runs = made.success_rate, made.attempts
     rows = [{"task": task, "success": rate, "episodes_run": runs[task]} for task, rate in rates.items()]
     columns: Columns = {"task": "task", "success": lambda row: f"{row['success']:.2f}", "episodes run": "episodes_run"}
-    output.table("tasks", rows, columns)
-    output.show("dataset", made.root)
-    output.show("steps", made.num_steps, f"{counted(made.num_steps, 'step')} in {made.root}")
-    return output
+    output = Output(json).table("tasks", rows, columns).show("dataset", made.root)
+    return output.show("steps", made.num_steps, f"{counted(made.num_steps, 'step')} in {made.root}")
 
 
 def data(

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+import lw_torchrl as lw
 from lw_torchrl._checks import counted
+from lw_torchrl._files import held, write_json
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
-
-if TYPE_CHECKING:
-    from lw_torchrl.language.tasks import Task
-    from lw_torchrl.modules.policy import Policy
-    from lw_torchrl.suites.suite import Suite
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import Task
 
 
 def evaluate(
@@ -62,72 +61,60 @@ def evaluate(
     options.check_encoder(text_encoder)
     elsewhere = options.read_suite(suite, tasks)
     known = dict(options.read_tasks(task_file)) | dict({} if elsewhere is None else elsewhere.tasks)
-    if elsewhere is not None:
-        chosen = tuple(elsewhere.named_tasks(options.one_or_many(tasks))) if tasks else ()
-    else:
-        chosen = options.simulated("tasks", options.one_or_many(tasks), known) if tasks else ()
+    chosen = options.simulated("tasks", options.one_or_many(tasks), known, elsewhere) if tasks else ()
     given = options.read_plans(plans, known) if plans else None
-    import lw_torchrl as lw
     from lw_torchrl._devices import check_device
-    from lw_torchrl._files import held
     from lw_torchrl.data.missing_episodes import suite_expert
-    from lw_torchrl.evaluation import plot_failures
     from lw_torchrl.record.rollouts import run_recorded, write_recording
-    from lw_torchrl.training.files import demonstrated_tasks, load_evaluator
+    from lw_torchrl.training.files import demonstrated_tasks
 
     options.use_one_thread()
     there = check_device("device", device)
-    policy = None
-    if str(checkpoint) != "expert":
-        policy = options.load_policy(checkpoint, seed, None if elsewhere else given, text_encoder)
-        if elsewhere is not None:
-            policy = options.moved(policy, elsewhere, given, speed)
+    if str(checkpoint) == "expert":
+        chosen = chosen or (lw.MT10 if elsewhere is None else tuple(elsewhere.plans or elsewhere.tasks))
+        policy = None if elsewhere is None else suite_expert(elsewhere, chosen)
+    else:
+        policy = options.load_policy(checkpoint, seed, given, text_encoder, elsewhere, speed)
         if evaluator is not None:
             if policy.plans is None:
                 raise ValueError(f"--evaluator is for a policy with plans, {type(policy).__name__} has none")
             encoder = options.read_encoder(text_encoder)
-            policy = policy.with_evaluator(load_evaluator(evaluator, policy.plans, text_encoder=encoder))
+            inside = lw.training.load_evaluator(evaluator, policy.plans, text_encoder=encoder)
+            policy = policy.with_evaluator(inside)
         known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
-    if not chosen and policy is not None:
-        chosen = _default_tasks(policy, set() if plans else demonstrated_tasks(checkpoint), elsewhere)
-    if policy is None and elsewhere is not None:
-        chosen = chosen or tuple(elsewhere.plans or elsewhere.tasks)
-        policy = suite_expert(elsewhere, chosen)
+        chosen = chosen or _default_tasks(policy, set() if plans else demonstrated_tasks(checkpoint), elsewhere)
     if policy is None and there.type != "cpu":
         raise ValueError("--device is for a policy; the scripted experts work on the CPU")
-    if attribute and (policy is None or policy.plans is None):
+    own = getattr(policy, "plans", None)
+    if attribute and own is None:
         raise ValueError(f"--attribute is for a policy with plans, {checkpoint} has none")
-    chosen = chosen or (lw.MT10 if elsewhere is None else tuple(elsewhere.tasks))
     how: dict[str, Any] = {"tasks": chosen, "episodes_per_task": episodes, "seed": seed, "noise_scale": noise}
     how |= {"stop_at_success": stop_at_success, "num_envs": num_envs, "device": there, "attribute": attribute}
-    where: dict[str, Any] = {} if elsewhere is None else {"suite": elsewhere}
-    where |= {} if max_steps is None else {"max_steps": max_steps}
+    where: dict[str, Any] = {"suite": elsewhere, "max_steps": max_steps}
     trusted = options.read_plans(reference, known) if reference else None
     result = lw.evaluate(policy or lw.ExpertActor(chosen), reference=trusted, **how, **where)
-    output = Output(json)
-    output.result(result)
+    output = Output(json).result(result)
     if attribute:
         failures = [asdict(one) for one in result.failures or ()]
         output.show("failures", failures, f"\n{result.failure_table()}")
     if out is not None:
         with held(out, "out", folder=True, wait=True):
-            told: dict[str, Any] = {} if str(checkpoint) == "expert" else {"checkpoint": checkpoint}
-            told |= {} if policy is None or policy.plans is None else {"plans": policy.plans.fingerprint}
-            told |= {} if evaluator is None else {"evaluator": evaluator}
+            told: dict[str, Any] = {"plans": None if own is None else own.fingerprint, "evaluator": evaluator}
+            told["checkpoint"] = None if str(checkpoint) == "expert" else checkpoint
             result.save(out / "results.json", **told)
             lw.plot_success(result, out / "success.png", title=f"{checkpoint}, {episodes} episodes a task")
             if attribute:
-                plot_failures(result, out / "failures.png", title=str(checkpoint))
+                lw.evaluation.plot_failures(result, out / "failures.png", title=str(checkpoint))
             if policy is not None:
                 shown: list[str | Task] = list(result.config["tasks"][:3])
                 recorded = run_recorded(policy, shown, seed=seed, noise_scale=noise, **where)
                 said: dict[str, Any] = {"seed": seed, "policy": checkpoint.stem, "suite": elsewhere}
-                write_recording(out / "rollout.rrd", recorded, policy.plans, **said)
+                write_recording(out / "rollout.rrd", recorded, own, **said)
         print(f"written to {out}")
     return output
 
 
-def _default_tasks(policy: Policy, shown: set[str], suite: Suite | None) -> tuple[str, ...]:
+def _default_tasks(policy: lw.Policy, shown: set[str], suite: lw.suites.Suite | None) -> tuple[str, ...]:
     """The tasks that a policy was ``shown``, or all it has, if the suite, or any, has them; prints what is left out."""
     from lw_torchrl.suites.suite import known_suite
 
@@ -169,13 +156,9 @@ def scripted(
     chosen = options.simulated("tasks", options.one_or_many(names), known)
     loaded = options.read_plans(plans, known)
     loaded.require(chosen)
-    loaded = type(loaded)({task: loaded[task] for task in chosen})
+    loaded = Plans({task: loaded[task] for task in chosen})
     skills = options.read_skills(skill_file, known)
-    import lw_torchrl as lw
-    from lw_torchrl._files import held, write_json
-    from lw_torchrl.evaluation.plan_use import PlanUse
-
-    use = PlanUse(loaded)
+    use = lw.evaluation.PlanUse(loaded)
     actor = lw.ScriptedSkillActor(loaded, select, skills=skills)
     how: dict[str, Any] = {"tasks": chosen, "episodes_per_task": episodes, "seed": seed, "noise_scale": noise}
     how |= {"stop_at_success": not full, "also_record": ["qaf", "skill_weights"], "on_episode": use}
@@ -195,8 +178,7 @@ def scripted(
                 ended = f", stuck here in {one['stuck']} of {found.failed} failed episodes" if one["stuck"] else ""
                 print(f"    true {one['true']:4.0%}  chosen {one['chosen']:4.0%}  {one['skill']}{ended}")
         print()
-    output = Output(json)
-    output.result(result, steps=steps)
+    output = Output(json).result(result, steps=steps)
     with held(out, "out", folder=True, wait=True):
         result.save(out / "results.json", plans=loaded.fingerprint)
         write_json(out / "plan_use.json", {task: found.to_json() for task, found in seen.items()})

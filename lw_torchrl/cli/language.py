@@ -7,9 +7,14 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from lw_torchrl._checks import counted
+import lw_torchrl as lw
+from lw_torchrl._checks import check_int, counted
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Columns, Output, Row
+from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.nearest import nearest_query, nearest_skill
+from lw_torchrl.language.roles import plan_roles
+from lw_torchrl.language.tasks import check_task, resolve_tasks
 
 
 def tasks(
@@ -22,22 +27,19 @@ def tasks(
 
     Example: lw-torchrl tasks MT10
     """
-    import lw_torchrl as lw
-
     known = options.read_tasks(task_file, names)
     rows = [
         {"task": name, "mt10": name in lw.MT10, "description": known[name].description}
         | {"objects": [{"name": one.name, "ours": one.ours} for one in known[name].objects[1:]]}
-        for name in lw.language.tasks.resolve_tasks(options.one_or_many(names) or list(known), tasks=known)
+        for name in resolve_tasks(options.one_or_many(names) or list(known), tasks=known)
     ]
 
     def objects(row: Row) -> str:
         return ", ".join(one["name"] + (" (ours)" if one["ours"] else "") for one in row["objects"])
 
-    output = Output(json)
     columns: Columns = {"task": "task", "MT10": "mt10", "description": "description"}
-    output.table("tasks", rows, {**columns, "objects beside the gripper": objects}, counted(len(rows), "task"))
-    return output
+    columns = {**columns, "objects beside the gripper": objects}
+    return Output(json).table("tasks", rows, columns, counted(len(rows), "task"))
 
 
 def skills(
@@ -52,18 +54,14 @@ def skills(
 
     Example: lw-torchrl skills push --nearest "grab the puck"
     """
-    from lw_torchrl.language.named_objects import GRIPPER
-    from lw_torchrl.language.nearest import nearest_skill
-    from lw_torchrl.language.tasks import check_task
-
     known = options.read_tasks(task_file, () if task is None else (task,))
     table = options.read_skills(skill_file, known)
     definition = None if task is None else known[check_task(task, known)]
     output = Output(json)
     if nearest is not None:
         skill, score = nearest_skill(nearest, definition, table)
-        output.show("nearest", {"skill": skill.text, "similarity": score}, f"{skill.text}   (similarity {score:.2f})")
-        return output
+        found = {"skill": skill.text, "similarity": score}
+        return output.show("nearest", found, f"{skill.text}   (similarity {score:.2f})")
     rows = []
     for skill in table.values():
         if definition is not None and not skill.suits(definition):
@@ -79,8 +77,7 @@ def skills(
         "gain": lambda row: _numbers(row["gain"][:1] if len({*row["gain"]}) == 1 else row["gain"]),
         "gripper": lambda row: f"{row['gripper']:g}",
     }
-    output.table("skills", rows, columns, counted(len(rows), "scripted skill"))
-    return output
+    return output.table("skills", rows, columns, counted(len(rows), "scripted skill"))
 
 
 def _numbers(values: Iterable[float]) -> str:
@@ -104,16 +101,12 @@ def plans(
         roles: a table of the steps, what each moves and what it goes to, and what told: "skill", the text is a scripted
             skill's; "words", the text's; "condition", the things that it compares; "nothing".
     """
-    from lw_torchrl.language.tasks import resolve_tasks
-
     known = options.read_tasks(task_file, names)
     loaded = options.read_plans(plans, known, skill_set)
     chosen = resolve_tasks(options.one_or_many(names), tasks=known) if names else tuple(loaded)
     loaded.require(chosen)
     output = Output(json)
     if roles:
-        from lw_torchrl.language.roles import plan_roles
-
         told = [
             {"task": name, "step": number, "skill": step.skill}
             | {"moved": one.moved or None, "target": one.target or None, "told_by": one.source}
@@ -122,22 +115,19 @@ def plans(
         ]
         objects: Columns = {"moved": lambda row: row["moved"] or "?", "target": lambda row: row["target"] or "?"}
         columns: Columns = {"task": "task", "skill": "skill", **objects, "told by": "told_by"}
-        output.table("steps", told, columns, counted(len(told), "step"))
-        return output
+        return output.table("steps", told, columns, counted(len(told), "step"))
     rows: list[dict[str, Any]] = []
     for name in chosen:
         steps = [{"condition": str(step.condition), "skill": step.skill} for step in loaded[name].steps]
         rows.append({"task": name, "steps": steps, "text": str(loaded[name])})
     if names:
-        output.show("plans", rows, "\n".join(row["text"] for row in rows))
-        return output
+        return output.show("plans", rows, "\n".join(row["text"] for row in rows))
     columns = {
         "task": "task",
         "steps": lambda row: len(row["steps"]),
         "skills": lambda row: "; ".join(dict.fromkeys(step["skill"] for step in row["steps"])),
     }
-    output.table("plans", rows, columns, counted(len(rows), "plan"))
-    return output
+    return output.table("plans", rows, columns, counted(len(rows), "plan"))
 
 
 def queries(
@@ -152,24 +142,17 @@ def queries(
 
     Example: lw-torchrl queries push "the gripper touches the puck"
     """
-    import lw_torchrl as lw
-    from lw_torchrl.language.nearest import nearest_query
-    from lw_torchrl.language.tasks import check_task
-
     known = options.read_tasks(task_file, (task,))
     definition = known[check_task(task, known)]
-    output = Output(json)
     if text is not None:
         found = nearest_query(text, definition, by=by)
         nearest = {"query": str(found.query), "similarity": found.score}
-        output.show("nearest", nearest, f"{found.query}   (similarity {found.score:.2f})")
-        return output
+        return Output(json).show("nearest", nearest, f"{found.query}   (similarity {found.score:.2f})")
     published = set(lw.supported_queries(definition, published_only=True))
     listed = [{"query": query, "ours": query not in published} for query in lw.supported_queries(definition)]
     lines = [f"{one['query']}{'   (ours)' if one['ours'] else ''}" for one in listed]
     ending = f"\n{len(listed)} base queries; each may be negated, and joined to others by 'and'"
-    output.show("queries", listed, "\n".join([*lines, ending]))
-    return output
+    return Output(json).show("queries", listed, "\n".join([*lines, ending]))
 
 
 def query(
@@ -186,12 +169,6 @@ def query(
 
     Example: lw-torchrl query pick-place "Is the gripper open and not above the puck?" --step 40
     """
-    from torchrl.envs import EnvBase, TransformedEnv
-
-    import lw_torchrl as lw
-    from lw_torchrl._checks import check_int
-    from lw_torchrl.data.missing_episodes import suite_expert
-    from lw_torchrl.language.tasks import check_task
     from lw_torchrl.suites.suite import find_suite
 
     known = options.read_tasks(task_file, (task,))
@@ -202,6 +179,10 @@ def query(
     suite = find_suite(name)
     if check_int("step", step, minimum=0) > suite.max_steps:
         raise ValueError(f"step must be at most {suite.max_steps}, got {step}")
+    from torchrl.envs import EnvBase, TransformedEnv
+
+    from lw_torchrl.data.missing_episodes import suite_expert
+
     env: EnvBase = lw.LanguageWorldEnv(name, seed=seed)
     expert = suite_expert(suite, (name,)) if step else None
     if isinstance(expert, lw.ScriptedSkillActor):
@@ -221,5 +202,4 @@ def query(
     said = [one["query"] for one in answers if one["holds"]]
     if text is not None:
         said = [f"{'yes' if one['holds'] else 'no'}: {one['query']}" for one in answers]
-    output.show("queries", answers, "\n".join(said))
-    return output
+    return output.show("queries", answers, "\n".join(said))

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from tyro.conf import Positional
 
+from lw_torchrl._files import read_json
 from lw_torchrl.cli.options import Json, PlanSources, read_plans, read_tasks
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled
@@ -54,7 +55,6 @@ def offline(
     """
     schedule.check(out)
     known = read_plans(plans, read_tasks(None))
-    from lw_torchrl._files import read_json
     from lw_torchrl.paper.offline import OfflineRun, offline_runs, write_table
     from lw_torchrl.paper.recipes import OFFLINE_TABLES, OfflineRecipe
     from lw_torchrl.paper.runs import execute_run

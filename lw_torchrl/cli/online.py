@@ -10,23 +10,14 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from tyro.conf import Positional
 
+import lw_torchrl as lw
 from lw_torchrl._checks import counted, shown
-from lw_torchrl.cli.options import (
-    Json,
-    PlanSources,
-    check_saved,
-    make_logger,
-    one_or_many,
-    read_plans,
-    read_tasks,
-    simulated,
-)
+from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled
+from lw_torchrl.language.plans import Plans
 
 if TYPE_CHECKING:
-    from lw_torchrl.evaluation import EvaluationResult
-    from lw_torchrl.language.plans import Plans
     from lw_torchrl.paper.online import OnlineRun
 
 OnlineMethod = Literal["advantage", "td3", "sac", "residual", "ppo", "expert-iteration", "start"]
@@ -45,13 +36,13 @@ def online(
     frames: int | None = None,
     demonstrations: int = 1,  # of each task, without noise
     start: Path | None = None,  # a policy to begin with, of train; by default one is cloned from the demonstrations
-    condition: Literal["pcbc", "dc", "one-hot"] = "pcbc",  # that one is conditioned on plans, descriptions or numbers
-    plans: PlanSources = ("MT50",),
+    condition: options.Condition = "pcbc",  # that one is conditioned on plans, descriptions or numbers
+    plans: options.PlanSources = ("MT50",),
     episodes: int = 40,  # evaluated, on seeds that no training used, action noise 0.1
     step: str | None = None,
     logger: Literal["none", "csv", "tensorboard", "wandb"] = "none",
     out: Path = Path("runs/online"),  # where everything goes; on a cluster, a folder that all its machines share
-    json: Json = False,
+    json: options.Json = False,
 ) -> Output:
     """Train policies in their environment, beside demonstrations. If it is stopped, the same command resumes it.
 
@@ -78,11 +69,11 @@ def online(
             of = f"the method{'s' * (len(_READ_BY[option]) > 1)} {', '.join(_READ_BY[option])}"
             raise ValueError(f"--{option} is of {of}, --methods are {', '.join(methods)}")
     if start is not None:
-        check_saved("start", start)
+        options.check_saved("start", start)
     tuned = None if step is None else _read_step(step)
-    known = read_tasks(None, tasks)
-    chosen = simulated("tasks", one_or_many(tasks), known)
-    found = read_plans(plans, known)
+    known = options.read_tasks(None, tasks)
+    chosen = options.simulated("tasks", options.one_or_many(tasks), known)
+    found = options.read_plans(plans, known)
     found.require(chosen)
     if isinstance(tuned, int) and start is None:
         for task in chosen:
@@ -101,7 +92,7 @@ def online(
         for task in chosen
         for method in stage
     ]
-    make = None if logger == "none" else partial(make_logger, logger)
+    make = None if logger == "none" else partial(options.make_logger, logger)
     starts: dict[str, Job] = {}
     others: dict[str, Job] = {}
     for one in runs:
@@ -125,15 +116,14 @@ def _read_step(given: str) -> int | str:
     return int(given) - 1
 
 
-def _told_of_step(result: EvaluationResult) -> str:
+def _told_of_step(result: lw.EvaluationResult) -> str:
     """Of a run of one step: where failed episodes got stuck, which step was tuned, and what changed elsewhere."""
-    from lw_torchrl.evaluation import StuckStep, stuck_table
-
     config = result.config
     if "tuned" not in config:
         return ""
     tuned, elsewhere = config["tuned"], config["elsewhere"]
-    lines = [stuck_table([StuckStep(**step) for step in tuned["stuck"]])] if "stuck" in tuned else []
+    stuck = [lw.evaluation.StuckStep(**step) for step in tuned.get("stuck", ())]
+    lines = [lw.evaluation.stuck_table(stuck)] if stuck else []
     lines.append(f"tuned: step {tuned['step'] + 1}, {tuned['skill']}; success before {config['before']:.3f}")
     share = f"{elsewhere['outside']} of {elsewhere['states']} states are outside of it"
     return "\n".join([*lines, f"{share}: in {elsewhere['changed']} of them the action has changed"])
@@ -141,11 +131,10 @@ def _told_of_step(result: EvaluationResult) -> str:
 
 def _summarize(runs: Sequence[OnlineRun], plans: Plans, out: Path) -> dict[str, Any]:
     """A summary, tables and a figure, from the results on disk; returns what summary.json holds, by its group."""
-    from lw_torchrl.evaluation import plot_learning_curves
     from lw_torchrl.paper.online import START
     from lw_torchrl.paper.runs import compare, load_result, write_summary
 
-    found: dict[OnlineRun, EvaluationResult] = {}
+    found: dict[OnlineRun, lw.EvaluationResult] = {}
     for one in runs:
         result = load_result(one, plans, out)
         assert result is not None
@@ -171,6 +160,6 @@ def _summarize(runs: Sequence[OnlineRun], plans: Plans, out: Path) -> dict[str, 
     print(f"\n{folder}\n{text}")
     summary = comparison.to_json() | {"curves": curves}
     write_summary(folder / "summary", text, summary)
-    plot_learning_curves(curves, folder / "curves.png", starts=starts)
+    lw.evaluation.plot_learning_curves(curves, folder / "curves.png", starts=starts)
     print(f"summary.md, summary.json and curves.png are in {folder}")
     return {str(runs[0].group): summary}

@@ -16,21 +16,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from tyro.conf import arg
 
+import lw_torchrl as lw
 from lw_torchrl._checks import unknown_name
+from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
+from lw_torchrl.language.skills import ScriptedSkill, load_skills
+from lw_torchrl.language.tasks import TASKS, Task, load_tasks, resolve_tasks
 
 if TYPE_CHECKING:
-    from lw_torchrl.language.plans import Plans
-    from lw_torchrl.language.skills import ScriptedSkill
-    from lw_torchrl.language.tasks import Task
     from lw_torchrl.language.text import TextEncoder
-    from lw_torchrl.modules.policy import Policy
-    from lw_torchrl.suites.suite import Suite
 
 Loaded = TypeVar("Loaded")
 SETS = ("MT10", "MT50")
 ACTORS = ("expert", "scripted", "spoilt-60", "spoilt-30", "wrong", "random")
 """The names of :data:`lw_torchrl.data.BEHAVIOURS`."""
-METHODS = ("pcbc", "dc", "one-hot")
+Condition = Literal["pcbc", "dc", "one-hot"]
 """The names of :data:`lw_torchrl.modules.METHODS`."""
 
 Json = Annotated[bool, arg(help="print one JSON document instead, see docs/cli.md.")]
@@ -38,6 +38,10 @@ TaskFile = Annotated[Path | None, arg(help="a file of your tasks, which replace 
 SkillFile = Annotated[Path | None, arg(help="a file of your skills, which replace ours of the same text or join them.")]
 EncoderName = Annotated[str | None, arg(help="your function from texts to vectors, as my_texts:encode.")]
 OwnEncoder = Annotated[str | None, arg(help="the function of yours, if any, it was trained with, as my_texts:encode.")]
+_SUITES = "the suite that has the tasks, fetch for example, or yours, as my_module:suite."
+SuiteName = Annotated[str | None, arg(help=_SUITES)]
+_SPEED = "of a policy that was trained with another robot: times the metres a step that it moved there."
+Speed = Annotated[float, arg(help=_SPEED)]
 _DEVICES = "where networks work: cpu; cuda, or cuda:1 for the second of several; mps, a Mac's; or auto, the GPU if "
 Device = Annotated[str, arg(help=f"{_DEVICES}there is one. The simulation is always on the CPU.")]
 _PLANS = "MT10 or MT50 for the shipped plans, .plan files, .json files of pairs, or folders. "
@@ -58,8 +62,6 @@ def one_or_many(names: tuple[str, ...]) -> str | tuple[str, ...]:
 
 def read_tasks(task_file: Path | None, names: Sequence[str] = ()) -> Mapping[str, Task]:
     """The tasks of the suite that ``names`` are of, or the 50, which those of --task-file replace or join."""
-    from lw_torchrl.language.tasks import TASKS, load_tasks
-
     if (suite := read_suite(None, names)) is None:
         return TASKS if task_file is None else _load("--task-file", task_file, load_tasks)
     if task_file is not None:
@@ -69,8 +71,6 @@ def read_tasks(task_file: Path | None, names: Sequence[str] = ()) -> Mapping[str
 
 def read_skills(skill_file: Path | None, tasks: Mapping[str, Task]) -> Mapping[str, ScriptedSkill]:
     """The scripted skills of the suite that ``tasks`` are of, with those of --skill-file."""
-    from lw_torchrl.language.skills import load_skills
-
     own = {} if skill_file is None else _load("--skill-file", skill_file, partial(load_skills, tasks=tasks))
     if (suite := _suite_of(tasks)) is None:
         return own or load_skills()
@@ -88,13 +88,13 @@ def _load(option: str, file: Path, load: Callable[[Path], Loaded]) -> Loaded:
         raise ValueError(f"{option} {error}") from error
 
 
-def simulated(argument: str, names: str | Sequence[str], known: Mapping[str, Task]) -> tuple[str, ...]:
+def simulated(
+    argument: str, names: str | Sequence[str], known: Mapping[str, Task], suite: lw.suites.Suite | None = None
+) -> tuple[str, ...]:
     """The tasks behind ``names``, sorted; a task of the user's that the simulator lacks is refused."""
-    from lw_torchrl.language.tasks import TASKS, resolve_tasks
-
-    if (suite := read_suite(None, [names] if isinstance(names, str) else names)) is not None:
-        return tuple(suite.named_tasks(names))
     given = [names] if isinstance(names, str) else names
+    if (there := suite or read_suite(None, given)) is not None:
+        return tuple(there.named_tasks(names))
     if own := [name for name in given if name not in (*SETS, *TASKS) and name in known]:
         raise ValueError(
             f"{argument}: the simulator has no {', '.join(own)}; "
@@ -108,9 +108,6 @@ def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Litera
 
     Where these are of a suite, MT10 and MT50 stand for the plans that the suite ships.
     """
-    from lw_torchrl.language.plan_files import load_plans
-    from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
-
     suite = _suite_of(tasks)
     found: dict[str, ConditionalPlan] = {}
     for source in sources:
@@ -239,16 +236,6 @@ def read_encoder(name: str | None) -> TextEncoder | None:
     return found
 
 
-SuiteName = Annotated[
-    str | None, arg(help="the suite that has the tasks, fetch for example, or yours, as my_module:suite.")
-]
-
-
-Speed = Annotated[
-    float, arg(help="of a policy that was trained with another robot: times the metres a step that it moved there.")
-]
-
-
 def is_suite(name: str) -> bool:
     """Whether a word names a suite: a shipped one, or an object as my_module:suite."""
     from lw_torchrl.suites.suite import SUITES
@@ -257,7 +244,7 @@ def is_suite(name: str) -> bool:
     return name in SUITES or (attribute.isidentifier() and all(part.isidentifier() for part in module.split(".")))
 
 
-def read_suite(name: str | None, tasks: Sequence[str] = ()) -> Suite | None:
+def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite | None:
     """The suite of --suite: a name, or "package.module:object", for which the working folder is searched first; without
     one that of ``tasks``, fetch or fetch/push. None for Meta-World."""
     from lw_torchrl.suites.suite import SUITES, Suite, find_suite, load_suite
@@ -272,7 +259,7 @@ def read_suite(name: str | None, tasks: Sequence[str] = ()) -> Suite | None:
     return found
 
 
-def _suite_of(tasks: Mapping[str, Task]) -> Suite | None:
+def _suite_of(tasks: Mapping[str, Task]) -> lw.suites.Suite | None:
     """The suite that :func:`read_tasks` took all of ``tasks`` from; None for Meta-World."""
     from lw_torchrl.suites.suite import known_suite
 
@@ -290,26 +277,22 @@ def make_logger(kind: Literal["csv", "tensorboard", "wandb"], out: Path) -> Any:
         raise ImportError(f"--logger {kind} needs the package {kind}: pip install {kind}") from error
 
 
-def moved(policy: Policy, suite: Suite, plans: Plans | None, speed: float = 1.0) -> Policy:
-    """The policy under plans of a suite, turned into its actions where it was trained with another robot."""
+def load_policy(
+    file: Path, seed: int, plans: Plans | None, text_encoder: str | None, suite: lw.suites.Suite | None, speed: float
+) -> lw.Policy:
+    """The policy of a file, with the plans that are given; none that has seen the seed's states. Where it was trained
+    with another robot than a suite's, it is turned into that one's actions."""
     from lw_torchrl.modules.composed_actors import TransferredActor
+    from lw_torchrl.training.files import demonstration_seeds
 
-    if policy.layout == suite.layout:
+    if seed in demonstration_seeds(file):
+        raise ValueError(f"seed must differ from the demonstrations' seed, {seed}; an evaluation wants fresh states")
+    policy = lw.load_actor(file, text_encoder=read_encoder(text_encoder))
+    if suite is None or policy.layout == suite.layout:
         return policy if plans is None else policy.with_plans(plans)
     if (there := plans or suite.plans) is None:
         raise ValueError(f"--suite {suite.name} has no plans of its own; name yours with --plans")
     return TransferredActor(policy, there, speed=speed)
-
-
-def load_policy(checkpoint: Path, seed: int, plans: Plans | None, text_encoder: str | None) -> Policy:
-    """The policy of a file, with the plans that are given; none that has seen the seed's states."""
-    import lw_torchrl as lw
-    from lw_torchrl.training.files import demonstration_seeds
-
-    if seed in demonstration_seeds(checkpoint):
-        raise ValueError(f"seed must differ from the demonstrations' seed, {seed}; an evaluation wants fresh states")
-    policy = lw.load_actor(checkpoint, text_encoder=read_encoder(text_encoder))
-    return policy if plans is None else policy.with_plans(plans)
 
 
 def use_one_thread() -> None:

@@ -10,12 +10,10 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import lw_torchrl as lw
 from lw_torchrl._checks import counted
-
-if TYPE_CHECKING:
-    from lw_torchrl.evaluation import EvaluationResult
 
 BROKEN_PIPE = 141  # what a shell reports of a program that a closed pipe ended
 Row = Mapping[str, Any]
@@ -27,15 +25,11 @@ class Output:
     """Prints what is found as text, or gathers it for a JSON document; ``fault``, if any, then ends the command.
 
     Example:
-        >>> output = Output(as_json=False)
         >>> columns = {"task": "task", "episodes": "run"}
-        >>> output.table("tasks", [{"task": "push", "run": 3}, {"task": "reach", "run": None}], columns)
-        task   episodes
-        push   3
-        reach
-        >>> output = Output(as_json=True)
-        >>> output.show("rate", float("nan"), "no rate")
-        >>> output.document()
+        >>> _ = Output(as_json=False).table("tasks", [{"task": "push", "run": 3}], columns)
+        task  episodes
+        push  3
+        >>> Output(as_json=True).show("rate", float("nan"), "no rate").document()
         '{\\n  "rate": null\\n}'
     """
 
@@ -43,29 +37,29 @@ class Output:
         self.as_json, self.fault = as_json, ""
         self._found: dict[str, Any] = {}
 
-    def show(self, key: str, value: Any, text: str | None = None) -> None:
-        """Print ``text``, if there is any, or keep the value under the key."""
+    def show(self, key: str, value: Any, text: str | None = None) -> Output:
+        """Print ``text``, if there is any, or keep the value under the key; returns itself, as the others do."""
         if self.as_json:
             self._found[key] = value
         elif text is not None:
             print(text)
+        return self
 
-    def table(self, key: str, rows: Sequence[Row], columns: Columns, title: str = "") -> None:
+    def table(self, key: str, rows: Sequence[Row], columns: Columns, title: str = "") -> Output:
         """Print rows as a table of these columns, or keep them under the key."""
         if self.as_json:
-            self._found[key] = [dict(row) for row in rows]
-            return
+            return self.show(key, [dict(row) for row in rows])
         cells = [[_cell(row[of] if isinstance(of, str) else of(row)) for of in columns.values()] for row in rows]
         (_on_terminal if sys.stdout.isatty() else _in_pipe)(title, [*columns], cells)
+        return self
 
-    def result(self, found: EvaluationResult, **more: Mapping[str, Any]) -> None:
+    def result(self, found: lw.EvaluationResult, **more: Mapping[str, Any]) -> Output:
         """Print an evaluation's table, or keep its numbers under "tasks", with more of each, and its configuration."""
         rates = ("success_once", "success_at_end", "first_success", "mean_return")
         columns = {name: getattr(found, name) for name in rates} | more
         rows = [{"task": task, **{name: of[task] for name, of in columns.items()}} for task in found.config["tasks"]]
-        self.show("tasks", rows, found.table())
-        self.show("mean_success", found.mean_success)
-        self.show("config", found.config)
+        self.show("tasks", rows, found.table()).show("mean_success", found.mean_success)
+        return self.show("config", found.config)
 
     def notes(self, found: Iterable[str]) -> None:
         """Print what is noted of answers, the most frequent first, or keep it under "notes"."""
@@ -90,9 +84,7 @@ def _plain(value: Any) -> Any:
 
 
 def _cell(value: Any) -> str:
-    if value is None or value is False:
-        return ""
-    return "yes" if value is True else str(value)
+    return "" if value is None or value is False else "yes" if value is True else str(value)
 
 
 def _in_pipe(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -138,7 +130,9 @@ def nobody_reads() -> bool:
     return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
 
 
-def _replace_absent() -> None:
+@contextmanager
+def sound_streams() -> Iterator[None]:
+    """Within the block there are streams to print to; where nobody reads, the program ends quietly, with 141."""
     # In this order, since an opened file gets the lowest free number: nothing of ours is opened as 1 or 2.
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
@@ -146,12 +140,6 @@ def _replace_absent() -> None:
     for stream in (sys.stdout, sys.stderr):
         if getattr(stream, "errors", None) in ("strict", "surrogateescape"):  # the latter in the C locale
             stream.reconfigure(errors="replace")  # type: ignore[union-attr]
-
-
-@contextmanager
-def sound_streams() -> Iterator[None]:
-    """Within the block there are streams to print to; where nobody reads, the program ends quietly, with 141."""
-    _replace_absent()
     try:
         yield
     except BrokenPipeError:

@@ -10,9 +10,12 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from lw_torchrl._checks import check_choice
+from lw_torchrl._files import read_text
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.plan_models import generate, repair
+from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.language.tasks import check_task
 
 
 def prompt(
@@ -53,10 +56,6 @@ def check(
         file: an answer FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it, or a .plan file TASK.plan; any text with
             --task and --format.
     """
-    import lw_torchrl as lw
-    from lw_torchrl._files import read_text
-    from lw_torchrl.language.tasks import check_task
-
     if not file.is_file():
         raise FileNotFoundError(f"file: there is no file {str(file)!r}")
     known = options.read_tasks(task_file, () if task is None else (task,))
@@ -66,17 +65,16 @@ def check(
             raise ValueError(f"--task must be given, since the file's name, {file.name!r}, names no task")
     if format is None:
         format = "basic_py" if file.suffix == ".plan" else file.absolute().parent.name
-        if format not in lw.PLAN_FORMATS:
-            raise ValueError(f"--format must be given, one of {', '.join(lw.PLAN_FORMATS)}: the file's folder is none")
+        if format not in PLAN_FORMATS:
+            raise ValueError(f"--format must be given, one of {', '.join(PLAN_FORMATS)}: the file's folder is none")
     check_task(task, known)
-    check_choice("format", format, lw.PLAN_FORMATS)
+    check_choice("format", format, PLAN_FORMATS)
     skills = options.read_skills(skill_file, known) if skill_file else None
     text = read_text(file, ValueError)
     from lw_torchrl.planners.checking import check_plan
 
     options.use_one_thread()
     found = check_plan(text, task, format, episodes=episodes, seed=seed, skills=skills, tasks=known)
-    output = Output(json)
     steps = [step for step in found.decoded.steps if not step.dropped]
     rows = [
         {"condition": str(step.condition), "skill": step.written_skill, "scripted": step.scripted}
@@ -85,15 +83,9 @@ def check(
         | {"chosen": None if found.own is None else found.own.chosen[k], "never": k in found.never}
         for k, step in enumerate(steps)
     ]
-    output.show("task", found.task, str(found))
-    output.show("reason", found.decoded.reason or None)
-    output.show("notes", [*map(str, found.decoded.notes)])
-    output.show("steps", rows)
-    output.show("success", None if found.own is None else found.success)
-    return output
-
-
-_BEST = ": of each task the plan that did best, be it one that never succeeds"
+    output = Output(json).show("task", found.task, str(found)).show("reason", found.decoded.reason or None)
+    output.show("notes", [*map(str, found.decoded.notes)]).show("steps", rows)
+    return output.show("success", None if found.own is None else found.success)
 
 
 def compare(
@@ -148,7 +140,8 @@ def compare(
         names = ", ".join(map(str, strays[:5])) + (", ..." if len(strays) > 5 else "")
         print(f"not read, since no answer is named so (<task>-<attempt>.<ext>): {names}\n")
     for file in write_report(found, out):
-        print(f"written to {file}{_BEST if file.name == 'best' else ''}")
+        best = ": of each task the plan that did best, be it one that never succeeds" if file.name == "best" else ""
+        print(f"written to {file}{best}")
     return output
 
 

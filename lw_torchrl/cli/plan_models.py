@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional
 
+import lw_torchrl as lw
 from lw_torchrl._checks import check_choice, counted
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Columns, Output, Row
-
-if TYPE_CHECKING:
-    from lw_torchrl.language.tasks import Task
-    from lw_torchrl.planners import Answer, OpenAIPlanner
+from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.language.tasks import Task, named_tasks
 
 
 @dataclass(frozen=True)
@@ -41,13 +40,10 @@ class Asking:
     cache: Path = Path("runs/answers")  # folder where answers are kept, each under a key of all that determines it.
     out: Path = Path("runs/plans")  # folder for the answers as texts, OUT/<name>/<format>/<task>-<attempt>.py or .md.
 
-    def begin(self, names: tuple[str, ...]) -> tuple[OpenAIPlanner, dict[str, Task], Mapping[str, Task]]:
+    def begin(self, names: tuple[str, ...]) -> tuple[lw.OpenAIPlanner, dict[str, Task], Mapping[str, Task]]:
         """The model, the tasks that are named, and all tasks."""
         options.check_folder("--out", self.out)
         options.check_folder("--cache", self.cache)
-        import lw_torchrl as lw
-        from lw_torchrl.language.tasks import named_tasks
-
         known = options.read_tasks(self.task_file, names)
         chosen = dict(named_tasks(options.one_or_many(names), known=known))
         ours = ("attempts", "out", "plans", "skill_file", "task_file")
@@ -74,8 +70,6 @@ def generate(
     Example: lw-torchrl plan generate MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --attempts 4
     """
     planner, chosen, _ = asking.begin(tasks)
-    from lw_torchrl.language.formats import PLAN_FORMATS
-
     formats = [*PLAN_FORMATS] if format == ("all",) else list(dict.fromkeys(format))
     for one in formats:
         if one == "all":
@@ -94,11 +88,10 @@ def generate(
     output.notes(notes)
     output.show("tokens", total)
     folder = asking.out / planner.name
-    output.show("folder", folder, f"{total} tokens; written to {folder}")
-    return output
+    return output.show("folder", folder, f"{total} tokens; written to {folder}")
 
 
-def _counts(answers: Sequence[Answer]) -> dict[str, int]:
+def _counts(answers: Sequence[lw.planners.Answer]) -> dict[str, int]:
     """What a row of the table says of the answers to one question."""
     plans = [answer.decoded for answer in answers if answer.decoded.plan is not None]
     return {
@@ -133,8 +126,6 @@ def repair(
     Example: lw-torchrl plan repair MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --rounds 3
     """
     planner, chosen, known = asking.begin(tasks)
-    from lw_torchrl.language.formats import PLAN_FORMATS
-
     check_choice("format", format, PLAN_FORMATS)
     from lw_torchrl.planners.repairing import repair_plans
 
@@ -159,5 +150,4 @@ def repair(
     print(f"{counted(len(first), 'answer')} to begin with, {asked} asked now")
     done = max(len(one.checks) for one in found) - 1
     folders = [asking.out / planner.name, *(asking.out / f"{planner.name}-round{k}" for k in range(1, done + 1))]
-    output.show("folders", folders, f"written to {', '.join(map(str, folders))}")
-    return output
+    return output.show("folders", folders, f"written to {', '.join(map(str, folders))}")

@@ -6,18 +6,17 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
+import lw_torchrl as lw
+from lw_torchrl._files import replacing
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
-
-if TYPE_CHECKING:
-    from lw_torchrl.evaluation.failure_records import Failure
-    from lw_torchrl.language.plans import Plans
-    from lw_torchrl.language.tasks import Task
+from lw_torchrl.language.plans import Plans
 
 
 def record(
@@ -58,22 +57,21 @@ def record(
     label = names[0].replace("/", "-") if len(names) == 1 else f"{len(names)}-tasks"
     out = out or Path("runs/recordings") / f"{label}-{Path(policy).stem}.rrd"
     options.check_file("--out", out, ".rrd")
-    import lw_torchrl as lw
-    from lw_torchrl._files import replacing
     from lw_torchrl.record.rollouts import run_recorded
 
     options.use_one_thread()
     trusted = options.read_plans(reference, known) if reference else None
     episode_options: dict[str, Any] = {"seed": seed, "noise_scale": noise, "max_steps": max_steps}
     # What can be refused is refused before the first episode runs.
-    how = (seed, max_steps, speed, text_encoder)
-    cast = [_cast(who, tasks, given, known, *how) for who in filter(None, (policy, compare))]
-    output, rows = Output(json), []
+    suite = options.read_suite(None, tasks)
+    load = partial(options.load_policy, seed=seed, plans=given, text_encoder=text_encoder, suite=suite, speed=speed)
+    cast = [_cast(who, tasks, given, known, load, seed, max_steps) for who in filter(None, (policy, compare))]
+    rows: list[dict[str, Any]] = []
     recorded: list[list[str]] = []
     with replacing(out) as file, lw.RerunLogger(file, exp_name=out.stem) as logger:
         for actor, shown, who in cast:
             found = run_recorded(actor, tasks, plans=shown, episodes=episodes, progress=True, **episode_options)
-            why: Mapping[tuple[str, int], Failure] = {}
+            why: Mapping[tuple[str, int], lw.evaluation.Failure] = {}
             if attribute and shown is not None and hasattr(actor, "with_plans"):
                 failures = lw.attribute_failures(found, shown, actor=actor, reference=trusted, **episode_options)
                 why = {(one.task, one.episode): one for one in failures}
@@ -92,46 +90,34 @@ def record(
             recorded.append(pages)
         for pair, one in zip(zip(*recorded, strict=True), found, strict=True) if compare is not None else ():
             logger.compare(pair, f"{one.task} · episode {one.episode} · side by side")
-    output.show("episodes", rows)
-    output.show("recording", out, f"written to {out}\nlook at it with: lw-torchrl view {out}")
-    return output
+    output = Output(json).show("episodes", rows)
+    return output.show("recording", out, f"written to {out}\nlook at it with: lw-torchrl view {out}")
 
 
 def _cast(
-    who: str,
-    tasks: Sequence[str],
-    plans: Plans | None,
-    known: Mapping[str, Task],
-    seed: int,
-    max_steps: int | None,
-    speed: float,
-    text_encoder: str | None,
+    who: str, tasks: Sequence[str], plans: Plans | None, known: Any, load: Any, seed: int, max_steps: int | None
 ) -> tuple[Any, Plans | None, str]:
     """Who acts, the plans whose conditions are answered, and what the policy is called."""
-    import lw_torchrl as lw
     from lw_torchrl.data.behaviours import SegmentActor, behaviour_of
     from lw_torchrl.data.missing_episodes import suite_expert
     from lw_torchrl.suites.suite import find_suite
 
     if who not in options.ACTORS:
-        there = options.read_suite(None, tasks)
-        actor = options.load_policy(Path(who), seed, None if there else plans, text_encoder)
-        actor = actor if there is None else options.moved(actor, there, plans, speed)
+        actor = load(Path(who))
         if missing := [task for task in tasks if task not in actor.tasks]:
             knows = f"it knows {', '.join(actor.tasks)}"
             raise ValueError(f"the policy of {who!r} does not know {', '.join(missing)}; {knows}")
         return actor, actor.plans, Path(who).stem
     shown = options.read_plans(("MT50",), known) if plans is None else plans
     shown.require(tasks)
-    shown = lw.Plans({task: shown[task] for task in tasks})
+    shown = Plans({task: shown[task] for task in tasks})
     suite = find_suite(tasks)
     if who == "expert":
         return suite_expert(suite, tasks), shown, who
     if who == "scripted":
         return lw.ScriptedSkillActor(shown, skills=suite.skills), shown, who
-    spoilt = behaviour_of(who, tasks, suite=suite)
-    steps = max_steps or suite.max_steps
-    return SegmentActor(spoilt, shown, seed, steps, skills=suite.skills), shown, who
+    behaviour, steps = behaviour_of(who, tasks, suite=suite), max_steps or suite.max_steps
+    return SegmentActor(behaviour, shown, seed, steps, skills=suite.skills), shown, who
 
 
 def view(

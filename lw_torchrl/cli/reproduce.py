@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from tyro.conf import Positional
 
+import lw_torchrl as lw
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled
+from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import MT50, Task
 
 if TYPE_CHECKING:
-    from lw_torchrl.language.plans import Plans
-    from lw_torchrl.language.tasks import Task
     from lw_torchrl.paper.imitation import ImitationRun
 
 Experiment = Literal["zero-shot", "few-shot", "one-shot", "scripted", "all"]
@@ -38,10 +40,7 @@ def demo(out: Path | None = None, quick: bool = False, json: options.Json = Fals
 
     options.use_one_thread()
     result = run_demo(folder, QUICK if quick else DemoConfig())
-    output = Output(json)
-    if json:  # as text it has printed itself
-        output.result(result)
-    return output
+    return Output(json).result(result) if json else Output(json)  # as text it has printed itself
 
 
 def reproduce(
@@ -91,7 +90,6 @@ def reproduce(
     if plans:
         load("own")
     from lw_torchrl._devices import check_device
-    from lw_torchrl.modules import METHODS
     from lw_torchrl.paper.imitation import SCRIPTED, ImitationRun
     from lw_torchrl.paper.recipes import PRESETS, SETTINGS
     from lw_torchrl.paper.runs import execute_run
@@ -106,7 +104,7 @@ def reproduce(
     if passes is not None:
         recipes = {name: replace(recipe, passes=passes) for name, recipe in recipes.items()}
     if methods is None:
-        methods = cast("tuple[Method, ...]", (*METHODS, *([] if plans else [SCRIPTED])))
+        methods = cast("tuple[Method, ...]", (*lw.modules.METHODS, *([] if plans else [SCRIPTED])))
     if experiment == SCRIPTED:
         methods = ("scripted",)
     plans_name = "+".join(map(_plans_name, plans))
@@ -134,16 +132,12 @@ def reproduce(
 
 def _plans_name(source: str) -> str:
     """What plans are called in a run's folder: their file or folder, and of a format's folder the model too."""
-    from lw_torchrl.language.formats import PLAN_FORMATS
-
     path = Path(source)
     return f"{path.parent.name}-{path.name}" if path.name in PLAN_FORMATS and path.parent.name else path.stem
 
 
 def _all_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Literal["own", "MT10"]) -> Plans:
     """The plans of these sources, shipped ones with these skills; each of the 50 tasks must have one."""
-    from lw_torchrl.language.tasks import MT50
-
     found = options.read_plans(sources, tasks, skills)
     if missing := [task for task in MT50 if task not in found]:
         lack = f"{len(missing)}: {', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"

@@ -11,16 +11,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes
 
-from lw_torchrl._checks import check_choice, check_int
+import lw_torchrl as lw
+from lw_torchrl._checks import check_choice
 from lw_torchrl.cli.options import check_folder, use_one_thread
 from lw_torchrl.cli.output import Output
-
-if TYPE_CHECKING:
-    from lw_torchrl.evaluation import EvaluationResult
 
 Job = Callable[[], Any]
 """Does a run, whose :class:`EvaluationResult` it returns, or makes what several runs share."""
@@ -42,7 +40,6 @@ class Schedule:
             check_folder("--out", out)
         elif self.run is not None:
             raise ValueError("--list names the runs and does none, --run does one: give one of them")
-        check_int("jobs", self.jobs, minimum=1)
 
     def execute(
         self,
@@ -51,7 +48,7 @@ class Schedule:
         runs: Sequence[Mapping[str, Job]],
         command: Sequence[object],
         summarize: Callable[[], Mapping[str, Any]],
-        told: Callable[[EvaluationResult], str] = lambda result: "",
+        told: Callable[[lw.EvaluationResult], str] = lambda result: "",
     ) -> Output:
         """Do what is asked for; the summary is written when all runs are done.
 
@@ -61,11 +58,10 @@ class Schedule:
         every = {name: job for stage in (*shared, *runs) for name, job in stage.items()}
         names = [name for stage in runs for name in stage]
         if self.list:
-            output.show("runs", [*every], "\n".join(every))
-            return output
+            return output.show("runs", [*every], "\n".join(every))
         use_one_thread()
 
-        def line(name: str) -> tuple[EvaluationResult | None, str]:
+        def line(name: str) -> tuple[lw.EvaluationResult | None, str]:
             result = every[name]()
             if name not in names:
                 return None, name
@@ -87,8 +83,7 @@ class Schedule:
                 commands = [[*map(str, command), "--run", name] for name in stage]
                 ended = run_commands(commands, self.launcher, self.jobs)
                 _report(len(stage), (printed.strip() or stage[index] for index, printed in ended))
-        output.show("summaries", summarize())
-        return output
+        return output.show("summaries", summarize())
 
 
 Scheduled = Annotated[Schedule, OmitArgPrefixes]

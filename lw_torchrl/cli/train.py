@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+import lw_torchrl as lw
 from lw_torchrl._checks import check_choice
+from lw_torchrl._files import read_json
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
-
-if TYPE_CHECKING:
-    from lw_torchrl.language.plans import Plans
-    from lw_torchrl.language.text import TextEncoder
-    from lw_torchrl.modules.query_evaluator import QueryEvaluator
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import resolve_tasks
 
 
 def train(
@@ -27,7 +27,7 @@ def train(
     plans: options.PlanSources = ("MT10",),
     task_file: options.TaskFile = None,
     text_encoder: options.EncoderName = None,
-    method: str = "pcbc",  # pcbc, by plan; or a baseline: dc, by the task's description, one-hot, by its number
+    method: options.Condition = "pcbc",  # pcbc, by plan; or a baseline: dc, by description, one-hot, by number
     mix: Literal["latents", "actions"] | None = None,
     features: Literal["raw", "differences", "relative", "both"] = "differences",
     width: int = 256,  # of the action decoder's hidden layers
@@ -65,8 +65,6 @@ def train(
     options.check_file("--out", out)
     if begin is not None and out.resolve() == begin.resolve():
         raise ValueError("--out must be another file than --begin, which is only read")
-    from lw_torchrl.language.tasks import resolve_tasks
-
     if answers is not None and evaluator is None:
         raise ValueError("--answers is of an evaluator's answers; give --evaluator")
     if qaf_anchor and evaluator is None and begin is None:
@@ -76,12 +74,8 @@ def train(
             "--evaluator new knows nothing: give --qaf-anchor 1 too, by which it learns what conditions mean"
         )
     options.check_dataset("data", data)
-    check_choice("method", method, options.METHODS)
     options.check_encoder(text_encoder)
-    from lw_torchrl.data.dataset import read_metadata
-
-    held = read_metadata(data).config
-    known = options.read_tasks(task_file, held.tasks)
+    known = options.read_tasks(task_file, _told_tasks(data))
     chosen = resolve_tasks(options.one_or_many(tasks), tasks=known) if tasks else ()
     if begin is not None:
         options.check_saved("--begin", begin)
@@ -94,27 +88,25 @@ def train(
     loaded = options.read_plans(plans, known)
     import torch
 
-    import lw_torchrl as lw
-    from lw_torchrl import modules
     from lw_torchrl._devices import check_device
-    from lw_torchrl.modules.policy import make_policy, policy_class
+    from lw_torchrl.data.dataset import read_metadata
+    from lw_torchrl.modules.policy import METHODS, make_policy, policy_class
 
     options.use_one_thread()
-    there = check_device("device", device)
+    there, held = check_device("device", device), read_metadata(data).config
     encoder = options.read_encoder(text_encoder)
     actor_options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
-    reads_plans = policy_class(modules.METHODS[method].policy).plan_options
-    for option, value in (("--mix", mix), ("--latent-consistency", latent_consistency)):
-        if value and not reads_plans:
-            raise ValueError(f"{option} is for a method that reads plans, --method {method} does not")
+    reads_plans = policy_class(METHODS[method].policy).plan_options
     if reads_plans:
         actor_options["mix"] = mix or "latents"
+    for option, value in (("mix", mix), ("latent-consistency", latent_consistency), ("evaluator", evaluator)):
+        if value and not reads_plans:
+            raise ValueError(f"--{option} is for a method that reads plans, --method {method} does not")
     numbers: dict[str, Any] = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed}
     numbers |= {"latent_consistency": latent_consistency, "qaf_anchor": qaf_anchor}
     config = lw.BehavioralCloningConfig(normalize=begin is None, **numbers)
-    rows: dict[str, Any] = {"episodes": None, "after_success": after_success}
-    if chosen:
-        rows["episodes"] = {check_choice("tasks", task, held.tasks): held.episodes_per_task for task in chosen}
+    wanted = {check_choice("tasks", task, held.tasks): held.episodes_per_task for task in chosen}
+    rows: dict[str, Any] = {"episodes": wanted or None, "after_success": after_success}
     replay = lw.LanguageWorldExperienceReplay(data, sampler=lw.TaskBalancedSampler(), device=there, **rows)
     torch.manual_seed(seed)
     if begin is not None:
@@ -130,8 +122,6 @@ def train(
     else:
         shown = loaded if reads_plans else {task: loaded[task] for task in replay.tasks}
         if evaluator is not None:
-            if not reads_plans:
-                raise ValueError(f"--evaluator is for a method that reads plans, --method {method} does not")
             actor_options |= {"evaluator": _evaluator(evaluator, loaded, encoder), "answers": answers or "tanh"}
         actor = make_policy(method, shown, text_encoder=encoder, **actor_options)
     loaded.require(replay.tasks)
@@ -155,17 +145,21 @@ def train(
     output.show("steps", steps)
     output.show("loss", loss, f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}") + f": {out}")
     if inside is not None:
-        from lw_torchrl.evaluation import condition_drift, drift_table
-
-        drifts = condition_drift(actor, replay[:])
+        drifts = lw.evaluation.condition_drift(actor, replay[:])
         heading = "conditions that drifted most from their words, in the demonstrations' states:"
-        output.show("drift", [asdict(one) for one in drifts], f"{heading}\n{drift_table(drifts, most=5)}")
+        table = lw.evaluation.drift_table(drifts, most=5)
+        output.show("drift", [asdict(one) for one in drifts], f"{heading}\n{table}")
     return output
 
 
-def _evaluator(named: str, plans: Plans, encoder: TextEncoder | None) -> QueryEvaluator:
-    import lw_torchrl as lw
+def _told_tasks(folder: Path) -> tuple[str, ...]:
+    """A dataset's tasks, read without torch; none where its metadata are no such, which is an error later."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        return tuple(map(str, read_json(folder / "metadata.json", "data")["config"]["tasks"]))
+    return ()
 
+
+def _evaluator(named: str, plans: Plans, encoder: Any) -> lw.QueryEvaluator:
     if named == "new":
         return lw.StateQueryEvaluator(plans)
     return lw.training.load_evaluator(named, plans, text_encoder=encoder)

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
+import lw_torchrl as lw
 from lw_torchrl._checks import check_choice
+from lw_torchrl._rendering import CAMERAS
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
-
-if TYPE_CHECKING:
-    from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 
 WHO = ("expert", "scripted", "spoilt-30", "random")
 
@@ -59,8 +58,6 @@ def train_evaluator(
     options.check_folder("--out", out)
     if text_encoder is not None and structure:
         raise ValueError("--text-encoder is for --no-structure; with structure no text is read")
-    from lw_torchrl._rendering import CAMERAS
-
     known = options.read_tasks(None, tasks)
     names = options.simulated("tasks", options.one_or_many(tasks), known)
     drawn = len(held_out_tasks) == 1 and held_out_tasks[0].isdigit()
@@ -76,10 +73,7 @@ def train_evaluator(
     options.check_encoder(text_encoder)
     import torch
 
-    import lw_torchrl as lw
     from lw_torchrl.data.dataset import read_metadata
-    from lw_torchrl.evaluation.evaluator_figures import plot_reliability, plot_wrong_answers
-    from lw_torchrl.evaluation.evaluator_report import score_evaluator
 
     options.use_one_thread()
     numbers: dict[str, Any] = {"learning_rate": 2e-3} if cameras else {"steps": 6000}
@@ -94,7 +88,7 @@ def train_evaluator(
     network["text_encoder"] = options.read_encoder(text_encoder)
     pictures: dict[str, Any] = {"cameras": cameras, "height": picture, "width": picture}
     plans = options.read_plans(("MT50",), known)
-    evaluator: ClauseEvaluator
+    evaluator: Any
     if cameras:
         own = lw.Plans({task: plans[task] for task in names})
         evaluator = lw.modules.ImageQueryEvaluator(own, **network, **pictures)
@@ -124,11 +118,11 @@ def train_evaluator(
     output.show("evaluator", out / "evaluator.zip")
     output.show("steps", config.steps)
     output.show("loss", loss, f"trained to step {config.steps}" + ("" if loss != loss else f", loss {loss:.4f}"))
-    report = score_evaluator(evaluator, labelled)
+    report = lw.evaluation.score_evaluator(evaluator, labelled)
     output.show("parts", {name: one.to_json() for name, one in report.parts.items()}, report.table())
     report.save(out / "report.json")
-    plot_reliability(report, out / "reliability.png")
+    lw.evaluation.plot_reliability(report, out / "reliability.png")
     if cameras:
-        plot_wrong_answers(evaluator, labelled, out / "wrong.png")
+        lw.evaluation.plot_wrong_answers(evaluator, labelled, out / "wrong.png")
     print(f"written to {out}")
     return output

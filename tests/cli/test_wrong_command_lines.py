@@ -239,7 +239,7 @@ def test_the_words_of_the_command_line_are_those_of_the_library():
     from lw_torchrl.paper.recipes import MIXTURES, OFFLINE_METHODS
 
     assert tuple(BEHAVIOURS) == options.ACTORS
-    assert tuple(METHODS) == options.METHODS
+    assert tuple(METHODS) == get_args(options.Condition)
     assert get_args(offline.Mixture) == tuple(MIXTURES)
     assert get_args(offline.OfflineMethod) == tuple(OFFLINE_METHODS)
     assert online.WEAKEST == WEAKEST

@@ -13,23 +13,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._checks import check_choice
 from lw_torchrl._rendering import naming_absent_renderer
-from lw_torchrl.suites.cameras import SeenRows
-from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
-from lw_torchrl.suites.fetch.frame import (
-    HAND_HEIGHT,
-    OPEN,
-    Array,
-    fetch_actions,
-    our_positions,
-    our_quaternions,
-    turned_quaternions,
-)
+from lw_torchrl.suites.engine import BodyPoses, RowModel
+from lw_torchrl.suites.fetch import frame
 from lw_torchrl.suites.fetch.words import FETCH
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
-from lw_torchrl.suites.metaworld.vectorized.engine import available_cores
-from lw_torchrl.suites.metaworld.vectorized.simulated_rows import RowGroup, WorkerPool, split_into_groups
+from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask
+from lw_torchrl.suites.metaworld.vectorized.simulated_rows import ThreadedEngine
 from lw_torchrl.suites.metaworld.vectorized.task_programs import WARNED_ALREADY
 
 CAMERAS = ("external_camera_0", "head_camera_rgb", "gripper_camera_rgb", "lidar")
@@ -41,7 +32,6 @@ _FINGERS = ("robot0:r_gripper_finger_joint", "robot0:l_gripper_finger_joint")
 _TURN = np.array([1.0, 0.0, 1.0, 0.0])  # what each action adds to the hand's quaternion: fingers down
 _METRES = 0.05  # per unit of a displacement
 _SUCCESS = 0.05  # metres
-_Mask = NDArray[np.bool_]
 
 
 class _Scene(NamedTuple):
@@ -134,7 +124,7 @@ class _Row:
         return RowModel(self.path, self._model), self.data
 
 
-class FetchEngine(SeenRows):
+class FetchEngine(ThreadedEngine):
     """Simulates rows of FetchReach-v4, FetchPush-v4, FetchSlide-v4 and FetchPickAndPlace-v4.
 
     Its states, goals and successes are gymnasium-robotics', bit for bit, whatever the number of threads and whatever a
@@ -171,50 +161,27 @@ class FetchEngine(SeenRows):
         self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: int | None = None
     ) -> None:
         self._dense = check_choice("reward", reward, ("sparse", "dense")) == "dense"
-        num_threads = check_int("num_threads", available_cores() if num_threads is None else num_threads, minimum=1)
         tasks = [check_choice("task", task, _SCENES) for task in tasks]
-        self._rows = [_Row(task) for task in tasks]
-        # Rows do not share what they write, so any of them may be together.
-        self._groups = split_into_groups([""] * len(tasks), num_threads)
-        self._pool = WorkerPool(num_threads)
-
         n = len(tasks)
+        super().__init__([""] * n, FETCH, num_threads)  # rows share what they read alone: any of them may be together
+        self._rows = [_Row(task) for task in tasks]
         self._origin = np.array([_SCENES[task].origin for task in tasks]).reshape(n, 3)
         self._has_thing = np.array([row.has_thing for row in self._rows], dtype=bool)
         self._read = np.zeros((n, _READ))
-        self._goal = np.zeros((n, 3))
-        self._observation = np.zeros((n, FETCH.size))
-        self._started = np.zeros(n, dtype=bool)
-        self._faulted = np.zeros(n, dtype=bool)
 
-    def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
-        index, seed_of = seeds_of_rows(rows, seeds)
-        # A reset that fails half-way leaves rows that must not be stepped.
-        self._started[index] = False
+    def _reset_row(self, row: int, seed: int) -> None:
+        self._rows[row].reset(seed, self._read[row])
+        self._goal[row] = self._rows[row].goal
 
-        def reset(row: int) -> None:
-            self._rows[row].reset(seed_of[row], self._read[row])
-            self._goal[row] = self._rows[row].goal
+    def _observe_first(self, rows: Index) -> None:
+        now = self._now(rows)
+        goal = frame.our_positions(self._goal[rows], self._origin[rows])
+        goal[:, 2] += np.where(self._has_thing[rows], 0.0, frame.HAND_HEIGHT)
+        self._observation[rows] = np.concatenate((now, now, goal), axis=1)
 
-        self._pool.work(self._by_group(index), reset)
-        now = self._now(index)
-        lift = np.where(self._has_thing[index], 0.0, HAND_HEIGHT)
-        goal = our_positions(self._goal[index], self._origin[index])
-        goal[:, 2] += lift
-        self._observation[index] = np.concatenate((now, now, goal), axis=1)
-        self._faulted[index] = False
-        self._started[index] = True
-        return self._observation[index]
-
-    def step(self, action: NDArray[Any], active: _Mask) -> EngineStep:
-        n = len(self._rows)
-        action, active = checked_step(action, active, self._started, FETCH.action_size)
-        # NaN must not reach the physics: MuJoCo would silently restart the row.
-        self._faulted |= active & ~np.isfinite(action).all(axis=1)
-        rows = np.flatnonzero(active & ~self._faulted)
-        reward, success = np.zeros(n), np.zeros(n, dtype=bool)
-        warnings = np.full((n, 3), WARNED_ALREADY, dtype=np.int32)
-        theirs = fetch_actions(np.clip(action, -1, 1))
+    def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
+        warnings = np.full((len(action), 3), WARNED_ALREADY, dtype=np.int32)
+        theirs = frame.fetch_actions(np.clip(action, -1, 1))
         displacement = (theirs[:, :3] * _METRES).astype(np.float64)  # multiplied in the action's own precision
         effort = theirs[:, 3].astype(np.float64)
 
@@ -233,39 +200,24 @@ class FetchEngine(SeenRows):
         reward[rows] = -distance if self._dense else success[rows]
         self._observation[rows, _NOW : 2 * _NOW] = self._observation[rows, :_NOW]
         self._observation[rows, :_NOW] = now
-        return EngineStep(self._observation.copy(), reward, success, active & self._faulted)
 
-    def _now(self, rows: NDArray[np.intp]) -> Array:
+    def _now(self, rows: Index) -> Array:
         """The first 11 numbers of the rows' observations."""
         read, origin = self._read[rows], self._origin[rows]
         now = np.zeros((len(rows), _NOW))
-        now[:, :3] = our_positions(read[:, :3], origin)
-        now[:, 2] += HAND_HEIGHT
-        now[:, 3] = np.clip((read[:, 3] + read[:, 4]) / OPEN, 0.0, 1.0)
+        now[:, :3] = frame.our_positions(read[:, :3], origin)
+        now[:, 2] += frame.HAND_HEIGHT
+        now[:, 3] = np.clip((read[:, 3] + read[:, 4]) / frame.OPEN, 0.0, 1.0)
         thing = self._has_thing[rows]
-        now[thing, 4:7] = our_positions(read[thing, 5:8], origin[thing])
-        now[thing, 7:] = our_quaternions(read[thing, 8:])
+        now[thing, 4:7] = frame.our_positions(read[thing, 5:8], origin[thing])
+        now[thing, 7:] = frame.our_quaternions(read[thing, 8:])
         return now
-
-    def _by_group(self, rows: NDArray[np.intp]) -> list[tuple[RowGroup, list[int]]]:
-        wanted = set(rows.tolist())
-        found = [(group, [row for row in group.rows if row in wanted]) for group in self._groups]
-        return [(group, members) for group, members in found if members]
-
-    def _seen(self, row: int) -> tuple[RowModel, Any]:
-        return self._rows[row].seen()
 
     def poses(self, row: int) -> BodyPoses:
         """Where all bodies of a row are now, in our axes."""
-        found = super().poses(row)
-        return BodyPoses(our_positions(found.position, self._origin[row]), turned_quaternions(found.quaternion))
+        position, quaternion = super().poses(row)
+        return BodyPoses(frame.our_positions(position, self._origin[row]), frame.turned_quaternions(quaternion))
 
     def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
         """As :meth:`SeenRows.render`, by one of Fetch's own cameras."""
         return super().render(rows, camera=check_choice("camera", camera, CAMERAS), height=height, width=width)
-
-    def close(self) -> None:
-        """End the threads."""
-        super().close()
-        self._pool.close()
-        self._rows = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import weakref
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -10,11 +9,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._checks import check_choice
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import check_task
-from lw_torchrl.suites.cameras import SeenRows
-from lw_torchrl.suites.engine import EngineStep, RowModel, checked_step, seeds_of_rows
 from lw_torchrl.suites.metaworld.vectorized import observation as at
 from lw_torchrl.suites.metaworld.vectorized import simulated_rows, task_programs
 from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask, Observer, SuccessFunction
@@ -24,11 +21,7 @@ from lw_torchrl.suites.metaworld.vectorized.tables import reward_table, simulati
 FINGERS = np.array([1.0, -1.0])  # the two fingers are driven against each other by one number of the action
 
 
-def available_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-class VectorizedEngine(SeenRows):
+class VectorizedEngine(simulated_rows.ThreadedEngine):
     """Simulates all rows together: physics in threads, by default one a core, everything else in NumPy over all rows.
 
     Its numbers are those of :class:`~lw_torchrl.suites.metaworld.plain_engine.MetaWorldEngine`, bit for bit, whatever
@@ -52,9 +45,8 @@ class VectorizedEngine(SeenRows):
     ) -> None:
         task_programs.check_versions()
         dense = check_choice("reward", reward, ("sparse", "dense")) == "dense"
-        num_threads = check_int("num_threads", available_cores() if num_threads is None else num_threads, minimum=1)
         tasks = [check_task(task) for task in tasks]
-        self._groups = simulated_rows.split_into_groups([task_programs.model_path(task) for task in tasks], num_threads)
+        super().__init__([task_programs.model_path(task) for task in tasks], METAWORLD, num_threads)
         rewards = [reward_table()[task] if dense else None for task in tasks]
         rows: dict[int, simulated_rows.SimulatedRow] = {}
         models: list[task_programs.SharedModel] = []
@@ -70,8 +62,6 @@ class VectorizedEngine(SeenRows):
         self._rows = [rows[row] for row in range(len(tasks))]
         self._starts = EpisodeStarts([reward for reward in rewards if reward is not None]) if dense else None
         self._width = at.REWARD_WIDTH if dense else at.WIDTH
-        self._pool = simulated_rows.WorkerPool(num_threads)
-
         n, builders = len(tasks), [row.builder for row in self._rows]
         bounds = [builder.sawyer_observation_space for builder in builders]
         self._low = np.array([space.low for space in bounds]).reshape(n, METAWORLD.size)
@@ -81,59 +71,29 @@ class VectorizedEngine(SeenRows):
         (self._action_scale,) = {builder.action_scale for builder in builders} or {0.01}  # all tasks share one
 
         self._mocap = np.zeros((n, 3))
-        self._goal = np.zeros((n, 3))
         self._current = np.zeros((n, 18))
-        self._observation = np.zeros((n, METAWORLD.size))
-        self._started = np.zeros(n, dtype=bool)
-        self._faulted = np.zeros(n, dtype=bool)
         self._running: _RunningRows | None = None
 
-    def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
-        index, seed_of = seeds_of_rows(rows, seeds)
-        # A reset that fails half-way leaves rows that must not be stepped.
-        self._started[index] = False
+    def _reset_row(self, row: int, seed: int) -> None:
+        self._observation[row] = self._rows[row].reset(seed)
+        self._mocap[row] = self._rows[row].mocap
+        self._goal[row] = self._rows[row].program._target_pos
+        if self._starts is not None:
+            self._starts.begin(row, self._rows[row].program)
 
-        def reset(row: int) -> None:
-            self._observation[row] = self._rows[row].reset(seed_of[row])
-            self._mocap[row] = self._rows[row].mocap
-            self._goal[row] = self._rows[row].program._target_pos
-            if self._starts is not None:
-                self._starts.begin(row, self._rows[row].program)
-
-        self._pool.work(self._by_group(index), reset)
-        self._current[index] = self._observation[index, at.CURRENT]
-        self._faulted[index] = False
-        self._started[index] = True
-        return self._observation[index]
-
-    def step(self, action: NDArray[Any], active: Mask) -> EngineStep:
-        n = len(self._rows)
-        action, active = checked_step(action, active, self._started, METAWORLD.action_size)
-        # NaN must not reach the physics: MuJoCo would silently restart the row.
-        self._faulted |= active & ~np.isfinite(action).all(axis=1)
-        reward, success = np.zeros(n), np.zeros(n, dtype=bool)
-        running = active & ~self._faulted
-        if running.any():
-            key = running.tobytes()
-            if self._running is None or self._running.key != key:  # the mask seldom changes
-                self._running = _RunningRows(self, running, key)
-            self._step_running(self._running, action, reward, success)
-        return EngineStep(self._observation.copy(), reward, success, active & self._faulted)
-
-    def _seen(self, row: int) -> tuple[RowModel, Any]:
-        return self._rows[row].seen()
+    def _observe_first(self, rows: Index) -> None:
+        self._current[rows] = self._observation[rows, at.CURRENT]
 
     def close(self) -> None:
         """End the threads and give the models back, for the next engine of this process."""
         super().close()
-        self._pool.close()
-        self._rows = []
         self._running = None
         self._return_models()
 
-    def _step_running(self, running: _RunningRows, action: NDArray[Any], reward: Array, success: Mask) -> None:
-        rows = running.rows
-        action = action[rows]
+    def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
+        if self._running is None or not np.array_equal(self._running.rows, rows):  # which run seldom changes
+            self._running = _RunningRows(self, rows)
+        running, action = self._running, action[rows]
         shift = np.minimum(np.maximum(action[:, :3], -1), 1) * self._action_scale
         mocap = np.minimum(np.maximum(self._mocap[rows] + shift, running.mocap_low), running.mocap_high)
         self._mocap[rows] = mocap
@@ -163,18 +123,12 @@ class VectorizedEngine(SeenRows):
         success[rows] = achieved
         reward[rows] = rewards
 
-    def _by_group(self, rows: Index) -> list[tuple[simulated_rows.RowGroup, list[int]]]:
-        wanted = set(rows.tolist())
-        found = [(group, [row for row in group.rows if row in wanted]) for group in self._groups]
-        return [(group, members) for group, members in found if members]
-
 
 class _RunningRows:
     """What is constant for one set of running rows."""
 
-    def __init__(self, engine: VectorizedEngine, running: Mask, key: bytes) -> None:
-        self.key = key
-        self.rows = rows = np.flatnonzero(running)
+    def __init__(self, engine: VectorizedEngine, rows: Index) -> None:
+        self.rows = rows
         self.members = members = [engine._rows[row] for row in rows]
         sources = [member.sources for member in members]
         self.observer = Observer(sources)

@@ -1,7 +1,9 @@
-"""Simulated rows, each a MuJoCo state on a shared model, and the threads that work through groups of rows."""
+"""Simulated rows, each a MuJoCo state on a shared model, and engines whose threads work through groups of rows."""
 
 from __future__ import annotations
 
+import os
+from abc import abstractmethod
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,9 +16,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.suites.engine import RowModel
+from lw_torchrl._checks import check_int
+from lw_torchrl.language.layout import Layout
+from lw_torchrl.suites.cameras import SeenRows
+from lw_torchrl.suites.engine import EngineStep, RowModel, checked_step, seeds_of_rows
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
-from lw_torchrl.suites.metaworld.vectorized.observation import Array, StateView, sensor_index
+from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask, StateView, sensor_index
 from lw_torchrl.suites.metaworld.vectorized.tables import TaskReward, TaskSources
 from lw_torchrl.suites.metaworld.vectorized.task_programs import SharedModel
 
@@ -155,3 +160,66 @@ class WorkerPool:
     def close(self) -> None:
         if self._threads is not None:
             self._threads.shutdown()
+
+
+def available_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class ThreadedEngine(SeenRows):
+    """An engine whose physics runs in threads, by default one a core; rows of one of the ``keys`` share a model."""
+
+    _rows: list[Any]  # each with ``seen``
+
+    def __init__(self, keys: Sequence[str], layout: Layout, num_threads: int | None) -> None:
+        threads = check_int("num_threads", available_cores() if num_threads is None else num_threads, minimum=1)
+        self._groups, self._pool = split_into_groups(keys, threads), WorkerPool(threads)
+        self._layout = layout
+        self._goal = np.zeros((len(keys), 3))
+        self._observation = np.zeros((len(keys), layout.size))
+        self._started, self._faulted = np.zeros((2, len(keys)), dtype=bool)
+
+    @abstractmethod
+    def _reset_row(self, row: int, seed: int) -> None:
+        """Start an episode in a row, in a thread."""
+
+    @abstractmethod
+    def _observe_first(self, rows: Index) -> None:
+        """Write the observations of rows that were reset."""
+
+    @abstractmethod
+    def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
+        """Step rows, by the actions of all, and write their observations, rewards and successes, or that they fault."""
+
+    def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
+        index, seed_of = seeds_of_rows(rows, seeds)
+        # A reset that fails half-way leaves rows that must not be stepped.
+        self._started[index] = False
+        self._pool.work(self._by_group(index), lambda row: self._reset_row(row, seed_of[row]))
+        self._observe_first(index)
+        self._faulted[index] = False
+        self._started[index] = True
+        return self._observation[index]
+
+    def step(self, action: NDArray[Any], active: Mask) -> EngineStep:
+        action, active = checked_step(action, active, self._started, self._layout.action_size)
+        # NaN must not reach the physics: MuJoCo would silently restart the row.
+        self._faulted |= active & ~np.isfinite(action).all(axis=1)
+        reward, success = np.zeros(len(active)), np.zeros(len(active), dtype=bool)
+        if (rows := np.flatnonzero(active & ~self._faulted)).size:
+            self._step_running(rows, action, reward, success)
+        return EngineStep(self._observation.copy(), reward, success, active & self._faulted)
+
+    def _by_group(self, rows: Index) -> list[tuple[RowGroup, list[int]]]:
+        wanted = set(rows.tolist())
+        found = [(group, [row for row in group.rows if row in wanted]) for group in self._groups]
+        return [(group, members) for group, members in found if members]
+
+    def _seen(self, row: int) -> tuple[RowModel, Any]:
+        return self._rows[row].seen()
+
+    def close(self) -> None:
+        """End the threads."""
+        super().close()
+        self._pool.close()
+        self._rows = []
