@@ -36,8 +36,7 @@ class Slot:
 class Layout:
     """What the numbers of an observation and of an action are, for all tasks of a suite.
 
-    The frame is the same in every suite: metres, x to the right, y away from the robot, z above the table. A suite
-    turns its own numbers into this frame.
+    The frame, into which a suite turns its own numbers: metres, x to the right, y away from the robot, z up.
 
     Attributes:
         name: the suite's.
@@ -46,20 +45,17 @@ class Layout:
         opening: index of the gripper's opening, from 0, closed, to 1, open.
         things: the things, in the order in which tasks have them. All but the first may be absent: zeros.
         goal: index of the x of the task's target.
-        past: by how many places the numbers of the step before stand further back; None without them. The goal has no
-            past.
+        past: by how many places the numbers of the step before, the goal's aside, stand further back; None without.
         action_size: A, how many numbers an action has, each in [-1, 1].
         displacement: index of the x of the hand's displacement; y and z follow. None where actions are something else,
             velocities of joints for one: scripted skills, ``RandomYaw`` and ``TransferredActor`` then refuse it.
         reach: metres that the hand moves in a step at a displacement of 1, once it moves.
         gripper: index of the gripper's effort; None where no number is one.
         closes: the effort's sign that closes, 1 or -1.
-        binary_gripper: whether the gripper opens or closes fully within a few steps, so that an effort in between has
-            to be decided.
+        binary_gripper: whether the gripper opens or closes fully within a few steps: an effort in between is decided.
         closes_above: the effort above which such a gripper closes. Meta-World's fingers, which close as fast as the
             effort is large, have closed within a quarter of a second at 0.3.
-        thresholds: relation to a threshold, metres, that replaces the published one, where the hand is measured
-            elsewhere; only for relations of one comparison.
+        thresholds: relation, of one comparison, to a threshold, metres, where the hand is measured elsewhere.
 
     Raises:
         ValueError: an index outside the numbers, or a wrong sign.
@@ -138,9 +134,8 @@ class Layout:
     def displaced(self, what: str) -> slice:
         """The hand's displacement among the numbers of an action; :class:`ValueError` names ``what`` needs one."""
         if self.displacement is None:
-            raise ValueError(
-                f"{what}: an action of layout {self.name!r} has no displacement of the hand, which it needs"
-            )
+            lacks = "has no displacement of the hand, which it needs"
+            raise ValueError(f"{what}: an action of layout {self.name!r} {lacks}")
         return slice(self.displacement, self.displacement + 3)
 
     def a_step_before(self, part: slice) -> slice:
