@@ -156,7 +156,7 @@ class SegmentActor(TensorDictModuleBase):
 
     Reads ``observation`` (N, D) float32, ``task_id`` and ``episode`` (N,) int64, ``qaf`` (N, S) bool and ``_step``
     (N,) bool, the rows that count; writes ``action`` (N, A) float32 in [-1, 1]. An episode begins in a row whose task
-    or episode differs from the last call's. ``plans`` has a plan for each task, of scripted ``skills`` if it has any.
+    or episode differs from the last call's. ``plans`` has a plan for each task, of ``skills`` unless all is chance.
     """
 
     row_by_row = True  # no network: its rows need no blocks of one size

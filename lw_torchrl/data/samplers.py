@@ -230,7 +230,8 @@ class TaskBalancedSampler(GroupSampler):
 
     The buffer may grow: new rows take random places in the present passes, and overwritten ones leave them; when a task
     comes or goes, all passes begin anew. It draws from the replay buffer's generator, so ``ReplayBuffer(...,
-    generator=...)`` fixes the batches; its state is saved with the buffer's. An epoch is one of the largest task.
+    generator=...)`` fixes the batches; its state is saved with the buffer's. An epoch is a pass over the largest task.
+    The storage's entry ``task_key`` holds the task.
 
     Raises:
         ValueError: at sampling, a batch size that the number of tasks does not divide (with the nearest that it does).

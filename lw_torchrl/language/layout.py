@@ -36,7 +36,7 @@ class Slot:
 class Layout:
     """What the numbers of an observation and of an action are, for all tasks of a suite.
 
-    The frame, into which a suite turns its own numbers: metres, x to the right, y away from the robot, z up.
+    The frame that suites turn their numbers into: metres, x to the right, y away from the robot, z above the table.
 
     Attributes:
         name: the suite's.

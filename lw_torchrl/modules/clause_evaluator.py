@@ -130,7 +130,8 @@ class ClauseEvaluator(QueryEvaluator):
         return found.reshape(*task_id.shape, self.plans.num_steps)
 
     def code(self, clauses: Sequence[tuple[Task, Clause]]) -> tuple[Clauses, Tensor | None]:
-        """Any clauses of tasks, for the network, (G,), and, if it reads any, texts' vectors: then negations follow."""
+        """Any clauses of tasks, for the network: (G,) of them, and the vectors of their texts, if it reads texts; the
+        second half are then the negations of the first."""
         if self.predicates:
             return _as_tensors(clauses, self.predicates, None, self.names), None
         both = [*clauses, *((task, replace(clause, negated=not clause.negated)) for task, clause in clauses)]

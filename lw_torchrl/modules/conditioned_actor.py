@@ -168,7 +168,7 @@ class ConditionedActor(Policy):
         return dist.log_prob(action)
 
     def as_sequential(self) -> ProbabilisticTensorDictSequential:
-        """The same actor, on the same weights, as TorchRL's; :class:`TypeError` without a distribution.
+        """The same actor and weights as a ProbabilisticTensorDictSequential; :class:`TypeError` without a distribution.
 
         Example:
             >>> import lw_torchrl as lw

@@ -59,7 +59,7 @@ class QueryEvaluator(Prepared):
     @checked
     def __init__(self, plans: Plans) -> None:
         super().__init__()
-        self.plans, self.config = plans, {}
+        self.plans, self.tasks, self.layout, self.config = plans, tuple(plans), plans.layout, {}
         self.in_keys: list[NestedKey] = ["observation", "task_id"]
         self.out_keys: list[NestedKey] = ["qaf_logits"]
 

@@ -266,9 +266,10 @@ class Training:
         for replay in self.replays:
             if isinstance(replay, LanguageWorldExperienceReplay):
                 replay.verify()
-        state, load = (self.described, self.contents()), self.load_state_dict
         device = self.device if self.says_device else None
-        self.envelope.resume(self.checkpoint, *state, load, device=device, packages=packages)
+        self.envelope.resume(
+            self.checkpoint, self.described, self.contents(), self.load_state_dict, device=device, packages=packages
+        )
         return True
 
     def state_dict(self) -> dict[str, Any]:

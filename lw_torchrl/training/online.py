@@ -48,7 +48,7 @@ class OnlineTrainer(Training):
         actor: the policy to begin with, one that was cloned, say. "advantage", "td3" and "expert-iteration" train it in
             place, and so does "residual" a :class:`ResidualActor`; the others train one that is made of it.
         replay: demonstrations that grow: ``LanguageWorldExperienceReplay(..., grow=, label="executed",
-            terminate_on_success=True, sampler=CoLearningSampler("grown"))`` with the actor's transform, and a reward.
+            terminate_on_success=True, sampler=CoLearningSampler("grown"))`` with a reward and the actor's transform.
         config: how to train: the method's own configuration, of :mod:`lw_torchrl.training.algorithms`, or an
             :class:`OnlineConfig` for the method's defaults of all else; None for its defaults.
         method: a name of :data:`LEARNERS`, whose classes say what they do.

@@ -60,8 +60,8 @@ class SuiteTransform(Transform):
     ) -> None:
         for key in in_keys:
             check_key("in_keys", key)
-        inverse = dict.fromkeys(("in_keys_inv", "out_keys_inv"), ["action"] if act is not None else [])
-        super().__init__(in_keys=list(in_keys), out_keys=["observation", "task_id"], **inverse)
+        inverse, written = ["action"] if act is not None else [], ["observation", "task_id"]
+        super().__init__(in_keys=list(in_keys), out_keys=written, in_keys_inv=inverse, out_keys_inv=inverse)
         self.task, self.observe, self.act, self.layout = task, observe, act, task.layout
 
     def _seen(self, tensordict: TensorDictBase) -> Tensor:
