@@ -21,6 +21,7 @@ MAPPING = [3, "one", ["one"], {"one": 3}, {3: "one"}]
 CAMERAS = ["corner9", ["corner", "nose"], 3, [], ["corner", "corner"], [3]]
 WRONG: dict[str, list[Any]] = {
     "Plans | Mapping[str, ConditionalPlan]": PLANS,
+    "AnyPlans": PLANS,
     "Plans": [3, "reach", [], {}, object()],
     "Mapping[str, ConditionalPlan] | Iterable[ConditionalPlan]": [
         3,

@@ -110,9 +110,8 @@ def segment_plans(tasks: Iterable[str], suite: str | Suite = "metaworld") -> Pla
     """The plans that behaviours of kind "segments" carry out, or spoil: the suite's; ValueError without."""
     suite, tasks = load_suite(suite), list(tasks)
     if suite.plans is None:
-        raise ValueError(
-            f"policy: suite {suite.name!r} has no plans, which this behaviour follows; give a policy of yours"
-        )
+        what = f"suite {suite.name!r} has no plans, which this behaviour follows"
+        raise ValueError(f"policy: {what}; give a policy of yours")
     suite.plans.require(tasks)
     return Plans([suite.plans[task] for task in tasks])
 
@@ -120,8 +119,7 @@ def segment_plans(tasks: Iterable[str], suite: str | Suite = "metaworld") -> Pla
 def behaviour_of(
     policy: Any, tasks: Iterable[str], name: str | None = None, suite: str | Suite = "metaworld"
 ) -> Behaviour:
-    """The behaviour in these tasks of ``suite`` that an argument ``policy`` stands for, under another name if one is
-    given."""
+    """The behaviour in these tasks of ``suite`` that an argument ``policy`` stands for, perhaps under another name."""
     if isinstance(policy, Policy):
         if name is None:
             raise ValueError("behaviour must name the policy in the dataset, behaviour='my-policy' say, got None")
@@ -158,8 +156,7 @@ class SegmentActor(TensorDictModuleBase):
 
     Reads ``observation`` (N, D) float32, ``task_id`` and ``episode`` (N,) int64, ``qaf`` (N, S) bool and ``_step``
     (N,) bool, the rows that count; writes ``action`` (N, A) float32 in [-1, 1]. An episode begins in a row whose task
-    or episode differs from the last call's. ``plans`` has a plan for each task, of scripted ``skills`` unless all that
-    it does is chance.
+    or episode differs from the last call's. ``plans`` has a plan for each task, of ``skills`` unless all is chance.
     """
 
     row_by_row = True  # no network: its rows need no blocks of one size

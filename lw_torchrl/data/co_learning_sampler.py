@@ -25,7 +25,6 @@ GROWN = "grown"  # the target that is what a buffer was extended with
 def _check_target(target: Any) -> str | Tensor:
     if isinstance(target, str):
         return target if "/" in target else check_choice("target", target, (GROWN, *TASKS))
-        return target
     wanted = "target must be a task's name or one bool for each episode"
     try:
         mask = torch.as_tensor(target)
@@ -170,9 +169,8 @@ class CoLearningSampler(GroupSampler):
         if batch_size % unit:
             share = f"so that {self.target_fraction} of it is the target's and {base} base tasks share the rest equally"
             near = nearest_sizes(batch_size, unit)
-            raise ValueError(
-                f"batch_size must be a multiple of {unit}, {share}, got {batch_size}; the nearest are {near}"
-            )
+            wanted = f"a multiple of {unit}, {share}, got {batch_size}"
+            raise ValueError(f"batch_size must be {wanted}; the nearest are {near}")
         mine = batch_size // whole * part
         return torch.tensor([mine] * (not self._grown) + [(batch_size - mine) // base] * base)
 

@@ -194,8 +194,7 @@ def collect_demonstrations(
         next/success, next/done, next/terminated, next/truncated: (R, 1) bool.
 
     Args:
-        tasks: of the 50, as for :func:`resolve_tasks`, or of another suite; docs/training.md shows demonstrations in
-            tasks of your own.
+        tasks: of the 50, as for :func:`resolve_tasks`, or of another suite; docs/training.md shows tasks of your own.
         episodes_per_task: how many episodes of each task to keep.
         root: the dataset's folder, new or left by an earlier call.
         suite: the :class:`~lw_torchrl.suites.Suite` that has the tasks; None for the one that their names begin with.
@@ -216,8 +215,7 @@ def collect_demonstrations(
         UserWarning: a dataset was damaged, or begun under another version of numpy, torch or this package.
 
     Raises:
-        DatasetError: (a ValueError) ``root`` holds something else, or episodes of another version of MuJoCo or
-            Meta-World, or another call is at work in it.
+        DatasetError: (a ValueError) ``root`` holds something else, or of another simulator, or another call is at work.
         OSError: it cannot be written, for lack of room, say; nothing is lost.
         RuntimeError: redrawing found too few successes.
 

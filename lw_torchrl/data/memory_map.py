@@ -233,7 +233,6 @@ def whole_episodes(demonstrations: Demonstrations, *, progress: bool) -> list[Ep
 
 
 def _files(root: Path) -> tuple[tuple[int, ...], ...]:
-    """What changes when a dataset's files do."""
     found = [path.stat() for path in (root / METADATA, *(_path(root / DATA, key) for key in COLUMNS))]
     return tuple((one.st_dev, one.st_ino, one.st_size, one.st_mtime_ns, one.st_ctime_ns) for one in found)
 

@@ -119,7 +119,10 @@ class Passes:
         mixed = mixed[label[mixed].argsort(stable=True)]
         count = label.bincount(minlength=len(self.size))
         if (self.size + count > self._room).any():
-            self._enlarge(2 * (self.size + count))
+            left, self._room = self.compact(), 2 * (self.size + count)
+            self.start = self._room.cumsum(0) - self._room
+            self.order = torch.zeros(int(self._room.sum()), dtype=torch.int64)
+            self._put(spans(self.start, self.size), left)
         end = spans(self.start + self.size, count)
         self._put(end, rows[mixed])
         self.size = self.size + count
@@ -128,12 +131,6 @@ class Passes:
         come, go = self.order[back], self.order[to]
         self._put(to, come)
         self._put(back, go)
-
-    def _enlarge(self, room: Tensor) -> None:
-        rows = self.compact()
-        self._room, self.start = room, room.cumsum(0) - room
-        self.order = torch.zeros(int(room.sum()), dtype=torch.int64)
-        self._put(spans(self.start, self.size), rows)
 
 
 def check_state(state: Any) -> dict[str, Any]:

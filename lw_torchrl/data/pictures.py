@@ -36,8 +36,6 @@ _LARGEST = 64 * 2**20  # bytes of a file of pictures
 
 @dataclass(frozen=True)
 class _Pictures:
-    """The pictures of episodes by some cameras, and their files."""
-
     cameras: tuple[str, ...]
     height: int
     width: int
@@ -139,9 +137,8 @@ def add_pictures(
 def _taken(
     found: Demonstrations, rows: TensorDictBase, episodes: Sequence[EpisodeInfo], wanted: _Pictures
 ) -> list[list[np.ndarray[Any, Any]]]:
-    base = LanguageWorldEnv(
-        episodes[0].task, num_envs=len(episodes), seed=found.config.seed, max_steps=found.config.max_steps
-    )
+    task, seed, steps = episodes[0].task, found.config.seed, found.config.max_steps
+    base = LanguageWorldEnv(task, num_envs=len(episodes), seed=seed, max_steps=steps)
     camera = CameraTransform(wanted.cameras, height=wanted.height, width=wanted.width, every=wanted.every)
     taken: list[list[np.ndarray[Any, Any]]] = [[] for _ in episodes]
     starts = torch.tensor([one.start for one in episodes])

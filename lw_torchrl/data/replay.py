@@ -195,9 +195,8 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         self.n_steps, self.gamma, self.columns = n_steps, gamma, dict[str, str]()
         self.label, self.reward, self.terminate_on_success = label, reward, terminate_on_success
         self._grows = grow is not None
-        super().__init__(
-            storage=storage, sampler=sampler, writer=writer, batch_size=batch_size, transform=transform, **kwargs
-        )
+        kwargs |= {"sampler": sampler, "writer": writer, "batch_size": batch_size, "transform": transform}
+        super().__init__(storage=storage, **kwargs)
 
     def set_sampler(self, sampler: Sampler) -> Sampler:
         """Take another sampler, which draws from the buffer's generator, in a DataLoader's worker after ``set_rng``."""

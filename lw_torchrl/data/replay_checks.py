@@ -111,9 +111,8 @@ def check_growing(sampler: Any, options: Mapping[str, Any]) -> None:
     if options.get("shared"):
         raise ValueError("shared=True: a buffer that grows is of one process")
     if isinstance(sampler, SliceSampler) and not sampler._fetch_traj:
-        raise ValueError(
-            "sampler: a SliceSampler by end_key joins cut trajectories; give it traj_key=('collector', 'traj_ids')"
-        )
+        instead = "give it traj_key=('collector', 'traj_ids')"
+        raise ValueError(f"sampler: a SliceSampler by end_key joins cut trajectories; {instead}")
 
 
 def check_rows(reward: RewardName, terminate_on_success: bool, rows: Columns) -> None:
@@ -148,8 +147,7 @@ def check_column(name: Any, values: Any, rows: int, there: Iterable[str], transf
 
 def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, size: int) -> None:
     """Raise :class:`ValueError` unless networks can be trained on a buffer's minibatches, and training be resumed: the
-    buffer answers the queries of their plans, and draws neither ahead, nor on a device, where the trainers' generators
-    are not, nor by priorities, which no trainer changes."""
+    buffer answers the queries of their plans, and draws neither ahead, nor on a device, nor by priorities."""
     for network in networks:
         own = plans_of(network)
         for answered in map(plans_of, replay.transform):
@@ -160,9 +158,8 @@ def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, s
     if replay._prefetch:
         raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
     if replay.batch_size not in (None, size):
-        raise ValueError(
-            f"batch_size of the replay buffer must be None or the configuration's, {size}, got {replay.batch_size}"
-        )
+        wanted = f"None or the configuration's, {size}, got {replay.batch_size}"
+        raise ValueError(f"batch_size of the replay buffer must be {wanted}")
     rows, sampler = replay.storage, replay.sampler
     if isinstance(sampler, PrioritizedSampler):
         raise ValueError("replay: nothing here gives rows new priorities, so a PrioritizedSampler draws them all alike")

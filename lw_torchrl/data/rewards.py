@@ -19,8 +19,7 @@ _MOST = 10.0  # Meta-World's dense reward, which it gives at success
 
 @dataclass(frozen=True)
 class Reward:
-    """A reward of a step: ``(source + shift) * scale`` of the environment's "sparse" or "dense" one, ``at_success`` if
-    that is not None at a step that succeeds."""
+    """A reward: ``(source + shift) * scale`` of "sparse" or "dense"; at a success ``at_success``, if not None."""
 
     source: Literal["sparse", "dense"]
     shift: float = 0.0

@@ -71,11 +71,8 @@ def shared_keys(columns: Iterable[NestedKey]) -> dict[NestedKey, NestedKey]:
 
 def _continues(was: Columns, before: Tensor, now: Columns, after: Tensor) -> Tensor:
     """Whether the "next" of the rows ``before`` of ``was`` equals the rows ``after`` of ``now``."""
-    equal = [
-        (was[later][before] == now[key][after]).unsqueeze(-1).flatten(1).all(1)
-        for key, later in shared_keys(now).items()
-    ]
-    return torch.stack(equal).all(0)
+    pairs = [(was[later][before], now[key][after]) for key, later in shared_keys(now).items()]
+    return torch.stack([(one == other).unsqueeze(-1).flatten(1).all(1) for one, other in pairs]).all(0)
 
 
 def _match(start: Tensor, candidate: Tensor, starts: int, candidates: int) -> Tensor:

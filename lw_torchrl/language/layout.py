@@ -36,8 +36,7 @@ class Slot:
 class Layout:
     """What the numbers of an observation and of an action are, for all tasks of a suite.
 
-    The frame is the same in every suite: metres, x to the right, y away from the robot, z above the table. A suite
-    turns its own numbers into this frame.
+    The frame that suites turn their numbers into: metres, x to the right, y away from the robot, z above the table.
 
     Attributes:
         name: the suite's.
@@ -59,8 +58,7 @@ class Layout:
             to be decided.
         closes_above: the effort above which such a gripper closes. Meta-World's fingers, which close as fast as the
             effort is large, have closed within a quarter of a second at 0.3.
-        thresholds: relation to a threshold, metres, that replaces the published one, where the hand is measured
-            elsewhere; only for relations of one comparison.
+        thresholds: relation, of one comparison, to a threshold, metres, where the hand is measured elsewhere.
 
     Raises:
         ValueError: an index outside the numbers, a number that is two things, or a wrong sign.
@@ -148,9 +146,8 @@ class Layout:
     def displaced(self, what: str) -> slice:
         """The hand's displacement among the numbers of an action; :class:`ValueError` names ``what`` needs one."""
         if self.displacement is None:
-            raise ValueError(
-                f"{what}: an action of layout {self.name!r} has no displacement of the hand, which it needs"
-            )
+            lacks = "has no displacement of the hand, which it needs"
+            raise ValueError(f"{what}: an action of layout {self.name!r} {lacks}")
         return slice(self.displacement, self.displacement + 3)
 
     def a_step_before(self, part: slice) -> slice:

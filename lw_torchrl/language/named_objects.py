@@ -33,14 +33,11 @@ def typed(position: Sequence[Coordinate]) -> TypedPosition:
     return tuple((isinstance(coordinate, int), coordinate) for coordinate in position)
 
 
-def coordinate_index(coordinate: Coordinate, constants: list[float], size: int) -> int:
-    """The index of a coordinate in the ``size`` numbers of an observation followed by ``constants``, which grow at
-    need."""
-    if isinstance(coordinate, int):
-        return coordinate
-    if coordinate not in constants:
-        constants.append(coordinate)
-    return size + constants.index(coordinate)
+def coordinate_indices(position: Sequence[Coordinate], constants: list[float], size: int) -> list[int]:
+    """Where coordinates stand in the ``size`` numbers of an observation followed by ``constants``, which may grow."""
+    fixed = dict.fromkeys(c for c in position if not isinstance(c, int))
+    constants += [c for c in fixed if c not in constants]
+    return [c if isinstance(c, int) else size + constants.index(c) for c in position]
 
 
 @dataclass(frozen=True)
@@ -72,9 +69,8 @@ class NamedObject:
         if not is_triple(self.offset):
             raise ValueError(f"offset of {self.name!r} must be three numbers in metres, got {shown(self.offset)}")
         if self.opening is not None and (type(self.opening) is not int or self.ours or self.name == GRIPPER):
-            raise ValueError(
-                f"opening of {self.name!r} must be an index, of an object alone, got {shown(self.opening)}"
-            )
+            wanted = f"an index, of an object alone, got {shown(self.opening)}"
+            raise ValueError(f"opening of {self.name!r} must be {wanted}")
 
 
 def read_position(name: str, at: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
@@ -124,12 +120,6 @@ def read_point(name: str, at: Any, objects: Mapping[str, NamedObject]) -> NamedO
     return NamedObject(name, objects[at["object"]].position, tuple(at["offset"]), ours=True)
 
 
-def gripper_of(layout: Layout) -> NamedObject:
-    """The robot's gripper, which every task has first."""
-    x, y, z = places(layout.positions[0])
-    return NamedObject(GRIPPER, (x, y, z))
-
-
 def check_inside(named: NamedObject, size: int) -> None:
     """Raise :class:`ValueError` if a position's index is outside the ``size`` numbers of an observation."""
     for coordinate in (*named.position, 0 if named.opening is None else named.opening):
@@ -147,7 +137,8 @@ def read_objects(row: Mapping[str, Any], layout: Layout = METAWORLD) -> tuple[Na
             raise ValueError(f"{key} must be a table of names and positions, got {shown(found)}")
         return found
 
-    objects = {GRIPPER: gripper_of(layout)}
+    x, y, z = places(layout.positions[0])
+    objects = {GRIPPER: NamedObject(GRIPPER, (x, y, z))}
     for named, at in table("objects").items():
         if named in objects:
             raise ValueError(f"objects may not name {named!r}, which every task has")

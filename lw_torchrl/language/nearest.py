@@ -71,8 +71,7 @@ def nearest_query(
         >>> str(nearest_query("gripper open and over the target locaton", "push").query)
         "the robot's gripper is open and the robot's gripper is above the target location"
 
-    Source: paper section 'Query Answering Function', which maps other queries to the nearest supported one by a
-    sentence embedding or by string edit distance.
+    Source: paper section 'Query Answering Function': the nearest by sentence embedding or by edit distance.
     """
     owner = get_task(task).published if published_only else get_task(task)
     relations = PUBLISHED if published_only else tuple(PREDICATES)
@@ -190,8 +189,7 @@ def nearest_skill(
 
 
 class StepMapper:
-    """Maps the words of one answer, those of data/words.toml replaced by ours, to queries and scripted skills; a
-    distance is 1 minus a similarity in [0, 1].
+    """Maps the words of an answer, by data/words.toml, to queries and skills; a distance is 1 minus a similarity.
 
     Source: paper section 'LLM Experiments', which takes the nearest by string edit distance.
     """

@@ -43,8 +43,7 @@ class DecodedPlan:
 
     Attributes:
         plan: the plan, its conditions as queries and its skills in the text's words; None if there is none.
-        scripted: the same with the nearest scripted skills, for :class:`~lw_torchrl.ScriptedSkillActor`, without the
-            steps whose skill is near none; None if no step is left.
+        scripted: the same with the nearest scripted skills, without the steps that are near none; None if none is left.
         reason: why there is no plan; "" if there is one.
         notes: what was left out or changed, in the order of the lines.
         steps: the clauses for the task, also those that were dropped.
@@ -94,8 +93,7 @@ def decode_plan(
         task: the task that was asked for, or its name.
         format: the format that was asked for, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
         by: nearest in spelling ("edit"), or in meaning ("embedding"; an ImportError without the extra ``[text]``).
-        limit, skill_limit: the largest distance, from 0 to 1, at which a condition or a goal is taken for a query, and
-            a skill for a scripted one.
+        limit, skill_limit: the largest distance, from 0 to 1, of a condition or a goal, and of a skill, from ours.
         skills: the scripted skills to choose from; None for the shipped ones.
         tasks: where a task's name is looked up, as from :func:`~lw_torchrl.load_tasks`.
 

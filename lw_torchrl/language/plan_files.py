@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -13,7 +12,7 @@ from lw_torchrl._checks import checked, shown
 from lw_torchrl._files import parse_json, read_text, write_text
 from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.plan_text import MOST_STEPS, PLAN_LIMIT, no_task, too_many_steps
-from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, as_plans, parse_plan
+from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, PlanError, Plans, PlanStep, as_plans, parse_plan
 from lw_torchrl.language.queries import QueryError
 from lw_torchrl.language.tasks import MT10, TASKS, Tasks
 
@@ -111,7 +110,7 @@ def _read_pairs(path: Path, tasks: Tasks) -> Plans:
 
 
 @checked
-def save_plans(plans: Plans | Mapping[str, ConditionalPlan], folder: str | os.PathLike[str]) -> list[Path]:
+def save_plans(plans: AnyPlans, folder: str | os.PathLike[str]) -> list[Path]:
     """Write each plan to ``folder``/<task>.plan, "__" for a slash; a file is replaced whole or not at all."""
     texts = {Path(folder) / f"{task.replace('/', '__')}.plan": str(plan) for task, plan in as_plans(plans).items()}
     Path(folder).mkdir(parents=True, exist_ok=True)

@@ -49,8 +49,7 @@ class ConditionalPlan:
     Attributes:
         task: the task's name.
         steps: 1 to 1,000 of :class:`PlanStep`, in canonical spelling, so that the plan's text reads back as the same
-            plan: conditions as ``str(query)`` gives them, skills with "the" before the task's nouns. Plans with equal
-            conditions, skills and goals are equal.
+            plan: conditions as ``str(query)``, "the" before nouns. Equal conditions, skills and goals make equal plans.
         definition: the :class:`Task` whose objects the conditions name; None for ours of that name.
 
     Example:
@@ -153,9 +152,7 @@ def parse_plan(text: str, task: str | None = None, source: str = "plan", tasks: 
     return plan
 
 
-def _read(
-    text: str, task: str | None, source: str, tasks: Tasks, report: Callable[[str], Any]
-) -> ConditionalPlan | None:
+def _read(text: str, task: str | None, source: str, tasks: Tasks, report: Callable[..., Any]) -> ConditionalPlan | None:
     if (found := read_plan_text(text, task, source, tasks, report)) is None:
         return None
     name, steps = found
@@ -291,7 +288,11 @@ class Plans(Mapping[str, ConditionalPlan]):
             raise PlanError(f"{what}. Load or write a plan for each task, or leave the task out.")
 
 
-def as_plans(plans: Plans | Mapping[str, ConditionalPlan], argument: str = "plans") -> Plans:
+AnyPlans = Plans | Mapping[str, ConditionalPlan]
+"""What an argument ``plans`` takes: :class:`Plans`, or a mapping from task names that they are made of."""
+
+
+def as_plans(plans: AnyPlans, argument: str = "plans") -> Plans:
     """``plans`` as :class:`Plans`; a mapping is checked and copied. Errors name the argument."""
     if isinstance(plans, Plans):
         return plans

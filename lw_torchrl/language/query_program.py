@@ -117,8 +117,7 @@ class QueryProgram(nn.Module):
 
         A comparison's margin is the distance to its threshold, divided by its temperature (see
         :class:`~lw_torchrl.language.relations.Comparison`). A conjunction has the least margin of its parts, a
-        negation the opposite one. The sign is the hard truth, never zero. The gradient is that of the comparison that
-        decides; it is finite everywhere.
+        negation the opposite one. The sign is the hard truth, never zero. The gradient, of what decides, is finite.
 
         Args:
             observation, task_id: as for :meth:`forward`.

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lw_torchrl.language.named_objects import TypedPosition, coordinate_index, typed
+from lw_torchrl.language.named_objects import TypedPosition, coordinate_indices, typed
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import STATES, Comparison, comparisons
 from lw_torchrl.language.tasks import MT50, Task, one_layout, task_id
@@ -28,7 +28,7 @@ class Atom(NamedTuple):
         """Where the coordinates of one position stand; those of 0 for an axis left out."""
         position = (self.first, self.second)[side if self.part.sense == "<" else 1 - side]
         used = [c if axis in self.part.axes else 0.0 for axis, (_, c) in zip("xyz", position, strict=True)]
-        return [coordinate_index(c, constants, size) for c in used]
+        return coordinate_indices(used, constants, size)
 
     @property
     def offset(self) -> list[float]:

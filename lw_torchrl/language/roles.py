@@ -44,8 +44,7 @@ def plan_roles(plan: ConditionalPlan, skills: Skills | None = None) -> tuple[Rol
     words of the text decide; if they name nothing of the task ("close the gripper around the puck" for a mug), the
     condition does. If the gripper goes to a thing and the condition compares it with a point on that thing, the point
     is the target. If the text moves a thing that the condition says is held, the thing is moved. ``skills`` are the
-    scripted skills by their text; None for the shipped ones, an empty mapping for words alone. "the target location" is
-    the goal in every task.
+    scripted skills by text; None for the shipped ones, {} for words alone. "the target location" is the goal of all.
 
     Example:
         >>> from lw_torchrl.language.plan_files import load_plans

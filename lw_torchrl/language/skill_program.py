@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl.language.named_objects import coordinate_index
+from lw_torchrl.language.named_objects import coordinate_indices
 from lw_torchrl.language.skills import ScriptedSkill, Skills, load_skills
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
 from lw_torchrl.language.tasks import Task, get_task, one_layout
@@ -74,8 +74,7 @@ class SkillProgram(nn.Module):
             for s, skill in enumerate(listed):
                 ends = task.object(skill.target), task.object(skill.moved)
                 for side, end in enumerate(ends):
-                    found_at = [coordinate_index(c, constants, layout.size) for c in end.position]
-                    place[t, side, s] = torch.tensor(found_at)
+                    place[t, side, s] = torch.tensor(coordinate_indices(end.position, constants, layout.size))
                 offsets = torch.tensor([skill.offset, *(end.offset for end in ends)], dtype=torch.float64)
                 numbers[t, 0, s] = torch.tensor(skill.gain, dtype=torch.float64)
                 numbers[t, 1, s] = numbers[t, 0, s] * (offsets[0] + offsets[1] - offsets[2])

@@ -219,6 +219,5 @@ def closes(skill: str) -> bool:
 
 
 def has_direction(skill: str) -> bool:
-    """Whether a skill says a direction in the plane, "to the left", "toward the robot", "into the hole"; "toward the
-    reach target" and "above the puck" say none."""
+    """Whether a skill says a direction in the plane, "to the left", "into the hole"; "above the puck" says none."""
     return not _DIRECTIONS.isdisjoint(skill.split())

@@ -18,8 +18,7 @@ Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
 
 
 class TaskIndex:
-    """The rows that tasks have in a table, in the order of their ids, which it follows to their device; two tasks of
-    one id are a ValueError.
+    """The rows that tasks have in a table, in the order of their ids; two tasks of one id are a ValueError.
 
     Example:
         >>> index = TaskIndex(["reach", "stack-blocks", "push"])
@@ -43,8 +42,7 @@ class TaskIndex:
 
     def rows(self, task_id: Tensor, problem: str) -> Tensor:
         """The row of each task, (...) int64 to (...) int64. An id without one is a ValueError that names the
-        ``problem``, "tasks without a plan"; compiled or on a GPU a RuntimeError when it runs. Inside ``torch.vmap`` it
-        gets a row beyond the last."""
+        ``problem``, "tasks without a plan"; compiled or on a GPU a RuntimeError; in ``vmap`` a row beyond the last."""
         if task_id.dtype not in (torch.int64, torch.int32):
             raise ValueError(f"task_id must be int64, got {task_id.dtype}")
         kept = plain(task_id)

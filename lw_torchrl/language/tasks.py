@@ -16,14 +16,7 @@ from typing import TYPE_CHECKING, Any
 from lw_torchrl._checks import check_choice, check_fields, checked, nearest, shown, unknown_name
 from lw_torchrl._files import read_toml
 from lw_torchrl.language.layout import METAWORLD, Layout
-from lw_torchrl.language.named_objects import (
-    GRIPPER,
-    Coordinate,
-    NamedObject,
-    check_inside,
-    read_objects,
-    write_objects,
-)
+from lw_torchrl.language.named_objects import GRIPPER, NamedObject, check_inside, read_objects, write_objects
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -99,14 +92,13 @@ class Task:
         """Where each object is: (..., D) float, metres, to name -> (..., 3) of the same dtype, metres."""
         import torch  # here, since words alone should not wait for it
 
-        def coordinate(at: Coordinate, shift: float) -> Tensor:
+        def coordinate(at: int | float, shift: float) -> Tensor:
             return (observation[..., at] if isinstance(at, int) else torch.full_like(observation[..., 0], at)) + shift
 
         return {one.name: torch.stack(list(map(coordinate, one.position, one.offset)), -1) for one in self.objects}
 
     def to_json(self) -> dict[str, Any]:
-        """The task as a row of tasks.toml; a :class:`TaskError` where a row cannot hold it: the gripper is elsewhere,
-        or a point has an offset from a place without an object.
+        """The task as a row of tasks.toml; a :class:`TaskError` where a row cannot hold it, another gripper's say.
 
         Example:
             >>> TASKS["reach"].to_json()["objects"]
@@ -125,8 +117,7 @@ class Task:
 
     @classmethod
     def from_json(cls, name: str, row: Any, layout: Layout = METAWORLD) -> Task:
-        """The task of a row of tasks.toml, as :meth:`to_json` gives it, of ``layout`` where it states none; any other
-        value is a :class:`TaskError`."""
+        """The task of a row of tasks.toml, by default of ``layout``; any other value is a :class:`TaskError`."""
         try:
             if not isinstance(row, Mapping):
                 raise ValueError(f"must be a table, got {shown(row)}")
@@ -256,8 +247,7 @@ def load_tasks(path: str | os.PathLike[str]) -> Tasks:
     """All 50 tasks and those of your own file: some of the 50 with other objects, points or words, or new tasks.
 
     Args:
-        path: a file in the format of data/tasks.toml, else a :class:`TaskError`. A task with a new name must name its
-            objects.
+        path: a file in the format of data/tasks.toml, else a :class:`TaskError`. A new task must name its objects.
 
     Returns:
         Task name to :class:`Task`, sorted; pass one wherever a task is asked for, or all of them to

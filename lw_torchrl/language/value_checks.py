@@ -37,8 +37,7 @@ def readable(*tensors: Tensor) -> bool:
 
 
 def asserted(*tensors: Tensor) -> bool:
-    """Whether ``torch._assert_async`` checks the tensors: compiled, and on a CUDA device, where it stops the program
-    later. Not inside ``vmap``, which lacks it."""
+    """Whether ``torch._assert_async`` checks the tensors: compiled, or on a CUDA device, but not inside ``vmap``."""
     if not torch.compiler.is_compiling():
         return waits(*tensors) and plain(*tensors)
     for tensor in tensors:  # noqa: SIM110 - as above

@@ -34,29 +34,13 @@ class Clauses(NamedTuple):
     text: Tensor  # (...) int64, its number in the list of texts
     subject: Tensor  # (...) int64, its name's number in the list of names
     object: Tensor  # (...) int64, likewise; the number behind the last for none
+    # Of T tasks' plans alone, whose clauses (T, C) come once each:
+    parts: Tensor = torch.empty(0)  # (T, S, K) int64, which of its task's clauses make up each condition
+    mask: Tensor = torch.empty(0)  # (T, S, K) bool, the parts that there are
 
     def pick(self, which: Tensor) -> Clauses:
         """Of (G,) clauses those of these numbers, (...) int64."""
-        return Clauses(*(table[which] for table in self))
-
-
-class PlanClauses(NamedTuple):
-    """The :class:`Clauses` (T, C) of T tasks' plans, each once, and which of them make up each condition."""
-
-    first: Tensor
-    second: Tensor
-    shift: Tensor
-    predicate: Tensor
-    negated: Tensor
-    text: Tensor
-    subject: Tensor
-    object: Tensor
-    parts: Tensor  # (T, S, K) int64, which of its task's clauses
-    mask: Tensor  # (T, S, K) bool, the parts that there are
-
-    @property
-    def clauses(self) -> Clauses:
-        return Clauses(*self[:8])
+        return Clauses(*(table[which] for table in self[:8]))
 
 
 def conjunction(logits: Tensor, mask: Tensor) -> Tensor:
@@ -85,8 +69,7 @@ class ClauseEvaluator(QueryEvaluator):
             needs the extra ``[text]``: clauses' vectors are not shipped.
 
     Raises:
-        ValueError: a plan asks for a predicate or a thing that it cannot tell; at call time, what is seen is of
-            another shape, or a task_id has no plan.
+        ValueError: a plan asks for what it cannot tell; at call time, another shape, or a task_id without a plan.
         ImportError: without ``structure``, the extra ``[text]`` is not installed and there is no ``text_encoder``.
 
     Source: paper section 'Differentiability and Optimization', which names a visual question answering model.
@@ -102,14 +85,14 @@ class ClauseEvaluator(QueryEvaluator):
         *,
         structure: bool,
         predicates: Sequence[str] | None,
-        names: Sequence[str] = (),
+        names: Sequence[str] | None = None,
         text_encoder: TextEncoder | None,
     ) -> None:
         super().__init__(plans)
         if not structure and predicates is not None:
             raise ValueError("predicates is for structure=True; without, an evaluator reads texts alone")
         self.predicates = _checked("predicates", sorted(PREDICATES) if predicates is None else predicates, structure)
-        self.names = _checked("names", names, structure and bool(names))
+        self.names = _checked("names", names or (), structure and bool(names))
         self.config = {"structure": structure}
         if structure:
             self.config["predicates"] = list(self.predicates)
@@ -120,7 +103,7 @@ class ClauseEvaluator(QueryEvaluator):
         tables = _plan_clauses(plans, index.tasks, self.predicates, texts, self.names)
         vectors = None if texts is None else unit_scale(_vectors(texts, text_encoder))
         self.register_buffer("text_vectors", vectors, persistent=False)
-        self.tables: TaskTables[PlanClauses] = TaskTables(index, tables, f"tasks without a plan in {plans!r}")
+        self.tables: TaskTables[Clauses] = TaskTables(index, tables, f"tasks without a plan in {plans!r}")
 
     @property
     def text_size(self) -> int:
@@ -141,7 +124,7 @@ class ClauseEvaluator(QueryEvaluator):
             raise ValueError(f"task_id must be of shape {tuple(shape)}, {each}, got {tuple(task_id.shape)}")
         rows = seen.reshape(-1, *seen.shape[-self.seen_dims :])
         tables = self.tables.select(task_id.reshape(-1), rows)
-        clauses = self.network(rows, tables.clauses, self.text_vectors)
+        clauses = self.network(rows, tables, self.text_vectors)
         parts = clauses.gather(-1, tables.parts.flatten(1)).reshape(tables.parts.shape)
         found = torch.where(tables.mask.any(-1), conjunction(parts, tables.mask), _PADDING)
         return found.reshape(*task_id.shape, self.plans.num_steps)
@@ -227,18 +210,16 @@ def _as_tensors(
 
 
 def _texts(clauses: Iterable[tuple[Task, Clause]]) -> list[str]:
-    """The different texts of clauses, sorted."""
     return sorted({str(clause) for _, clause in clauses})
 
 
 def _of(plan: ConditionalPlan) -> list[Clause]:
-    """The clauses of a plan's conditions, each once."""
     return list(dict.fromkeys(clause for step in plan.steps for clause in step.condition.clauses))
 
 
 def _plan_clauses(
     plans: Plans, tasks: Sequence[str], predicates: Sequence[str], texts: Sequence[str] | None, names: Sequence[str]
-) -> PlanClauses:
+) -> Clauses:
     """The clauses of plans as tensors, with a row for each of ``tasks``; errors as of :func:`_as_tensors`."""
     listed = [_of(plans[task]) for task in tasks]
     flat = [(plans[task].definition, clause) for task, found in zip(tasks, listed, strict=True) for clause in found]
@@ -254,4 +235,4 @@ def _plan_clauses(
             own = [found.index(clause) for clause in dict.fromkeys(step.condition.clauses)]
             parts[row, column, : len(own)] = torch.tensor(own)
             mask[row, column, : len(own)] = True
-    return PlanClauses(*_as_tensors(flat, predicates, texts, names).pick(number), parts, mask)
+    return _as_tensors(flat, predicates, texts, names).pick(number)._replace(parts=parts, mask=mask)

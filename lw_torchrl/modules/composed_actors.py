@@ -13,7 +13,7 @@ from torchrl.envs import Transform
 from lw_torchrl._checks import checked, shown
 from lw_torchrl._keys import dispatched, write
 from lw_torchrl.language.layout import Layout
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.held_evaluator import HeldEvaluator
 from lw_torchrl.modules.policy import Policy, from_description
@@ -21,8 +21,7 @@ from lw_torchrl.modules.policy import Policy, from_description
 
 class ActorEnsemble(Policy):
     """The mean action of policies that were trained separately on the same demonstrations. Where these do not say what
-    to do, each member errs in its own way, and the mean errs less. Members with different features or augmentations
-    differ most.
+    to do, each member errs in its own way, and the mean errs less, most so with different features or augmentations.
 
     Reads what a member reads; writes ``action`` (B, 4) float32, and ``skill_weights`` (B, S) float32 where the members
     have plans: the mean of the members' own.
@@ -35,11 +34,9 @@ class ActorEnsemble(Policy):
 
     Example:
         >>> import lw_torchrl as lw
-        >>> env = lw.LanguageWorldEnv("reach")
         >>> actor = lw.modules.ActorEnsemble([lw.DescriptorConditionedActor("MT10") for _ in range(4)])
-        >>> actor(env.reset())["action"].shape
+        >>> actor(lw.LanguageWorldEnv("reach").reset())["action"].shape
         torch.Size([1, 4])
-        >>> env.close()
 
     Source: as the mean of ``torchrl.modules.EnsembleModule``.
     """
@@ -92,12 +89,11 @@ class ActorEnsemble(Policy):
             raise ValueError("members of an ensemble must be a list of policies that are no ensembles")
         return cls([from_description(member, text_encoder) for member in members])
 
-    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ActorEnsemble:
+    def with_plans(self, plans: AnyPlans) -> ActorEnsemble:
         return ActorEnsemble([member.with_plans(plans) for member in self.members]).train(self.training)
 
 
 def _shared(policy: Policy) -> dict[str, Any]:
-    """What the members of an ensemble must have in common."""
     plans = None if policy.plans is None else policy.plans.fingerprint
     return {"plans": plans, "tasks": policy.tasks, "in_keys": policy.in_keys, "out_keys": policy.out_keys_source}
 
@@ -106,21 +102,17 @@ class TransferredActor(Policy):
     """The same weights under plans of another suite, and their actions turned into that suite's.
 
     A displacement keeps its metres a step, times ``speed``: it is multiplied by the ratio of the layouts' ``reach`` and
-    cut off at 1. Where the suite's gripper opens or closes within a few steps, ``binary_gripper``, it closes at an
-    effort above ``closes_above`` and opens below.
+    cut off at 1. A ``binary_gripper``, that opens and closes at once, closes at an effort above ``closes_above``.
 
-    Reads what the policy reads, of the other layout; writes ``action`` (B, A) float32 in [-1, 1], and what else the
-    policy writes.
+    Reads what the policy reads, of the other layout; writes what it writes, ``action`` (B, A) float32 in [-1, 1] first.
 
     Args:
-        actor: a policy with plans, all of whose features mean the same in both layouts: those of ``roles=True`` and
-            ``features="opening"``.
+        actor: a policy with plans whose features mean the same in both layouts: ``roles=True, features="opening"``.
         plans: what it is to do, of the other suite's tasks.
         speed: how many times as many metres a step as where it was trained, for simulators whose steps last longer.
 
     Raises:
-        ValueError: features that do not carry over, by name; a layout without a displacement; a speed that is not above
-            0.
+        ValueError: features that do not carry over, by name; a layout without a displacement; a speed of 0 or less.
         TypeError: a policy without plans.
 
     Example:
@@ -134,12 +126,12 @@ class TransferredActor(Policy):
     """
 
     @checked
-    def __init__(self, actor: Policy, plans: Plans | Mapping[str, ConditionalPlan], *, speed: float = 1.0) -> None:
-        super().__init__()
+    def __init__(self, actor: Policy, plans: AnyPlans, *, speed: float = 1.0) -> None:
         self._take(actor.with_plans(as_plans(plans)), actor.layout, speed)
 
     def _take(self, actor: Policy, trained: Layout, speed: float) -> None:
         """Hold a policy that has the other suite's plans already, and weights of the layout ``trained``."""
+        super().__init__()
         assert actor.plans is not None
         if speed <= 0:
             raise ValueError(f"speed must be above 0, got {shown(speed)}")
@@ -172,23 +164,18 @@ class TransferredActor(Policy):
         return turned
 
     def describe(self) -> dict[str, Any]:
-        return super().describe() | {
-            "actor": self.actor.describe(),
-            "trained": self.trained.to_json(),
-            "speed": self.speed,
-        }
+        trained = {"trained": self.trained.to_json(), "speed": self.speed}
+        return super().describe() | {"actor": self.actor.describe()} | trained
 
     @classmethod
     def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> TransferredActor:
         if not isinstance(inner := found["actor"], Mapping) or inner.get("kind") == cls.__name__:
             raise ValueError("the actor of a TransferredActor must be a policy that is none itself")
         made = cls.__new__(cls)
-        Policy.__init__(made)
         made._take(from_description(inner, text_encoder), Layout.from_json(found["trained"]), found["speed"])
         return made
 
-    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> TransferredActor:
+    def with_plans(self, plans: AnyPlans) -> TransferredActor:
         made = TransferredActor.__new__(TransferredActor)
-        Policy.__init__(made)
         made._take(self.actor.with_plans(plans), self.trained, self.speed)
         return made.train(self.training)

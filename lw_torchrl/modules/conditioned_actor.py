@@ -7,13 +7,8 @@ from typing import Any, ClassVar, Self
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import (
-    InteractionType,
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModuleBase,
-)
-from tensordict.nn.probabilistic import interaction_type
+from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn.probabilistic import InteractionType, interaction_type
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Distribution
@@ -111,20 +106,17 @@ class ConditionedActor(Policy):
         named = as_keys("out_keys", keys, self._written)
         check_apart(self.in_keys, named)
         self._out_keys = self._out_keys_apparent = self.config["out_keys"] = named
-        self.dist_params_keys: list[NestedKey] = []
-        self.log_prob_keys: list[NestedKey] = []
-        self.dist_sample_keys: list[NestedKey] = []
+        drawn = named if self.head.distribution is not None else []
+        self.dist_params_keys, self.log_prob_keys, self.dist_sample_keys = drawn[-3:-1], drawn[-1:], drawn[:1]
         if self.head.distribution is not None:
-            action, *_, loc, scale, log_prob = named
-            self.dist_params_keys, self.log_prob_keys, self.dist_sample_keys = [loc, scale], [log_prob], [action]
             # KLPENPPOLoss looks for it here.
             self.sampler = ProbabilisticTensorDictModule(
-                in_keys={"loc": loc, "scale": scale},
-                out_keys=[action],
+                in_keys=dict(zip(("loc", "scale"), self.dist_params_keys, strict=True)),
+                out_keys=self.dist_sample_keys,
                 distribution_class=DISTRIBUTIONS[self.head.distribution],
                 default_interaction_type=InteractionType.DETERMINISTIC,
                 return_log_prob=True,
-                log_prob_key=log_prob,
+                log_prob_key=named[-1],
             )
 
     def definition(self, task: str) -> Task | None:
@@ -176,8 +168,7 @@ class ConditionedActor(Policy):
         return dist.log_prob(action)
 
     def as_sequential(self) -> ProbabilisticTensorDictSequential:
-        """The same actor as a ProbabilisticTensorDictSequential, on the same weights; :class:`TypeError` without a
-        distribution.
+        """The same actor and weights as a ProbabilisticTensorDictSequential; :class:`TypeError` without a distribution.
 
         Example:
             >>> import lw_torchrl as lw

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -14,7 +14,7 @@ from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_int, checked, passes_on
 from lw_torchrl._keys import as_keys, check_apart, check_key, dispatched, read, write
-from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.language.plans import AnyPlans
 from lw_torchrl.modules.networks import DistributionName, check_width, head
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
@@ -103,8 +103,7 @@ class QValue(Value):
     Args:
         encoder, ensemble, width, depth, layer_norm, out_keys: as for :class:`Value`.
         action_key: where the action is; may be nested.
-        quantiles: Q, how many quantiles of the return are the value, as ``torchrl.objectives.TQCLoss`` needs it; 1 for
-            its mean.
+        quantiles: Q, how many quantiles of the return are the value, for ``torchrl.objectives.TQCLoss``; 1: its mean.
 
     Source: ``torchrl.modules.ValueOperator``.
     """
@@ -153,7 +152,7 @@ class PlanConditionedValue(Value):
     """
 
     @passes_on(Value.__init__, PlanEncoder.__init__)
-    def __init__(self, plans: Plans | Mapping[str, ConditionalPlan], **options: Any) -> None:
+    def __init__(self, plans: AnyPlans, **options: Any) -> None:
         own = {name: options.pop(name) for name in _OWN if name in options}
         super().__init__(PlanEncoder(plans, **options), **own)
 
@@ -161,8 +160,7 @@ class PlanConditionedValue(Value):
 class PlanConditionedQValue(QValue):
     """:class:`QValue` on a :class:`PlanEncoder`.
 
-    Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64, ``qaf`` (B, S) bool and ``action`` (B, 4) float32;
-    writes as :class:`QValue`.
+    Reads what :class:`PlanConditionedValue` does, and ``action`` (B, 4) float32; writes as :class:`QValue`.
 
     Args:
         plans: a plan for each task that will be seen.
@@ -176,7 +174,7 @@ class PlanConditionedQValue(QValue):
     """
 
     @passes_on(QValue.__init__, PlanEncoder.__init__)
-    def __init__(self, plans: Plans | Mapping[str, ConditionalPlan], **options: Any) -> None:
+    def __init__(self, plans: AnyPlans, **options: Any) -> None:
         own = {name: options.pop(name) for name in (*_OWN, "action_key", "quantiles") if name in options}
         super().__init__(PlanEncoder(plans, **options), **own)
 
@@ -184,7 +182,7 @@ class PlanConditionedQValue(QValue):
 @passes_on(PlanConditionedActor.__init__)
 @checked
 def plan_actor_value(
-    plans: Plans | Mapping[str, ConditionalPlan],
+    plans: AnyPlans,
     *,
     distribution: DistributionName = "tanh_normal",
     value_width: int | tuple[int, ...] = 256,

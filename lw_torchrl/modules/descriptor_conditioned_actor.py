@@ -28,8 +28,7 @@ class DescriptorEncoder(Encoder):
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``encoding`` (B, D + F) float32.
 
     Args:
-        tasks: the tasks that it knows, as for :func:`resolve_tasks`; a :class:`Task` in a list brings its own
-            description.
+        tasks: those that it knows, as for :func:`resolve_tasks`; a :class:`Task` brings its own description.
         condition: "description", the text's vector; "one-hot", one number for each task, which knows no words.
         features, feature_noise, latent_size, encoder_width, encoder_depth, text_encoder, in_keys, out_keys: as for
             :class:`PlanEncoder`; ``features`` other than "opening".
@@ -104,18 +103,15 @@ class DescriptorConditionedActor(ConditionedActor):
 
     Args:
         tasks: the tasks it is to act in, see :class:`DescriptorEncoder`.
-        **options: of :class:`~lw_torchrl.modules.ConditionedActor` and of :class:`DescriptorEncoder`; ``out_keys`` are
-            the actor's.
+        **options: of :class:`ConditionedActor` and of :class:`DescriptorEncoder`; ``out_keys`` are the actor's.
 
     Raises:
         ValueError: an unknown task; at call time, a task_id outside ``tasks``.
 
     Example:
         >>> import lw_torchrl as lw
-        >>> env = lw.LanguageWorldEnv("reach")
-        >>> lw.DescriptorConditionedActor("MT10")(env.reset())["action"].shape
+        >>> lw.DescriptorConditionedActor("MT10")(lw.LanguageWorldEnv("reach").reset())["action"].shape
         torch.Size([1, 4])
-        >>> env.close()
 
     Source: paper section 'Conditional Plan Experiments'.
     """

@@ -49,8 +49,7 @@ class HeldEvaluator(QueryEvaluator):
         >>> lw.evaluate(actor, tasks="reach", episodes_per_task=1, seed=1_000, max_steps=5).mean_success
         0.0
 
-    Source: paper section 'Differentiability and Optimization', which proposes to evaluate queries less often than at
-    every step.
+    Source: paper section 'Differentiability and Optimization', which proposes to evaluate queries less often.
     """
 
     @checked

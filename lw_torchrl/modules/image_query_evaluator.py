@@ -25,8 +25,7 @@ _SHARP = 30.0  # what scores count in the softmax over a picture's places: at 1 
 
 
 class SmallImageEncoder(nn.Module):
-    """Pictures (n, 3, H, W) float32 in [0, 1] to a map of features (n, 32, H/2, W/2): five convolutions, the inner ones
-    at a quarter of the size, to see further."""
+    """Pictures (n, 3, H, W) float32 in [0, 1] to features (n, 32, H/2, W/2): five convolutions, some at a quarter."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -173,9 +172,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
             raise ValueError("names is for structure=True; without, an evaluator reads texts alone")
         if structure and names is None:
             names = sorted({name for plan in plans.values() for name in plan.definition.object_names})
-        super().__init__(
-            plans, structure=structure, predicates=predicates, names=names or (), text_encoder=text_encoder
-        )
+        super().__init__(plans, structure=structure, predicates=predicates, names=names, text_encoder=text_encoder)
         self.cameras, self.every = check_cameras(cameras, height, width), check_int("every", every, minimum=1)
         if max(height, width) > _LARGEST:
             raise ValueError(f"height and width must be at most {_LARGEST} pixels, got {height} and {width}")

@@ -64,10 +64,7 @@ def head(
 _LEAST_STD = 1e-3
 
 DistributionName = Literal["tanh_normal", "normal"]
-DISTRIBUTIONS: dict[str, Callable[[Tensor, Tensor], Distribution]] = {
-    "tanh_normal": TanhNormal,
-    "normal": IndependentNormal,
-}
+DISTRIBUTIONS: dict[str, Callable[..., Distribution]] = {"tanh_normal": TanhNormal, "normal": IndependentNormal}
 
 
 class ActionHead(nn.Module):

@@ -96,8 +96,7 @@ class ObservationFeatures(nn.Module):
         return _KINDS[self.kind](observation, self.layout)
 
     def for_layout(self, layout: Layout) -> ObservationFeatures:
-        """The same statistics, shared, for observations of another layout; :class:`ValueError` if they do not carry
-        over."""
+        """The same statistics, shared, for another layout; :class:`ValueError` if they do not carry over."""
         if layout == self.layout:
             return self
         if self.kind not in TRANSFERS:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lw_torchrl._checks import checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.language.value_checks import check_values
 from lw_torchrl.transforms.qaf import plan_number_key
@@ -58,8 +58,7 @@ class PlanAttention(TensorDictModuleBase):
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
     Raises:
-        ValueError: at call time, ``qaf`` of another number of steps, outside [0, 1] or, as ``qaf_plan`` tells,
-            of other plans; a task_id without a plan.
+        ValueError: at call time, ``qaf`` of other steps, outside [0, 1] or of other plans; a task_id without a plan.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -79,7 +78,7 @@ class PlanAttention(TensorDictModuleBase):
     @checked
     def __init__(
         self,
-        plans: Plans | Mapping[str, ConditionalPlan],
+        plans: AnyPlans,
         *,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lw_torchrl._checks import check_choice, passes_on
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.plan_attention import Answers
@@ -27,10 +27,8 @@ class PlanConditionedActor(ConditionedActor):
 
     Args:
         plans: a plan for each task it is to act in.
-        mix: "latents", decode the mixed latent, as in the paper; "actions", decode every step's latent and mix the
-            actions.
-        **options: of :class:`~lw_torchrl.modules.ConditionedActor` and of :class:`~lw_torchrl.modules.PlanEncoder`;
-            ``out_keys`` are the actor's.
+        mix: "latents", decode the mixed latent, as in the paper; "actions", decode all latents and mix the actions.
+        **options: of :class:`ConditionedActor` and of :class:`PlanEncoder`; ``out_keys`` are the actor's.
 
     Attributes:
         skills: the K different skill texts, sorted.
@@ -57,13 +55,7 @@ class PlanConditionedActor(ConditionedActor):
     plans: Plans
 
     @passes_on(ConditionedActor.__init__, PlanEncoder.__init__)
-    def __init__(
-        self,
-        plans: Plans | Mapping[str, ConditionalPlan],
-        *,
-        mix: Literal["latents", "actions"] = "latents",
-        **options: Any,
-    ) -> None:
+    def __init__(self, plans: AnyPlans, *, mix: Literal["latents", "actions"] = "latents", **options: Any) -> None:
         check_choice("mix", mix, ("latents", "actions"))
         if mix == "actions" and options.get("distribution") is not None:
             raise ValueError("mix must be 'latents' with a distribution: a mean of several actions has no likelihood")
@@ -120,7 +112,7 @@ class PlanConditionedActor(ConditionedActor):
         other.encoder.texts, other.encoder.features, other.head = self.encoder.texts, self.encoder.features, self.head
         return other.train(self.training)
 
-    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> PlanConditionedActor:
+    def with_plans(self, plans: AnyPlans) -> PlanConditionedActor:
         """An actor that carries out other plans with the same weights: training either trains both."""
         encoder = self.encoder.with_plans(as_plans(plans))
         text_encoder = self.encoder.text_encoder

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lw_torchrl._checks import check_probability, check_scale, checked
 from lw_torchrl.language.layout import METAWORLD, Layout, places
-from lw_torchrl.language.plans import ConditionalPlan, Plans, PlanStep, as_plans
+from lw_torchrl.language.plans import AnyPlans, Plans, PlanStep, as_plans
 from lw_torchrl.language.skills import closes
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.language.tasks import Task
@@ -55,8 +55,7 @@ class PlanEncoder(ReadsPlans, Encoder):
         encoder_width, encoder_depth: hidden layers of the skill encoder.
         evaluator: answers the conditions in the place of ``qaf``, which is then not read; see :class:`QueryEvaluator`.
         answers: what an evaluator's logit counts in the attention's softmax, where exact truth counts 5 and -5:
-            "logit", what it is; "tanh", 5·tanh(answer_scale·logit); "hard", 5 or -5 by its sign, with the gradient of
-            "tanh".
+            "logit", what it is; "tanh", 5·tanh(answer_scale·logit); "hard", 5 or -5 by its sign, with tanh's gradient.
         answer_scale: the scale in "tanh" and "hard"; 0.5 makes "tanh" the paper's 10·p - 5 of the probability p.
         text_encoder: texts to vectors (n, E) float32; None for the shipped sentence encoder.
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
@@ -88,7 +87,7 @@ class PlanEncoder(ReadsPlans, Encoder):
     @checked
     def __init__(
         self,
-        plans: Plans | Mapping[str, ConditionalPlan],
+        plans: AnyPlans,
         *,
         features: Features = "differences",
         feature_noise: float = 0.0,
@@ -173,7 +172,6 @@ class PlanEncoder(ReadsPlans, Encoder):
         return weights, self.skill_index[rows], seen
 
     def _augmented(self, observation: Tensor, weights: Tensor, rows: Tensor) -> Tensor:
-        """Training observations in which what the steps in force do not mention is another row's."""
         in_force = weights > IN_FORCE
         if probability := self.config["swap_unmentioned"]:
             kept = (in_force.unsqueeze(-1) & self.mentioned[rows]).any(-2)
@@ -213,7 +211,7 @@ class PlanEncoder(ReadsPlans, Encoder):
         """(K, D), the latent of each skill."""
         return self.texts(self.text_vectors)
 
-    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> PlanEncoder:
+    def with_plans(self, plans: AnyPlans) -> PlanEncoder:
         evaluator = None if self.evaluator is None else self.evaluator.with_plans(as_plans(plans))
         other = PlanEncoder(plans, evaluator=evaluator, text_encoder=self.text_encoder, **self.config)
         other.texts, other.features = self.texts, self.features.for_layout(other.plans.layout)

@@ -17,7 +17,7 @@ from torchrl.envs import Compose, Transform
 from lw_torchrl._checks import check_choice, checked
 from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.layout import METAWORLD, Layout
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.observation_features import ObservationFeatures
@@ -109,8 +109,7 @@ class Encoder(Prepared):
     """From what is to be done, and where things are, to a latent and features.
 
     A subclass splits its work into :meth:`prepare`, which no trained parameter touches and which checks the values,
-    and :meth:`encode`, which can be vmapped over parameters. As a module it writes ``encoding`` (B, D + F) float32,
-    for networks of yours.
+    and :meth:`encode`, which can be vmapped over parameters. As a module it writes ``encoding`` (B, D + F) float32.
 
     Attributes:
         features: what it sees of the observation.
@@ -136,7 +135,7 @@ class Encoder(Prepared):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return write(tensordict, self, [self.encode(*self.prepare(tensordict)).joined])
 
-    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> Encoder:
+    def with_plans(self, plans: AnyPlans) -> Encoder:
         """The same weights for other plans: training either trains both."""
         raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} is conditioned on descriptions")
 
@@ -144,16 +143,13 @@ class Encoder(Prepared):
 class Policy(Prepared):
     """A module that acts, and knows what it was made of.
 
-    A subclass splits its work into :meth:`prepare` and :meth:`act`; ``out_keys`` names what :meth:`act` returns, in
-    its order, the action first.
+    A subclass splits its work into :meth:`prepare` and :meth:`act`, which returns ``out_keys``, the action first.
 
     Attributes:
-        config: the options that make it again, as JSON; :meth:`describe` adds what else it needs, its tasks for
-            example, and :meth:`from_description` reads that.
+        config: the options that make it again, as JSON; :meth:`describe` adds what :meth:`from_description` needs.
         plans, tasks: as for :class:`Prepared`.
         plan_options: whether its class has options about a plan's steps, like ``focus``.
-        row_by_row: whether a row's action is the same to the last bit whatever the other rows are; networks' are not,
-            and run on blocks of one size.
+        row_by_row: whether a row's action is the same to the last bit whatever the other rows are: not of networks.
         draws: whether its actions, without exploration, depend on random numbers drawn before, for other episodes too.
 
     Example:
@@ -228,7 +224,7 @@ class Policy(Prepared):
         what = f"with_evaluator is for PlanConditionedActor and ScriptedSkillActor, {type(self).__name__} has none"
         raise TypeError(f"{what}; evaluate(..., evaluator=) answers any policy's conditions")
 
-    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> Policy:
+    def with_plans(self, plans: AnyPlans) -> Policy:
         """The same weights under other plans; :class:`TypeError` if it is not conditioned on plans."""
         raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} has none")
 
@@ -240,13 +236,7 @@ def policy_class(kind: Any) -> type[Policy]:
 
 
 @checked
-def make_policy(
-    method: str,
-    plans: Plans | Mapping[str, ConditionalPlan],
-    *,
-    text_encoder: TextEncoder | None = None,
-    **options: Any,
-) -> Policy:
+def make_policy(method: str, plans: AnyPlans, *, text_encoder: TextEncoder | None = None, **options: Any) -> Policy:
     """A policy of a method for the tasks of some plans.
 
     Args:
@@ -261,9 +251,8 @@ def make_policy(
         True
     """
     chosen = METHODS[check_choice("method", method, METHODS)]
-    return policy_class(chosen.policy).for_plans(
-        as_plans(plans), text_encoder=text_encoder, **{**chosen.options, **options}
-    )
+    kind, given = policy_class(chosen.policy), {**chosen.options, **options}
+    return kind.for_plans(as_plans(plans), text_encoder=text_encoder, **given)
 
 
 def from_description(found: Any, text_encoder: TextEncoder | None = None) -> Policy:

@@ -8,14 +8,13 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, write
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.policy import Prepared
 from lw_torchrl.transforms.qaf import QAFTransform
@@ -28,7 +27,7 @@ EVALUATORS: dict[str, str | type[QueryEvaluator]] = {
 """The name of a class, as in policy files, to the module that has the class, or to the class itself."""
 
 
-class QueryEvaluator(TensorDictModuleBase):
+class QueryEvaluator(Prepared):
     """A module inside a policy that answers the plans' conditions: saved with the policy, and trained by its loss.
 
     A subclass gives :meth:`logits` and, in ``config``, the keyword arguments that make it again beside the plans.
@@ -54,14 +53,13 @@ class QueryEvaluator(TensorDictModuleBase):
     Source: paper section 'Differentiability and Optimization', which names a visual question answering model.
     """
 
-    config: dict[str, Any]
+    plans: Plans
     text_encoder: TextEncoder | None = None
 
     @checked
     def __init__(self, plans: Plans) -> None:
         super().__init__()
-        self.plans = plans
-        self.config = {}
+        self.plans, self.tasks, self.layout, self.config = plans, tuple(plans), plans.layout, {}
         self.in_keys: list[NestedKey] = ["observation", "task_id"]
         self.out_keys: list[NestedKey] = ["qaf_logits"]
 
@@ -70,8 +68,7 @@ class QueryEvaluator(TensorDictModuleBase):
         raise NotImplementedError(f"{type(self).__name__} must override logits")
 
     def answers(self, *read: Tensor) -> Tensor:
-        """:meth:`logits` as float32; :class:`TypeError` if they are no floats, :class:`ValueError` if they have not a
-        column for each of the plans' steps."""
+        """:meth:`logits` as float32; :class:`TypeError` if they are no floats, :class:`ValueError` if not (B, S)."""
         found = self.logits(*read)
         what = f"logits of {type(self).__name__} must be"
         if not isinstance(found, Tensor) or not found.is_floating_point():
@@ -81,10 +78,6 @@ class QueryEvaluator(TensorDictModuleBase):
             wanted = f"(B, {self.plans.num_steps}), a column for each step of the longest plan"
             raise ValueError(f"{what} {wanted}, got shape {tuple(found.shape)}")
         return found.to(torch.float32)
-
-    def transform(self) -> Transform | None:
-        """A new transform that writes what it reads and the environment does not give; None for none."""
-        return None
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -132,7 +125,7 @@ class ReadsPlans(Prepared):
 
     def read_plans(
         self,
-        plans: Plans | Mapping[str, ConditionalPlan],
+        plans: AnyPlans,
         evaluator: QueryEvaluator | None,
         in_keys: Sequence[NestedKey] | None,
         out_keys: Sequence[NestedKey] | None,
@@ -162,9 +155,7 @@ class ReadsPlans(Prepared):
         return {**super().describe(), "plans": self.plans.to_json(), **asked}
 
 
-def plans_and_evaluator(
-    found: Mapping[str, Any], text_encoder: TextEncoder | None
-) -> tuple[Plans, QueryEvaluator | None]:
+def plans_and_evaluator(found: Mapping[str, Any], encoder: TextEncoder | None) -> tuple[Plans, QueryEvaluator | None]:
     """What :meth:`ReadsPlans.describe` described."""
     plans, asked = Plans.from_json(found["plans"]), found.get("evaluator")
-    return plans, None if asked is None else evaluator_from_description(asked, plans, text_encoder)
+    return plans, None if asked is None else evaluator_from_description(asked, plans, encoder)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import check_scale
 from lw_torchrl.language.layout import places
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject, coordinate_index
+from lw_torchrl.language.named_objects import GRIPPER, NamedObject, coordinate_indices
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.roles import plan_roles, role_object
 from lw_torchrl.language.skills import closes, presses, pushes
@@ -57,9 +57,7 @@ class RelativePositions(nn.Module):
                 for one, ends in enumerate(found):
                     at = (tables.index.row(task), step, one)
                     for side, thing in enumerate(ends):
-                        index[(side, *at)] = torch.tensor(
-                            [coordinate_index(c, constants, size) for c in thing.position]
-                        )
+                        index[(side, *at)] = torch.tensor(coordinate_indices(thing.position, constants, size))
                         offset[at] += torch.tensor(thing.offset) * (2 * side - 1)
         # The tables come from the plans, not from training: they are not part of the state that is saved.
         self.register_buffer("begin", index[0], persistent=False)
@@ -97,8 +95,7 @@ class PlanFocus(RelativePositions):
 
     A step's condition names what its skill is about: "the gripper is above the handle and not near the handle". So the
     position of the handle relative to the gripper stands in the same place as that of the puck in another task, and
-    what was learned there is of use here. Of each step the first and the last clause with two things: 18 features, 0
-    for a step without such a clause.
+    what was learned there is of use here. Of each step the first and last clause with two things: 18 features, or 0s.
     """
 
     def __init__(self, plans: Plans, tables: PlanTables, noise: float = 0.0) -> None:
@@ -132,10 +129,8 @@ class PlanRoles(RelativePositions):
 
         def moved_to_target(plan: ConditionalPlan) -> list[list[Pair]]:
             task, of = plan.definition, role_object
-            return [
-                [(of(task, one.moved), of(task, one.target))] if one.moved and one.target else []
-                for one in roles[plan.task]
-            ]
+            each = [(one.moved, one.target) for one in roles[plan.task]]
+            return [[(of(task, moved), of(task, target))] if moved and target else [] for moved, target in each]
 
         super().__init__(plans, tables, moved_to_target, 1, noise)
         self.jitter = check_scale("jitter", jitter)

@@ -12,7 +12,7 @@ from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, check_int, check_scale, checked, shown
 from lw_torchrl._keys import key_beside, read
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
@@ -140,7 +140,7 @@ class ResidualActor(Policy):
             raise ValueError("the base of a residual must be a policy that is neither a residual nor an ensemble")
         return cls(from_description(base, text_encoder), **found["options"])
 
-    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ResidualActor:
+    def with_plans(self, plans: AnyPlans) -> ResidualActor:
         """One on the same weights for other plans; :class:`ValueError` if these lack ``steps`` or their skills."""
         if self.steps is not None:
             assert self.plans is not None
@@ -180,6 +180,5 @@ def check_steps(steps: Any, plans: Plans) -> dict[str, list[int]]:
 
 
 def weight_in_force(weights: Tensor, chosen: Tensor) -> Tensor:
-    """How much of the attention (B, S) float32 is on chosen steps (B, S) bool: (B, 1) float32, exactly 0 where none of
-    them is in force."""
+    """The attention (B, S) float32 on chosen steps (B, S) bool: (B, 1) float32, exactly 0 where none is in force."""
     return weights.masked_fill(~chosen | (weights <= IN_FORCE), 0.0).sum(-1, keepdim=True)

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import checked, shown
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import PlanTables
@@ -27,23 +27,19 @@ class ScriptedSkillActor(ReadsPlans, Policy):
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool, or float in [0, 1] for soft
     truth; writes ``action`` (B, 4) float32 in [-1, 1] and ``skill_weights`` (B, S) float32, which sum to 1. A step of
-    soft truth is true above 0.5, whatever ``select`` is, as its hard truth would be. Where an observation is NaN, so is
-    the action, which the environment does not execute.
+    soft truth is true above 0.5, whatever ``select`` is. Where an observation is NaN, so is the action.
 
     Args:
         plans: a plan for each task it is to act in; every step's skill is the text of a scripted one.
-        select: of several true steps, "first" takes the first, "random" any, as in the paper, and "mix" all of them,
-            in equal parts.
+        select: of several true steps, "first" takes the first, "random" any, as in the paper, "mix" all, equally.
         skills: the scripted skills by text, as from :func:`load_skills`; None for the shipped ones.
         seed: of the random choice, from -2**63 to 2**64 - 1.
-        evaluator: answers the conditions in the place of ``qaf``, which is then not read: a step is true where its
-            logit is positive; see :class:`QueryEvaluator`.
+        evaluator: answers the conditions in the place of ``qaf``, true where positive; see :class:`QueryEvaluator`.
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
     Raises:
         ValueError: a skill text that is no scripted skill (with the nearest), or that names objects that its task
-            lacks; at call time, ``qaf`` of another number of steps, outside [0, 1], or of other plans, as ``qaf_plan``
-            beside it tells.
+            lacks; at call time, ``qaf`` of other steps, outside [0, 1], or, as ``qaf_plan`` tells, of other plans.
 
     Example:
         >>> import lw_torchrl as lw
@@ -57,7 +53,7 @@ class ScriptedSkillActor(ReadsPlans, Policy):
     @checked
     def __init__(
         self,
-        plans: Plans | Mapping[str, ConditionalPlan],
+        plans: AnyPlans,
         select: Literal["first", "random", "mix"] = "first",
         *,
         skills: Mapping[str, ScriptedSkill] | None = None,
@@ -74,9 +70,8 @@ class ScriptedSkillActor(ReadsPlans, Policy):
         self.select = select
         self.draws = self.select == "random"
         self._skills = skills
-        self.program = SkillProgram(
-            {plan.definition: [step.skill for step in plan.steps] for plan in self.plans.values()}, skills
-        )
+        listed: Any = {plan.definition: [step.skill for step in plan.steps] for plan in self.plans.values()}
+        self.program = SkillProgram(listed, skills)
         self.tables = PlanTables(self.plans)
         self._last = self.tables.mask.sum(-1) - 1
         self._generator = torch.Generator().manual_seed(seed)
@@ -85,7 +80,7 @@ class ScriptedSkillActor(ReadsPlans, Policy):
     def for_plans(cls, plans: Plans, *, text_encoder: TextEncoder | None = None, **options: Any) -> ScriptedSkillActor:
         return cls(plans, **options)
 
-    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> ScriptedSkillActor:
+    def with_plans(self, plans: AnyPlans) -> ScriptedSkillActor:
         """The same skills under other plans."""
         evaluator = None if self.evaluator is None else self.evaluator.with_plans(as_plans(plans))
         return ScriptedSkillActor(plans, skills=self._skills, evaluator=evaluator, **self.config)

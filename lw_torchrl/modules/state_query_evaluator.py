@@ -31,8 +31,7 @@ class ClauseNetwork(nn.Module):
     the observation's positions (hand, first, second, goal, the gripper's opening or none) the two are, by attention,
     what is added to d, and what is asked of it, "not" too.
 
-    ``width`` and ``depth`` are of the trunk; ``predicates`` is how many there are, 0 for a network that reads texts,
-    ``text_size`` the numbers of a text's vector.
+    ``width`` and ``depth`` are of the trunk; ``predicates`` their number, or 0, with ``text_size``, to read texts.
     """
 
     numbers: int = 3  # of a difference
@@ -63,10 +62,11 @@ class ClauseNetwork(nn.Module):
         """Observations (B, 39), clauses (B, C) and texts' vectors (U, E) to logits (B, C) of size 30 at most."""
         if self.reads_text:
             assert text_vectors is not None
-            d, asked = self._from_text(observation, self.texts(text_vectors)[clauses.text])
-        else:
-            d, asked = _difference(observation, clauses), self.predicates.weight[clauses.predicate]
-        return self.judge(d, asked, None if self.reads_text else clauses.negated)
+            return self.judge(*self._from_text(observation, self.texts(text_vectors)[clauses.text]), None)
+        numbers = torch.cat((observation, torch.zeros_like(observation[..., :1])), -1)
+        first, second = (numbers.gather(-1, index.flatten(-2)) for index in (clauses.first, clauses.second))
+        d = (first - second).unflatten(-1, (-1, 3)) + clauses.shift  # metres, where the tasks' table has the two
+        return self.judge(d, self.predicates.weight[clauses.predicate], clauses.negated)
 
     def judge(self, d: Tensor, asked: Tensor, negated: Tensor | None) -> Tensor:
         """The logits (B, C) of differences d (B, C, 3) and what is asked (B, C, W + 1), opposite where ``negated``."""
@@ -88,13 +88,6 @@ class ClauseNetwork(nn.Module):
         return chosen.sum(-2) + 0.1 * shift, asked
 
 
-def _difference(observation: Tensor, clauses: Clauses) -> Tensor:
-    """d (B, C, 3), metres, where the tasks' table says that the two things stand."""
-    numbers = torch.cat((observation, torch.zeros_like(observation[..., :1])), -1)
-    first, second = (numbers.gather(-1, index.flatten(-2)) for index in (clauses.first, clauses.second))
-    return (first - second).unflatten(-1, (-1, 3)) + clauses.shift
-
-
 class StateQueryEvaluator(ClauseEvaluator):
     """Answers conditions from the observation, by a network that was trained on the query answering function's answers.
 
@@ -111,10 +104,8 @@ class StateQueryEvaluator(ClauseEvaluator):
         >>> import lw_torchrl as lw
         >>> plans = lw.load_plans("MT10")
         >>> actor = lw.PlanConditionedActor(plans, evaluator=StateQueryEvaluator(plans), answers="tanh")
-        >>> env = lw.LanguageWorldEnv("reach")
-        >>> actor(env.reset())["action"].shape
+        >>> actor(lw.LanguageWorldEnv("reach").reset())["action"].shape
         torch.Size([1, 4])
-        >>> env.close()
     """
 
     network: ClauseNetwork

@@ -117,9 +117,8 @@ class ExpectileValueLoss(LossModule):
         if not isinstance(value_type, (str, ValueEstimators)):
             return super().make_value_estimator(value_type, **hyperparams)
         keys = {name: getattr(self.tensor_keys, name) for name in self._value_estimator_default_keys}
-        dispatch_value_estimator(
-            self, value_type, supported=(ValueEstimators.TD0,), tensor_keys=keys, value_network=None, **hyperparams
-        )
+        known = {"supported": (ValueEstimators.TD0,), "tensor_keys": keys, "value_network": None}
+        dispatch_value_estimator(self, value_type, **known, **hyperparams)
         return self
 
     def train(self, mode: bool = True) -> ExpectileValueLoss:
@@ -282,8 +281,7 @@ def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
         task_id: (R,) int64, the task of each row.
 
     Returns:
-        (R, 1) float32, of each task with mean 0 and standard deviation 1 (over its rows, not one less); 0 where all
-        rows of a task have the same, or it has one row.
+        (R, 1) float32, of each task with mean 0 and standard deviation 1 (over its rows); 0 where all are the same.
 
     Raises:
         ValueError: other shapes or types, NaN or infinity.

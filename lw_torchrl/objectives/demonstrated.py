@@ -55,9 +55,7 @@ class _ImitatesDemonstrations(_Loss):
             raise ValueError(f"action_spec must be of one row, got {got}")
         critics = qvalue_network if isinstance(qvalue_network, list) else [qvalue_network]
         if not critics or not all(isinstance(critic, TensorDictModuleBase) for critic in critics):
-            raise TypeError(
-                f"qvalue_network must be a TensorDictModule, or a list of these, got {shown(qvalue_network)}"
-            )
+            raise TypeError(f"qvalue_network must be a TensorDictModule, or a list, got {shown(qvalue_network)}")
         super().__init__(actor_network, qvalue_network, reduction=reduction, **self._fixed, **options)
         self.bc_weight = check_scale("bc_weight", bc_weight)
         self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
@@ -68,7 +66,6 @@ class _ImitatesDemonstrations(_Loss):
         self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
 
     def _imitation(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
-        """As :func:`imitation`, of a minibatch."""
         key = self.tensor_keys.is_demonstration
         if (found := tensordict.get(key, None)) is None:
             raise ValueError(

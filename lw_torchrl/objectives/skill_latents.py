@@ -30,8 +30,7 @@ class SkillLatentLoss(LossModule):
     It reads no batch, and gives ``loss_latents`` () float32, of K skills (K,) by ``reduction="none"``.
 
     Args:
-        network: a :class:`PlanEncoder`, or a policy or critic with one, of at least two different skills; its weights
-            are trained, not copies.
+        network: a :class:`PlanEncoder`, or a policy or critic with one, of two skills or more; it is trained itself.
         kind: "consistency" or "contrastive".
         reduction: "mean", "none" or "sum" of the skills' terms, each of which is a mean over the others.
 
@@ -76,9 +75,8 @@ def skill_encoder(argument: str, network: Any) -> PlanEncoder:
     """The encoder of a network that is one or has one; :class:`ValueError` if it has no two skills to tell apart."""
     encoder = network if isinstance(network, PlanEncoder) else getattr(network, "encoder", None)
     if not isinstance(encoder, PlanEncoder):
-        raise ValueError(
-            f"{argument} is for policies with plans, whose skills have latents; {type(network).__name__} has none"
-        )
+        what = f"{argument} is for policies with plans, whose skills have latents"
+        raise ValueError(f"{what}; {type(network).__name__} has none")
     if len(encoder.skills) < 2:
         raise ValueError(f"{argument} is for plans of at least two different skills, got {', '.join(encoder.skills)}")
     return encoder

@@ -88,9 +88,8 @@ class ChatServer:
         self._hidden = Redactor([self._key, *(unquote(text) for text in inside if text)])
         self.dialect = dialect or Dialect("max_completion_tokens" if own else "max_tokens")
         self._settled = False  # whether it has answered, so that its dialect is known
-        self._client = openai.AsyncOpenAI(
-            api_key=self._key or "none", base_url=base_url, http_client=bounded_client(openai, timeout)
-        )
+        http = bounded_client(openai, timeout)
+        self._client = openai.AsyncOpenAI(api_key=self._key or "none", base_url=base_url, http_client=http)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="questions to a server", daemon=True)
 
@@ -123,8 +122,7 @@ class ChatServer:
     def ask(self, request: Mapping[str, Any], question: str) -> Reply:
         """The answer to a request; if none came that can be read, a :class:`PlannerError` that names the question.
 
-        It has "messages", "schema" (None for any text), "max_tokens", and "temperature", "seed" and "options", None for
-        the server's own.
+        It has "messages", "schema" (None for any text), "max_tokens", and "temperature", "seed" and "options", or None.
         """
         fault: Exception
         while True:

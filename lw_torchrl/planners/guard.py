@@ -244,7 +244,6 @@ async def _whole(headers: dict[bytes, str], receive: Any) -> bytes:
 
 
 def _given(body: bytes, then: Any) -> Any:
-    """What an application receives of a request that was read."""
     left = [body]
 
     async def receive() -> Any:
@@ -267,7 +266,5 @@ def run_server(app: Any, listener: Any) -> None:
             if self.cycle is None:
                 self.transport.close()
 
-    config = uvicorn.Config(
-        app, http=Protocol, ws="none", log_level="warning", proxy_headers=False, timeout_graceful_shutdown=5
-    )
-    uvicorn.Server(config).run(sockets=[listener])
+    options: Any = {"log_level": "warning", "proxy_headers": False, "timeout_graceful_shutdown": 5}
+    uvicorn.Server(uvicorn.Config(app, http=Protocol, ws="none", **options)).run(sockets=[listener])

@@ -13,7 +13,7 @@ from typing import Any, Literal
 from lw_torchrl._checks import Count, Natural, Positive, Scale, check_choice, check_int, checked, counted, shown
 from lw_torchrl._progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import TASKS, Task, TaskList, Tasks, get_task, named_tasks
 from lw_torchrl.planners.answer_files import AnswerCache, folder_name, recorded_answer, settle_folder, write_answer
@@ -33,8 +33,7 @@ class OpenAIPlanner:
     Args:
         model: the model's name at the server.
         base_url: the server, "http://127.0.0.1:8000/v1"; None for what OPENAI_BASE_URL says, or OpenAI's.
-        constrain: hold the model to a schema that only plans of the task pass (:func:`plan_schema`); it answers in
-            JSON, which becomes a text in the format.
+        constrain: hold the model to a schema of the task's plans (:func:`plan_schema`): it answers in JSON.
         free_skills: with ``constrain``, skills in any words instead of the scripted ones.
         skills: the scripted skills to choose from; None for the shipped ones.
         plans: the plans that prompts show examples of; None for the hand-written ones of MT10.
@@ -69,7 +68,7 @@ class OpenAIPlanner:
         constrain: bool = False,
         free_skills: bool = False,
         skills: Skills | None = None,
-        plans: Plans | Mapping[str, ConditionalPlan] | None = None,
+        plans: AnyPlans | None = None,
         vocabulary: bool = False,
         temperature: Scale | None = None,
         max_tokens: Count = 1024,

@@ -15,7 +15,7 @@ from lw_torchrl._files import parse_json
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.structured import write_structured
 from lw_torchrl.language.plan_files import load_plans
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.queries import base_clauses
 from lw_torchrl.language.relations import PREDICATES, RELATIONS, STATES
 from lw_torchrl.language.skills import SkillError, Skills, skills_for
@@ -27,7 +27,7 @@ _EXAMPLES = 3
 
 @checked
 def prompt_examples(
-    task: str | Task, plans: Plans | Mapping[str, ConditionalPlan] | None = None, *, tasks: Tasks = TASKS
+    task: str | Task, plans: AnyPlans | None = None, *, tasks: Tasks = TASKS
 ) -> tuple[ConditionalPlan, ...]:
     """The plans that a prompt shows: pick-place's, and those of the tasks whose descriptions are nearest in edits.
 
@@ -55,7 +55,7 @@ def prompt_examples(
     return (first, *reversed(nearest)) if first.task == _ALWAYS else (*reversed(nearest), first)
 
 
-def example_plans(plans: Plans | Mapping[str, ConditionalPlan] | None) -> Plans:
+def example_plans(plans: AnyPlans | None) -> Plans:
     """The plans that examples are chosen from; None for the hand-written ones of MT10."""
     return _load("MT10") if plans is None else as_plans(plans)
 
@@ -65,12 +65,7 @@ _load = cache(load_plans)
 
 @checked
 def plan_prompt(
-    task: str | Task,
-    format: str,
-    *,
-    plans: Plans | Mapping[str, ConditionalPlan] | None = None,
-    vocabulary: bool = False,
-    tasks: Tasks = TASKS,
+    task: str | Task, format: str, *, plans: AnyPlans | None = None, vocabulary: bool = False, tasks: Tasks = TASKS
 ) -> str:
     """The text that asks a language model for a plan.
 
@@ -113,7 +108,7 @@ class Question(NamedTuple):
 
 
 def chat_messages(
-    task: Task, format: str, plans: Plans | Mapping[str, ConditionalPlan] | None, vocabulary: bool, constrain: bool
+    task: Task, format: str, plans: AnyPlans | None, vocabulary: bool, constrain: bool
 ) -> list[dict[str, str]]:
     """The messages that ask for a plan: a prompt, and a system message that tells a chat model how to go on from there.
 

@@ -31,8 +31,7 @@ class PlanLike(Protocol):
 class TargetPose(NamedTuple):
     """What a scripted skill moves (``moved``) and where to (``position``), each T×3 float32, metres.
 
-    On an axis that the skill leaves alone they are equal. A ``relative`` one goes by a distance from the hand, not to a
-    place, so it never arrives.
+    Equal on an axis that the skill leaves alone. A ``relative`` one goes by a distance from the hand: it never arrives.
     """
 
     position: NDArray[np.float32]

@@ -209,7 +209,6 @@ def opening_step(path: str | os.PathLike[str], tab: str | None = None, step: int
 
 
 def _run_rerun(recording: Path, *arguments: str | Path) -> None:
-    """Run ``rerun rrd``; a ValueError says what is wrong with the recording."""
     done = subprocess.run([binary(), "rrd", *map(str, arguments)], capture_output=True, text=True, check=False)
     if done.returncode:
         said = [line for line in plain(done.stdout + done.stderr).splitlines() if str(recording) in line]

@@ -47,8 +47,7 @@ class RerunLogger(Logger):
         connect: the address of a viewer that shows the recording as it grows, "127.0.0.1:9876" or
             "rerun+http://127.0.0.1:9876/proxy"; start it with ``rerun``.
         exp_name: the name of the run; None takes the file's, without ".rrd".
-        application_id: recordings of one application share the last one's layout in rerun's viewer; None makes one of
-            ``exp_name`` and chance.
+        application_id: recordings of one application share the last one's layout in rerun's viewer; None for a new one.
 
     Attributes:
         previous: where an older file of that name is kept, or None.

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase, Transform
 
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.record.mujoco_scene import Motion, model_geometry
 from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.rollouts import read_rollout
@@ -32,8 +32,7 @@ class RolloutRecorder(Transform):
 
     It adds a page like :func:`lw_torchrl.log_rollout`'s at an episode's end; one that is cut off, by a reset or by
     closing the environment, is recorded as far as it came. Put it after :class:`~lw_torchrl.QAFTransform` and before
-    what changes the observation, and close the environment before the logger. An environment in a worker of another
-    process cannot be recorded.
+    what changes the observation, and close the environment before the logger. It sees no worker of another process.
 
     Args:
         logger: the recording.
@@ -62,7 +61,7 @@ class RolloutRecorder(Transform):
         logger: RerunLogger,
         rows: Sequence[int] = (0,),
         *,
-        plans: Plans | Mapping[str, ConditionalPlan] | None = None,
+        plans: AnyPlans | None = None,
         every: int = 1,
         policy: str | None = None,
     ) -> None:
@@ -134,8 +133,6 @@ class RolloutRecorder(Transform):
 
 
 class _Row:
-    """One row of an environment, and what there is of its episode."""
-
     def __init__(self, env: LanguageWorldEnv, row: int) -> None:
         self.task = env.task_of_row[row]
         self.ended = 0

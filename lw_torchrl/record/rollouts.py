@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from lw_torchrl.evaluation.protocol import actor_plans, tasks_of
 from lw_torchrl.evaluation.running import make_env, running
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
 from lw_torchrl.record.mujoco_scene import Motion
 from lw_torchrl.record.recorded_episode import RecordedEpisode
@@ -42,7 +42,7 @@ _PLAN_KEYS = {"qaf", "skill_weights", "action_corrected"}
 def log_rollout(
     logger: RerunLogger,
     rollout: TensorDictBase,
-    plans: Plans | Mapping[str, ConditionalPlan] | None = None,
+    plans: AnyPlans | None = None,
     *,
     seed: int | None = None,
     name: str | None = None,
@@ -110,7 +110,7 @@ def log_rollout(
 
 def read_rollout(
     rollout: TensorDictBase,
-    plans: Plans | Mapping[str, ConditionalPlan] | None = None,
+    plans: AnyPlans | None = None,
     *,
     seed: int | None = None,
     policy: str | None = None,
@@ -164,8 +164,7 @@ def simulate_again(
     observation: NDArray[np.float32],
     suite: Suite | None = None,
 ) -> Motion | None:
-    """The motion of all bodies in an episode, of T + 1 rows; None where the suite's engine has no ``poses``; a
-    :class:`DiffersError` where it is another episode.
+    """The motion in an episode, of T + 1 rows; None where the engine has no ``poses``; else :class:`DiffersError`.
 
     The simulation depends on the seed and the actions alone, so equal observations, bit for bit, mean equal motion.
     Actions are T×A float32 in [-1, 1], as executed; observations T×D float32, those from which they were taken.
@@ -206,7 +205,6 @@ def _motion(heading: Heading, episode: RecordedEpisode, suite: Suite | None) -> 
 
 
 def _single(rollout: TensorDictBase, key: str, *, required: bool) -> int | None:
-    """The one number that a column of integers holds."""
     column = rollout.get(key, None)
     if column is None:
         if required:
@@ -281,8 +279,7 @@ def write_recording(
 
 
 def active_skills(episode: FinishedEpisode, plan: ConditionalPlan) -> list[tuple[str, int]]:
-    """The skills, or "no condition holds", in the order in which they led (had the largest weight), with how many steps
-    each did, up to the first success."""
+    """The skills, or "no condition holds", that had the largest weight, in order, and for how long, up to success."""
     end = episode.first_success
     leading = episode.steps.get("skill_weights")[:end].argmax(-1).tolist()
     answered = episode.steps.get("qaf")[:end].any(-1).tolist()

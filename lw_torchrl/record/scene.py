@@ -31,8 +31,7 @@ TABLE, GRID = (58, 64, 74), (92, 99, 112)
 def log_scene(stream: Any, root: str, episode: RecordedEpisode, motion: Motion | None = None) -> list[str]:
     """Draw robot, objects, goal, the hand's path and the target pose under ``root``/scene; returns the trails' paths.
 
-    A trail is one short line per row, to be shown up to the time cursor. Without a motion, the robot is a hand over a
-    table, and what it handles are points.
+    A trail is one short line per row, shown up to the cursor. Without a motion, the robot is a hand over a table.
     """
     scene, times = f"{root}/scene", time_columns(np.arange(len(episode)))
     stream.log(scene, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -80,7 +79,6 @@ def log_scene(stream: Any, root: str, episode: RecordedEpisode, motion: Motion |
 
 
 def _log_simple_robot(stream: Any, scene: str, episode: RecordedEpisode) -> None:
-    """The table and the gripper below ``scene``."""
     times = time_columns(np.arange(len(episode)))
 
     def box(path: str, centers: Any, half_sizes: Any, color: Color, labels: list[str] | None = None) -> None:

@@ -101,7 +101,6 @@ class Page:
 
 
 def _stacked(parts: Sequence[tuple[float, Any]], name: str | None = None) -> rrb.Vertical:
-    """Views with their shares of the height, one below another."""
     return rrb.Vertical(*(view for _, view in parts), row_shares=[share for share, _ in parts], name=name)
 
 

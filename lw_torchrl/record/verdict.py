@@ -103,7 +103,6 @@ def _why(failure: Failure, episode: RecordedEpisode) -> list[str]:
 
 
 def _facts(episode: RecordedEpisode) -> list[str]:
-    """What can be seen without asking why."""
     if episode.in_force is None or not episode.steps:
         return []
     facts = []

@@ -40,8 +40,7 @@ def open_viewer(
         path: the .rrd file, or a folder that holds one.
         screenshot: a PNG file to write instead of opening a window; it is replaced whole or not at all.
         window_size: of the picture or the window, "1400x900" points.
-        step: where the time cursor stands; None takes the step that tells most of an episode, its first success, say,
-            and of a training the last.
+        step: where the time cursor stands; None for an episode's first success or failure, and a training's last step.
         episode: the tab to open at, by its title ("Metrics") or its episode's name; None takes the layout's.
 
     Raises:
@@ -72,7 +71,6 @@ def open_viewer(
 
 
 def _take_picture(recording: Path, picture: Path, window_size: str, step: int | None) -> None:
-    """Write a PNG of what the viewer shows of ``recording``, at ``step`` of the timeline that is in force."""
     port = free_port()
     arguments = (recording, "--headless", "--port", str(port), "--window-size", window_size)
     with running(*arguments) as (process, output):

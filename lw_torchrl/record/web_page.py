@@ -38,8 +38,7 @@ def write_html(
 ) -> Path:
     """Write a recording as one page to send to somebody: it opens from disk, without a network.
 
-    The page is some 20 MB of viewer and the recording, compressed. It wants WebGL 2 or WebGPU. The other arguments and
-    the errors are those of :func:`open_viewer`.
+    Some 20 MB of viewer, and the recording, compressed. It wants WebGL 2 or WebGPU. The rest is as :func:`open_viewer`.
 
     Args:
         page: the .html file; it is replaced whole or not at all.
@@ -71,8 +70,7 @@ def write_html(
 class WebPage(AbstractContextManager["WebPage"]):
     """A recording as a page at ``address``, served until :meth:`close`.
 
-    The recording is read once, when the page is made; where it still grows, make another. The other arguments and
-    errors are those of :func:`open_viewer`.
+    The recording is read once; where it still grows, make another page. The rest is as for :func:`open_viewer`.
 
     Args:
         port: of this machine, 127.0.0.1; 0 takes a free one. Another machine reaches it through a tunnel,
@@ -161,7 +159,6 @@ def _handler(files: dict[str, tuple[str, bytes]]) -> type[BaseHTTPRequestHandler
 
 
 def _page(title: str, data: str, step: int | None) -> str:
-    """The page of the viewer, which opens at ``step``."""
     template = Template(Path(__file__).with_name("viewer_page.html").read_text(encoding="utf-8"))
     quoted = json.dumps(title).replace("<", "\\u003c")
     cursor = json.dumps(None if step is None else {"request": list(request(step)), "sign": list(sign(step))})

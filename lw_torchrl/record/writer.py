@@ -123,8 +123,7 @@ class RecordingWriter:
 class RecordingFile:
     """A file that grows by pieces of a rerun stream; between two of them, it is a recording that any viewer opens.
 
-    An older file of its name, unless it is empty, is set aside as "run.previous.rrd" or "run.previous-2.rrd";
-    ``previous`` is that name, or None.
+    An older file of its name, unless it is empty, is set aside as ``previous``, "run.previous.rrd" say.
     """
 
     def __init__(self, path: Path) -> None:
@@ -253,9 +252,8 @@ def check_address(address: str) -> tuple[str, str, int]:
     """The URL, host and port of a viewer from "127.0.0.1:9876", "host" or "rerun+http://host:9876/proxy"."""
     found = _URL.fullmatch(address)
     if found is None or found["end"] not in (None, "/", "/proxy") or not 0 < int(found["port"] or 1) < 65536:
-        raise ValueError(
-            f"connect must be an address like '127.0.0.1:9876' or 'rerun+http://127.0.0.1:9876/proxy', got {address!r}"
-        )
+        like = "'127.0.0.1:9876' or 'rerun+http://127.0.0.1:9876/proxy'"
+        raise ValueError(f"connect must be an address like {like}, got {address!r}")
     port = int(found["port"] or DEFAULT_PORT)
     return f"{found['scheme'] or 'rerun+http'}://{found['host']}:{port}/proxy", found["host"].strip("[]"), port
 

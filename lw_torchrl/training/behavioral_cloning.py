@@ -49,8 +49,7 @@ class BehavioralCloningConfig:
         max_grad_norm: gradients are clipped to it.
         seed: of the minibatches, and of what the buffer's transforms and the actor draw while training.
         checkpoint_every: steps between checkpoints; the last step always makes one.
-        latent_consistency: weight of :class:`SkillLatentLoss` "consistency" in the loss, of a policy with plans: skills
-            whose texts are near stay near.
+        latent_consistency: weight of :class:`SkillLatentLoss` "consistency", with plans: skills of near texts are near.
         latent_contrast: weight of the "contrastive" one: different skills keep apart.
         qaf_anchor: weight of the cross entropy of an evaluator's answers with the query answering function's, of a
             policy with an evaluator: its conditions keep to their words.
@@ -96,8 +95,7 @@ def bc_loss(actor: nn.Module, distance: str) -> BCLoss:
 
 
 class LatentTerms(nn.Module):
-    """The weighted sum of a configuration's terms on the latents of an actor's skills, of which there must be some; a
-    module, for ``functional_call``."""
+    """A module, for ``functional_call``: the weighted sum of a configuration's terms on the latents of skills."""
 
     def __init__(self, actor: Any, config: BehavioralCloningConfig) -> None:
         super().__init__()
@@ -137,8 +135,7 @@ class EvaluatorAnchor:
 class BehavioralCloningTrainer(Training):
     """Trains an actor to give the demonstrated actions.
 
-    Any TensorDictModule that writes ``action`` can be trained; a :class:`Policy` first takes its statistics from the
-    demonstrations, and it alone can have a checkpoint.
+    Any TensorDictModule that writes ``action`` can be trained; a :class:`Policy` alone has statistics and checkpoints.
 
     Args:
         actor: it is trained in place.
@@ -149,8 +146,7 @@ class BehavioralCloningTrainer(Training):
             steps. Make the buffer with the same ``device``, or each minibatch has to go over.
 
     Raises:
-        ValueError: the actor writes no ``action``, has no plans for the configuration's terms on skills' latents, or no
-            evaluator for its anchor.
+        ValueError: the actor writes no ``action``, or has no plans for terms on latents, no evaluator for the anchor.
         TypeError: a checkpoint for an actor that is no :class:`Policy`.
 
     Example:
@@ -159,10 +155,8 @@ class BehavioralCloningTrainer(Training):
         >>> with tempfile.TemporaryDirectory() as root:
         ...     _ = lw.collect_demonstrations("reach", episodes_per_task=1, root=root + "/demos", max_steps=80)
         ...     replay = lw.LanguageWorldExperienceReplay(root + "/demos", transform=lw.QAFTransform(plans))
-        ...     trainer = lw.BehavioralCloningTrainer(
-        ...         lw.PlanConditionedActor(plans), replay, lw.BehavioralCloningConfig(steps=5, batch_size=16)
-        ...     )
-        ...     trainer.train() < 1.0
+        ...     config = lw.BehavioralCloningConfig(steps=5, batch_size=16)
+        ...     lw.BehavioralCloningTrainer(lw.PlanConditionedActor(plans), replay, config).train() < 1.0
         True
 
     Source: paper section 'Conditional Plan Experiments'; ``torchrl.objectives.BCLoss``.
@@ -227,8 +221,7 @@ class BehavioralCloningTrainer(Training):
         Ctrl-C ends it between two steps, with a checkpoint; a second Ctrl-C at once.
 
         Args:
-            until: end after so many steps in all, with a checkpoint, to look at the actor; None for all that the
-                configuration has. What is learned is the same.
+            until: end after so many steps in all, with a checkpoint, and learn the same; None for the configuration's.
 
         Returns:
             The mean loss over the last 100 steps made; NaN if there were none left to make.

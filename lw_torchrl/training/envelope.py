@@ -22,18 +22,11 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import differences, shown
-from lw_torchrl._state_tree import check_like, join, split
+from lw_torchrl._state_tree import join, split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl._versions import LIBRARIES, warn_of_other_versions
 from lw_torchrl.language.text import TextEncoder
-from lw_torchrl.training.file_checks import (
-    check_finite,
-    check_integers,
-    check_size,
-    check_texts,
-    copy_weights,
-    first_line,
-)
+from lw_torchrl.training.file_checks import check_integers, check_size, check_texts, copy_weights, first_line
 
 _ADDED = {"actors", "replay"}
 """What older descriptions do not say: a training that was begun without it goes on."""
@@ -82,7 +75,7 @@ class Envelope:
         """The archive of a file whose format, version and part have been checked."""
         begin = f"{self.argument}: {str(path)!r}"
         if not Path(path).exists():
-            raise FileNotFoundError(f"{self.argument}: no file {str(path)!r}; `{self.command}` writes one")
+            raise FileNotFoundError(f"{self.argument}: no file {str(path)!r}; `lw-torchrl {self.command}` writes one")
         if Path(path).is_dir():
             raise ValueError(f"{begin} is a folder; {self.called} is one file")
         try:
@@ -108,15 +101,12 @@ class Envelope:
         return found
 
     def check_can_be_saved(self, module: Any, make: Callable[[Any], nn.Module]) -> None:
-        """Raise :class:`ValueError` if a file could not hold a module: ``make`` of its description gives another, or
-        its weights are no finite numbers."""
+        """Raise :class:`ValueError` if a file could not hold a module: its description makes another, or it has NaN."""
         described = module.describe()
         try:
             with torch.random.fork_rng(devices=[]):
                 again = make(json.loads(json.dumps(described)))
-            weights = module.state_dict(keep_vars=True)
-            check_like(weights, again.state_dict(), "weights")
-            check_finite(weights, weights)
+            copy_weights(module.state_dict(), again.state_dict(keep_vars=True))
         except Exception as error:
             what = f"{self.part} cannot be kept in a file, whose description would not make it again"
             raise ValueError(f"{what} ({first_line(error)})") from error
@@ -179,13 +169,9 @@ class Envelope:
             raise ValueError(f"{what} ({first_line(error)})") from error
 
 
-def _envelope(name: str, *of: Any) -> Envelope:
-    return Envelope(f"lw_torchrl.{name}", *of)
-
-
-POLICY: Envelope = _envelope("policy", 3, "actor", "checkpoint", "a policy", "lw-torchrl train")
-EVALUATOR: Envelope = _envelope("evaluator", 1, "evaluator", "evaluator", "an evaluator", "lw-torchrl train-evaluator")
-TRAINING: Envelope = _envelope("training", 1, "loss", "checkpoint", "a loss's training", "lw-torchrl offline", "loss")
+POLICY: Envelope = Envelope("lw_torchrl.policy", 3, "actor", "checkpoint", "a policy", "train")
+EVALUATOR: Envelope = Envelope("lw_torchrl.evaluator", 1, "evaluator", "evaluator", "an evaluator", "train-evaluator")
+TRAINING: Envelope = Envelope("lw_torchrl.training", 1, "loss", "checkpoint", "a loss's training", "offline", "loss")
 
 
 def check_description(path: Path, ours: Mapping[str, Any]) -> None:

@@ -4,40 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from hashlib import blake2b
 from typing import Any, ClassVar, Unpack
 
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import Count, Scale, checked_but, passes_on
+from lw_torchrl._checks import checked_but, passes_on
 from lw_torchrl._state_tree import check_like, check_optimizer_state
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
 from lw_torchrl.training.envelope import EVALUATOR
 from lw_torchrl.training.files import check_evaluator_can_be_saved, evaluator_texts
-from lw_torchrl.training.labelled_queries import Asked, LabelledQueries, QueryEvaluatorConfig
+from lw_torchrl.training.labelled_queries import Asked, ImageQueryEvaluatorConfig, LabelledQueries, QueryEvaluatorConfig
 from lw_torchrl.training.loop import Training, TrainingOptions
 
 _MOST_WEIGHT = 20.0  # of a rare truth, by the median
-
-
-@dataclass(frozen=True)
-class ImageQueryEvaluatorConfig(QueryEvaluatorConfig):
-    """How an evaluator of pictures is trained, as :class:`QueryEvaluatorConfig`, but that a minibatch is of states.
-
-    Attributes:
-        batch_size: states in a minibatch, each asked all clauses of its task.
-        position_weight: of the error in the things' positions, in units of 5 cm, and in how far the gripper is open, in
-            the loss, of an evaluator with ``structure``: the simulator knows them. 0 to learn from answers alone.
-    """
-
-    batch_size: Count = 48
-    learning_rate: Scale = 1e-3
-    every: Count = 5
-    position_weight: Scale = 1.0
 
 
 class _StateMinibatches:
@@ -247,8 +231,7 @@ class QueryEvaluatorTrainer(Training):
 class ImageQueryEvaluatorTrainer(QueryEvaluatorTrainer):
     """Trains an evaluator of pictures, as :class:`QueryEvaluatorTrainer` does one of states.
 
-    A minibatch has equally many states of each task; of each state all clauses are asked, and each predicate and truth
-    weighs alike.
+    Each minibatch has equally many states of each task, and is asked all clauses; predicates and truths weigh alike.
 
     Raises:
         TypeError: the evaluator is no :class:`ImageQueryEvaluator`, or the configuration is of another class.

@@ -16,8 +16,7 @@ _TEXT_TOLERANCE = 0.01  # of numbers of size 1: more than machines differ, far l
 
 
 def check_finite(weights: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> None:
-    """Raise :class:`ValueError` unless the weights of what is a parameter in ``live`` are finite, and the statistics of
-    features too, with a standard deviation above 0."""
+    """Raise :class:`ValueError` unless the weights of parameters in ``live`` are finite, and statistics, std over 0."""
     for name, tensor in live.items():
         statistics = name.endswith(("features.mean", "features.std"))
         if (statistics or isinstance(tensor, nn.Parameter)) and not weights[name].isfinite().all():
@@ -38,8 +37,7 @@ def tensors_of(module: nn.Module) -> dict[str, Tensor]:
 
 
 def check_integers(found: Any, numbers: int, tensors: int, name: str = "") -> None:
-    """Refuse integers in a description that no network of so many numbers and tensors can have, before lists of that
-    length are made."""
+    """Refuse integers in a description that no network of so many numbers has, before lists of that length are made."""
     if isinstance(found, dict):
         for key, one in found.items():
             check_integers(one, numbers, tensors, key)

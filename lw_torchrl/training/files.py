@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from typing import Any
 
 from torch import Tensor, nn
 from torchrl.envs import Compose, Transform
 
 from lw_torchrl._checks import checked, checked_but
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.policy import Policy, from_description
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
@@ -80,8 +79,7 @@ def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None
 
 @checked_but("evaluator")
 def save_evaluator(evaluator: QueryEvaluator, path: str | os.PathLike[str], **about: Any) -> None:
-    """Write an evaluator, for :func:`load_evaluator`; an earlier file is replaced whole. It holds the network alone,
-    whatever the plans whose conditions it answers.
+    """Write an evaluator, for :func:`load_evaluator`; an earlier file is replaced whole. It holds the network alone.
 
     Args:
         evaluator: what to write, of a class in :data:`~lw_torchrl.modules.EVALUATORS`; else :class:`TypeError`.
@@ -113,17 +111,13 @@ def evaluator_texts(evaluator: QueryEvaluator) -> dict[str, Tensor]:
 
 @checked
 def load_evaluator(
-    path: str | os.PathLike[str],
-    plans: Plans | Mapping[str, ConditionalPlan],
-    *,
-    text_encoder: TextEncoder | None = None,
+    path: str | os.PathLike[str], plans: AnyPlans, *, text_encoder: TextEncoder | None = None
 ) -> QueryEvaluator:
     """Make the evaluator of a file, for the conditions of some plans, in eval mode.
 
     Args:
         path, text_encoder: as of :func:`load_actor`, with its errors.
-        plans: whose conditions it is to answer; they need not be those that it was trained beside. :class:`ValueError`
-            if they ask for what it cannot answer.
+        plans: whose conditions it is to answer, any; :class:`ValueError` if they ask for what it cannot answer.
     """
 
     def make(described: Any, encoder: TextEncoder | None) -> QueryEvaluator:
@@ -161,16 +155,13 @@ def describe_data(replay: Any) -> dict[str, Any] | None:
 
 def describe_replay(replay: Any) -> dict[str, Any]:
     """How a replay buffer shows its rows, as JSON: what its batches depend on besides :func:`describe_data`."""
-    parts = [part for part in replay.transform.modules() if isinstance(part, Transform)]
+    parts = [one for one in replay.transform.modules() if isinstance(one, Transform) and not isinstance(one, Compose)]
+    told = [{"class": type(one).__name__} | {k: repr(v) for k, v in plain_options(one).items()} for one in parts]
     return {
         "label": getattr(replay, "label", None),
         "rows": None if describe_data(replay) is None else len(replay),  # after_success leaves so many
         "sampler": type(replay.sampler).__name__,
-        "transforms": [
-            {"class": type(part).__name__} | {name: repr(value) for name, value in plain_options(part).items()}
-            for part in parts
-            if not isinstance(part, Compose)
-        ],
+        "transforms": told,
     }
 
 

@@ -107,8 +107,7 @@ class Training:
             training goes on with the same minibatches, but not bit for bit.
 
     Raises:
-        ValueError: the checkpoint is damaged, or of another architecture, configuration or data; or, while it trains, a
-            loss or weights are no numbers.
+        ValueError: the checkpoint is damaged, or of other architecture, configuration or data; a loss or weight is NaN.
         OSError: the checkpoint cannot be written; the earlier one stays.
     """
 
@@ -158,8 +157,7 @@ class Training:
         """Change the gradients before the optimizer's step."""
 
     def means(self, losses: Tensor) -> dict[str, float]:
-        """What is logged, by name, of the losses of the last 100 steps, (n,) or (n, M) float32 on the CPU; what has
-        "loss" in its name is shown."""
+        """What is logged, by name, of the last losses, (n,) or (n, M) float32 on the CPU; "loss" in a name is shown."""
         return {"loss": losses.mean().item()}
 
     def descend(self, losses: Tensor) -> Tensor:
@@ -321,8 +319,7 @@ class Interrupt:
 @contextmanager
 def interrupts_between_steps() -> Iterator[Interrupt]:
     """Within the block the first Ctrl-C only sets ``asked``, and the end of the block raises
-    :class:`KeyboardInterrupt`; a second Ctrl-C does so at once. Outside of the main thread, and where SIGINT is
-    ignored, nothing is changed."""
+    :class:`KeyboardInterrupt`; a second does so at once. Not outside the main thread, nor where SIGINT is ignored."""
     interrupt = Interrupt()
     before = signal.getsignal(signal.SIGINT) if threading.current_thread() is threading.main_thread() else None
     if not callable(before):

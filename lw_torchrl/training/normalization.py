@@ -62,14 +62,14 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
         return
     check_contacts(target)
     known: dict[tuple[str, Layout], ObservationFeatures] = {}
-    for features, mean, std in _statistics(target):
+    for features, of in _held(target, ObservationFeatures):
         kind = features.kind, features.layout
         if kind not in known:
             known[kind] = ObservationFeatures(features.kind, layout=features.layout).to(observation.device)
             known[kind].fit(observation, weights)
         with torch.no_grad():
-            mean.copy_(known[kind].mean)
-            std.copy_(known[kind].std)
+            of("mean").copy_(known[kind].mean)
+            of("std").copy_(known[kind].std)
     if not known:
         raise ValueError(f"{type(target).__name__} holds no ObservationFeatures: there is nothing to normalise")
 
@@ -85,7 +85,8 @@ def check_contacts(actor: nn.Module) -> None:
 
 def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
     """As :func:`fit_normalization`; :class:`ValueError` if a network was trained with other statistics."""
-    before = [(mean, mean.clone(), std, std.clone()) for _, mean, std in _statistics(loss)]
+    held = [(of("mean"), of("std")) for _, of in _held(loss, ObservationFeatures)]
+    before = [(mean, mean.clone(), std, std.clone()) for mean, std in held]
     fit_normalization(loss, replay)
     for mean, old_mean, std, old_std in before:
         untrained = not old_mean.any() and bool((old_std == 1).all())
@@ -97,12 +98,6 @@ def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
                 "normalize: a network of the loss has the statistics of other rows, with which it was trained: give "
                 "normalize=False to keep them, and fresh networks theirs by fit_normalization(network, replay)"
             )
-
-
-def _statistics(target: nn.Module) -> Iterator[tuple[ObservationFeatures, Tensor, Tensor]]:
-    """Each :class:`ObservationFeatures` with its mean and its standard deviation; of a loss, those of every copy."""
-    for module, of in _held(target, ObservationFeatures):
-        yield module, of("mean"), of("std")
 
 
 def _held(target: nn.Module, kind: type[nn.Module]) -> Iterator[tuple[Any, Callable[[str], Tensor]]]:

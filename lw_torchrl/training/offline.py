@@ -36,8 +36,7 @@ class OfflineConfig:
         learning_rate: of the loss's actor, at the start.
         critic_learning_rate: of everything else that it trains.
         target_eps: how much of target networks stays at a step, where the loss has any.
-        normalize: first take the statistics of the observation's features from the buffer, for all networks; False
-            for those that were trained before on others.
+        normalize: first take the features' statistics from the buffer; False for networks trained before on others.
         max_grad_norm: the actor's gradients, and those of all else, are clipped to it.
     """
 
@@ -59,8 +58,7 @@ class OfflineConfig:
 
 class OfflineTrainer(Training):
     """Trains what a loss holds on a buffer's minibatches: a step minimises the sum of the loss's ``loss_`` entries,
-    each of which reaches its own network alone, and moves its targets. CQL's ``loss_actor_bc``, which is for its first
-    steps instead of ``loss_actor``, is left out.
+    each of which reaches its own network alone, and moves its targets. CQL's ``loss_actor_bc`` is left out.
 
     Args:
         loss: of ``torchrl.objectives`` or ``lw_torchrl.objectives``, with its value estimator; networks are trained in
@@ -82,9 +80,8 @@ class OfflineTrainer(Training):
         >>> plans = lw.load_plans("MT10")
         >>> with tempfile.TemporaryDirectory() as root:
         ...     _ = lw.collect_demonstrations("reach", episodes_per_task=1, root=root + "/data", policy="random")
-        ...     replay = lw.LanguageWorldExperienceReplay(
-        ...         root + "/data", label="executed", n_steps=5, gamma=0.99, transform=lw.QAFTransform(plans)
-        ...     )
+        ...     options = {"label": "executed", "n_steps": 5, "gamma": 0.99, "transform": lw.QAFTransform(plans)}
+        ...     replay = lw.LanguageWorldExperienceReplay(root + "/data", **options)
         ...     loss = lw.objectives.ExpectileValueLoss(lw.PlanConditionedValue(plans)).make_value_estimator(gamma=0.99)
         ...     trainer = lw.OfflineTrainer(loss, replay, lw.OfflineConfig(steps=5, batch_size=16), progress=False)
         ...     trainer.train()
@@ -119,7 +116,6 @@ class OfflineTrainer(Training):
         actor = [parameter for name, parameter in trained if name.startswith("actor_network_params")]
         others = [parameter for name, parameter in trained if not name.startswith("actor_network_params")]
         rates = (actor, config.learning_rate), (others, config.critic_learning_rate)
-        self.groups = [group for group, _ in rates if group]
         groups = [{"params": group, "lr": float(rate)} for group, rate in rates if group]
         self.optimizer = torch.optim.AdamW(groups, weight_decay=config.weight_decay, fused=True)
         self.schedule = make_schedule(config.schedule, self.optimizer, config.steps)
@@ -148,8 +144,8 @@ class OfflineTrainer(Training):
         return found.detach()
 
     def clip_gradients(self) -> None:
-        for group in self.groups:
-            clip_grad_norm_(group, self.config.max_grad_norm)
+        for group in self.optimizer.param_groups:
+            clip_grad_norm_(group["params"], self.config.max_grad_norm)
 
     def means(self, losses: Tensor) -> dict[str, float]:
         """Of what the loss gave since they were last asked for."""
@@ -174,9 +170,7 @@ def networks_of(loss: LossModule) -> list[nn.Module]:
 def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
     """Raise unless a loss can be trained on a buffer; a value estimator that TorchRL would make later is made."""
     if not isinstance(loss, LossModule):
-        raise TypeError(
-            f"loss must be a LossModule, got {type(loss).__name__}; compile one in place, by loss.compile()"
-        )
+        raise TypeError(f"loss must be a LossModule, got {type(loss).__name__}; compile one by loss.compile()")
     if getattr(loss, "reduction", "mean") == "none":
         raise ValueError("loss must give the mean of its rows, got reduction='none'")
     if getattr(loss, "with_lagrange", False):

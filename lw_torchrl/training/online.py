@@ -48,8 +48,7 @@ class OnlineTrainer(Training):
         actor: the policy to begin with, one that was cloned, say. "advantage", "td3" and "expert-iteration" train it in
             place, and so does "residual" a :class:`ResidualActor`; the others train one that is made of it.
         replay: demonstrations that grow: ``LanguageWorldExperienceReplay(..., grow=, label="executed",
-            terminate_on_success=True, sampler=CoLearningSampler("grown"))`` with the actor's transform. Its reward is
-            what is learned from.
+            terminate_on_success=True, sampler=CoLearningSampler("grown"))`` with a reward and the actor's transform.
         config: how to train: the method's own configuration, of :mod:`lw_torchrl.training.algorithms`, or an
             :class:`OnlineConfig` for the method's defaults of all else; None for its defaults.
         method: a name of :data:`LEARNERS`, whose classes say what they do.
@@ -75,19 +74,11 @@ class OnlineTrainer(Training):
         >>> import lw_torchrl as lw, tempfile
         >>> from lw_torchrl.training.algorithms import TD3Config
         >>> plans = lw.load_plans("MT10")
+        >>> options = {"grow": 1_000, "label": "executed", "terminate_on_success": True}
+        >>> options |= {"sampler": lw.CoLearningSampler("grown"), "transform": lw.QAFTransform(plans)}
         >>> with tempfile.TemporaryDirectory() as root:
         ...     _ = lw.collect_demonstrations("reach", episodes_per_task=1, root=root + "/demos", max_steps=80)
-        ...     replay = lw.LanguageWorldExperienceReplay(
-        ...         root + "/demos",
-        ...         label="executed",
-        ...         reward="dense_cost",
-        ...         terminate_on_success=True,
-        ...         n_steps=5,
-        ...         gamma=0.99,
-        ...         grow=1_000,
-        ...         sampler=lw.CoLearningSampler("grown"),
-        ...         transform=lw.QAFTransform(plans),
-        ...     )
+        ...     replay = lw.LanguageWorldExperienceReplay(root + "/demos", **options)
         ...     config = TD3Config(frames=40, rows=4, round_steps=5, max_steps=5, first_frames=20, batch_size=8)
         ...     trainer = lw.OnlineTrainer(lw.PlanConditionedActor(plans), replay, config, progress=False)
         ...     trainer.train()
@@ -208,9 +199,8 @@ class OnlineTrainer(Training):
                     self._drawn, self._episodes = drawn, base.get_extra_state()
                     self.round, self.steps = self.round + 1, self.learner.made
                     if wrong := [name for name, value in done.items() if name.startswith("loss") and value != value]:
-                        raise ValueError(
-                            f"{wrong[0]} is no number in round {self.round}: the learning rate is too high"
-                        )
+                        what = f"{wrong[0]} is no number in round {self.round}"
+                        raise ValueError(f"{what}: the learning rate is too high")
                     self.history.append(done)
                     self.log({name: value for name, value in done.items() if name != "frames"}, int(done["frames"]))
                     self.save()
@@ -258,7 +248,6 @@ class OnlineTrainer(Training):
 
 
 def _fingerprint(module: torch.nn.Module) -> str:
-    """Of the weights."""
     found = sha256()
     for name, tensor in sorted(module.state_dict().items()):
         found.update(name.encode() + tensor.cpu().contiguous().numpy().tobytes())
@@ -271,9 +260,7 @@ def check_growing_replay(actor: Policy, replay: Any, config: OnlineConfig) -> No
         raise ValueError("replay must be a LanguageWorldExperienceReplay that grows: give it grow=, a number of rows")
     sampler = replay.sampler
     if not isinstance(sampler, CoLearningSampler) or sampler.target != GROWN:
-        raise ValueError(
-            "replay's sampler must be CoLearningSampler('grown'), which draws demonstrations and rows that came 1:1"
-        )
+        raise ValueError("replay's sampler must be CoLearningSampler('grown'), of demonstrations and new rows 1:1")
     if not replay.terminate_on_success:
         raise ValueError("replay must end at success, as the environment does: give it terminate_on_success=True")
     if replay.storage.n_steps > 1 and replay.storage.gamma != config.gamma:

@@ -55,8 +55,7 @@ class StackedBehavioralCloning(Training):
     it would have alone, so its losses are those it would have alone, up to rounding.
 
     Args:
-        actors: M policies, each with weights of its own, that differ in plans and tasks alone; they are trained in
-            place.
+        actors: M policies, each with weights of its own, trained in place, that differ in plans and tasks alone.
         replays: M buffers, each with its sampler; the i-th actor's batches come from the i-th.
         config: how to train each; the i-th has the seed ``config.seed + i``.
         checkpoint, logger, progress, title: as of :class:`~lw_torchrl.training.loop.Training`, with its errors.
@@ -71,12 +70,9 @@ class StackedBehavioralCloning(Training):
         >>> with tempfile.TemporaryDirectory() as root:
         ...     _ = lw.collect_demonstrations("reach", episodes_per_task=1, root=root + "/demos", max_steps=80)
         ...     load = lambda: lw.LanguageWorldExperienceReplay(root + "/demos", transform=lw.QAFTransform(plans))
-        ...     trainer = lw.training.StackedBehavioralCloning(
-        ...         [lw.PlanConditionedActor(plans), lw.PlanConditionedActor(plans)],
-        ...         [load(), load()],
-        ...         lw.BehavioralCloningConfig(steps=5, batch_size=16),
-        ...     )
-        ...     trainer.train().shape
+        ...     actors = [lw.PlanConditionedActor(plans), lw.PlanConditionedActor(plans)]
+        ...     config = lw.BehavioralCloningConfig(steps=5, batch_size=16)
+        ...     lw.training.StackedBehavioralCloning(actors, [load(), load()], config).train().shape
         torch.Size([2])
 
     Source: paper section 'Conditional Plan Experiments', which trains 50 one-shot models; ``torch.func``.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -13,7 +13,7 @@ from torchrl.data import Composite, TensorSpec
 from lw_torchrl._checks import check_int, check_probability, checked, missing_keys, shown, unknown_name
 from lw_torchrl._keys import as_keys, read
 from lw_torchrl._seeding import episode_generator
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.queries import Query, read_query
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.transforms.environment import DelayedAnswers, EpisodeTransform, reset_rows
@@ -64,7 +64,7 @@ class CorruptQAF(EpisodeTransform):
     @checked
     def __init__(
         self,
-        plans: Plans | Mapping[str, ConditionalPlan],
+        plans: AnyPlans,
         *,
         flip: float = 0.0,
         stick: float = 0.0,
@@ -95,13 +95,12 @@ class CorruptQAF(EpisodeTransform):
         self._rows = DelayedAnswers(delay=self.lag)
         self._draws = {purpose: _Draws(purpose, self.seed, self._tables, self.plans) for purpose in ("stick", "flip")}
 
-    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> CorruptQAF:
+    def with_plans(self, plans: AnyPlans) -> CorruptQAF:
         """One that spoils the answers of other plans alike; queries that these lack are not dropped."""
         other = as_plans(plans)
         dropped = [text for text in self.drop if _steps_with(text, PlanTables(other), other).any()]
-        return CorruptQAF(
-            other, flip=self.flip, stick=self.stick, lag=self.lag, drop=dropped, seed=self.seed, in_keys=self.in_keys
-        )
+        same = {name: getattr(self, name) for name in ("flip", "stick", "lag", "seed", "in_keys")}
+        return CorruptQAF(other, drop=dropped, **same)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         truth, task, episode = read(tensordict_reset, self.in_keys)

@@ -30,8 +30,13 @@ def base_env(transform: Transform) -> EnvBase | None:
     return env
 
 
-def refuse_changed(transform: Transform, key: NestedKey) -> None:
-    """Raise :class:`ValueError` where a transform before this one says that it writes what this one is to read."""
+def refuse_changed(transform: Transform, key: NestedKey, beside: int = -1) -> int:
+    """Raise :class:`ValueError` where a transform before this one says that it writes what this one is to read; return
+    how many its Compose has, 0 without one. As many as ``beside`` say that none was put there since: none is asked."""
+    container = _container(transform)
+    now = len(container.transforms) if isinstance(container, Compose) else 0
+    if now == beside:
+        return now
     for entry, chain in product((key, unravel_key(("next", key))), _before(transform)):
         for earlier in reversed(chain):
             written = [unravel_key(out) for out in earlier.__dict__.get("_out_keys") or ()]
@@ -47,12 +52,7 @@ def refuse_changed(transform: Transform, key: NestedKey) -> None:
                 f"{other} changes {entry!r} before {name} reads it, which is made for the observation as it was: put "
                 f"{name} before {other}"
             )
-
-
-def transforms_beside(transform: Transform) -> int:
-    """How many transforms its Compose has, 0 where it is in none: the cheap sign that one was put there."""
-    container = _container(transform)
-    return len(container.transforms) if isinstance(container, Compose) else 0
+    return now
 
 
 def _before(transform: Transform) -> list[list[Transform]]:
@@ -164,8 +164,7 @@ class EnvState(KeepsEnvState):
 
 
 def reset_rows(before: Tensor | None, now: Tensor, begun: Tensor | None, more: int = 0) -> Tensor:
-    """``now`` (B, ...), with ``more`` dimensions beyond B, of each row that has ``begun``, B bool or None for all; the
-    others keep ``before``."""
+    """``now`` (B, ...), with ``more`` dims beyond B, of rows that have ``begun``, B bool or None; or ``before``"""
     if before is None or begun is None or before.shape != now.shape:
         return now
     shape = (*now.shape[: now.dim() - more], *[1] * more)
@@ -190,9 +189,7 @@ class DelayedAnswers:
     def step(self) -> Tensor:
         """B int64, the step of its episode that each row is at; :class:`RuntimeError` if no episode has begun."""
         if self._step is None:
-            raise RuntimeError(
-                "the rows' episodes have not begun, or not since load_state_dict: reset the environment before its step"
-            )
+            raise RuntimeError("rows have begun no episode, or not since load_state_dict: reset the environment")
         return self._step
 
     def begin(self, answers: Tensor, rows: Tensor | None) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -15,17 +15,10 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 
 from lw_torchrl._checks import check_int, checked, missing_keys
 from lw_torchrl._keys import as_keys, check_apart, key_beside
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.task_index import PlanTables, TaskTables
-from lw_torchrl.transforms.environment import (
-    DelayedAnswers,
-    KeepsEnvState,
-    base_env,
-    refuse_changed,
-    reset_rows,
-    transforms_beside,
-)
+from lw_torchrl.transforms.environment import DelayedAnswers, KeepsEnvState, base_env, refuse_changed, reset_rows
 
 _HALF = (torch.float16, torch.bfloat16)  # in which metres are not told apart as conditions do
 
@@ -71,8 +64,7 @@ class QAFTransform(KeepsEnvState):
         PlanError: (a ValueError) the environment has a task without a plan.
         ValueError: a wrong argument, a task_id without a plan, a malformed observation, one of half precision, or a
             transform before it that changes it; ``every`` or ``delay`` on a replay buffer.
-        RuntimeError: with ``every`` or ``delay``, a step of an environment that was never reset, or not since
-            ``load_state_dict``.
+        RuntimeError: with ``every`` or ``delay``, a step of an environment that was not reset since it was loaded.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -88,7 +80,7 @@ class QAFTransform(KeepsEnvState):
     @checked
     def __init__(
         self,
-        plans: Plans | Mapping[str, ConditionalPlan],
+        plans: AnyPlans,
         *,
         every: int = 1,
         delay: int = 0,
@@ -112,7 +104,7 @@ class QAFTransform(KeepsEnvState):
     def _forget_episodes(self) -> None:
         self._rows = DelayedAnswers(self.every, self.delay) if self.every > 1 or self.delay else None
 
-    def with_plans(self, plans: Plans | Mapping[str, ConditionalPlan]) -> QAFTransform:
+    def with_plans(self, plans: AnyPlans) -> QAFTransform:
         """One that answers the conditions of other plans as often and as late."""
         return QAFTransform(plans, every=self.every, delay=self.delay, in_keys=self.in_keys, out_keys=self.out_keys[:1])
 
@@ -156,10 +148,8 @@ class QAFTransform(KeepsEnvState):
                 f"QAFTransform(every={self.every}, delay={self.delay}) counts the steps of an environment's episodes, "
                 "which rows of a replay buffer do not tell: put it into the environment, or leave both out here"
             )
-        if (beside := transforms_beside(self)) != self._beside:  # something was put there later
-            refuse_changed(self, self.in_keys[0])
-            self._beside = beside
         observation, task = self.in_keys
+        self._beside = refuse_changed(self, observation, self._beside)  # something may be put there later
         task_id = tensordict.get(task, None)
         self._write(tensordict, task_id)
         following = tensordict.get("next", None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase, unravel_key
@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase, Transform
 from lw_torchrl._checks import check_scale, checked, missing_keys
 from lw_torchrl._keys import as_keys, check_apart, key_beside, read
 from lw_torchrl.language.layout import METAWORLD, Layout
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.skills import has_direction
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.transforms.qaf import plan_number_key
@@ -64,15 +64,13 @@ class RandomYaw(Transform):
     Args:
         scale: standard deviation of the angle, in radians.
         plans: the actor's plans: rows whose steps in force say no direction ("move the puck to the target location")
-            are then turned by any angle. It reads ``qaf`` (B, S) bool and ``task_id`` (B,) int64; None turns all rows
-            alike.
+            are then turned by any angle, by ``qaf`` (B, S) bool and ``task_id`` (B,) int64; None turns all rows alike.
         layout: of the observations and actions; None for that of the plans, or Meta-World's without plans.
         in_keys: where observation, action, the expert's action and the unclipped one are, in this order.
         out_keys: where they go, turned; None for the same places.
 
     Raises:
-        ValueError: a wrong argument; a sample without observation or action, or, with plans, without qaf and task_id,
-            or with those of other plans.
+        ValueError: a wrong argument; a sample without observation or action, or, with plans, qaf and task_id of them.
         TypeError: it is given to an environment.
 
     Example:
@@ -90,7 +88,7 @@ class RandomYaw(Transform):
         self,
         scale: float,
         *,
-        plans: Plans | Mapping[str, ConditionalPlan] | None = None,
+        plans: AnyPlans | None = None,
         layout: Layout | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,

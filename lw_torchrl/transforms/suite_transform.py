@@ -28,8 +28,7 @@ class SuiteTransform(Transform):
 
     Args:
         task: what is to be done; its layout says what D and A are.
-        observe: from the tensors of ``in_keys`` to (..., D) numbers in the layout's order and frame. Numbers of the
-            step before may be anything.
+        observe: from the tensors of ``in_keys`` to (..., D) numbers in the layout's order and frame; any for the past.
         act: from an action of the layout (..., A) to one of the environment; None where they are the same.
         in_keys: what ``observe`` is given.
 
@@ -61,10 +60,8 @@ class SuiteTransform(Transform):
     ) -> None:
         for key in in_keys:
             check_key("in_keys", key)
-        inverse = ["action"] if act is not None else []
-        super().__init__(
-            in_keys=list(in_keys), out_keys=["observation", "task_id"], in_keys_inv=inverse, out_keys_inv=inverse
-        )
+        inverse, written = ["action"] if act is not None else [], ["observation", "task_id"]
+        super().__init__(in_keys=list(in_keys), out_keys=written, in_keys_inv=inverse, out_keys_inv=inverse)
         self.task, self.observe, self.act, self.layout = task, observe, act, task.layout
 
     def _seen(self, tensordict: TensorDictBase) -> Tensor:

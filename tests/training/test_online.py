@@ -20,7 +20,7 @@ from torchrl.record.loggers import CSVLogger
 import lw_torchrl as lw
 from lw_torchrl.modules import DescriptorEncoder, QValue
 from lw_torchrl.training import LEARNERS
-from lw_torchrl.training.algorithms import Learner, PPOConfig, TD3Config, imitation
+from lw_torchrl.training.algorithms import Learner, PPOConfig, TD3Config, expert_iteration
 from lw_torchrl.training.algorithms.expert_iteration import successful
 from lw_torchrl.training.algorithms.learner import ReplayConfig
 from lw_torchrl.training.envelope import POLICY
@@ -34,7 +34,7 @@ def demos(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def each_first_row_succeeds(monkeypatch):
     """So short an episode hardly ever does; expert iteration is then to learn from the first row all the same."""
-    monkeypatch.setattr(imitation, "successful", lambda rows: rows[0])
+    monkeypatch.setattr(expert_iteration, "successful", lambda rows: rows[0])
 
 
 methods = pytest.mark.parametrize("method", LEARNERS)
@@ -215,7 +215,7 @@ def test_expert_iteration_makes_as_many_steps_of_what_succeeded(demos, monkeypat
     trainer.train()
     assert trainer.learner.made == int((240 - 40) * 0.1)
     assert trainer.replay.storage.count == 4 * 15
-    monkeypatch.setattr(imitation, "successful", lambda rows: None)
+    monkeypatch.setattr(expert_iteration, "successful", lambda rows: None)
     trainer = make_online(demos, "expert-iteration")
     trainer.train()
     assert trainer.learner.made == trainer.replay.storage.count == 0

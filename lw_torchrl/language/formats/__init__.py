@@ -23,13 +23,8 @@ class PlanFormats(UserDict[str, PlanFormat]):
         super().__setitem__(name, format)
 
 
-PLAN_FORMATS = PlanFormats(
-    {
-        f"{name}_{container}": make(style)
-        for name, style in STYLES.items()
-        for container, make in {"py": py, "py_md": py_md, "md": md}.items()
-    }
-)
+_CONTAINERS = {"py": py, "py_md": py_md, "md": md}
+PLAN_FORMATS = PlanFormats({f"{a}_{b}": make(said) for a, said in STYLES.items() for b, make in _CONTAINERS.items()})
 """The formats by name: the nine of the paper, and those that you add, ``PLAN_FORMATS["mine"] = PlanFormat(...)``."""
 
 
@@ -37,8 +32,7 @@ PLAN_FORMATS = PlanFormats(
 def encode_plan(plan: ConditionalPlan, format: str) -> str:
     """A plan as text, from which :func:`~lw_torchrl.decode_plan` reads an equal plan.
 
-    Reasons are written where a format explains; a goal that is not its skill's usual one has no place in the basic and
-    chain formats.
+    Reasons are written where a format explains; a goal other than its skill's usual one only in the goal formats.
 
     Example:
         >>> from lw_torchrl.language.plan_files import load_plans

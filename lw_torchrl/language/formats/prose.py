@@ -128,7 +128,6 @@ def _heading(line: str) -> str:
 
 
 def _listing(line: str) -> str | None:
-    """What a line that begins a list of steps lists, maybe nothing yet."""
     found = re.match(r"[#*\s]*steps\s*:[*\s]*(.*)", line, re.IGNORECASE)
     return found[1] if found else None
 

@@ -105,8 +105,7 @@ class _Block:
 
 
 class PythonReading(Reading):
-    """What a text says in Python, for :attr:`PlanFormat.read`: its lines are matched against a few forms; blocks follow
-    the indentation, and an ``if`` in a block asks for both."""
+    """What a text says in Python, for :attr:`PlanFormat.read`, line by line; an ``if`` in a block asks for both."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

@@ -80,7 +80,6 @@ def _clause(step: Any, line: int) -> Clause | None:
 
 
 def _said(value: Any) -> str:
-    """A condition in words."""
     parts = []
     for one in value if isinstance(value, list) else [value]:
         if isinstance(one, dict):

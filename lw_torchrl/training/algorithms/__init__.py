@@ -1,5 +1,4 @@
-"""The methods of ``lw-torchrl online``: a file each, with what it reads and what it does, and a line in
-:data:`LEARNERS`."""
+"""The methods of ``lw-torchrl online``: a file each, with what it reads and does, and a line in :data:`LEARNERS`."""
 
 from lw_torchrl._checks import check_choice
 from lw_torchrl.training.algorithms.advantage import AdvantageConfig, AdvantageLearner
@@ -21,8 +20,7 @@ LEARNERS: dict[str, type[Learner]] = {
 
 
 def method_config(method: str, given: OnlineConfig | None = None) -> OnlineConfig:
-    """The configuration of a method: the given one; of a plain :class:`OnlineConfig`, or None, the method's defaults
-    for all that it does not say.
+    """The configuration of a method: the given one; of a plain :class:`OnlineConfig` with the method's other defaults.
 
     Raises:
         TypeError: it is another method's.

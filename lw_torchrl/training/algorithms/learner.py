@@ -111,8 +111,7 @@ class Learner:
         replay, config, critic: as of :class:`~lw_torchrl.OnlineTrainer`; the configuration is of ``config_type``.
 
     Attributes:
-        config_type: of its configuration; with a :class:`NoiseConfig` noise is added to its actions, else they are
-            drawn from the policy's distribution.
+        config_type: of its configuration; a :class:`NoiseConfig` adds noise to its actions, others draw them.
         policy: what acts, and is kept: the start itself, or another made of it.
         loss: holds all that is trained.
         optimizers: by what they train.

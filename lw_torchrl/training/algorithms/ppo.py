@@ -43,9 +43,8 @@ class PPOLearner(Learner):
         self.policy = actor = stochastic(self.policy, "normal", config.init_std)
         value = Value(actor.encoder)
         self.loss = ClipPPOLoss(actor, value, clip_epsilon=config.clip, entropy_coeff=config.entropy)
-        self.advantage = GAE(
-            gamma=config.gamma, lmbda=config.gae_lambda, value_network=value, average_gae=True, deactivate_vmap=True
-        )
+        how = {"gamma": config.gamma, "lmbda": config.gae_lambda, "average_gae": True, "deactivate_vmap": True}
+        self.advantage = GAE(value_network=value, **how)
         self.optimizers["all"] = adamw(self.loss.parameters(), config.actor_learning_rate)
 
     def end_round(self, rows: TensorDictBase | None, steps: int) -> None:

@@ -27,13 +27,8 @@ class SACLearner(OffPolicyLearner):
     def make(self, critic: Any) -> None:
         config = self.config
         self.policy = stochastic(self.policy, "tanh_normal", config.init_std)
-        loss = DemonstratedSACLoss(
-            self.policy,
-            self.q_value(critic),
-            bc_weight=config.bc_weight,
-            loss_function=config.distance,
-            alpha_init=config.entropy,
-        )
+        how: Any = {"bc_weight": config.bc_weight, "loss_function": config.distance, "alpha_init": config.entropy}
+        loss = DemonstratedSACLoss(self.policy, self.q_value(critic), **how)
         self.target_entropy = loss.target_entropy  # which makes a buffer of the loss
         self.set_loss(loss)
         self.optimizers["alpha"] = adamw([loss.log_alpha], config.actor_learning_rate)

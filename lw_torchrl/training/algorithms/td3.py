@@ -61,8 +61,7 @@ class ResidualConfig(TD3Config):
 
 
 class ResidualLearner(TD3Learner):
-    """TD3 of a small network that corrects the start's actions, which stays as it is; of the start itself if it is such
-    a :class:`~lw_torchrl.ResidualActor`."""
+    """TD3 of a small network that corrects the start's actions, or of a start that is a :class:`ResidualActor`."""
 
     config_type = ResidualConfig
     config: ResidualConfig
