@@ -90,7 +90,7 @@ def evaluate(
         raise ValueError(f"--attribute is for a policy with plans, {checkpoint} has none")
     how: dict[str, Any] = {"tasks": chosen, "episodes_per_task": episodes, "seed": seed, "noise_scale": noise}
     how |= {"stop_at_success": stop_at_success, "num_envs": num_envs, "device": there, "attribute": attribute}
-    where: dict[str, Any] = {"suite": elsewhere, "max_steps": max_steps}
+    where: dict[str, Any] = {"suite": elsewhere} | ({} if max_steps is None else {"max_steps": max_steps})
     trusted = options.read_plans(reference, known) if reference else None
     result = lw.evaluate(policy or lw.ExpertActor(chosen), reference=trusted, **how, **where)
     output = Output(json).result(result)
