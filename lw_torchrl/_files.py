@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import io
 import json
 import os
@@ -17,11 +18,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
+AnyPath = str | os.PathLike[str]
 PATIENCE = 1.0  # seconds to wait for others that are at work in a place: they may be about to end
 JSON_LIMIT = 32 * 2**20  # bytes of a file of JSON or text; read, JSON takes some twenty times as much memory
 TOML_LIMIT = 2**18  # bytes of a TOML file, which takes a second to read; the largest of ours has 22 kB
@@ -32,7 +29,7 @@ _DOTTED = re.compile(rf"{_KEY}(?:[ \t]*+\.[ \t]*+{_KEY})*+")
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str], *, sync: bool = True) -> Iterator[Path]:
+def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to; it takes the name when the block ends without an error.
 
     Whenever the process is killed or the machine stops, ``path`` is the old file or the new one, whole. The next write
@@ -63,27 +60,21 @@ def _temporary(target: Path) -> Iterator[Path]:
         # The suffix stays, since writers choose the format by it.
         path = target.with_name(f".{target.stem}.{secrets.token_hex(8)}.tmp{target.suffix}")
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        if fcntl is not None:
-            with suppress(OSError):  # a file system without locks, where no sweep gets one either
-                fcntl.flock(handle, fcntl.LOCK_EX)
+        with suppress(OSError):  # a file system without locks, where no sweep gets one either
+            fcntl.flock(handle, fcntl.LOCK_EX)
         if path.exists():
             break
         os.close(handle)  # it was swept before it was locked
-    if fcntl is None:
-        os.close(handle)  # an open file cannot be renamed there
     try:
         yield path
     finally:
         path.unlink(missing_ok=True)
-        if fcntl is not None:
-            os.close(handle)
+        os.close(handle)
 
 
 def flush(path: Path) -> None:
     """Return once a file's content, or a folder's list of names, is on the disk."""
-    if os.name != "posix" and path.is_dir():
-        return  # a folder cannot be opened there
-    handle = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     except OSError as error:
@@ -93,7 +84,7 @@ def flush(path: Path) -> None:
         os.close(handle)
 
 
-def sweep(target: str | os.PathLike[str]) -> list[Path]:
+def sweep(target: AnyPath) -> list[Path]:
     """Remove the temporary files that killed writers of ``target`` left, and return them; locked ones stay."""
     path = Path(target)
     pattern = re.compile(rf"\.+{re.escape(path.stem)}(\.[0-9a-f]{{16}}\.tmp)+{re.escape(path.suffix)}")
@@ -102,8 +93,6 @@ def sweep(target: str | os.PathLike[str]) -> list[Path]:
 
 
 def _remove_unlocked(path: Path) -> bool:
-    if fcntl is None:
-        return False
     try:
         handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
     except OSError:
@@ -120,7 +109,7 @@ def _remove_unlocked(path: Path) -> bool:
 
 @contextmanager
 def held(
-    place: str | os.PathLike[str],
+    place: AnyPath,
     argument: str,
     who: str = "process",
     *,
@@ -157,8 +146,7 @@ def _locked(lock: Path, patience: float) -> int | None:
     while True:
         handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
         try:
-            if fcntl is not None:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.fstat(handle).st_nlink:
                 return handle
         except BlockingIOError:
@@ -171,13 +159,13 @@ def _locked(lock: Path, patience: float) -> int | None:
         os.close(handle)  # it is held, or was removed before it was locked
 
 
-def write_text(path: str | os.PathLike[str], text: str) -> None:
+def write_text(path: AnyPath, text: str) -> None:
     """Write a text file whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_json(path: str | os.PathLike[str], value: Any) -> None:
+def write_json(path: AnyPath, value: Any) -> None:
     """Write a JSON file whole or not at all; NaN is refused, since it is no JSON."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
@@ -216,7 +204,7 @@ def read_toml(path: Path | Traversable, error: type[ValueError]) -> dict[str, An
         raise error(f"{path}: {fault}") from fault
 
 
-def read_json(path: str | os.PathLike[str], what: str, *, limit: int = JSON_LIMIT) -> dict[str, Any]:
+def read_json(path: AnyPath, what: str, *, limit: int = JSON_LIMIT) -> dict[str, Any]:
     """The object in a JSON file of at most ``limit`` bytes, see :func:`parse_json`; a :class:`ValueError` begins with
     ``what``, "root: the metadata". A file that is not there is a :class:`FileNotFoundError`."""
     file = Path(path)
@@ -227,7 +215,7 @@ def read_json(path: str | os.PathLike[str], what: str, *, limit: int = JSON_LIMI
 
 
 @contextmanager
-def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
+def reading(path: AnyPath, what: str) -> Iterator[None]:
     """Let an error in the block name the argument ``path``, a folder that was to hold ``what``."""
     try:
         yield

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import re
 import zipfile
 from collections.abc import Iterable, Mapping
@@ -19,7 +18,7 @@ from typing import Any
 from safetensors.torch import load, save
 from torch import Tensor
 
-from lw_torchrl._files import parse_json, read_bytes, replacing
+from lw_torchrl._files import AnyPath, parse_json, read_bytes, replacing
 from lw_torchrl._versions import package_versions
 
 _DESCRIPTION = "description.json"
@@ -37,9 +36,7 @@ class ArchiveError(ValueError):
         self.names = list(names)
 
 
-def write_archive(
-    path: str | os.PathLike[str], description: Mapping[str, Any], groups: Mapping[str, Mapping[str, Tensor]]
-) -> None:
+def write_archive(path: AnyPath, description: Mapping[str, Any], groups: Mapping[str, Mapping[str, Tensor]]) -> None:
     """Write a file whole or not at all: the ``description``, JSON to which ``sha256`` and the ``versions`` of packages
     are added, and ``groups`` of tensors by name. What could not be read again is a :class:`ValueError`."""
     data = {}
@@ -60,7 +57,7 @@ def write_archive(
 class TensorArchive:
     """A file that :func:`write_archive` wrote, in memory; :class:`ArchiveError`, a ValueError, for any other."""
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: AnyPath) -> None:
         try:
             self._data = _entries(read_bytes(Path(path), _MOST_BYTES))
             self.description = parse_json(self._data.pop(_DESCRIPTION))

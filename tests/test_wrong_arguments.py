@@ -29,7 +29,7 @@ WRONG: dict[str, list[Any]] = {
     "int": ["3", 1.5, math.nan, True, None, [], "many"],
     "float": ["0.1", "", True, None, [], math.nan],
     "str": [3, None, [], b"text", 1.5],
-    "str | os.PathLike[str]": [3, None, [], 1.5, True],
+    "AnyPath": [3, None, [], 1.5, True],
     "Count": ["3", 1.5, math.nan, True, None, [], 0, -1],
     "Natural": ["3", 1.5, math.nan, True, None, [], -1],
     "Scale": ["0.1", "", True, None, [], math.nan, math.inf, -0.1],
@@ -37,7 +37,7 @@ WRONG: dict[str, list[Any]] = {
     "Probability": ["0.1", "", True, None, [], math.nan, -0.1, 1.1],
     "Literal": ["no such choice", 3, None, [], True],
 }
-RIGHT = {"bool": True, "int": 1, "float": 0.5, "str": "reach", "str | os.PathLike[str]": "folder"}
+RIGHT = {"bool": True, "int": 1, "float": 0.5, "str": "reach", "AnyPath": "folder"}
 
 
 def kind_of(annotation):

@@ -80,7 +80,7 @@ WRONG: dict[str, list[Any]] = {
     "Literal['vectorized', 'metaworld'] | Callable[..., Engine]": [3, "mujoco", None, []],
     "tuple[int, int]": [3, (0,), (2, 1), ("0", 1), (0, 0), "01", (0.5, 2)],
     "tuple[()]": [3, (2,), "x"],
-    "str | os.PathLike[str] | Sequence[str | os.PathLike[str]]": [3, None, [], [3], [None], 1.5],
+    "AnyPath | Sequence[AnyPath]": [3, None, [], [3], [None], 1.5],
     "str | Behaviour | Policy": [3, None, "expart", [], object()],
     "str | Sequence[str]": CAMERAS,
     "Sequence[int]": [3, "0", [-1], ["0"], [0.5]],

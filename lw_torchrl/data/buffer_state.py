@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
@@ -15,7 +14,7 @@ from torchrl.data import TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers.storages import Storage
 
-from lw_torchrl._files import reading
+from lw_torchrl._files import AnyPath, reading
 from lw_torchrl._state_tree import join, split
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
 from lw_torchrl.data.dataset import Demonstrations, read_metadata
@@ -88,13 +87,13 @@ class RestorableReplay(BaseDatasetExperienceReplay):
                 raise
             raise ValueError(f"state_dict does not fit this buffer ({type(error).__name__}: {error})") from error
 
-    def dumps(self, path: str | os.PathLike[str]) -> None:
+    def dumps(self, path: AnyPath) -> None:
         """Save the state to a folder, as one file that is there whole or not at all."""
         tensors: dict[str, Tensor] = {}
         tree = split(self.state_dict(), tensors)
         write_archive(Path(path) / _FILE, {"format_version": _VERSION, "state": tree}, {"tensors": tensors})
 
-    def loads(self, path: str | os.PathLike[str]) -> None:
+    def loads(self, path: AnyPath) -> None:
         """Restore what :meth:`dumps` saved, after :meth:`verify`; ValueError, and no change, if it is damaged."""
         self.verify()
         with reading(path, "buffer's state"):

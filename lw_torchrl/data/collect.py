@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDictBase
 
 from lw_torchrl._checks import checked, differences, shown
-from lw_torchrl._files import flush, held, write_json
+from lw_torchrl._files import AnyPath, flush, held, write_json
 from lw_torchrl._versions import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import dataset, memory_map
 from lw_torchrl.data.behaviours import Behaviour, behaviour_of
@@ -166,7 +166,7 @@ def collect_demonstrations(
     tasks: str | Iterable[str],
     *,
     episodes_per_task: int,
-    root: str | os.PathLike[str],
+    root: AnyPath,
     suite: str | Suite | None = None,
     policy: str | Behaviour | Policy = "expert",
     behaviour: str | None = None,

@@ -8,7 +8,6 @@ root/.lock            held while collecting
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
@@ -17,7 +16,7 @@ from reprlib import repr as short
 from typing import Any, TypeVar
 
 from lw_torchrl._checks import check_fields, check_int, check_scale
-from lw_torchrl._files import read_json, write_json
+from lw_torchrl._files import AnyPath, read_json, write_json
 from lw_torchrl.data.behaviours import EXPERT, NOISY, Behaviour, check_own_label
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.tasks import MT50, resolve_tasks
@@ -157,7 +156,7 @@ def write_metadata(made: Demonstrations) -> None:
     write_json(made.root / METADATA, stated | {"episodes": columns})
 
 
-def read_metadata(root: str | os.PathLike[str]) -> Demonstrations:
+def read_metadata(root: AnyPath) -> Demonstrations:
     """Describe the dataset in a folder; DatasetError if it is half-written, damaged, or of another version."""
     folder = Path(root)
     path = folder / METADATA

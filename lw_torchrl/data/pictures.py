@@ -6,7 +6,6 @@ root/pictures/<cameras>-<height>x<width>-every<k>/<task>.<episode>.zip    "0.png
 from __future__ import annotations
 
 import io
-import os
 import zipfile
 from collections.abc import Sequence
 from contextlib import closing, suppress
@@ -21,7 +20,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv, step_mdp
 
 from lw_torchrl._checks import check_int, checked
-from lw_torchrl._files import replacing
+from lw_torchrl._files import AnyPath, replacing
 from lw_torchrl._progress import Progress
 from lw_torchrl._rendering import check_cameras
 from lw_torchrl.data.dataset import DatasetError, Demonstrations, EpisodeInfo, read_metadata
@@ -88,7 +87,7 @@ class _Pictures:
 
 @checked
 def add_pictures(
-    root: str | os.PathLike[str],
+    root: AnyPath,
     cameras: str | Sequence[str] = "corner",
     *,
     height: int = 64,

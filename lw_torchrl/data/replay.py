@@ -20,6 +20,7 @@ from torchrl.envs import Transform
 
 from lw_torchrl._checks import Count, Natural, check_path, checked_but
 from lw_torchrl._devices import CPU, check_device
+from lw_torchrl._files import AnyPath
 from lw_torchrl.data import replay_checks, selection
 from lw_torchrl.data.buffer_state import RestorableReplay, fingerprint
 from lw_torchrl.data.dataset import DATA, read_metadata
@@ -107,7 +108,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
     @checked_but("episodes")
     def __init__(
         self,
-        root: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+        root: AnyPath | Sequence[AnyPath],
         *,
         episodes: EpisodeChoice | Sequence[EpisodeChoice] = None,
         keep: EpisodeFilter | None = None,

@@ -17,7 +17,7 @@ from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.counterfactuals import Counterfactuals, EpisodeId, EpisodeRepeater, own_evaluators
 from lw_torchrl.evaluation.explanation import EpisodeStates, Explanation, Scripts, explain, stall_step, states_of
 from lw_torchrl.evaluation.failure_records import Cause, Failure
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.networks import evaluating
@@ -38,10 +38,10 @@ _PARTS: dict[str, str] = {"query": "true answers", "plan": "the reference plan",
 @checked
 def attribute_failures(
     rollouts: Iterable[FinishedEpisode | TensorDictBase],
-    plans: Plans | Mapping[str, ConditionalPlan],
+    plans: AnyPlans,
     *,
     actor: Callable[[TensorDictBase], TensorDictBase] | None = None,
-    reference: Plans | Mapping[str, ConditionalPlan] | None = None,
+    reference: AnyPlans | None = None,
     evaluator: Callable[[TensorDictBase], TensorDictBase] | None = None,
     skills: Mapping[str, ScriptedSkill] | None = None,
     seed: int,

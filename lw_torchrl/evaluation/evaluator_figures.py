@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from textwrap import fill
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 
 from lw_torchrl._checks import checked
+from lw_torchrl._files import AnyPath
 from lw_torchrl.evaluation.evaluator_report import BINS, PARTS, EvaluatorReport, clause_logits
 from lw_torchrl.evaluation.figures import check_image, new_figure, saved, trim
 from lw_torchrl.language.queries import Clause
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @checked
-def plot_reliability(report: EvaluatorReport, path: str | os.PathLike[str] | None = None) -> Figure:
+def plot_reliability(report: EvaluatorReport, path: AnyPath | None = None) -> Figure:
     """Draw, for each part of a report, the share of answers that are true over their mean probability, and how many
     answers there are.
 
@@ -100,7 +100,7 @@ def wrong_answers(evaluator: ImageQueryEvaluator, data: LabelledQueries, most: i
 
 @checked
 def plot_wrong_answers(
-    evaluator: ImageQueryEvaluator, data: LabelledQueries, path: str | os.PathLike[str] | None = None, most: int = 12
+    evaluator: ImageQueryEvaluator, data: LabelledQueries, path: AnyPath | None = None, most: int = 12
 ) -> Figure:
     """Draw the surest wrong answers in held-out states: the pictures, what was asked, and how far from where they are
     the things were taken to be.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from lw_torchrl._checks import checked
-from lw_torchrl._files import write_json
+from lw_torchrl._files import AnyPath, write_json
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.networks import evaluating
@@ -108,7 +107,7 @@ class EvaluatorReport:
                 lines.append(f"  {name:34}{sum(score.asked[name]):10}{both}")
         return "\n".join(lines)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: AnyPath) -> None:
         """Write it as JSON."""
         write_json(path, {"about": self.about, "parts": {name: one.to_json() for name, one in self.parts.items()}})
 

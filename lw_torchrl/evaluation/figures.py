@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from lw_torchrl._checks import checked, counted
-from lw_torchrl._files import replacing
+from lw_torchrl._files import AnyPath, replacing
 from lw_torchrl.evaluation.failure_records import CAUSES, count_causes
 from lw_torchrl.evaluation.result import EvaluationResult, attributed
 from lw_torchrl.evaluation.statistics import Array, check_rates, wilson_interval
@@ -28,7 +27,7 @@ _CAUSE_COLORS = dict(zip(CAUSES, ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#
 Curve = Sequence[tuple[float, float]]  # points: steps of the environment, success rate in [0, 1]
 
 
-def check_image(path: str | os.PathLike[str] | None) -> None:
+def check_image(path: AnyPath | None) -> None:
     """Raise :class:`ValueError` unless the file's name tells a format."""
     if path is not None and (given := Path(path).suffix.lower()) not in _FORMATS:
         raise ValueError(f"path must end in {', '.join(_FORMATS)}, got {given!r} of {str(path)!r}")
@@ -41,7 +40,7 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def saved(figure: Figure, path: str | os.PathLike[str] | None) -> Figure:
+def saved(figure: Figure, path: AnyPath | None) -> Figure:
     if path is not None:
         with replacing(path) as temporary:
             figure.savefig(temporary, dpi=140)
@@ -57,7 +56,7 @@ def trim(axes: Axes, grid: Literal["x", "y"] | None = None) -> None:
 
 
 @checked
-def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None = None, *, title: str = "") -> Figure:
+def plot_success(result: EvaluationResult, path: AnyPath | None = None, *, title: str = "") -> Figure:
     """Draw the any-step success rate of each task, best first, with 95 % intervals over the episodes.
 
     Args:
@@ -92,7 +91,7 @@ def plot_success(result: EvaluationResult, path: str | os.PathLike[str] | None =
 
 
 @checked
-def plot_failures(result: EvaluationResult, path: str | os.PathLike[str] | None = None, *, title: str = "") -> Figure:
+def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, title: str = "") -> Figure:
     """Draw how many episodes of each task failed, and of what; the task with most failures at the top.
 
     Args:
@@ -136,7 +135,7 @@ def plot_failures(result: EvaluationResult, path: str | os.PathLike[str] | None 
 @checked
 def plot_sorted_tasks(
     curves: Mapping[str, Rates | Summary],
-    path: str | os.PathLike[str] | None = None,
+    path: AnyPath | None = None,
     *,
     published: Mapping[str, Mapping[str, float]] | None = None,
     order: Literal["shared", "own"] = "shared",
@@ -241,7 +240,7 @@ def _as_rates(argument: str, given: Rates | Summary | Mapping[str, float]) -> di
 @checked
 def plot_learning_curves(
     curves: Mapping[str, Mapping[str, Sequence[Curve]]],
-    path: str | os.PathLike[str] | None = None,
+    path: AnyPath | None = None,
     *,
     starts: Mapping[str, float] | None = None,
     title: str = "",
@@ -295,7 +294,7 @@ def plot_learning_curves(
 
 @checked
 def plot_methods(
-    groups: Mapping[str, Mapping[str, Summary]], path: str | os.PathLike[str] | None = None, *, title: str = ""
+    groups: Mapping[str, Mapping[str, Summary]], path: AnyPath | None = None, *, title: str = ""
 ) -> Figure:
     """Draw the mean success of each method: a bar for the mean over seeds and tasks with its 95 % interval, a dot for
     each seed; methods from the top in the order in which they are given.

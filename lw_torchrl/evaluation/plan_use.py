@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ from torchrl.envs import TransformedEnv
 from lw_torchrl._checks import check_choice, checked
 from lw_torchrl.envs.episodes import FinishedEpisode, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.suites.metaworld.experts import ExpertActor
 from lw_torchrl.transforms import QAFTransform
@@ -63,7 +63,7 @@ class _Episode(NamedTuple):
 class PlanUse:
     """Collects how plans are used from finished episodes: pass it to :func:`evaluate` as ``on_episode``."""
 
-    def __init__(self, plans: Plans | Mapping[str, ConditionalPlan]) -> None:
+    def __init__(self, plans: AnyPlans) -> None:
         self.plans = as_plans(plans)
         self._seen: dict[str, list[_Episode]] = {}
 
@@ -115,7 +115,7 @@ def _summed(seen: list[_Episode]) -> TaskUse:
 
 
 def expert_use(
-    plans: Plans | Mapping[str, ConditionalPlan],
+    plans: AnyPlans,
     tasks: str | Iterable[str] | None = None,
     *,
     episodes_per_task: int = 10,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal
 
 import torch
@@ -18,13 +18,13 @@ from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.attribution import attribute_failures, keys_to_attribute
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.evaluation.running import ROWS, Acts, answered_by, make_env, running
-from lw_torchrl.language.plans import ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.tasks import Task, TaskList
 from lw_torchrl.modules.policy import Policy, plans_of
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
 
-def actor_plans(actor: Any, plans: Plans | Mapping[str, ConditionalPlan] | None) -> Plans | None:
+def actor_plans(actor: Any, plans: AnyPlans | None) -> Plans | None:
     """The plans to answer queries for: those given, or the actor's own; different ones are an error."""
     own = plans_of(actor)
     if plans is None:
@@ -68,7 +68,7 @@ def evaluate(
     actor: TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase],
     *,
     tasks: str | Task | Iterable[str | Task],
-    plans: Plans | Mapping[str, ConditionalPlan] | None = None,
+    plans: AnyPlans | None = None,
     episodes_per_task: Count = 20,
     seed: int,
     noise_scale: Scale = 0.1,
@@ -86,7 +86,7 @@ def evaluate(
     device: str | torch.device | None = None,
     evaluator: Callable[[TensorDictBase], TensorDictBase] | None = None,
     attribute: bool = False,
-    reference: Plans | Mapping[str, ConditionalPlan] | None = None,
+    reference: AnyPlans | None = None,
 ) -> EvaluationResult:
     """Run episodes 0 to k - 1 of each task and report how they went.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -15,7 +14,7 @@ from typing import Any
 from torch import Tensor
 
 from lw_torchrl._checks import Count, Natural, check_flag, check_int, check_scale
-from lw_torchrl._files import read_json, write_json
+from lw_torchrl._files import AnyPath, read_json, write_json
 from lw_torchrl._versions import package_versions
 from lw_torchrl.evaluation.failure_records import Failure, failure_table, is_number, read_failures, read_records
 
@@ -98,11 +97,11 @@ class EvaluationResult:
 
     def save(
         self,
-        path: str | os.PathLike[str],
+        path: AnyPath,
         *,
-        checkpoint: str | os.PathLike[str] | None = None,
+        checkpoint: AnyPath | None = None,
         plans: str | None = None,
-        evaluator: str | os.PathLike[str] | None = None,
+        evaluator: AnyPath | None = None,
     ) -> None:
         """Write the result as JSON; a file is replaced whole or not at all.
 
@@ -132,7 +131,7 @@ class EvaluationResult:
         write_json(path, told)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> EvaluationResult:
+    def load(cls, path: AnyPath) -> EvaluationResult:
         """Read what :meth:`save` wrote.
 
         Raises:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Literal
 
 from lw_torchrl._checks import checked, shown
-from lw_torchrl._files import parse_json, read_text, write_text
+from lw_torchrl._files import AnyPath, parse_json, read_text, write_text
 from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.plan_text import MOST_STEPS, PLAN_LIMIT, no_task, too_many_steps
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, PlanError, Plans, PlanStep, as_plans, parse_plan
@@ -20,9 +19,7 @@ _MOST_PAIRS = 2_000  # of a file, each compared with all queries of its task
 
 
 @checked
-def load_plans(
-    source: str | os.PathLike[str], *, skills: Literal["own", "MT10"] = "own", tasks: Tasks = TASKS
-) -> Plans:
+def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks: Tasks = TASKS) -> Plans:
     """Load plans.
 
     A .json file maps task names to lists of (condition, skill) pairs, at its top or under the key "plans", as language
@@ -110,7 +107,7 @@ def _read_pairs(path: Path, tasks: Tasks) -> Plans:
 
 
 @checked
-def save_plans(plans: AnyPlans, folder: str | os.PathLike[str]) -> list[Path]:
+def save_plans(plans: AnyPlans, folder: AnyPath) -> list[Path]:
     """Write each plan to ``folder``/<task>.plan, "__" for a slash; a file is replaced whole or not at all."""
     texts = {Path(folder) / f"{task.replace('/', '__')}.plan": str(plan) for task, plan in as_plans(plans).items()}
     Path(folder).mkdir(parents=True, exist_ok=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
@@ -14,7 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 from lw_torchrl._checks import check_choice, checked, nearest, shown
-from lw_torchrl._files import read_toml
+from lw_torchrl._files import AnyPath, read_toml
 from lw_torchrl.language.named_objects import GRIPPER, is_number, is_triple
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task
 
@@ -130,7 +129,7 @@ def _read(file: Path | Traversable, tasks: Tasks) -> dict[str, ScriptedSkill]:
 
 
 @checked
-def load_skills(path: str | os.PathLike[str] | None = None, *, tasks: Tasks = TASKS) -> Skills:
+def load_skills(path: AnyPath | None = None, *, tasks: Tasks = TASKS) -> Skills:
     """The scripted skills by their text.
 
     Args:

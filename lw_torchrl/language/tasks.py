@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -14,7 +13,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from lw_torchrl._checks import check_choice, check_fields, checked, nearest, shown, unknown_name
-from lw_torchrl._files import read_toml
+from lw_torchrl._files import AnyPath, read_toml
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, check_inside, read_objects, write_objects
 
@@ -243,7 +242,7 @@ def one_layout(tasks: Iterable[Task]) -> Layout:
 
 
 @checked
-def load_tasks(path: str | os.PathLike[str]) -> Tasks:
+def load_tasks(path: AnyPath) -> Tasks:
     """All 50 tasks and those of your own file: some of the 50 with other objects, points or words, or new tasks.
 
     Args:

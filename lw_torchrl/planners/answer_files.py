@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from lw_torchrl._checks import check_choice, check_int, checked, counted, differences, shown, unknown_name
-from lw_torchrl._files import JSON_LIMIT, parse_json, read_bytes, read_json, read_text, write_json, write_text
+from lw_torchrl._files import JSON_LIMIT, AnyPath, parse_json, read_bytes, read_json, read_text, write_json, write_text
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plan_decoding import decode_plan
 from lw_torchrl.language.skills import Skills
@@ -33,13 +32,13 @@ def folder_name(model: str) -> str:
 
 
 @checked
-def answer_path(folder: str | os.PathLike[str], model: str, format: str, task: str, attempt: int) -> Path:
+def answer_path(folder: AnyPath, model: str, format: str, task: str, attempt: int) -> Path:
     """Where the answer of a model is kept."""
     return Path(folder) / folder_name(model) / format / f"{task}-{attempt}.{PLAN_FORMATS[format].extension}"
 
 
 @checked
-def write_answer(folder: str | os.PathLike[str], model: str, answer: Answer) -> Path:
+def write_answer(folder: AnyPath, model: str, answer: Answer) -> Path:
     """Write an answer to its place, whole or not at all; one that came in another form beside it, as .json."""
     path = answer_path(folder, model, answer.format, answer.task, answer.attempt)
     if answer.raw != answer.text:
@@ -68,7 +67,7 @@ def settle_folder(folder: Path, settings: Mapping[str, Any], *, reading: bool = 
 
 
 def recorded_answer(
-    out: str | os.PathLike[str], model: str, question: Question, format: str, kept: Reply | None, skills: Skills | None
+    out: AnyPath, model: str, question: Question, format: str, kept: Reply | None, skills: Skills | None
 ) -> Answer | None:
     """The answer recorded in ``out/<model>``, if any; ``kept`` is the reply in the cache, which knows more of it."""
     path = answer_path(out, model, format, question.task.name, question.attempt)
@@ -84,7 +83,7 @@ def recorded_answer(
     return replace(answer, cached=True)
 
 
-def recorded_answers(source: str | os.PathLike[str]) -> dict[str, dict[_Place, str | Path]]:
+def recorded_answers(source: AnyPath) -> dict[str, dict[_Place, str | Path]]:
     """Models to their answers, or files of these, by format, task and attempt; errors as of :class:`FilePlanner`."""
     path = Path(source)
     if not path.exists():
@@ -94,7 +93,7 @@ def recorded_answers(source: str | os.PathLike[str]) -> dict[str, dict[_Place, s
     return found
 
 
-def ignored_files(source: str | os.PathLike[str]) -> list[Path]:
+def ignored_files(source: AnyPath) -> list[Path]:
     """Files that look like answers and lie where answers do, but have another name or ending."""
     root = Path(source)
     read = {path for answers in _of_folder(root).values() for path in answers.values()}
@@ -154,7 +153,7 @@ def answer_key(request: dict[str, Any]) -> str:
 class AnswerCache:
     """Answers in a folder, each a JSON file with its question, so that nothing is asked twice."""
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
+    def __init__(self, folder: AnyPath) -> None:
         self.folder = Path(folder)
 
     def path(self, request: dict[str, Any]) -> Path:
@@ -208,7 +207,7 @@ class Planner(Protocol):
         ...
 
     def plans(
-        self, tasks: TaskList, *, format: str = "chain_py", attempts: int = 1, out: str | os.PathLike[str] | None = None
+        self, tasks: TaskList, *, format: str = "chain_py", attempts: int = 1, out: AnyPath | None = None
     ) -> Answers:
         """Plans of tasks, an answer for each task and attempt.
 
@@ -249,7 +248,7 @@ class FilePlanner:
     """
 
     @checked
-    def __init__(self, source: str | os.PathLike[str], model: str | None = None) -> None:
+    def __init__(self, source: AnyPath, model: str | None = None) -> None:
         found = recorded_answers(source)
         if model is None and len(found) > 1:
             raise ValueError(f"model must be given, since {str(source)!r} has answers of {', '.join(sorted(found))}")
@@ -263,7 +262,7 @@ class FilePlanner:
         return f"FilePlanner({self.name!r}, {counted(len(self.recorded), 'answer')})"
 
     def plans(
-        self, tasks: TaskList, *, format: str = "chain_py", attempts: int = 1, out: str | os.PathLike[str] | None = None
+        self, tasks: TaskList, *, format: str = "chain_py", attempts: int = 1, out: AnyPath | None = None
     ) -> Answers:
         """The recorded answers, see :meth:`Planner.plans`; one that is not recorded is a :class:`PlannerError`."""
         check_choice("format", format, PLAN_FORMATS)

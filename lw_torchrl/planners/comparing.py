@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -10,7 +9,7 @@ from time import monotonic
 from typing import Any, Literal
 
 from lw_torchrl._checks import differences
-from lw_torchrl._files import read_json, write_json
+from lw_torchrl._files import AnyPath, read_json, write_json
 from lw_torchrl._progress import Progress
 from lw_torchrl.evaluation.many_plans import evaluate_plans
 from lw_torchrl.evaluation.statistics import mean_rate
@@ -118,7 +117,7 @@ class PlanComparison:
 
 
 def compare_plans(
-    source: str | os.PathLike[str],
+    source: AnyPath,
     *,
     episodes: int = 20,
     seed: int = 1000,
@@ -128,7 +127,7 @@ def compare_plans(
     num_envs: int = 256,
     num_threads: int | None = None,
     tasks: Tasks = TASKS,
-    resume: str | os.PathLike[str] | None = None,
+    resume: AnyPath | None = None,
     progress: bool = True,
 ) -> PlanComparison:
     """Decode recorded answers, and carry out all their plans by scripted skills in one simulation.
@@ -193,7 +192,7 @@ def _mean(numbers: Sequence[float]) -> float:
     return sum(numbers) / len(numbers) if numbers else float("nan")
 
 
-def _read(file: str | os.PathLike[str] | None, settings: Mapping[str, Any]) -> dict[str, tuple[bool, ...]]:
+def _read(file: AnyPath | None, settings: Mapping[str, Any]) -> dict[str, tuple[bool, ...]]:
     if file is None or not Path(file).exists():
         return {}
     found = read_json(file, "resume: the kept results")
@@ -208,7 +207,7 @@ def _read(file: str | os.PathLike[str] | None, settings: Mapping[str, Any]) -> d
     return {key: tuple(one == "1" for one in found["fared"][key]) for key in found["fared"]}
 
 
-def _write(file: str | os.PathLike[str], settings: Mapping[str, Any], fared: Mapping[str, Sequence[bool]]) -> None:
+def _write(file: AnyPath, settings: Mapping[str, Any], fared: Mapping[str, Sequence[bool]]) -> None:
     bits = {key: _bits(success) for key, success in fared.items()}
     write_json(Path(file), {"settings": dict(settings), "fared": bits})
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import socket
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
 from lw_torchrl._checks import Count, Natural, check_int, checked, unknown_name
+from lw_torchrl._files import AnyPath
 from lw_torchrl.planners.guard import Guard, run_server
 
 INSTALL = (
@@ -31,7 +31,7 @@ def _small_folder() -> Path | None:
 
 @checked
 def serve_model(
-    model: str | os.PathLike[str] | None = None,
+    model: AnyPath | None = None,
     *,
     host: str = LOCAL,
     port: Natural = 8000,
@@ -89,7 +89,7 @@ def local_names(host: str) -> set[str] | None:
     return {"localhost", host} if host == "localhost" or host.startswith("127.") else None
 
 
-def model_file(model: str | os.PathLike[str] | None) -> Path:
+def model_file(model: AnyPath | None) -> Path:
     """The GGUF file of a model, the small one's for None; errors as of :func:`serve_model`."""
     if model is None:  # SmolLM2 of 135 million weights, 98 MB
         files = sorted(folder.glob("*.gguf")) if (folder := _small_folder()) else []

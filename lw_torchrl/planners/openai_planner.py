@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Generator, Iterable, Mapping
 from contextlib import closing
 from dataclasses import replace
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lw_torchrl._checks import Count, Natural, Positive, Scale, check_choice, check_int, checked, counted, shown
+from lw_torchrl._files import AnyPath
 from lw_torchrl._progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import AnyPlans, as_plans
@@ -75,7 +75,7 @@ class OpenAIPlanner:
         seed: int | None = None,
         options: Mapping[str, Any] | None = None,
         name: str | None = None,
-        cache: str | os.PathLike[str] = "runs/answers",
+        cache: AnyPath = "runs/answers",
         concurrency: Count = 4,
         retries: Natural = 6,
         timeout: Positive = 300.0,
@@ -128,7 +128,7 @@ class OpenAIPlanner:
         *,
         format: str = "chain_py",
         attempts: int = 1,
-        out: str | os.PathLike[str] | None = None,
+        out: AnyPath | None = None,
         recorded: bool = False,
         progress: bool = True,
     ) -> Answers:
@@ -159,7 +159,7 @@ class OpenAIPlanner:
         *,
         round: int = 1,
         tasks: Tasks = TASKS,
-        out: str | os.PathLike[str] | None = None,
+        out: AnyPath | None = None,
         progress: bool = True,
     ) -> Answers:
         """Tell the model what became of its answers, and ask for another in the place of each.
@@ -192,7 +192,7 @@ class OpenAIPlanner:
         questions: Iterable[Question],
         format: str,
         name: str,
-        out: str | os.PathLike[str] | None,
+        out: AnyPath | None,
         progress: bool,
         recorded: Literal["taken", "replaced", "refused"],
     ) -> Answers:

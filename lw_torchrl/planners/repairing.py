@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 
 from lw_torchrl._checks import check_int
+from lw_torchrl._files import AnyPath
 from lw_torchrl._progress import Progress
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
@@ -92,7 +92,7 @@ def repair_plans(
     episodes: int = 10,
     seed: int = 0,
     tasks: Tasks = TASKS,
-    out: str | os.PathLike[str] | None = None,
+    out: AnyPath | None = None,
     progress: bool = True,
 ) -> list[Repair]:
     """Carry out plans, tell the model what became of those that fail, and ask for others, round by round.

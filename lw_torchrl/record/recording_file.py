@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO
 
 from lw_torchrl._checks import check_int
+from lw_torchrl._files import AnyPath
 from lw_torchrl.record.conventions import EPISODE_TIMELINE, METRIC_TIMELINE, rr
 from lw_torchrl.record.tabs import Layout
 
@@ -94,7 +95,7 @@ def plain(text: str) -> str:
 FLUSH_SECONDS = 60.0
 
 
-def find_recording(path: str | os.PathLike[str]) -> Path:
+def find_recording(path: AnyPath) -> Path:
     """The recording ``path``, or the only one in the folder ``path``, that begins as one; else an error."""
     recording = Path(path)
     if recording.is_dir():
@@ -182,7 +183,7 @@ def copy_recording(source: Path, target: Path, tab: str | None = None) -> None:
         raise OSError(f"{str(target)!r} could not be written to its end")
 
 
-def opening_step(path: str | os.PathLike[str], tab: str | None = None, step: int | None = None) -> int | None:
+def opening_step(path: AnyPath, tab: str | None = None, step: int | None = None) -> int | None:
     """The step for a viewer's cursor in a tab (None: the first); None for a tab of no episode.
 
     It is ``step``, or a ValueError if the recording does not go so far; without one :meth:`Layout.opening_step`.

@@ -21,6 +21,7 @@ from torch import Tensor
 from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import check_choice, checked
+from lw_torchrl._files import AnyPath
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.record import metrics
@@ -72,7 +73,7 @@ class RerunLogger(Logger):
     @checked
     def __init__(
         self,
-        path: str | os.PathLike[str] | None = None,
+        path: AnyPath | None = None,
         *,
         connect: str | None = None,
         exp_name: str | None = None,

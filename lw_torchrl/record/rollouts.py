@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Iterable, Sequence
 from itertools import groupby
@@ -17,7 +16,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import checked, missing_keys, shown
-from lw_torchrl._files import replacing
+from lw_torchrl._files import AnyPath, replacing
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import episode_seed
@@ -261,7 +260,7 @@ def run_recorded(
 
 
 def write_recording(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     episodes: Iterable[FinishedEpisode],
     plans: Plans | None = None,
     *,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import subprocess
 import threading
@@ -14,7 +13,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from lw_torchrl._checks import checked
-from lw_torchrl._files import replacing
+from lw_torchrl._files import AnyPath, replacing
 from lw_torchrl.record.conventions import EPISODE_TIMELINE
 from lw_torchrl.record.recording_file import LOCAL, failure, find_recording, free_port, opened, opening_step, running
 
@@ -25,8 +24,8 @@ PAINT_SECONDS, SETTLE_SECONDS = 0.7, 15.0
 
 @checked
 def open_viewer(
-    path: str | os.PathLike[str],
-    screenshot: str | os.PathLike[str] | None = None,
+    path: AnyPath,
+    screenshot: AnyPath | None = None,
     window_size: str = "1400x900",
     *,
     step: int | None = None,

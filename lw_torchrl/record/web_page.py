@@ -6,7 +6,6 @@ import base64
 import gzip
 import html
 import json
-import os
 import socket
 import threading
 import time
@@ -20,7 +19,7 @@ from string import Template
 from urllib.error import URLError
 
 from lw_torchrl._checks import checked
-from lw_torchrl._files import replacing
+from lw_torchrl._files import AnyPath, replacing
 from lw_torchrl.record.conventions import EPISODE_TIMELINE
 from lw_torchrl.record.recording_file import LOCAL, failure, find_recording, free_port, opened, opening_step, running
 
@@ -33,9 +32,7 @@ _PIECE = 65_536
 
 
 @checked
-def write_html(
-    path: str | os.PathLike[str], page: str | os.PathLike[str], *, episode: str | None = None, step: int | None = None
-) -> Path:
+def write_html(path: AnyPath, page: AnyPath, *, episode: str | None = None, step: int | None = None) -> Path:
     """Write a recording as one page to send to somebody: it opens from disk, without a network.
 
     Some 20 MB of viewer, and the recording, compressed. It wants WebGL 2 or WebGPU. The rest is as :func:`open_viewer`.
@@ -86,9 +83,7 @@ class WebPage(AbstractContextManager["WebPage"]):
     """
 
     @checked
-    def __init__(
-        self, path: str | os.PathLike[str], *, episode: str | None = None, step: int | None = None, port: int = 0
-    ) -> None:
+    def __init__(self, path: AnyPath, *, episode: str | None = None, step: int | None = None, port: int = 0) -> None:
         recording = find_recording(path)
         with opened(recording, episode) as file:
             at = opening_step(file, episode, step)

@@ -17,7 +17,7 @@ from itertools import count
 from pathlib import Path
 from queue import SimpleQueue
 
-from lw_torchrl._files import replacing
+from lw_torchrl._files import AnyPath, replacing
 from lw_torchrl.record.conventions import rr
 from lw_torchrl.record.recording_file import copy_recording
 
@@ -258,7 +258,7 @@ def check_address(address: str) -> tuple[str, str, int]:
     return f"{found['scheme'] or 'rerun+http'}://{found['host']}:{port}/proxy", found["host"].strip("[]"), port
 
 
-def check_path(path: str | os.PathLike[str]) -> Path:
+def check_path(path: AnyPath) -> Path:
     """Return the path that a recording is to have, else raise :class:`ValueError`."""
     target = Path(path)
     if target.suffix != ".rrd" or not target.stem:

@@ -11,7 +11,6 @@ Nothing is unpickled, and what the file says of sizes is held against what it ho
 from __future__ import annotations
 
 import json
-import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import differences, shown
+from lw_torchrl._files import AnyPath
 from lw_torchrl._state_tree import join, split
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl._versions import LIBRARIES, warn_of_other_versions
@@ -46,7 +46,7 @@ class Envelope:
     command: str
     group: str = "weights"
 
-    def save(self, path: str | os.PathLike[str], module: Any, texts: Mapping[str, Tensor], about: dict) -> None:
+    def save(self, path: AnyPath, module: Any, texts: Mapping[str, Tensor], about: dict) -> None:
         """Write a module that a file can hold, and ``about``; :class:`ValueError` if it names what a file says."""
         if reserved := sorted({"format", "version", "versions", self.part, "state", "sha256"} & set(about)):
             raise ValueError(f"about must not be named {', '.join(reserved)}, which {self.called} file says itself")
@@ -54,7 +54,7 @@ class Envelope:
 
     def write(
         self,
-        path: str | os.PathLike[str],
+        path: AnyPath,
         described: Mapping[str, Any],
         groups: Mapping[str, Mapping[str, Tensor]],
         training: Mapping[str, Any] | None = None,
@@ -71,7 +71,7 @@ class Envelope:
             what = f"{self.argument}: {str(path)!r} cannot be written ({error.strerror}); an earlier file is as it was"
             raise OSError(error.errno, what) from error
 
-    def open(self, path: str | os.PathLike[str]) -> TensorArchive:
+    def open(self, path: AnyPath) -> TensorArchive:
         """The archive of a file whose format, version and part have been checked."""
         begin = f"{self.argument}: {str(path)!r}"
         if not Path(path).exists():
@@ -113,7 +113,7 @@ class Envelope:
 
     def load(
         self,
-        path: str | os.PathLike[str],
+        path: AnyPath,
         make: Callable[[Any, TextEncoder | None], Module],
         encoder: TextEncoder | None,
         texts_of: Callable[[Module], dict[str, Tensor]],

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 from torch import Tensor, nn
 from torchrl.envs import Compose, Transform
 
 from lw_torchrl._checks import checked, checked_but
+from lw_torchrl._files import AnyPath
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.policy import Policy, from_description
@@ -20,7 +20,7 @@ _PROBE = "the robot's gripper is open"
 
 
 @checked
-def save_actor(actor: Policy, path: str | os.PathLike[str], **about: Any) -> None:
+def save_actor(actor: Policy, path: AnyPath, **about: Any) -> None:
     """Write a policy, for :func:`load_actor`; an earlier file is replaced whole.
 
     Args:
@@ -61,7 +61,7 @@ def check_can_be_saved(actor: Any) -> Policy:
 
 
 @checked
-def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None = None) -> Policy:
+def load_actor(path: AnyPath, *, text_encoder: TextEncoder | None = None) -> Policy:
     """Make the policy of a file, with its plans and weights, in eval mode.
 
     Args:
@@ -78,7 +78,7 @@ def load_actor(path: str | os.PathLike[str], *, text_encoder: TextEncoder | None
 
 
 @checked_but("evaluator")
-def save_evaluator(evaluator: QueryEvaluator, path: str | os.PathLike[str], **about: Any) -> None:
+def save_evaluator(evaluator: QueryEvaluator, path: AnyPath, **about: Any) -> None:
     """Write an evaluator, for :func:`load_evaluator`; an earlier file is replaced whole. It holds the network alone.
 
     Args:
@@ -110,9 +110,7 @@ def evaluator_texts(evaluator: QueryEvaluator) -> dict[str, Tensor]:
 
 
 @checked
-def load_evaluator(
-    path: str | os.PathLike[str], plans: AnyPlans, *, text_encoder: TextEncoder | None = None
-) -> QueryEvaluator:
+def load_evaluator(path: AnyPath, plans: AnyPlans, *, text_encoder: TextEncoder | None = None) -> QueryEvaluator:
     """Make the evaluator of a file, for the conditions of some plans, in eval mode.
 
     Args:
@@ -126,19 +124,19 @@ def load_evaluator(
     return EVALUATOR.load(path, make, text_encoder, evaluator_texts)
 
 
-def read_description(path: str | os.PathLike[str]) -> dict[str, Any]:
+def read_description(path: AnyPath) -> dict[str, Any]:
     """The description that a policy file was saved with; errors as of :func:`load_actor`."""
     return POLICY.open(path).description
 
 
-def demonstration_seeds(path: str | os.PathLike[str]) -> set[int]:
+def demonstration_seeds(path: AnyPath) -> set[int]:
     """The seeds of the demonstrations that a file's policy was trained on, as far as the file says."""
     data = read_description(path).get("data")
     parts = data.get("parts", [data]) if isinstance(data, dict) else []
     return {part["seed"] for part in parts if isinstance(part, dict) and isinstance(part.get("seed"), int)}
 
 
-def demonstrated_tasks(path: str | os.PathLike[str]) -> set[str]:
+def demonstrated_tasks(path: AnyPath) -> set[str]:
     """The tasks of the demonstrations that a file's policy was trained on, as far as the file says."""
     data = read_description(path).get("data")
     found = data if isinstance(data, dict) else {}

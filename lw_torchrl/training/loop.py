@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import threading
 from collections import deque
@@ -20,7 +19,7 @@ from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl._devices import CPU, drawn_on
-from lw_torchrl._files import held, sweep
+from lw_torchrl._files import AnyPath, held, sweep
 from lw_torchrl._progress import Progress
 from lw_torchrl._state_tree import check_like, check_optimizer_state, check_same
 from lw_torchrl._versions import LIBRARIES
@@ -78,7 +77,7 @@ class ReplayState:
 class TrainingOptions(TypedDict, total=False):
     """The options of :class:`Training` that every trainer takes."""
 
-    checkpoint: str | os.PathLike[str] | None
+    checkpoint: AnyPath | None
     logger: Logger | None
     progress: bool
     title: str
@@ -124,7 +123,7 @@ class Training:
         config: Any,
         replays: Sequence[TensorDictReplayBuffer],
         *,
-        checkpoint: str | os.PathLike[str] | None = None,
+        checkpoint: AnyPath | None = None,
         logger: Logger | None = None,
         progress: bool = True,
         title: str = "training",
