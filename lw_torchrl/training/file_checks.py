@@ -121,7 +121,10 @@ def check_texts(stored: Mapping[str, Tensor], ours: Mapping[str, Tensor]) -> Non
                 given += f"; its texts have {found.shape[-1]} numbers each: text_encoder must be the one that gave them"
             raise ValueError(given)
         if not torch.allclose(found, vectors.cpu(), atol=_TEXT_TOLERANCE, rtol=0.0):
-            raise ValueError("text_encoder is not the one that the policy was made with: its texts have other vectors")
+            raise ValueError(
+                "text_encoder is not the one that the policy was made with, whose vectors are others; pass that one as "
+                "text_encoder"
+            )
 
 
 def first_line(error: Exception) -> str:
