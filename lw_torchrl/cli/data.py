@@ -19,6 +19,7 @@ from lw_torchrl.cli.output import Columns, Output, Row
 if TYPE_CHECKING:
     from lw_torchrl.data.behaviours import Behaviour
     from lw_torchrl.data.dataset import Demonstrations, EpisodeInfo
+    from lw_torchrl.language.layout import Layout
 
 
 class _Episode(NamedTuple):
@@ -47,7 +48,7 @@ def collect(
     Example: lw-torchrl collect MT10 --out demos/mt10 --noise 0 0.1 0.2 --redraw-failures
 
     Args:
-        policy: who acts: expert, Meta-World's scripts; scripted, plans with scripted skills; spoilt-60 or spoilt-30,
+        policy: who acts: expert, the suite's own, Meta-World's scripts for example; scripted, plans with scripted skills; spoilt-60 or spoilt-30,
             the same in so many of 100 pieces of an episode; wrong, any skill of the plan; random; or a policy's file,
             of `lw-torchrl train`.
     """
@@ -131,7 +132,7 @@ def _about(part: Demonstrations) -> list[str]:
     redrawn = sum(part.attempts.values()) - len(part.episodes)
     lines = {
         "dataset": f"{part.root}: {_bytes(_size(part))}, format version {FORMAT_VERSION}",
-        "behaviour": f"{how.behaviour}: {_acted(how.policy)}",
+        "behaviour": f"{how.behaviour}: {_acted(how.policy, how.layout)}",
         "tasks": ", ".join(how.tasks) if len(how.tasks) <= 10 else counted(len(how.tasks), "task"),
         "episodes": asked + (f"; {counted(redrawn, 'failure')} drawn again" if how.redraw_failures else ""),
         "noise": noise,
@@ -141,9 +142,9 @@ def _about(part: Demonstrations) -> list[str]:
     return [fit.fill(f"{name:10} {line}").replace("\N{NO-BREAK SPACE}", " ") for name, line in lines.items()]
 
 
-def _acted(who: Behaviour) -> str:
+def _acted(who: Behaviour, layout: Layout) -> str:
     if who.kind == "expert":
-        return "Meta-World's scripts"
+        return "Meta-World's scripts" if layout.name == "metaworld" else f"the expert of {layout.name}"
     if who.kind == "policy":
         return f"a policy, fingerprint {who.fingerprint}"
     pieces = f"{who.shortest} to {who.longest} steps"
