@@ -48,9 +48,9 @@ def collect(
     Example: lw-torchrl collect MT10 --out demos/mt10 --noise 0 0.1 0.2 --redraw-failures
 
     Args:
-        policy: who acts: expert, the suite's own, Meta-World's scripts for example; scripted, plans with scripted skills; spoilt-60 or spoilt-30,
-            the same in so many of 100 pieces of an episode; wrong, any skill of the plan; random; or a policy's file,
-            of `lw-torchrl train`.
+        policy: who acts: expert, Meta-World's scripts or the suite's own; scripted, plans with scripted skills;
+            spoilt-60 or spoilt-30, the same in so many of 100 pieces of an episode; wrong, any skill of the plan;
+            random; or a policy's file, of `lw-torchrl train`.
     """
     options.check_folder("--out", out)
     options.check_actor("policy", policy)
