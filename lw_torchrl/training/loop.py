@@ -188,12 +188,16 @@ class Training:
             while self.steps < last and not interrupt.asked:
                 self.step()
                 bar.update()
-                if self.steps % READ_EVERY == 0 or self.steps == last:
-                    self.log(found := self.means(self._read_losses()), self.steps)
+                saves = self.steps % self.config.checkpoint_every == 0 or self.steps == last
+                tells = self.steps % READ_EVERY == 0 or self.steps == last
+                losses = self._read_losses() if saves or tells else None
+                if tells and losses is not None:
+                    self.log(found := self.means(losses), self.steps)
                     bar.note(**{name: f"{value:.4f}" for name, value in found.items() if "loss" in name})
-                if self.steps % self.config.checkpoint_every == 0 or self.steps == last:
+                if saves:
                     self.save()
             if interrupt.asked:
+                self._read_losses()
                 self.save()
         for network in self.networks:
             network.eval()
@@ -247,8 +251,7 @@ class Training:
         return stat.st_ino, stat.st_size, stat.st_mtime_ns
 
     def save(self) -> None:
-        """Write the checkpoint, if there is to be one and all losses are finite; an earlier one is replaced whole."""
-        self._read_losses()
+        """Write the checkpoint, if there is to be one; an earlier one is replaced whole."""
         try:
             check_finite(self.parameters(), self.parameters())
         except ValueError as error:
