@@ -70,13 +70,9 @@ class Adapted(TensorDictModuleBase):
 def as_metaworld(observation: Tensor, layout: Layout) -> Tensor:
     """Numbers (B, D) of a layout with one thing in their places of Meta-World's 39, (B, 39)."""
     seen = observation.new_zeros(len(observation), METAWORLD.size)
-    here, there = layout.things[0], METAWORLD.things[0]
-    places = [(layout.hand, METAWORLD.hand, 3), (layout.opening, METAWORLD.opening, 1)]
-    places += [(here.position, there.position, 3), (here.quaternion, there.quaternion, 4)]
-    for old, new, width in places:
-        for past in (False, True):
-            start, end = (old + layout.past, new + METAWORLD.past) if past else (old, new)
-            seen[:, end : end + width] = observation[:, start : start + width]
+    for here, there in zip(layout.present, METAWORLD.present, strict=False):  # which has a second thing
+        seen[:, there] = observation[:, here]
+        seen[:, METAWORLD.a_step_before(there)] = observation[:, layout.a_step_before(here)]
     seen[:, METAWORLD.goal : METAWORLD.goal + 3] = observation[:, layout.goal : layout.goal + 3]
     return seen
 

@@ -72,6 +72,14 @@ def test_somebody_else_s_environment_trains(tmp_path):
 
 
 @pytest.mark.slow
+def test_fetch_learns_from_demonstrations(tmp_path):
+    pytest.importorskip("gymnasium_robotics")
+    done = run("fetch_few_shot.py", tmp_path, "--demonstrations", 1, "--steps", 3, "--episodes", 1)
+    assert "seed 0: fetch/pick-and-place" in done.stdout
+    assert (tmp_path / "runs/fetch-few-shot/seed0/policy.zip").is_file()
+
+
+@pytest.mark.slow
 def test_ppo_runs(tmp_path):
     done = run("ppo.py", tmp_path, "--updates", 2, "--rows", 4, "--horizon", 20, "--clone", 5)
     assert "update   1  reward" in done.stdout

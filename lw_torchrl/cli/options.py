@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from tyro.conf import arg
@@ -197,29 +198,32 @@ def check_actor(argument: str, who: str) -> None:
         check_saved(argument, Path(who))
 
 
-def _imported(option: str, name: str, kind: str) -> Any:
-    """What "package.module:name" names; the working folder is searched first."""
-    module, _, attribute = name.partition(":")
+def _own_module(name: str) -> ModuleType:
+    """A module of the user's; the working folder is searched first."""
     if "" not in sys.path:
         sys.path.insert(0, "")
+    return import_module(name)
+
+
+def _imported(option: str, name: str, kind: str) -> Any:
+    """What "package.module:name" names."""
+    module, _, attribute = name.partition(":")
     try:
-        return getattr(import_module(module), attribute)
+        return getattr(_own_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise ValueError(f"{option} {name!r} names no {kind}: {error}") from error
 
 
 def import_modules(given: Sequence[str]) -> list[str]:
-    """The command line without each ``--import MODULE``, which is imported; the working folder is searched first."""
+    """The command line without each ``--import MODULE``, which is imported."""
     rest, words = [], iter(given)
     for word in words:
         if word != "--import" and not word.startswith("--import="):
             rest.append(word)
             continue
         name = next(words, "") if word == "--import" else word.removeprefix("--import=")
-        if "" not in sys.path:
-            sys.path.insert(0, "")
         try:
-            import_module(name)
+            _own_module(name)
         except (ImportError, ValueError) as error:
             raise ValueError(f"--import {name!r} names no module: {error}") from error
     return rest

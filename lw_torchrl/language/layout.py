@@ -31,6 +31,11 @@ class Slot:
         """The numbers of the position."""
         return slice(self.position, self.position + 3)
 
+    @property
+    def numbers(self) -> tuple[slice, ...]:
+        """The numbers of the position and, where it is told, of the orientation."""
+        return (self.xyz,) if self.quaternion is None else (self.xyz, slice(self.quaternion, self.quaternion + 4))
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -94,9 +99,8 @@ class Layout:
         ends += [thing.quaternion + 4 for thing in self.things if thing.quaternion is not None]
         if min(self.hand, self.opening, self.goal) < 0 or max(ends) > self.size:
             raise ValueError(f"layout {self.name!r} names numbers outside the {self.size} of an observation")
-        told = [number for part in self.parts[:-1] for place in part for number in range(place.start, place.stop)]
-        own = [*range(self.hand, self.hand + 3), self.opening]
-        told += [*own, *(number + (self.past or 0) for number in own if self.past is not None)]
+        places = [*self.present, *(self.a_step_before(part) for part in self.present if self.past is not None)]
+        told = [number for place in places for number in range(place.start, place.stop)]
         if twice := sorted({number for number in told if told.count(number) > 1}):
             raise ValueError(f"layout {self.name!r} says of number {twice[0]} that it is two things")
         for name, index, width in (("displacement", self.displacement, 3), ("gripper", self.gripper, 1)):
@@ -117,6 +121,12 @@ class Layout:
         object.__setattr__(self, "thresholds", MappingProxyType(dict(self.thresholds)))
 
     @cached_property
+    def present(self) -> tuple[slice, ...]:
+        """The numbers of this step that may have a past: the hand, its opening, those of each thing."""
+        opening = slice(self.opening, self.opening + 1)
+        return (slice(self.hand, self.hand + 3), opening, *(part for thing in self.things for part in thing.numbers))
+
+    @cached_property
     def positions(self) -> tuple[slice, ...]:
         """The positions of this step: of the hand, of each thing, of the goal."""
         starts = (self.hand, *(thing.position for thing in self.things), self.goal)
@@ -132,9 +142,7 @@ class Layout:
         """The numbers of each thing, now and a step before, then those of the goal."""
         found = []
         for thing in self.things:
-            now = [thing.xyz]
-            if thing.quaternion is not None:
-                now.append(slice(thing.quaternion, thing.quaternion + 4))
+            now = thing.numbers
             found.append((*now, *(self.a_step_before(part) for part in now if self.past is not None)))
         return (*found, (self.positions[-1],))
 

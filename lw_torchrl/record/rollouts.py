@@ -88,9 +88,6 @@ def log_rollout(
         'reach-0'
         >>> env.close()
     """
-    if suite is not None:
-        suite = load_suite(suite)
-        tasks = [*tasks, *suite.tasks.values()]
     if len(rollout.batch_size) == 2:
         if name is not None:
             raise ValueError(f"name is of one episode, but rollout holds {len(rollout)}; got {name!r}")
@@ -102,6 +99,9 @@ def log_rollout(
         return [log_rollout(logger, row, plans, failure=why, **same) for row, why in rows]
     if isinstance(failure, Sequence):
         raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
+    if suite is not None:
+        suite = load_suite(suite)
+        tasks = [*tasks, *suite.tasks.values()]
     heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
     motion = _motion(heading, episode, suite or known_suite(heading.task))
     return logger.add_page(heading, episode, motion=motion, name=name)

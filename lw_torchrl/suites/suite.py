@@ -16,6 +16,8 @@ from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import Task, TaskList, Tasks, named_tasks
 from lw_torchrl.suites.engine import Engine
 
+_KINDS: dict[str, Any] = dict(tasks=Mapping, layout=Layout, make_engine=Callable, skills=Mapping, plans=Plans)
+
 
 @dataclass(frozen=True)
 class Suite:
@@ -55,17 +57,9 @@ class Suite:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        kinds: dict[str, Any] = {
-            "tasks": Mapping,
-            "layout": Layout,
-            "make_engine": Callable,
-            "skills": Mapping,
-            "plans": Plans,
-        }
-        for name, kind in kinds.items():
-            if not isinstance(value := getattr(self, name), kind) and (
-                value is not None or name in ("tasks", "layout")
-            ):
+        for name, kind in _KINDS.items():
+            value = getattr(self, name)
+            if not isinstance(value, kind) and not (value is None and name in ("skills", "plans")):
                 raise TypeError(f"{name} of suite {self.name!r} must be a {kind.__name__}, got {shown(value)}")
         for relation in self.layout.thresholds:
             check_choice(f"thresholds of layout {self.layout.name!r}", relation, PREDICATES)
