@@ -13,7 +13,6 @@ from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Columns, Output, Row
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.nearest import nearest_query, nearest_skill
-from lw_torchrl.language.roles import plan_roles
 from lw_torchrl.language.tasks import check_task, resolve_tasks
 
 
@@ -89,40 +88,25 @@ def plans(
     /,
     plans: options.PlanSources = ("MT50",),
     skill_set: Literal["own", "MT10"] = "own",  # of shipped plans: with scripted skills of their own, or MT10's words
-    roles: bool = False,
     task_file: options.TaskFile = None,
     json: options.Json = False,
 ) -> Output:
-    """Show plans: the whole text of those named, or a list of all; or which thing each of their steps brings where.
+    """Show plans: the whole text of those named, or a list of all.
 
-    Example: lw-torchrl plans drawer-open --roles
-
-    Args:
-        roles: a table of the steps, what each moves and what it goes to, and what told: "skill", the text is a scripted
-            skill's; "words", the text's; "condition", the things that it compares; "nothing".
+    Example: lw-torchrl plans drawer-open
     """
     known = options.read_tasks(task_file, names)
     loaded = options.read_plans(plans, known, skill_set)
     chosen = resolve_tasks(options.one_or_many(names), tasks=known) if names else tuple(loaded)
     loaded.require(chosen)
     output = Output(json)
-    if roles:
-        told = [
-            {"task": name, "step": number, "skill": step.skill}
-            | {"moved": one.moved or None, "target": one.target or None, "told_by": one.source}
-            for name in chosen
-            for number, (step, one) in enumerate(zip(loaded[name].steps, plan_roles(loaded[name]), strict=True), 1)
-        ]
-        objects: Columns = {"moved": lambda row: row["moved"] or "?", "target": lambda row: row["target"] or "?"}
-        columns: Columns = {"task": "task", "skill": "skill", **objects, "told by": "told_by"}
-        return output.table("steps", told, columns, counted(len(told), "step"))
     rows: list[dict[str, Any]] = []
     for name in chosen:
         steps = [{"condition": str(step.condition), "skill": step.skill} for step in loaded[name].steps]
         rows.append({"task": name, "steps": steps, "text": str(loaded[name])})
     if names:
         return output.show("plans", rows, "\n".join(row["text"] for row in rows))
-    columns = {
+    columns: Columns = {
         "task": "task",
         "steps": lambda row: len(row["steps"]),
         "skills": lambda row: "; ".join(dict.fromkeys(step["skill"] for step in row["steps"])),

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, counted
 from lw_torchrl._files import read_text
 from lw_torchrl.cli import options
-from lw_torchrl.cli.output import Output
+from lw_torchrl.cli.output import Columns, Output
 from lw_torchrl.cli.plan_models import generate, repair
 from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.tasks import check_task
+from lw_torchrl.language.tasks import Task, check_task
 
 
 def prompt(
@@ -37,6 +37,82 @@ def prompt(
     print(found, end="")
 
 
+def _answer(
+    file: Path, task: str | None, format: str | None, task_file: Path | None
+) -> tuple[str, str, str, Mapping[str, Task]]:
+    """The text of an answer, the task that it is for, how it is written, and the tasks that are known."""
+    if not file.is_file():
+        raise FileNotFoundError(f"file: there is no file {str(file)!r}")
+    known = options.read_tasks(task_file, () if task is None else (task,))
+    if task is None:
+        task = re.sub(r"-\d+$", "", file.stem)
+        if task not in known:
+            raise ValueError(f"--task must be given, since the file's name, {file.name!r}, names no task")
+    if format is None:
+        format = "basic_py" if file.suffix == ".plan" else file.absolute().parent.name
+        if format not in PLAN_FORMATS:
+            raise ValueError(f"--format must be given, one of {', '.join(PLAN_FORMATS)}: the file's folder is none")
+    check_task(task, known)
+    check_choice("format", format, PLAN_FORMATS)
+    return read_text(file, ValueError), task, format, known
+
+
+def read(
+    source: Positional[Annotated[str, arg(metavar="FILE")]],
+    /,
+    task: str | None = None,  # of an answer; by default as the file's name says
+    format: str | None = None,  # of an answer; by default as the file's folder says
+    task_file: options.TaskFile = None,
+    json: options.Json = False,
+) -> Output:
+    """Show what policies with roles see of a plan: what became of each step, and how far the plan is trusted.
+
+    Trust is the share of usual states of the plan's motion in which the plan, as written, does what the motion needs.
+    Below 0.75 the plan is completed: its motion, things and directions stay, and its conditions are ours. A plan that
+    says no motion becomes the default plan: grasp the first thing and move it to the goal.
+
+    Example: lw-torchrl plan read my-plans/coffee-pull.plan
+
+    Args:
+        source: a .plan file, a folder of them, a .json file of pairs, "MT10" or "MT50"; or a language model's answer,
+            FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it.
+    """
+    from lw_torchrl.language.canonical import canonical_plan
+
+    file = Path(source)
+    if file.is_file() and file.suffix not in (".plan", ".json"):
+        from lw_torchrl.language.plan_decoding import decode_plan
+
+        text, task, format, known = _answer(file, task, format, task_file)
+        decoded = decode_plan(text, task, format, tasks=known)
+        if decoded.plan is None:
+            raise ValueError(f"{source}: no plan can be read, {decoded.reason}")
+        plans = [decoded.plan]
+    else:
+        known = options.read_tasks(task_file, () if task is None else (task,))
+        plans = [plan for plan in options.read_plans([source], known).values() if task in (None, plan.task)]
+        if not plans:
+            raise ValueError(f"--task {task}: {source} has no plan for it")
+    output, rows, steps = Output(json), [], []
+    for found in map(canonical_plan, plans):
+        notes = found.notes()
+        rows.append({"task": found.written.task, "source": found.source, "trust": found.trust, "steps": notes})
+        steps += [
+            {"task": found.written.task, "source": f"{found.source}, trust {found.trust:.2f}", **n} for n in notes
+        ]
+    columns: Columns = {
+        "task": "task",
+        "plan": "source",
+        "as written": lambda row: row["written"] or "(lacking)",
+        "read as": lambda row: row["skill"] or "(left out: it cannot be read)",
+        "if": lambda row: row["condition"] or "",
+        "sure": lambda row: f"{row['sure']:.1f}" if row["written"] else "",
+        "seen": "seen",
+    }
+    output.table("read", steps, columns, counted(len(rows), "plan"))
+    return output.show("plans", rows)
+
+
 def check(
     file: Positional[options.File],
     /,
@@ -56,21 +132,8 @@ def check(
         file: an answer FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it, or a .plan file TASK.plan; any text with
             --task and --format.
     """
-    if not file.is_file():
-        raise FileNotFoundError(f"file: there is no file {str(file)!r}")
-    known = options.read_tasks(task_file, () if task is None else (task,))
-    if task is None:
-        task = re.sub(r"-\d+$", "", file.stem)
-        if task not in known:
-            raise ValueError(f"--task must be given, since the file's name, {file.name!r}, names no task")
-    if format is None:
-        format = "basic_py" if file.suffix == ".plan" else file.absolute().parent.name
-        if format not in PLAN_FORMATS:
-            raise ValueError(f"--format must be given, one of {', '.join(PLAN_FORMATS)}: the file's folder is none")
-    check_task(task, known)
-    check_choice("format", format, PLAN_FORMATS)
+    text, task, format, known = _answer(file, task, format, task_file)
     skills = options.read_skills(skill_file, known) if skill_file else None
-    text = read_text(file, ValueError)
     from lw_torchrl.planners.checking import check_plan
 
     options.use_one_thread()
@@ -180,6 +243,7 @@ COMMANDS: dict[str, Callable[..., Output | None]] = {
     "prompt": prompt,
     "generate": generate,
     "serve": serve,
+    "read": read,
     "check": check,
     "compare": compare,
     "repair": repair,

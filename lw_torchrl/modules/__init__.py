@@ -1,7 +1,7 @@
 """Policies as TensorDictModules: plan-conditioned ones, the baselines, and what they are made of."""
 
 import lw_torchrl._torchrl  # noqa: F401
-from lw_torchrl.modules.composed_actors import ActorEnsemble, TransferredActor
+from lw_torchrl.modules.composed_actors import ActorEnsemble, DemonstratedActor, TransferredActor
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedValue, QValue, Value, plan_actor_value
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor, DescriptorEncoder
@@ -20,6 +20,7 @@ from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
 
 __all__ = [
     "EVALUATORS", "IMAGE_ENCODERS", "METHODS", "POLICIES", "ActorEnsemble", "ConditionedActor",
+    "DemonstratedActor",
     "DescriptorConditionedActor", "DescriptorEncoder", "Encoder", "HeldEvaluator", "ImageQueryEvaluator", "Method",
     "ObservationFeatures", "PlanAttention", "PlanConditionedActor", "PlanConditionedQValue", "PlanConditionedValue",
     "PlanEncoder", "PlanFocus", "Policy", "QValue", "QueryEvaluator", "ResidualActor", "ScriptedSkillActor",

@@ -14,9 +14,10 @@ from lw_torchrl._checks import checked, shown
 from lw_torchrl._keys import dispatched, write
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import AnyPlans, as_plans
+from lw_torchrl.language.tasks import task_id
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.held_evaluator import HeldEvaluator
-from lw_torchrl.modules.policy import Policy, from_description
+from lw_torchrl.modules.policy import Policy, decided, from_description
 
 
 class ActorEnsemble(Policy):
@@ -57,6 +58,7 @@ class ActorEnsemble(Policy):
         self.in_keys = first.in_keys
         self.out_keys = first.out_keys_source[: 1 if first.plans is None else 2]
         self.draws = any(member.draws for member in members)
+        self._decided = any(getattr(member, "decided_gripper", False) for member in members)  # by most of them
         self._own_evaluators = any(getattr(member, "evaluator", None) is not None for member in members)
 
     def transform(self) -> Transform | None:
@@ -65,7 +67,8 @@ class ActorEnsemble(Policy):
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         done = [member.act(*member.prepare(tensordict)) for member in self.members]
-        written = [torch.stack([action for action, *_ in done]).mean(0)]
+        action = torch.stack([action for action, *_ in done]).mean(0)
+        written = [decided(action, self.layout, 0.0) if self._decided and not self.training else action]
         if self.plans is not None:  # exact truth gives every member the same weights
             weights = [weights for _, weights, *_ in done]
             written.append(torch.stack(weights).mean(0) if self._own_evaluators else weights[0])
@@ -96,6 +99,77 @@ class ActorEnsemble(Policy):
 def _shared(policy: Policy) -> dict[str, Any]:
     plans = None if policy.plans is None else policy.plans.fingerprint
     return {"plans": plans, "tasks": policy.tasks, "in_keys": policy.in_keys, "out_keys": policy.out_keys_source}
+
+
+class DemonstratedActor(Policy):
+    """Two policies in one: in the tasks that were demonstrated, what was learned there without a plan; in all others, a
+    policy with plans. Where ten demonstrations show all that there is to do, words have nothing to add.
+
+    Reads what the two read; writes what ``others`` writes, ``action`` (B, 4) float32 first.
+
+    Args:
+        demonstrated: a policy without plans, :class:`DescriptorConditionedActor` for one, or an ensemble of them.
+        others: a policy with plans, of any tasks.
+
+    Raises:
+        ValueError: different layouts; ``demonstrated`` with plans, or ``others`` without.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> others = lw.PlanConditionedActor(lw.load_plans("MT50"), roles=True, features="none")
+        >>> actor = lw.modules.DemonstratedActor(lw.DescriptorConditionedActor("MT10"), others)
+        >>> env = lw.LanguageWorldEnv(["reach", "hammer"], transform=actor.transform())
+        >>> actor(env.reset())["action"].shape
+        torch.Size([2, 4])
+
+    Source: ours.
+    """
+
+    @checked
+    def __init__(self, demonstrated: Policy, others: Policy) -> None:
+        super().__init__()
+        if demonstrated.plans is not None or others.plans is None:
+            raise ValueError("demonstrated must be a policy without plans, and others one with plans")
+        if demonstrated.layout != others.layout:
+            layouts = f"{demonstrated.layout.name!r} and {others.layout.name!r}"
+            raise ValueError(f"demonstrated and others must be of one layout, got {layouts}")
+        self.demonstrated, self.others = demonstrated, others
+        self.plans, self.tasks, self.layout = others.plans, others.tasks, others.layout
+        self.in_keys = list(dict.fromkeys([*others.in_keys, *demonstrated.in_keys]))
+        self.out_keys = others.out_keys_source
+        self.draws, self.config = demonstrated.draws or others.draws, {}
+        self._ids = torch.tensor([task_id(task) for task in demonstrated.tasks])
+
+    def transform(self) -> Transform | None:
+        return self.others.transform()
+
+    @dispatched
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action, *extras = (self.others(tensordict.copy()).get(key) for key in self.out_keys_source)
+        task = tensordict.get("task_id")
+        ids = self._ids.to(task.device)
+        known = torch.isin(task, ids)
+        shown = tensordict.copy().set("task_id", torch.where(known, task, ids[0]))
+        learned = self.demonstrated(shown).get(self.demonstrated.out_keys_source[0])
+        return write(tensordict, self, [torch.where(known.unsqueeze(-1), learned, action), *extras])
+
+    def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
+        for part in (self.demonstrated, self.others):
+            part.fit_normalization(observation, weights)
+
+    def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
+        self.others.fit_contacts(observation, task_id)
+
+    def describe(self) -> dict[str, Any]:
+        parts = {"demonstrated": self.demonstrated.describe(), "others": self.others.describe()}
+        return super().describe() | parts
+
+    @classmethod
+    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> DemonstratedActor:
+        return cls(*(from_description(found[part], text_encoder) for part in ("demonstrated", "others")))
+
+    def with_plans(self, plans: AnyPlans) -> DemonstratedActor:
+        return DemonstratedActor(self.demonstrated, self.others.with_plans(plans)).train(self.training)
 
 
 class TransferredActor(Policy):

@@ -14,11 +14,11 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_int, checked
+from lw_torchrl._checks import check_flag, check_int, checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, key_beside, read, write
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.modules.networks import DISTRIBUTIONS, ActionHead, DistributionName
-from lw_torchrl.modules.policy import Encoder, Encoding, Policy
+from lw_torchrl.modules.policy import Encoder, Encoding, Policy, decided
 
 _ALTERING = ("jitter", "swap_unmentioned", "hide_opening")
 
@@ -40,6 +40,8 @@ class ConditionedActor(Policy):
         distribution: None for a deterministic actor; for RL "tanh_normal", a Normal through tanh, or "normal", about
             the action, clipped by the environment.
         init_std: the Normal's initial standard deviation, in every state: before tanh for "tanh_normal".
+        decided_gripper: when not training, open or close the gripper fully: half open fingers push things over, and
+            half closed ones lose them. The effort above which it closes is the layout's ``closes_above``.
         action_size: A, the numbers of an action; None for those of the tasks' layout. A policy that was trained with
             another robot, see :class:`~lw_torchrl.modules.TransferredActor`, has that robot's.
         out_keys: other names for what it writes, in the order above; nested ones too.
@@ -70,6 +72,7 @@ class ConditionedActor(Policy):
         squash: bool = True,
         distribution: DistributionName | None = None,
         init_std: float = 0.3,
+        decided_gripper: bool = False,
         action_size: int | None = None,
         out_keys: Sequence[NestedKey] | None = None,
         **options: Any,
@@ -91,7 +94,10 @@ class ConditionedActor(Policy):
         extras = () if self.plans is None else ("skill_weights", "skill_latent")
         drawn = () if distribution is None else ("loc", "scale", "action_log_prob")
         self._written = ("action", *extras, *drawn)
-        self.config = {**self.encoder.config, **head}
+        self.decided_gripper = check_flag("decided_gripper", decided_gripper)
+        if decided_gripper and distribution is not None:
+            raise ValueError("decided_gripper must be false with a distribution, which draws any effort")
+        self.config = {**self.encoder.config, **head, "decided_gripper": decided_gripper}
         if action_size is not None:
             self.config["action_size"] = action_size
         self.out_keys = as_keys("out_keys", out_keys, self._written)
@@ -135,12 +141,16 @@ class ConditionedActor(Policy):
     def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
         if self.head.distribution is None:
             encoding = self.encoder.encode(*prepared)
-            return self.head(encoding.joined), *self.extras(encoding)
+            return self.decide(self.head(encoding.joined)), *self.extras(encoding)
         *extras, loc, scale = self.before_sampling(*prepared)
         dist = self.head.dist(loc, scale)
         action = dist.rsample() if interaction_type() is InteractionType.RANDOM else self.head.mode(loc)
         # PyTorch's log_prob raises for no rows.
         return action, *extras, loc, scale, dist.log_prob(action) if action.numel() else action.sum(-1)
+
+    def decide(self, action: Tensor) -> Tensor:
+        """The action; with ``decided_gripper``, and when not training, its effort is -1 or 1."""
+        return decided(action, self.layout) if self.decided_gripper and not self.training else action
 
     def before_sampling(self, *prepared: Tensor) -> tuple[Tensor, ...]:
         """From what :meth:`prepare` gives to the extras, ``loc`` and ``scale``."""
@@ -214,6 +224,7 @@ class ConditionedActor(Policy):
             "distribution": distribution,
             "init_std": init_std,
             **{name: 0.0 for name in ("feature_noise", *_ALTERING) if name in self.config},
+            "decided_gripper": False,
             "out_keys": [*self.out_keys_source, "loc", "scale", key_beside(self.out_keys_source[0], "_log_prob")],
         }
         with torch.random.fork_rng(devices=[]):

@@ -31,7 +31,7 @@ class DescriptorEncoder(Encoder):
         tasks: those that it knows, as for :func:`resolve_tasks`; a :class:`Task` brings its own description.
         condition: "description", the text's vector; "one-hot", one number for each task, which knows no words.
         features, feature_noise, latent_size, encoder_width, encoder_depth, text_encoder, in_keys, out_keys: as for
-            :class:`PlanEncoder`; ``features`` other than "opening".
+            :class:`PlanEncoder`; ``features`` other than "opening" and "none".
 
     Source: paper section 'Conditional Plan Experiments'.
     """
@@ -54,8 +54,10 @@ class DescriptorEncoder(Encoder):
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__()
-        if features == "opening":
-            raise ValueError("features='opening' shows nothing of where things are; only plans with roles or focus do")
+        if features in ("opening", "none"):
+            raise ValueError(
+                f"features={features!r} shows nothing of where things are; only plans with roles or focus do"
+            )
         self.definitions = named_tasks(tasks)
         self.tasks, self.layout = tuple(self.definitions), one_layout(self.definitions.values())
         self.in_keys = as_keys("in_keys", in_keys, ("observation", "task_id"))

@@ -14,7 +14,7 @@ from lw_torchrl._checks import check_choice, check_scale
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.value_checks import check_finite
 
-Features = Literal["raw", "differences", "relative", "opening", "both"]
+Features = Literal["raw", "differences", "relative", "opening", "none", "both"]
 _FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
 
 
@@ -49,9 +49,10 @@ _KINDS: dict[str, Callable[[Tensor, Layout], Tensor]] = {
     "differences": differences,
     "relative": relative,
     "opening": lambda observation, layout: observation[..., layout.opening : layout.opening + 1],
+    "none": lambda observation, layout: observation[..., :0],
     "both": lambda observation, layout: torch.cat((observation, differences(observation, layout)), -1),
 }
-TRANSFERS = ("opening",)
+TRANSFERS = ("opening", "none")
 """The features that mean the same in every layout."""
 
 
@@ -69,7 +70,7 @@ class ObservationFeatures(nn.Module):
 
     Args:
         kind: "raw", the 39 numbers; "differences", see :func:`differences`; "relative", see :func:`relative`;
-            "opening", the gripper's opening alone; "both", the 39 numbers and the differences.
+            "opening", the gripper's opening alone; "none", nothing; "both", the 39 numbers and the differences.
         layout: of the observations.
         noise: standard deviation of the noise, in standard deviations of each feature.
 

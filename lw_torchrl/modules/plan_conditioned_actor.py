@@ -83,12 +83,14 @@ class PlanConditionedActor(ConditionedActor):
         steps = self.encoder.latents()[prepared[1]]  # (B, S, D)
         seen = encoding.features.unsqueeze(-2).expand(*steps.shape[:-1], -1)
         actions = self.head(encoding._replace(latent=steps, features=seen).joined)
-        return (encoding.weights.unsqueeze(-1) * actions).sum(-2), *self.extras(encoding)
+        return self.decide((encoding.weights.unsqueeze(-1) * actions).sum(-2)), *self.extras(encoding)
 
     @classmethod
     def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> Self:
         plans, evaluator = plans_and_evaluator(found, text_encoder)
-        return cls(plans, evaluator=evaluator, text_encoder=text_encoder, **found["options"])
+        made = cls(plans, evaluator=evaluator, text_encoder=text_encoder, **found["options"])
+        made.encoder.check_rules(found)
+        return made
 
     def with_evaluator(
         self, evaluator: QueryEvaluator, *, answers: Answers = "hard", answer_scale: float = 0.5

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import check_probability, check_scale, checked
+from lw_torchrl.language.canonical import RULES, CanonicalPlan, canonical_plan, step_vectors
 from lw_torchrl.language.layout import METAWORLD, Layout, places
 from lw_torchrl.language.plans import AnyPlans, Plans, PlanStep, as_plans
 from lw_torchrl.language.skills import closes
@@ -25,8 +26,9 @@ from lw_torchrl.modules.policy import Encoder, Encoding
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, ReadsPlans
 from lw_torchrl.modules.relative_positions import PlanFocus, PlanRoles, RelativePositions
 from lw_torchrl.transforms.qaf import plan_number_key, plan_program
-from lw_torchrl.transforms.random_yaw import yaw_key
+from lw_torchrl.transforms.random_yaw import tilt_key, yaw_key
 
+_HOLDING = ("slide the", "carry the")  # in canonical plans
 IN_FORCE = 0.01  # a step whose condition does not hold beside one that does has a weight of 1e-4
 
 
@@ -41,11 +43,15 @@ class PlanEncoder(ReadsPlans, Encoder):
         plans: a plan for each task that will be seen.
         features: what is seen of the observation: "raw", the 39 numbers; "differences", the pairwise differences
             between hand, objects and goal, the hand's height and the gripper's opening; "relative", the differences
-            alone; "opening", the gripper's opening alone, for ``roles``; "both", raw and differences.
+            alone; "opening", the gripper's opening alone, and "none", nothing, for ``roles``; "both", raw and
+            differences.
         feature_noise: standard deviation of the noise on the normalised features while training.
         focus: also see the relative positions of what the steps in force compare, see :class:`PlanFocus`.
         roles: also see the target's position relative to what the step in force moves, see
             :class:`~lw_torchrl.modules.relative_positions.PlanRoles`: for tasks that were not demonstrated.
+        canonical: see each plan in its canonical form, see :func:`~lw_torchrl.canonical_plan`: verbs and manners in the
+            place of the texts, conditions that cover the usual states. ``plans`` are then these. None for ``roles``,
+            which need it.
         jitter: standard deviation, in metres, of noise on that position while training, where the gripper pushes.
         swap_unmentioned: the probability, in training, that an object or the goal is put where it is in another row,
             if no step in force mentions it, or with ``roles`` moves it or to it.
@@ -93,6 +99,7 @@ class PlanEncoder(ReadsPlans, Encoder):
         feature_noise: float = 0.0,
         focus: bool = False,
         roles: bool = False,
+        canonical: bool | None = None,
         jitter: float = 0.0,
         swap_unmentioned: float = 0.0,
         hide_opening: float = 0.0,
@@ -107,21 +114,29 @@ class PlanEncoder(ReadsPlans, Encoder):
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__()
-        self.read_plans(plans, evaluator, in_keys, out_keys, ("encoding",))
+        self.written = as_plans(plans)
+        canonical = roles if canonical is None else canonical
+        if roles and not canonical:
+            raise ValueError("canonical must be true with roles=True, which are those of canonical plans")
+        self.canonical = {task: canonical_plan(plan) for task, plan in self.written.items()} if canonical else {}
+        seen_plans = Plans([one.plan for one in self.canonical.values()]) if canonical else self.written
+        self.read_plans(seen_plans, evaluator, in_keys, out_keys, ("encoding",))
         if evaluator is not None and (focus or roles or swap_unmentioned or hide_opening):
             raise ValueError(
                 "focus, roles, swap_unmentioned and hide_opening read exact truth, which an evaluator takes away; "
                 "lw.evaluate(actor, evaluator=...) evaluates what has learned with it"
             )
-        if features == "opening" and not (focus or roles):
-            raise ValueError("features='opening' shows nothing of where things are; it needs roles=True or focus=True")
-        if features == "relative" and hide_opening:
-            raise ValueError(f"hide_opening: features='relative' do not show the opening; got {hide_opening}")
+        if features in ("opening", "none") and not (focus or roles):
+            shows = "shows nothing of where things are; it needs roles=True or focus=True"
+            raise ValueError(f"features={features!r} {shows}")
+        if features in ("relative", "none") and hide_opening:
+            raise ValueError(f"hide_opening: features={features!r} do not show the opening; got {hide_opening}")
         if jitter and not roles:
             raise ValueError(f"jitter moves the way of the roles, and roles is False; got jitter={jitter}")
         if evaluator is None and (answers, answer_scale) != ("logit", 0.5):
             raise ValueError("answers and answer_scale are of an evaluator's logits, and evaluator is None")
-        seen = dict(features=features, feature_noise=feature_noise, focus=focus, roles=roles, jitter=jitter)
+        seen: dict[str, Any] = dict(features=features, feature_noise=feature_noise, focus=focus, roles=roles)
+        seen |= dict(canonical=canonical, jitter=jitter)
         texts = dict(latent_size=latent_size, encoder_width=encoder_width, encoder_depth=encoder_depth)
         altered = dict(swap_unmentioned=swap_unmentioned, hide_opening=hide_opening)
         altered = {name: check_probability(name, given) for name, given in altered.items()}
@@ -130,17 +145,20 @@ class PlanEncoder(ReadsPlans, Encoder):
             self.config |= {"answers": answers, "answer_scale": check_scale("answer_scale", answer_scale)}
         self.text_encoder = text_encoder
         self.skills = self.plans.skills
-        vectors = encoded(self.skills, text_encoder)
+        vectors = None if self.canonical else encoded(self.skills, text_encoder)
         self.attention = PlanAttention(self.plans)
         # The tables come from the plans, not from training: they are not part of the state that is saved.
+        index = self.attention.tables.skill_index
+        if vectors is None:
+            index, vectors = _canonical_skills(self.canonical, self.attention.tables)
+        self.register_buffer("skill_index", index, persistent=False)
         self.register_buffer("text_vectors", unit_scale(vectors), persistent=False)
-        self.register_buffer("skill_index", self.attention.tables.skill_index, persistent=False)
-        closing = torch.tensor([closes(skill) for skill in self.skills])
-        self.register_buffer("closing", closing[self.skill_index], persistent=False)
+        closing = torch.tensor([closes(skill) or skill.startswith(_HOLDING) for skill in self.skills])
+        self.register_buffer("closing", closing[self.attention.tables.skill_index], persistent=False)
         self.latent_size = latent_size
         self.texts = text_to_latent(vectors.shape[1], latent_size, encoder_width, encoder_depth)
         self.focus = PlanFocus(self.plans, self.attention.tables, feature_noise) if focus else None
-        self.roles = PlanRoles(self.plans, self.attention.tables, feature_noise, jitter) if roles else None
+        self.roles = PlanRoles(self.canonical, self.attention.tables, feature_noise, jitter) if roles else None
         about = mentioned(self.plans, self.attention.tables, self.roles)
         self.register_buffer("mentioned", about, persistent=False)
         self.features = ObservationFeatures(features, feature_noise, self.plans.layout)
@@ -167,7 +185,10 @@ class PlanEncoder(ReadsPlans, Encoder):
         if self.training:
             observation = self._augmented(observation, weights, rows)
         yaw = tensordict.get(yaw_key(self.in_keys[0]), None)
-        relative = [part(observation, weights, rows, yaw) for part in self._relative]
+        relative = [] if self.focus is None else [self.focus(observation, weights, rows, yaw)]
+        if self.roles is not None:
+            tilt = tensordict.get(tilt_key(self.in_keys[0]), None)
+            relative.append(self.roles(observation, weights, rows, yaw, tilt))
         seen = torch.cat((self.features(observation), *relative), -1) if relative else self.features(observation)
         return weights, self.skill_index[rows], seen
 
@@ -189,6 +210,14 @@ class PlanEncoder(ReadsPlans, Encoder):
             observation, truth, rows = (found.to(self.closing.device) for found in (observation, truth, rows))
             self.roles.fit(observation, self.attention.over_steps(truth, rows), rows)
 
+    def check_rules(self, found: Mapping[str, Any]) -> None:
+        """Raise :class:`ValueError` if a description is of a policy that saw plans by other rules than these."""
+        if self.canonical and found.get("rules") != RULES:
+            made = f"version {found['rules']!r:.20}" if "rules" in found else "those before version 1"
+            raise ValueError(
+                f"it was trained with {made} of the rules for canonical plans, here is {RULES}: train it again"
+            )
+
     def weights(self, *prepared: Tensor) -> Tensor:
         """From what :meth:`prepare` gives to the attention (B, S)."""
         if self.evaluator is None:
@@ -203,13 +232,22 @@ class PlanEncoder(ReadsPlans, Encoder):
     def encode(self, *prepared: Tensor) -> Encoding:
         weights = self.weights(*prepared)
         # A product with (B, K) is faster than picking (B, S, D) latents, forwards and backwards.
-        over_skills = weights.new_zeros((*weights.shape[:-1], len(self.skills))).scatter_add(-1, prepared[1], weights)
         latents = self.latents()
+        over_skills = weights.new_zeros((*weights.shape[:-1], len(latents))).scatter_add(-1, prepared[1], weights)
         return Encoding(over_skills.to(latents.dtype) @ latents, prepared[2], weights)
 
     def latents(self) -> Tensor:
-        """(K, D), the latent of each skill."""
+        """(K, D), the latent of each skill; of canonical plans, of each kind of step."""
         return self.texts(self.text_vectors)
+
+    def describe(self) -> dict[str, Any]:
+        rules = {"rules": RULES} if self.canonical else {}
+        return {**super().describe(), "plans": self.written.to_json(), **rules}
+
+    @property
+    def trust(self) -> dict[str, float]:
+        """Of each task, how far its plan as written is trusted; empty if the policy does not see canonical plans."""
+        return {task: found.trust for task, found in self.canonical.items()}
 
     def with_plans(self, plans: AnyPlans) -> PlanEncoder:
         evaluator = None if self.evaluator is None else self.evaluator.with_plans(as_plans(plans))
@@ -218,6 +256,15 @@ class PlanEncoder(ReadsPlans, Encoder):
         if self.roles is not None and other.roles is not None:
             other.roles.share_contact(self.roles)
         return other.train(self.training)
+
+
+def _canonical_skills(plans: Mapping[str, CanonicalPlan], tables: PlanTables) -> tuple[Tensor, Tensor]:
+    """The index (T, S) int64 of each step's vector, and the different vectors (K, E) float32."""
+    index, different = torch.zeros_like(tables.skill_index), dict[tuple[float, ...], int]()
+    for task, plan in sorted(plans.items()):
+        for number, vector in enumerate(step_vectors(plan)):
+            index[tables.index.row(task), number] = different.setdefault(tuple(vector), len(different))
+    return index, torch.tensor([*different])
 
 
 def _names(step: PlanStep, task: Task) -> set[str]:

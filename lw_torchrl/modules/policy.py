@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 POLICIES: dict[str, str | type[Policy]] = {
     "ActorEnsemble": "lw_torchrl.modules.composed_actors",
+    "DemonstratedActor": "lw_torchrl.modules.composed_actors",
     "DescriptorConditionedActor": "lw_torchrl.modules.descriptor_conditioned_actor",
     "PlanConditionedActor": "lw_torchrl.modules.plan_conditioned_actor",
     "ResidualActor": "lw_torchrl.modules.residual_actor",
@@ -260,6 +261,14 @@ def from_description(found: Any, text_encoder: TextEncoder | None = None) -> Pol
     if not isinstance(found, Mapping) or not isinstance(found.get("options"), Mapping):
         raise ValueError(f"a policy's description must have kind and options, got {found!r:.80}")
     return policy_class(found.get("kind")).from_description(found, text_encoder)
+
+
+def decided(action: Tensor, layout: Layout, closes_above: float | None = None) -> Tensor:
+    """Actions (..., A) of a layout with an effort of -1 or 1: closing above ``closes_above``, the layout's if None."""
+    at, action = layout.effort, action.clone()
+    bound = layout.closes_above if closes_above is None else closes_above
+    action[..., at] = torch.where(action[..., at] * layout.closes > bound, 1.0, -1.0) * layout.closes
+    return action
 
 
 def plans_of(actor: Any) -> Plans | None:

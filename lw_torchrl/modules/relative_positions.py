@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 from weakref import WeakSet
 
@@ -10,16 +10,19 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import check_scale
+from lw_torchrl.language.canonical import VECTORS, CanonicalPlan
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, coordinate_indices
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.language.roles import plan_roles, role_object
-from lw_torchrl.language.skills import closes, presses, pushes
 from lw_torchrl.language.task_index import PlanTables
+from lw_torchrl.language.wording import role_object
 from lw_torchrl.modules.observation_features import squash
 from lw_torchrl.transforms.random_yaw import turn_observation, turn_vectors
 
 _SCALE = 0.1  # metres
+_FAR = 0.25  # metres, beyond which demonstrations say nothing
+_LIFTED = 0.15  # metres above its target, on the way there
+_AWAY = 0.15  # metres: a place to the left, for what is moved to the left
 Pair = tuple[NamedObject, NamedObject]
 
 
@@ -70,12 +73,16 @@ class RelativePositions(nn.Module):
         (..., P, 3) float32 metres. Fixed places and offsets are turned by ``yaw`` (...) float32, that of RandomYaw."""
         if yaw is not None:
             observation = turn_observation(observation, -yaw, self.layout)
+        found = (weights[..., None, None] * self.of_steps(observation, rows)).sum(-3)
+        return found if yaw is None else turn_vectors(found, yaw.unsqueeze(-1))
+
+    def of_steps(self, observation: Tensor, rows: Tensor) -> Tensor:
+        """(..., 39) float32 and rows (...) int64 to (..., S, P, 3) float32 metres, the positions of each step."""
         known = torch.cat((observation, self.constants.expand(*observation.shape[:-1], -1)), -1)
         begin, end = self.begin[rows], self.end[rows]  # (..., S, P, 3)
         flat = (*begin.shape[: rows.ndim], -1)
         found = (known.gather(-1, end.reshape(flat)) - known.gather(-1, begin.reshape(flat))).reshape(begin.shape)
-        found = (weights[..., None, None] * (found + self.offset[rows])).sum(-3)
-        return found if yaw is None else turn_vectors(found, yaw.unsqueeze(-1))
+        return found + self.offset[rows]
 
     def forward(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
         """As :meth:`positions`, to (..., 9·P) float32 features."""
@@ -103,53 +110,70 @@ class PlanFocus(RelativePositions):
 
 
 class PlanRoles(RelativePositions):
-    """From the thing that a step moves to its target, mixed by the attention over the steps.
+    """From the thing that a step moves to its target, mixed by the attention over the steps, and the step's direction.
 
     "lower the gripper around the puck" and "... the mug" are the same motion in this relative position, so that what
-    was learned in one task is of use in another: 9 features, 0 for a step without roles (see :func:`plan_roles`). Where
-    the gripper acts on a thing that is touched beside its position, it is that of the *contact*, which
-    demonstrations of the task show, see :meth:`fit`; a task without any has the points that its plan's conditions name.
+    was learned in one task is of use in another: 12 features, the 9 of a relative position and a unit vector, which is
+    0 for a step without a direction. "push the dial to the right" points right, "push it toward the target location"
+    from the thing to the goal. Positions farther than 25 cm count as 25 cm away.
+
+    Where the gripper acts on a thing that is touched beside its position, the target is that of the *contact*, which
+    demonstrations of the task show, see :meth:`fit`; a task without any has the points that it names. What is carried
+    in such a task is lifted first, to 15 cm above its target, and comes down over it.
 
     ``jitter`` is the standard deviation, in metres, of the noise on the position's height while training, and half of
     it to the sides, where the gripper pushes or pulls. Saved with the module are ``contact`` (T, 3) float32, metres, a
-    row for each task, from the first object to the hand while this acts on it, and ``fitted`` () bool, whether
-    demonstrations were asked for contacts.
+    row for each task, from the first object to the hand while this acts on it, ``demonstrated`` (T,) bool, the tasks
+    with demonstrations, and ``fitted`` () bool, whether demonstrations were asked for contacts.
 
     Source: ours; as the keypoints of task-axis controllers, read from words.
     """
 
     contact: Tensor
+    demonstrated: Tensor
     fitted: Tensor
     at_contact: Tensor
     acts: Tensor
     pushes: Tensor
+    lifts: Tensor
+    direction: Tensor
+    to_goal: Tensor
 
-    def __init__(self, plans: Plans, tables: PlanTables, noise: float = 0.0, jitter: float = 0.0) -> None:
-        roles = {task: plan_roles(plan) for task, plan in plans.items()}
-
+    def __init__(
+        self, canonical: Mapping[str, CanonicalPlan], tables: PlanTables, noise: float = 0.0, jitter: float = 0.0
+    ) -> None:
         def moved_to_target(plan: ConditionalPlan) -> list[list[Pair]]:
-            task, of = plan.definition, role_object
-            each = [(one.moved, one.target) for one in roles[plan.task]]
-            return [[(of(task, moved), of(task, target))] if moved and target else [] for moved, target in each]
+            steps = canonical[plan.task].steps
+            return [[tuple(role_object(plan.definition, name) for name in (one.moved, one.target))] for one in steps]  # type: ignore[list-item]
 
+        plans = Plans([one.plan for one in canonical.values()])
         super().__init__(plans, tables, moved_to_target, 1, noise)
+        self.width += 3
         self.jitter = check_scale("jitter", jitter)
         self.tables = tables
-        at_contact, acts, pushing = (torch.zeros(len(plans), plans.num_steps, dtype=torch.bool) for _ in range(3))
-        for task, plan in plans.items():
-            for number, (step, role) in enumerate(zip(plan.steps, roles[task], strict=True)):
-                if not role.moved or not role.target:
-                    continue
+        shape = len(plans), plans.num_steps
+        at_contact, acts, pushes, lifts, to_goal = (torch.zeros(shape, dtype=torch.bool) for _ in range(5))
+        direction = torch.zeros(*shape, 3)
+        for task, found in canonical.items():
+            for number, step in enumerate(found.steps):
                 at = (tables.index.row(task), number)
-                by_hand = role.moved == GRIPPER
-                at_contact[at] = by_hand and _is_first(plan, role.target)
-                pushing[at] = by_hand and pushes(step.skill)
-                touches = closes(step.skill) or (pushes(step.skill) and not presses(step.skill))
-                acts[at] = _is_first(plan, role.moved) or (at_contact[at] and touches)
-        self.register_buffer("at_contact", at_contact, persistent=False)
-        self.register_buffer("acts", acts, persistent=False)
-        self.register_buffer("pushes", pushing, persistent=False)
+                by_hand, way = step.moved == GRIPPER, torch.tensor(VECTORS.get(step.direction or "", (0.0,) * 3))
+                at_contact[at] = by_hand and _is_first(found.written, step.target)
+                touches = step.verb in ("close", "pull") or (step.verb == "push" and step.manner == "push")
+                acts[at] = _is_first(found.written, step.moved) or (at_contact[at] and touches)
+                pushes[at] = step.verb in ("push", "pull")
+                lifts[at] = step.verb == "carry"
+                to_goal[at] = step.direction == "goal"
+                if step.verb == "move":  # a place beside where it is
+                    self.offset[at] += _AWAY * way
+                else:
+                    direction[at] = way
+        for name, table in (("at_contact", at_contact), ("acts", acts), ("pushes", pushes), ("lifts", lifts)):
+            self.register_buffer(name, table, persistent=False)
+        self.register_buffer("direction", direction, persistent=False)
+        self.register_buffer("to_goal", to_goal, persistent=False)
         self.register_buffer("contact", torch.zeros(len(plans), 3))
+        self.register_buffer("demonstrated", torch.zeros(len(plans), dtype=torch.bool))
         self.register_buffer("fitted", torch.tensor(False))
         self._sharing: WeakSet[PlanRoles] = WeakSet([self])  # those of actors with the same weights
 
@@ -170,6 +194,7 @@ class PlanRoles(RelativePositions):
         away = observation[:, hand] - observation[:, first]
         for row in rows[held].unique().tolist():
             self.contact[row] = away[held & (rows == row)].median(0).values
+        self.demonstrated[rows.unique()] = True
         self.fitted.fill_(True)
         for one in self._sharing:
             if one is not self:
@@ -185,19 +210,55 @@ class PlanRoles(RelativePositions):
     def _copy(self, other: PlanRoles) -> None:
         self.fitted.copy_(other.fitted)
         for task in {*self.tables.index.tasks} & {*other.tables.index.tasks}:
-            self.contact[self.tables.index.row(task)] = other.contact[other.tables.index.row(task)]
+            own, theirs = self.tables.index.row(task), other.tables.index.row(task)
+            self.contact[own], self.demonstrated[own] = other.contact[theirs], other.demonstrated[theirs]
+
+    def of_steps(self, observation: Tensor, rows: Tensor) -> Tensor:
+        """As :meth:`RelativePositions.of_steps`, of the contact where there is one; what is carried is lifted first."""
+        found = super().of_steps(observation, rows)
+        found = found + (self.at_contact[rows][..., None] * self.contact[rows].unsqueeze(-2)).unsqueeze(-2)
+        lifts = (self.lifts[rows] & ~self.demonstrated[rows].unsqueeze(-1))[..., None, None]
+        beside, height = found[..., :2], found[..., 2:]
+        far = beside.norm(dim=-1, keepdim=True)
+        height = height + lifts * _LIFTED * ((far - 0.03) / 0.04).clamp(0.0, 1.0)
+        rising = torch.where(lifts, ((0.06 - height) / 0.04).clamp(0.0, 1.0), 1.0)
+        return torch.cat((beside * rising, height), -1)
 
     def positions(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
-        """As :meth:`RelativePositions.positions`, of the contact where there is one."""
+        """As :meth:`RelativePositions.positions`, with ``jitter`` while training."""
         found = super().positions(observation, weights, rows, yaw)
-        share = (weights * self.at_contact[rows]).sum(-1, keepdim=True)
-        contact = share * self.contact[rows]
-        found = found + (contact if yaw is None else turn_vectors(contact, yaw)).unsqueeze(-2)
         if self.training and self.jitter:
             scale = self.jitter * found.new_tensor([0.5, 0.5, 1.0])
             pushed = (weights * self.pushes[rows]).sum(-1)[..., None, None] > 0.5
             found = found + pushed * scale * torch.randn_like(found)
         return found
+
+    def directions(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
+        """As :meth:`positions`, to (..., 3) float32, the direction of the step in force."""
+        if yaw is not None:
+            observation = turn_observation(observation, -yaw, self.layout)
+        _, thing, *_, goal = self.layout.positions
+        ahead = observation[..., goal] - observation[..., thing]
+        ahead = ahead / ahead.norm(dim=-1, keepdim=True).clamp(min=0.02)
+        each = self.direction[rows] + self.to_goal[rows].unsqueeze(-1) * ahead.unsqueeze(-2)
+        found = (weights.unsqueeze(-1) * each).sum(-2)
+        return found if yaw is None else turn_vectors(found, yaw)
+
+    def forward(
+        self,
+        observation: Tensor,
+        weights: Tensor,
+        rows: Tensor,
+        yaw: Tensor | None = None,
+        tilt: Tensor | None = None,
+    ) -> Tensor:
+        """As :meth:`positions`, to (..., 12) float32 features; ``tilt`` (..., 3, 3) float32 is that of RandomYaw."""
+        position = self.positions(observation, weights, rows, yaw).flatten(-2)
+        if tilt is not None:
+            position = (tilt @ position.unsqueeze(-1)).squeeze(-1)
+        position = position * (_FAR / position.norm(dim=-1, keepdim=True).clamp(min=_FAR))
+        found = torch.cat((position / _SCALE, *squash(position), self.directions(observation, weights, rows, yaw)), -1)
+        return found + self.noise * torch.randn_like(found) if self.training and self.noise else found
 
 
 def _is_first(plan: ConditionalPlan, name: str) -> bool:

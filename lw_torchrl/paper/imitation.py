@@ -16,7 +16,7 @@ from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, Ta
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import resolve_tasks
-from lw_torchrl.modules import ActorEnsemble, ScriptedSkillActor
+from lw_torchrl.modules import ActorEnsemble, DemonstratedActor, ScriptedSkillActor
 from lw_torchrl.modules.policy import METHODS, Policy, make_policy, policy_class
 from lw_torchrl.paper.recipes import DataSetting, Execution, Member, Preset
 from lw_torchrl.paper.runs import Dataset, Run, Work, joined, load_result, own_tasks, plain
@@ -46,6 +46,41 @@ class ExpertDataset(Dataset):
     def options(self) -> dict[str, Any]:
         noise = {name: value for name, value in asdict(self.execution).items() if name != "name"}
         return {"tasks": self.tasks, "episodes_per_task": self.episodes, "seed": self.seed, **noise}
+
+
+@dataclass(frozen=True)
+class _Trained:
+    """A member of a policy, of a method."""
+
+    member: Member
+    method: str
+
+    @property
+    def reads_plans(self) -> bool:
+        return policy_class(METHODS[self.method].policy).plan_options
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Of its actor."""
+        return {**self.member.actor, **(self.member.plan_actor if self.reads_plans else {})}
+
+    @property
+    def yaw(self) -> float:
+        plan_yaw = self.member.plan_yaw
+        return plan_yaw if self.reads_plans and plan_yaw is not None else self.member.yaw
+
+    def turned(self, actor: Policy) -> list[RandomYaw]:
+        """How its rows are turned."""
+        if not self.yaw:
+            return []
+        if not self.reads_plans:
+            return [RandomYaw(self.yaw)]
+        free, tilt = self.member.any_yaw, self.member.tilt
+        return [RandomYaw(self.yaw, plans=actor.plans if free or tilt else None, tilt=tilt)]
+
+    def describe(self) -> dict[str, Any]:
+        more = {"any_yaw": self.member.any_yaw, "tilt": self.member.tilt} if self.reads_plans else {}
+        return {"actor": self.options, "yaw": self.yaw} | {name: value for name, value in more.items() if value}
 
 
 @dataclass(frozen=True)
@@ -92,19 +127,17 @@ class ImitationRun(Run):
 
     @property
     def reads_plans(self) -> bool:
-        return self.method == SCRIPTED or policy_class(METHODS[self.method].policy).plan_options
+        return self.method == SCRIPTED or _Trained(Member({}), self.method).reads_plans
 
     @property
     def skills(self) -> Literal["own", "MT10"]:
         """Whose skills its plans speak of: what is trained on MT10 and never saw another task knows MT10's alone."""
         return "MT10" if self.setting.name == "zero-shot" and self.method != SCRIPTED else "own"
 
-    def actor_options(self, member: Member) -> dict[str, Any]:
-        return {**member.actor, **(member.plan_actor if self.reads_plans else {})}
-
-    def any_yaw(self, member: Member) -> bool:
-        """Whether plans tell which of a member's rows may be turned by any angle."""
-        return member.any_yaw and self.reads_plans
+    @property
+    def demonstrated(self) -> tuple[Member, ...]:
+        """The actors of descriptions beside those with plans, for the tasks that were demonstrated."""
+        return self.preset.demonstrated if self.reads_plans else ()
 
     def describe(self, plans: Plans) -> dict[str, Any]:
         described: dict[str, Any] = {"method": self.method, "seed": self.seed}
@@ -112,10 +145,9 @@ class ImitationRun(Run):
         if self.method != SCRIPTED:
             described |= {"setting": self.setting.name, "preset": self.preset.name}
             described["datasets"] = [asdict(dataset) for dataset in self.datasets]
-            described["members"] = [
-                {"actor": self.actor_options(one), "yaw": one.yaw} | ({"any_yaw": True} if self.any_yaw(one) else {})
-                for one in self.preset.members
-            ]
+            described["members"] = [_Trained(one, self.method).describe() for one in self.preset.members]
+            if self.demonstrated:
+                described["demonstrated"] = [_Trained(one, "dc").describe() for one in self.demonstrated]
             described["training"] = self.preset.training.describe()
             described |= {name: getattr(self.preset, name) for name in ("label", "after_success", "passes")}
             if self.preset.evaluations > 1:
@@ -140,7 +172,10 @@ class ImitationRun(Run):
         else:
             members, replays = self._train(work, targets or ())
             for file, replay, *actors in zip(files, replays, *members, strict=True):
-                policies.append(actors[0] if len(actors) == 1 else ActorEnsemble(actors))
+                others, seen = (
+                    _mean(part) for part in (actors[: len(self.preset.members)], actors[len(self.preset.members) :])
+                )
+                policies.append(others if seen is None else DemonstratedActor(seen, others))
                 save_actor(policies[-1], file, data=describe_data(replay), **described)
         for checkpoint in folder.glob("checkpoint-*.zip"):
             checkpoint.unlink()
@@ -178,14 +213,21 @@ class ImitationRun(Run):
             rows = len(LanguageWorldExperienceReplay(roots[0], after_success=preset.after_success))
             steps = max(1, preset.passes * (2 if targets else 1) * rows // preset.training.batch_size)
         members: list[list[Policy]] = []
-        for number, member in enumerate(preset.members):
+        trained = [_Trained(one, self.method) for one in preset.members] + [
+            _Trained(one, "dc") for one in self.demonstrated
+        ]
+        for number, member in enumerate(trained):
             first = 1_000 * self.seed + len(targets) * number if targets else self.seed + 1_000 * number
             config = replace(preset.training, steps=steps, seed=first)
             actors = []
             for i in range(len(targets) or 1):
                 torch.manual_seed(first + i)
-                given = self.actor_options(member)
-                actors.append(make_policy(self.method, work.plans, text_encoder=work.text_encoder, **given))
+                known = (
+                    work.plans
+                    if number < len(preset.members)
+                    else Plans({t: work.plans[t] for t in resolve_tasks(self.setting.base)})
+                )
+                actors.append(make_policy(member.method, known, text_encoder=work.text_encoder, **member.options))
             checkpoint = work.out / self.folder / f"checkpoint-{number}.zip"
             options: dict[str, Any] = {"checkpoint": checkpoint, "progress": work.progress, "device": work.device}
             trainer: BehavioralCloningTrainer | StackedBehavioralCloning
@@ -212,10 +254,14 @@ class ImitationRun(Run):
         return members, replays
 
     def _replay(
-        self, member: Member, work: Work, actor: Policy, roots: Any, sampler: Any, **options: Any
+        self, member: _Trained, work: Work, actor: Policy, roots: Any, sampler: Any, **options: Any
     ) -> LanguageWorldExperienceReplay:
         queries = actor.transform()
-        turned = RandomYaw(member.yaw, plans=actor.plans if self.any_yaw(member) else None)
-        transform = Compose(*([] if queries is None else [queries]), *([turned] if member.yaw else []))
+        transform = Compose(*([] if queries is None else [queries]), *member.turned(actor))
         options |= {"label": self.preset.label, "after_success": self.preset.after_success, "device": work.device}
         return LanguageWorldExperienceReplay(roots, sampler=sampler, transform=transform, **options)
+
+
+def _mean(actors: Sequence[Policy]) -> Any:
+    """The policy of some actors; None of none."""
+    return (actors[0] if len(actors) == 1 else ActorEnsemble(actors)) if actors else None

@@ -46,6 +46,8 @@ class Member:
     plan_actor: Mapping[str, Any] = field(default_factory=dict, hash=False)  # more, of those that read plans
     yaw: float = 0.0  # scale of :class:`RandomYaw` on its demonstrations, in radians
     any_yaw: bool = False  # with plans, turn rows by any angle if their steps in force say no direction
+    plan_yaw: float | None = None  # the scale with plans, if another
+    tilt: float = 0.0  # with plans, see :class:`RandomYaw`
 
     def __post_init__(self) -> None:
         for name in ("actor", "plan_actor"):  # a frozen recipe's options are read-only, too
@@ -61,6 +63,9 @@ class Preset:
     label: Label  # which of the expert's actions is imitated, as for :class:`LanguageWorldExperienceReplay`
     members: tuple[Member, ...]  # the actors of a policy, each trained by itself on the same demonstrations
     training: BehavioralCloningConfig  # of the optimizer
+    demonstrated: tuple[
+        Member, ...
+    ] = ()  # with plans, actors of the descriptions, for the tasks that were demonstrated
     target: Execution | None = None  # how a target task is demonstrated, once, where the setting has targets
     after_success: int | None = None  # drop what comes so many steps after the first success; None keeps all
     passes: int | None = None  # train for so many passes over the rows instead of ``training.steps`` minibatches
@@ -83,7 +88,8 @@ def _preset(name: str, every: Mapping[str, Any], own: Mapping[str, Any]) -> Pres
     """A preset in a setting, whose ``own`` table adds to the one of ``every`` setting."""
     given = {"name": name, **every, **own}
     given |= {key: EXECUTIONS[given[key]] for key in ("base", "target") if key in given}
-    given["members"] = tuple(_MEMBERS[member] for member in given["members"])
+    for field_name in ("members", "demonstrated"):
+        given[field_name] = tuple(_MEMBERS[member] for member in given.get(field_name, ()))
     given["training"] = BehavioralCloningConfig(**{**every.get("training", {}), **own["training"]})
     return Preset(**given)
 

@@ -26,9 +26,14 @@ def check_finite(weights: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> N
 
 
 def text_vectors(actor: nn.Module) -> dict[str, Tensor]:
-    """The vectors of an actor's texts, by the name of the buffer that holds them."""
-    named = actor.named_buffers(remove_duplicate=False)  # an ensemble may have one member twice
-    return {name: buffer for name, buffer in named if name.rpartition(".")[2] == "text_vectors"}
+    """The vectors of an actor's texts, by the name of the buffer that holds them; not those of canonical plans, which
+    no text encoder gives."""
+    found = {}
+    for name, module in actor.named_modules(remove_duplicate=False):  # an ensemble may have one member twice
+        vectors = module._buffers.get("text_vectors")
+        if vectors is not None and not getattr(module, "canonical", False):
+            found[f"{name}.text_vectors".lstrip(".")] = vectors
+    return found
 
 
 def tensors_of(module: nn.Module) -> dict[str, Tensor]:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import EnvBase, Transform
 
-from lw_torchrl._checks import check_scale, checked, missing_keys
+from lw_torchrl._checks import check_probability, check_scale, checked, missing_keys
 from lw_torchrl._keys import as_keys, check_apart, key_beside, read
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import AnyPlans, as_plans
@@ -18,6 +19,7 @@ from lw_torchrl.language.skills import has_direction
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.transforms.qaf import plan_number_key
 
+_TO_A_PLACE = re.compile(r"(?:carry|slide|move) the .+ to the (?!left$|right$)")
 _KEYS = ("observation", "action", "expert_action", "unclipped_action")
 _NOT_FOR_ENVIRONMENTS = "RandomYaw is for replay buffers: an environment has done its action before it is turned"
 
@@ -50,6 +52,25 @@ def yaw_key(observation: NestedKey) -> NestedKey:
     return key_beside(observation, "_yaw")
 
 
+def tilt_key(observation: NestedKey) -> NestedKey:
+    """Where :class:`RandomYaw` writes how a row was tilted: beside ``observation``, ``observation_tilt``."""
+    return key_beside(observation, "_tilt")
+
+
+def random_rotations(number: int, device: torch.device | None = None) -> Tensor:
+    """Rotations (number, 3, 3) float32, uniform over all, from PyTorch's global generator.
+
+    Source: K. Shoemake, "Uniform random rotations", from unit quaternions.
+    """
+    w, x, y, z = nn.functional.normalize(torch.randn(number, 4, device=device), dim=-1).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
 class RandomYaw(Transform):
     """Turns each sampled row, its positions and its action alike, by a random angle about the vertical, so that a
     policy learns to move towards the goal rather than in the direction that the demonstrations happened to have. For
@@ -62,9 +83,12 @@ class RandomYaw(Transform):
     "relative". ``focus`` and ``roles`` turn fixed places by the angle, which is drawn from PyTorch's global generator.
 
     Args:
-        scale: standard deviation of the angle, in radians.
+        scale: standard deviation of the angle, in radians; 10 is any angle.
         plans: the actor's plans: rows whose steps in force say no direction ("move the puck to the target location")
             are then turned by any angle, by ``qaf`` (B, S) bool and ``task_id`` (B,) int64; None turns all rows alike.
+        tilt: the probability that a row is also turned in space, by any rotation, if its step in force moves something
+            freely to a place; of canonical plans, an actor's with ``roles``. Such a row's ``observation_tilt``
+            (B, 3, 3) float32 turns the relative position that ``roles`` show; of all others it is the identity.
         layout: of the observations and actions; None for that of the plans, or Meta-World's without plans.
         in_keys: where observation, action, the expert's action and the unclipped one are, in this order.
         out_keys: where they go, turned; None for the same places.
@@ -89,6 +113,7 @@ class RandomYaw(Transform):
         scale: float,
         *,
         plans: AnyPlans | None = None,
+        tilt: float = 0.0,
         layout: Layout | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
@@ -112,20 +137,36 @@ class RandomYaw(Transform):
             self._tables = PlanTables(plans)
             free = torch.tensor([not has_direction(skill) for skill in plans.skills])
             self.register_buffer("_free", free[self._tables.skill_index], persistent=False)
+            places = torch.tensor([bool(_TO_A_PLACE.match(skill)) for skill in plans.skills])
+            self.register_buffer("_places", places[self._tables.skill_index], persistent=False)
+        elif tilt:
+            raise ValueError(f"tilt needs plans, which say what moves freely, and plans is None; got tilt={tilt}")
+        self.tilt = check_probability("tilt", tilt)
         self._begin = self.layout.displaced("RandomYaw").start
 
     def _angle(self, tensordict: TensorDictBase, observation: Tensor) -> Tensor:
         angle = self.scale * torch.randn(observation.shape[:-1], device=observation.device)
         if self._tables is None:
             return angle
+        any_angle = torch.pi * (2 * torch.rand_like(angle) - 1)
+        return torch.where(self._all_in_force(tensordict, self._free), any_angle, angle)
+
+    def _all_in_force(self, tensordict: TensorDictBase, wanted: Tensor) -> Tensor:
+        """(B,) bool, whether steps are in force, and all that are have what is ``wanted`` (T, S) bool."""
+        assert self._tables is not None
         qaf, task_id = read(tensordict, ["qaf", "task_id"])
         rows = self._tables.rows(task_id)
         self._tables.refuse_others(tensordict.get(plan_number_key("qaf"), None), rows)
         if qaf.shape != (shape := (*rows.shape, self._free.shape[-1])):
             raise ValueError(f"qaf must have shape {shape}, one column for each step of plans, got {tuple(qaf.shape)}")
-        any_angle = torch.pi * (2 * torch.rand_like(angle) - 1)
-        free = (self._free[rows] | (qaf < 0.5)).all(-1) & (qaf > 0.5).any(-1)
-        return torch.where(free, any_angle, angle)
+        return (wanted[rows] | (qaf < 0.5)).all(-1) & (qaf > 0.5).any(-1)
+
+    def _tilt(self, tensordict: TensorDictBase) -> Tensor:
+        """(B, 3, 3) float32, the rotation of each row."""
+        free = self._all_in_force(tensordict, self._places)
+        chosen = free & (torch.rand(free.shape, device=free.device) < self.tilt)
+        found = random_rotations(free.numel(), free.device).reshape(*free.shape, 3, 3)
+        return torch.where(chosen[..., None, None], found, torch.eye(3, device=free.device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = tensordict.copy()  # of a buffer's whole range it may be the storage itself
@@ -134,6 +175,9 @@ class RandomYaw(Transform):
         if observation is None or tensordict.get(actions[0][0], None) is None:
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys[:2]))
         angle = self._angle(tensordict, observation)
+        tilt = self._tilt(tensordict) if self.tilt else None
+        if tilt is not None:
+            tensordict.set(tilt_key(seen[1]), tilt)
         cos, sin = angle.cos(), angle.sin()
         starts, begin = _starts(self.layout), self._begin
         tensordict.set(seen[1], _turned(observation, starts, cos, sin)).set(yaw_key(seen[1]), angle)
@@ -146,6 +190,11 @@ class RandomYaw(Transform):
             turned = _turned(action, (begin,), cos, sin)
             before, now = (one[..., begin : begin + 2].abs().amax(-1, keepdim=True) for one in (action, turned))
             turned[..., begin : begin + 2] /= torch.where(before <= 1.0, now.clamp(min=1.0), 1.0)
+            if tilt is not None:
+                way = turned[..., begin : begin + 3]
+                tilted = (tilt @ way.unsqueeze(-1)).squeeze(-1)
+                longest = torch.where(way.abs().amax(-1, keepdim=True) <= 1.0, tilted.abs().amax(-1, keepdim=True), 1.0)
+                turned[..., begin : begin + 3] = tilted / longest.clamp(min=1.0)
             tensordict.set(turned_key, turned)
         return tensordict
 

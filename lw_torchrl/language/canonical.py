@@ -1,0 +1,435 @@
+"""Canonical plans: what policies see of a plan in anyone's words, and how far it can be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
+
+from lw_torchrl._checks import checked
+from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep
+from lw_torchrl.language.queries import Query, check_query
+from lw_torchrl.language.skills import WORDS
+from lw_torchrl.language.tasks import Task, task_id
+from lw_torchrl.language.wording import (
+    GOAL,
+    Direction,
+    Reading,
+    Verb,
+    first_thing,
+    is_goal,
+    point_on,
+    read_steps,
+    role_object,
+    same_thing,
+    thing_of,
+)
+
+Manner = Literal["grasp", "push", "press", "pull", "reach"]
+"""What a step is done for, which says how the hand comes: to grasp from above, to push from the side."""
+VECTORS: dict[str, tuple[float, float, float]] = {
+    "left": (1.0, 0.0, 0.0),
+    "right": (-1.0, 0.0, 0.0),
+    "away": (0.0, 1.0, 0.0),
+    "toward": (0.0, -1.0, 0.0),
+    "up": (0.0, 0.0, 1.0),
+    "down": (0.0, 0.0, -1.0),
+}
+"""Directions as unit vectors in the suites' frame; "left" and "right" are those of the query language."""
+RULES = 1
+"""The version of the rules by which plans are read, which a policy's file keeps; raised when they change."""
+TRUSTED = 0.75
+"""A plan keeps its own conditions if in this share of usual states it does what its motion needs."""
+_BY_HAND = ("approach", "descend", "beside", "open")
+_SAID: dict[Verb, str] = {
+    "approach": "place the gripper above the {target}",
+    "descend": "lower the gripper around the {target}",
+    "beside": "move the gripper beside the {target}",
+    "open": "open the gripper above the {target}",
+    "close": "close the gripper around the {target}",
+    "push": "push the {target}",
+    "pull": "pull the {target}",
+    "carry": "carry the {moved} to the {target}",
+    "move": "slide the {moved} to the {target}",
+    "reach": "move the gripper to the {target}",
+    "hold": "hold the gripper at the {target}",
+}
+_WAYS = {"left": "to the left", "right": "to the right", "away": "away from the robot", "toward": "toward the robot"}
+
+
+@dataclass(frozen=True)
+class CanonicalStep:
+    """One step as policies see it.
+
+    Attributes:
+        condition: when it is done, with the points at which things are touched in place of the things.
+        verb: what is done.
+        moved, target: what is to arrive where: names of the task's objects, or "target location", the goal.
+        manner: what it is done for.
+        direction: where a thing is pushed, pulled or moved to; of a hand that comes to do so, too.
+        written: the skill's own words; "" for a step that the plan lacked.
+        sure: from 0, a guess, to 1, said in words.
+    """
+
+    condition: Query
+    verb: Verb
+    moved: str
+    target: str
+    manner: Manner
+    direction: Direction | None = None
+    written: str = ""
+    sure: float = 1.0
+
+    @property
+    def skill(self) -> str:
+        """The step in one wording for all plans, "carry the mug to the target location"."""
+        said = _SAID[self.verb].format(moved=self.moved, target=self.target)
+        way = "" if self.direction is None else _WAYS.get(self.direction, self.direction)
+        way = "toward the target location" if way == "goal" else way
+        if self.verb == "move" and way:
+            return f"slide the {self.moved} {way}"
+        if self.verb in ("push", "pull"):
+            return f"{said} {way}"
+        if self.verb in _BY_HAND and self.manner != "grasp":
+            return f"{said} to {self.manner} it {way}".rstrip()
+        return said
+
+
+@dataclass(frozen=True)
+class CanonicalPlan:
+    """What became of a plan.
+
+    Attributes:
+        written: the plan as it was given.
+        steps: what policies see.
+        trust: in which share of usual states the plan, as written, does what its motion needs; in [0, 1].
+        source: "plan", its own steps; "completed", its motion, things and direction with conditions of ours, where
+            its own do not cover the usual states; "default", the plan for all tasks, where it says no motion.
+        read: the plan's own steps as they were read, also where ``steps`` are others.
+        left_out: the skills that could not be read.
+    """
+
+    written: ConditionalPlan
+    steps: tuple[CanonicalStep, ...]
+    trust: float
+    source: Literal["plan", "completed", "default"]
+    read: tuple[CanonicalStep, ...] = ()
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def plan(self) -> ConditionalPlan:
+        """The steps as a plan, whose reasons hold what was written."""
+        steps = (
+            PlanStep(step.condition, step.skill, f"as written: {step.written}" if step.written else "")
+            for step in self.steps
+        )
+        return ConditionalPlan(self.written.task, tuple(steps), self.written.definition)
+
+    def notes(self) -> list[dict[str, Any]]:
+        """What became of each step as written, then the steps that policies see instead, if they do, as JSON.
+
+        The keys are ``written``, None for a step that the plan lacked; ``skill``, ``verb``, ``moved``, ``target`` and
+        ``condition``, None for what was left out; ``sure``; and ``seen``, whether policies see it.
+        """
+        own = self.source == "plan"
+        told = [_told(step, step.written, own) for step in self.read]
+        told += [] if own else [_told(step, step.written or None, True) for step in self.steps]
+        nothing = dict.fromkeys(("skill", "verb", "moved", "target", "condition"))
+        return told + [{"written": skill, **nothing, "sure": 0.0, "seen": False} for skill in self.left_out]
+
+
+def _told(step: CanonicalStep, written: str | None, seen: bool) -> dict[str, Any]:
+    names = ("skill", "verb", "moved", "target")
+    told = {name: getattr(step, name) for name in names} | {"condition": str(step.condition), "sure": step.sure}
+    return {"written": written, **told, "seen": seen}
+
+
+@checked
+def canonical_plan(plan: ConditionalPlan) -> CanonicalPlan:
+    """What policies see of a plan, from its words, its conditions and the task's things alone.
+
+    Each step becomes a verb, a thing that is moved, a target and a direction. Where the hand acts on a thing that has
+    a named point, the point stands for it. A plan whose conditions leave usual states out, or that closes the gripper
+    around nothing, keeps its motion, things and direction, and has conditions of ours. A plan that says no motion
+    becomes :func:`default_plan`.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> written = [("gripper not above the mug", "put gripper over mug"), ("gripper near the mug", "grab it")]
+        >>> written.append(("gripper near the mug", "put the mug at the goal"))
+        >>> found = canonical_plan(lw.ConditionalPlan.from_pairs("coffee-push", written))
+        >>> found.source, [step.verb for step in found.steps]
+        ('completed', ['approach', 'descend', 'close', 'carry'])
+
+    Source: ours; the paper encodes a skill's words as they are.
+    """
+    read = read_steps(plan)
+    left_out = tuple(step.skill for step, one in zip(plan.steps, read, strict=True) if one is None)
+    steps = _steps(plan, read)
+    trust = _trust(plan.definition, steps)
+    if trust >= TRUSTED and _is_complete(steps):
+        return CanonicalPlan(plan, steps, trust, "plan", steps, left_out)
+    last = _motion(steps)
+    if last is None:
+        return replace(default_plan(plan), trust=trust, read=steps, left_out=left_out)
+    completed = _template(plan.definition, steps, last)
+    return CanonicalPlan(plan, completed, trust, "completed", steps, left_out)
+
+
+def step_vectors(plan: CanonicalPlan) -> list[list[float]]:
+    """For each step, what is told of it beside its roles: ones for its verb, its manner and, if MT10 demonstrates the
+    plan's motion in a way of its own, for that. Verbs of the same motion share theirs."""
+    last = _motion(plan.steps)
+    own = [float(last is not None and [last.moved, last.target] == pair) for pair in _OWN]
+    found = []
+    for step in plan.steps:
+        verb = _SAME_MOTION.get(step.verb, step.verb)
+        ones = [float(verb == one) for one in _VERBS], [float(step.manner == one) for one in get_args(Manner)]
+        found.append([*ones[0], *ones[1], *own])
+    return found
+
+
+_OWN: list[list[str]] = WORDS["canonical"]["own"]
+_SAME_MOTION: dict[str, Verb] = {"carry": "move", "open": "descend", "hold": "reach"}
+_VERBS = [verb for verb in get_args(Verb) if verb not in _SAME_MOTION]
+
+
+def default_plan(plan: ConditionalPlan) -> CanonicalPlan:
+    """The plan that is the same for all tasks: grasp the first thing and move it to the goal; without a thing, move the
+    gripper there. ``plan`` says the task, and no more."""
+    task = plan.definition
+    thing = first_thing(task)
+    if thing is None:
+        goal = next(name for name in task.object_names if name != GRIPPER and is_goal(task, name))
+        near = check_query(f"the gripper is near the {goal}", task)
+        steps = [CanonicalStep(_negated(near), "reach", GRIPPER, GOAL, "reach")]
+        steps.append(CanonicalStep(near, "hold", GRIPPER, GOAL, "reach"))
+        return CanonicalPlan(plan, tuple(steps), 0.0, "default")
+    last = CanonicalStep(check_query("the gripper is closed", task), "move", thing, GOAL, "grasp", sure=0.0)
+    return CanonicalPlan(plan, _template(task, (), last), 0.0, "default")
+
+
+def _negated(query: Query) -> Query:
+    return Query(tuple(replace(clause, negated=not clause.negated) for clause in query.clauses))
+
+
+def _steps(plan: ConditionalPlan, read: Sequence[Reading | None]) -> tuple[CanonicalStep, ...]:
+    """The readings as steps that know what they are done for."""
+    task = plan.definition
+    told = [(step, one) for step, one in zip(plan.steps, read, strict=True) if one and one.moved and one.target]
+    grasping = any(one.verb == "close" or one.verb in ("carry", "move") for _, one in told)
+    first = first_thing(task)
+    steps = []
+    for number, (step, one) in enumerate(told):
+        verb, direction = one.verb, one.direction
+        purpose = _purpose([other for _, other in told[number:]] + [other for _, other in told[:number][::-1]])
+        if verb in _BY_HAND:
+            pushes = purpose is not None and purpose.verb in ("push", "pull")
+            manner: Manner = "grasp"
+            if not grasping and purpose is not None:
+                manner = "reach" if purpose.verb in ("reach", "hold") else _manner(purpose)
+            if manner in ("push", "press"):
+                direction = purpose.direction if purpose is not None else None
+            elif direction is None and pushes and not grasping and purpose is not None:
+                direction = purpose.direction
+            elif manner == "grasp":
+                direction = None
+            if verb == "descend" and manner == "push":
+                verb = "beside"
+            elif verb == "descend" and manner == "press":
+                verb = "push"
+            elif verb == "beside" and manner not in ("push", "press"):
+                verb = "descend"
+        else:
+            manner = _manner(one)
+        target, moved = str(one.target), str(one.moved)
+        if moved == GRIPPER and first is not None and same_thing(task, target, first):
+            target = point_on(task, target)
+        condition = _at_points(step.condition, task)
+        steps.append(CanonicalStep(condition, verb, moved, target, manner, direction, step.skill, one.sure))
+    return tuple(_over_walls(steps, task))
+
+
+def _purpose(ahead: Sequence[Reading]) -> Reading | None:
+    """The next step, or else the last before, that moves something."""
+    return next((one for one in ahead if one.verb not in _BY_HAND), None)
+
+
+def _manner(one: Reading) -> Manner:
+    if one.verb in ("push", "pull"):
+        return "press" if one.verb == "push" and one.direction == "down" else one.verb
+    return "reach" if one.verb in ("reach", "hold") else "grasp"
+
+
+def _at_points(condition: Query, task: Task) -> Query:
+    """A condition whose clauses about the gripper and the first thing are about where that is touched."""
+    first = first_thing(task)
+
+    def at(name: str | None) -> Any:
+        return point_on(task, name) if name and name != GRIPPER and first and same_thing(task, name, first) else name
+
+    return Query(
+        tuple(
+            replace(clause, subject=at(clause.subject), object=at(clause.object))
+            if clause.object is not None and GRIPPER in (clause.subject, clause.object)
+            else clause
+            for clause in condition.clauses
+        )
+    )
+
+
+def _over_walls(steps: Sequence[CanonicalStep], task: Task) -> list[CanonicalStep]:
+    """ "lift the puck over the wall", then "move it to the goal", is one way through the air to the goal."""
+    found = list(steps)
+    for number, step in enumerate(steps):
+        after = next((one for one in steps[number + 1 :] if one.verb in ("carry", "move")), None)
+        fixed = not any(isinstance(number, int) for number in role_object(task, step.target).position)
+        if step.verb != "carry" or not fixed or after is None or same_thing(task, step.target, after.target):
+            continue
+        if same_thing(task, step.moved, after.moved):
+            found[number] = replace(step, moved=after.moved, target=after.target)
+    return found
+
+
+def _motion(steps: Sequence[CanonicalStep]) -> CanonicalStep | None:
+    """The last step that moves something."""
+    return next((one for one in reversed(steps) if one.verb in ("carry", "move", "push", "pull", "reach")), None)
+
+
+def _is_complete(steps: Sequence[CanonicalStep]) -> bool:
+    """Whether a plan moves something and, if it grasps, comes to the thing and closes the gripper before."""
+    verbs = [one.verb for one in steps]
+    moving = [number for number, verb in enumerate(verbs) if verb in ("carry", "move")]
+    if any(one.verb == "pull" and "handle" not in one.target.split() for one in steps):
+        return False  # a handle can be hooked; anything else is held better in closed fingers
+    if _motion(steps) is None and "hold" not in verbs:
+        return False
+    if not moving:
+        return True
+    closing = verbs.index("close") if "close" in verbs else len(verbs)
+    return closing < min(moving) and any(verb in ("approach", "descend") for verb in verbs[:closing])
+
+
+def _template(task: Task, steps: Sequence[CanonicalStep], last: CanonicalStep) -> tuple[CanonicalStep, ...]:
+    """The motion of a plan, ``last``, at the thing that the plan names, with conditions that cover the usual states."""
+    if last.manner == "reach":
+        return tuple(steps)
+    point = _touched(task, steps)
+    above, near, over, level = (
+        check_query(f"the gripper is {relation} the {point}", task)
+        for relation in ("above", "near", "vertically aligned with", "forward aligned with")
+    )
+    opened, closed = (check_query(f"the gripper is {state}", task) for state in ("open", "closed"))
+
+    def by_hand(verb: Verb, manner: Manner, *conditions: Query, way: Direction | None = None) -> CanonicalStep:
+        every = Query(tuple(clause for one in conditions for clause in one.clauses))
+        return CanonicalStep(every, verb, GRIPPER, point, manner, way, sure=0.0)
+
+    away = _negated(near)
+    if last.manner in ("grasp", "pull"):
+        held = thing_of(task, point)
+        if last.verb == "pull":
+            way = last.direction if last.direction in VECTORS else None
+            last = replace(last, verb="move", manner="grasp", moved=held, target=held if way else GOAL, direction=way)
+        elif last.moved == GRIPPER:
+            last = replace(last, moved=held)
+        both = Query((*near.clauses, *closed.clauses))
+        return (
+            by_hand("approach", "grasp", _negated(above), away),
+            by_hand("descend", "grasp", above, away),
+            by_hand("close", "grasp", near, opened),
+            replace(last, condition=both),
+        )
+    way = last.direction
+    if last.manner == "press":
+        down = by_hand("approach", "press", _negated(over), way=way)
+        return down, replace(last, condition=over, target=point)
+    if way == "away":
+        return by_hand("beside", "push", _negated(level), way=way), replace(last, condition=level, target=point)
+    come = by_hand("approach", "push", _negated(over), way=way), by_hand("beside", "push", over, away, way=way)
+    return *come, replace(last, condition=near, target=point)
+
+
+def _touched(task: Task, steps: Sequence[CanonicalStep]) -> str:
+    """Where the hand acts: on the thing that it first goes to."""
+    hands = (one.target for one in steps if one.moved == GRIPPER and not is_goal(task, one.target))
+    found = next(hands, None) or first_thing(task)
+    assert found is not None
+    return point_on(task, found)
+
+
+def _trust(task: Task, steps: Sequence[CanonicalStep]) -> float:
+    """In which share of usual states of a motion a step is in force, and all that are do what the motion needs."""
+    last = _motion(steps)
+    if last is None:
+        return 0.0
+    if last.manner == "reach":
+        return 1.0
+    import torch  # here, since words alone should not wait for it
+
+    from lw_torchrl.language.query_program import QueryProgram
+
+    point = role_object(task, _touched(task, steps))
+    states, wanted = [], []
+    layout = task.layout
+    for offset, opening, lift, verbs in _USUAL["pull" if last.verb == "pull" else last.manner]:
+        state = torch.zeros(layout.size)
+        for place, xyz in zip(layout.positions[1:-1], _THINGS, strict=False):
+            state[place] = torch.tensor(xyz)
+        state[layout.positions[-1]] = torch.tensor((0.1, 0.8, 0.2))
+        at = [number for number in point.position if isinstance(number, int)]
+        if at:
+            state[at[-1]] += lift
+        where = [state[number] if isinstance(number, int) else torch.tensor(number) for number in point.position]
+        state[layout.positions[0]] = torch.stack(where) + torch.tensor(point.offset) + torch.tensor(offset)
+        state[layout.opening] = opening
+        states.append(state)
+        wanted.append(verbs)
+    program = QueryProgram({task: [step.condition for step in steps]})
+    truth = program(torch.stack(states), torch.full((len(states),), task_id(task.name)))
+    good = 0
+    for holds, verbs in zip(truth.tolist(), wanted, strict=True):
+        in_force = [step.verb for step, true in zip(steps, holds, strict=True) if true]
+        good += bool(in_force) and set(in_force) <= verbs
+    return good / len(states)
+
+
+_THINGS = ((0.0, 0.6, 0.02), (0.2, 0.7, 0.02), (-0.2, 0.7, 0.02), (0.0, 0.8, 0.02))
+_State = tuple[tuple[float, float, float], float, float, frozenset[str]]
+
+
+def _usual(*rows: tuple[Sequence[tuple[float, float, float]], float, float, str]) -> list[_State]:
+    return [(at, opening, lift, frozenset(verbs.split())) for hands, opening, lift, verbs in rows for at in hands]
+
+
+_COMING = (
+    ([(0.1, 0.1, 0.15), (-0.1, -0.05, 0.1)], 1.0, 0.0, "approach"),
+    ([(0.0, 0.0, 0.12), (0.008, 0.0, 0.06)], 1.0, 0.0, "descend"),
+)
+_USUAL: dict[str, list[_State]] = {
+    "grasp": _usual(
+        *_COMING,
+        ([(0.0, 0.0, 0.01), (0.01, -0.01, 0.02), (0.0, 0.01, 0.0)], 1.0, 0.0, "close"),
+        ([(0.0, 0.0, 0.01), (0.01, 0.0, 0.02), (0.0, 0.0, -0.01)], 0.4, 0.0, "close carry move"),
+        ([(0.0, 0.0, 0.01), (0.01, 0.0, 0.02), (0.0, 0.0, -0.01)], 0.4, 0.1, "carry move"),
+    ),
+    "pull": _usual(*_COMING, ([(0.0, 0.0, -0.01), (0.01, -0.01, -0.02), (0.0, 0.01, -0.03)], 1.0, 0.0, "pull")),
+    "press": _usual(
+        ([(0.1, 0.1, 0.15)], 0.3, 0.0, "approach"),
+        ([(0.0, 0.0, 0.1)], 0.3, 0.0, "push approach"),
+        ([(0.005, 0.0, 0.06), (0.005, 0.0, 0.03), (0.005, 0.0, 0.01)], 0.3, 0.0, "push"),
+    ),
+    "push": _usual(
+        ([(0.15, 0.1, 0.15)], 0.3, 0.0, "approach beside"),
+        ([(0.0, 0.0, 0.12)], 0.3, 0.0, "beside descend approach"),
+        (
+            [(0.0, 0.0, 0.0), (0.01, 0.0, 0.01), (0.0, 0.015, 0.0), (-0.015, 0.0, 0.0), (0.0, 0.0, 0.02)],
+            0.3,
+            0.0,
+            "push",
+        ),
+    ),
+}
+"""Where the hand may be from where it touches, metres; the gripper's opening; how far the thing was lifted, metres;
+and the verbs that do there what the motion needs."""

@@ -1,0 +1,190 @@
+"""Canonical plans: what anyone's words become, when a plan keeps its own steps, and that nothing looks at our plans."""
+
+import inspect
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import lw_torchrl as lw
+from lw_torchrl.language import canonical, wording
+from lw_torchrl.language.canonical import TRUSTED, canonical_plan, default_plan, step_vectors
+from lw_torchrl.language.wording import GOAL, first_thing, mark, read_steps, role_object
+
+OWN, MT10_SKILLS = lw.load_plans("MT50"), lw.load_plans("MT50", skills="MT10")
+G = "robot's gripper"
+
+
+def plan_of(task, *steps):
+    return lw.ConditionalPlan.from_pairs(task, steps)
+
+
+def read_one(task, condition, text):
+    (found,) = read_steps(plan_of(task, (condition, text)))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("task", "condition", "text", "verb", "moved", "target", "direction"),
+    [
+        ("push", "gripper is closed", "carry the puck over to the goal", "carry", "puck", GOAL, None),
+        ("push", "gripper is open", "nudge the puck forward", "push", G, "puck", "away"),
+        ("push", "gripper is not near the puck", "grab the puck", "descend", G, "puck", None),
+        ("push", "gripper is near the puck", "grab it", "close", G, "puck", None),
+        ("push", "gripper is near the puck", "grip a puck", "close", G, "puck", None),
+        ("push", "gripper is open", "let go of the puck with the gripper", "open", G, "puck", None),
+        ("push", "gripper is open", "position gripper over puck", "approach", G, "puck", None),
+        ("push", "gripper is open", "put the hand around the puck", "descend", G, "puck", None),
+        ("dial-turn", "gripper is open", "turn the dial", "push", G, "dial", "goal"),
+        ("dial-turn", "gripper is open", "rotate the dial left", "push", G, "dial", "left"),
+        ("drawer-open", "gripper is open", "pull drawer open", "pull", G, "drawer handle", "goal"),
+        ("drawer-close", "gripper is open", "put the gripper in front of the drawer", "beside", G, "drawer handle", "away"),
+        ("handle-press-side", "gripper is open", "press the handle down", "push", G, "handle", "down"),
+        ("handle-pull-side", "gripper is open", "lift the handle", "move", "handle", "handle", "up"),
+        ("reach", "gripper is open", "reach toward the goal", "reach", G, GOAL, None),
+        ("reach", "gripper is open", "stay at the target", "hold", G, GOAL, None),
+    ],
+)  # fmt: skip
+def test_a_step_says_its_verb_things_and_direction(task, condition, text, verb, moved, target, direction):
+    found = read_one(task, condition, text)
+    assert (found.verb, found.moved, found.target, found.direction) == (verb, moved, target, direction)
+
+
+GRASP = ("gripper is near the stick handle and gripper is open", "close the gripper around the stick")
+HELD = "gripper is near the stick handle and gripper is closed"
+
+
+@pytest.mark.parametrize(
+    ("condition", "text", "moved", "target"),
+    [
+        (HELD, "bring the stick in line with the thermos", "stick", "thermos"),
+        (HELD, "pull the thermos to the goal with the stick", "thermos", GOAL),
+        (HELD, "shove the thermos with the stick", "stick", "thermos"),
+        (HELD + " and the stick is right of the thermos", "move the stick onwards", "stick", "thermos"),
+        (HELD, "move the gripper over the goal", "stick", GOAL),
+    ],
+)
+def test_what_is_held_goes_where_words_or_conditions_say(condition, text, moved, target):
+    *_, found = read_steps(plan_of("stick-pull", GRASP, (condition, text)))
+    assert (found.moved, found.target) == (moved, target if target != GOAL else "target location")
+
+
+def test_the_point_that_a_condition_compares_is_what_is_moved():
+    steps = canonical_plan(OWN["assembly"]).steps
+    assert [(one.verb, one.moved, one.target) for one in steps[3:]] == [("carry", "wrench ring", "peg")] * 2
+
+
+def test_over_a_wall_is_on_the_way_to_the_goal():
+    steps = canonical_plan(OWN["push-wall"]).steps
+    assert [(one.verb, one.moved, one.target) for one in steps[3:]] == [("carry", "puck", GOAL)] * 2
+
+
+@pytest.mark.parametrize("task", OWN)
+def test_shipped_plans_are_read_and_their_canonical_form_is_a_plan(task):
+    for plan in (OWN[task], MT10_SKILLS[task]):
+        found = canonical_plan(plan)
+        assert found.source in ("plan", "completed")
+        assert not found.left_out
+        assert lw.ConditionalPlan.from_pairs(task, [(s.condition, s.skill) for s in found.steps]) == found.plan
+        for step in found.steps:
+            for name in (step.moved, step.target):
+                role_object(plan.definition, name)
+
+
+@pytest.mark.parametrize("task", OWN)
+def test_the_canonical_form_of_a_canonical_plan_is_itself(task):
+    found = canonical_plan(OWN[task])
+    again = canonical_plan(found.plan)
+    assert [(s.verb, s.moved, s.target, s.direction, s.condition) for s in again.steps] == [
+        (s.verb, s.moved, s.target, s.direction, s.condition) for s in found.steps
+    ]
+
+
+def test_nothing_of_a_plan_comes_from_the_shipped_plans_or_skills():
+    for module in (canonical, wording):
+        source = inspect.getsource(module)
+        assert not any(name in source for name in ("load_plans", "load_skills", "skills_for", "usual_goal"))
+
+
+def test_a_plan_that_leaves_states_out_is_completed():
+    steps = [
+        ("the gripper is not above the mug", "place the gripper above the mug"),
+        ("the gripper is near the mug", "place the mug at goal"),
+    ]
+    found = canonical_plan(plan_of("coffee-pull", *steps))
+    assert found.source == "completed"
+    assert found.trust < TRUSTED
+    assert [one.verb for one in found.steps] == ["approach", "descend", "close", "carry"]
+    assert [one.target for one in found.steps] == ["mug rim"] * 3 + [GOAL]
+    assert [(note["written"], note["seen"]) for note in found.notes()] == [
+        *((step[1], False) for step in steps), (None, True), (None, True), (None, True), (steps[1][1], True)
+    ]  # fmt: skip
+
+
+def test_a_plan_without_a_motion_becomes_the_default_plan():
+    steps = [("the gripper is open", "place the gripper above the mug"), ("the gripper is closed", "ponder")]
+    found = canonical_plan(plan_of("coffee-pull", *steps))
+    assert (found.source, found.trust, found.left_out) == ("default", 0.0, ("ponder",))
+    default = default_plan(OWN["coffee-pull"])
+    assert [(s.verb, s.condition) for s in found.steps] == [(s.verb, s.condition) for s in default.steps]
+    assert canonical_plan(default.plan).trust == 1.0
+
+
+def test_what_cannot_be_read_is_left_out_by_name():
+    steps = [*((str(s.condition), s.skill) for s in OWN["push"].steps), ("the gripper is closed", "be careful")]
+    found = canonical_plan(plan_of("push", *steps))
+    assert found.left_out == ("be careful",)
+    assert found.notes()[-1] == dict.fromkeys(("skill", "verb", "moved", "target", "condition")) | {
+        "written": "be careful", "sure": 0.0, "seen": False
+    }  # fmt: skip
+
+
+def test_ones_own_task_has_its_own_things(tmp_path):
+    (tmp_path / "tasks.toml").write_text("""
+[stack-cup]
+description = "Put the cup on the saucer."
+objects.cup = "obs[4:7]"
+objects.saucer = "obs[36:39]"
+points."cup rim" = { object = "cup", offset = [0.0, 0.0, 0.05] }
+""")
+    tasks = lw.load_tasks(tmp_path / "tasks.toml")
+    steps = [
+        ("gripper is not near the cup rim", "lower the gripper around the cup"),
+        ("gripper is near the cup rim", "grab the cup"),
+        ("gripper is near the cup rim and gripper is closed", "lift the cup onto the saucer"),
+    ]
+    found = read_steps(plan_of(tasks["stack-cup"], *steps))
+    assert [(one.target, one.moved) for one in found] == [("cup", G), ("cup", G), ("saucer", "cup")]
+
+
+words = st.text("abcdefghijklmnopqrstuvwxyz '-.,0123456789", min_size=1, max_size=60)
+
+
+@given(st.sampled_from(sorted(OWN)), st.lists(st.tuples(st.integers(0, 5), words), min_size=1, max_size=6))
+def test_any_words_become_a_plan_that_covers_the_task(task, written):
+    """Whatever is written, there is a plan whose steps name things of the task, and a trust in [0, 1]."""
+    own = OWN[task].steps
+    steps = [(own[number % len(own)].condition, f"push {text}") for number, text in written]
+    found = canonical_plan(plan_of(task, *steps))
+    assert found.steps
+    assert 0.0 <= found.trust <= 1.0
+    assert len(step_vectors(found)) == len(found.steps)
+    assert found.plan.definition == OWN[task].definition
+
+
+@given(st.randoms(use_true_random=False), st.sampled_from(sorted(OWN)))
+def test_the_order_of_clauses_does_not_matter(random, task):
+    plan = OWN[task]
+    shuffled = [
+        (" and ".join(map(str, random.sample(step.condition.clauses, len(step.condition.clauses)))), step.skill)
+        for step in plan.steps
+    ]
+    found, other = canonical_plan(plan), canonical_plan(plan_of(task, *shuffled))
+    assert (found.source, found.trust) == (other.source, other.trust)
+    assert [step.skill for step in found.steps] == [step.skill for step in other.steps]
+
+
+def test_marks_are_of_the_longest_name():
+    task = OWN["drawer-open"].definition
+    assert mark("Pull the drawer handle, then the drawer", task) == "pull <drawer handle>, then <drawer handle>"
+    assert first_thing(OWN["reach"].definition) is None
