@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -41,6 +41,7 @@ RULES = 1
 """The version of the rules by which plans are read, which a policy's file keeps; raised when they change."""
 TRUSTED = 0.75
 """A plan keeps its own conditions if in this share of usual states it does what its motion needs."""
+_SOURCES = {"plan": "its own steps", "completed": "completed", "default": "the default plan in its place"}
 _BY_HAND = ("approach", "descend", "beside", "open")
 _SAID: dict[Verb, str] = {
     "approach": "place the gripper above the {target}",
@@ -119,11 +120,12 @@ class CanonicalPlan:
 
     @property
     def plan(self) -> ConditionalPlan:
-        """The steps as a plan, whose reasons hold what was written."""
-        steps = (
-            PlanStep(step.condition, step.skill, f"as written: {step.written}" if step.written else "")
-            for step in self.steps
-        )
+        """The steps as a plan, whose reasons hold what was written, and of the first the plan's trust."""
+        steps = []
+        for number, step in enumerate(self.steps):
+            told = [f"plan trusted {self.trust:.2f}, {_SOURCES[self.source]}"] if number == 0 else []
+            told += [f"as written: {step.written}"] if step.written and step.written != step.skill else []
+            steps.append(PlanStep(step.condition, step.skill, "; ".join(told)))
         return ConditionalPlan(self.written.task, tuple(steps), self.written.definition)
 
     def notes(self) -> list[dict[str, Any]]:
@@ -433,3 +435,25 @@ _USUAL: dict[str, list[_State]] = {
 }
 """Where the hand may be from where it touches, metres; the gripper's opening; how far the thing was lifted, metres;
 and the verbs that do there what the motion needs."""
+
+
+def most_trusted(plans: Iterable[ConditionalPlan]) -> ConditionalPlan:
+    """Of several plans for a task the one to take where nobody can try them: it says a motion, is trusted most, and its
+    steps are surest; of equals the first. :class:`ValueError` if there is none.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> bad = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "ponder")])
+        >>> good = lw.load_plans("MT10")["push"]
+        >>> most_trusted([bad, good]) is good
+        True
+    """
+
+    def worth(plan: ConditionalPlan) -> tuple[bool, float, float]:
+        found = canonical_plan(plan)
+        sure = sum(step.sure for step in found.read) / (len(found.read) + len(found.left_out))
+        return found.source != "default", found.trust, sure
+
+    if not (listed := list(plans)):
+        raise ValueError("plans must be at least one, got none")
+    return max(listed, key=worth)

@@ -61,6 +61,7 @@ class RecordedEpisode:
     steps: tuple[tuple[str, str], ...]  # the S (condition, skill) texts; empty where there is no plan
     target_poses: tuple[TargetPose | None, ...] = ()  # of each step; None where its skill is no scripted one
     layout: Layout = METAWORLD
+    reasons: tuple[str, ...] = ()  # what the plan says of each step, how it was written for one
 
     @property
     def answers(self) -> NDArray[np.bool_] | None:
@@ -172,6 +173,7 @@ class RecordedEpisode:
             corrected=optional("action_corrected", flat=True),
             steps=steps,
             layout=layout,
+            reasons=tuple(getattr(step, "reason", "") for step in plan.steps) if plan is not None else (),
         )
 
 

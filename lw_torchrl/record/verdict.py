@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lw_torchrl.evaluation.failure_records import CAUSES, Failure
 from lw_torchrl.language.layout import Layout
+from lw_torchrl.language.plan_text import one_line
 from lw_torchrl.record.conventions import FALSE, STEEL, TRUE, Color, entity_path, rr, step_color, time_columns
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
 
@@ -192,15 +193,17 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> None:
     states = np.concatenate(columns, axis=1)
     changes = np.flatnonzero(np.concatenate([[True], (states[1:] != states[:-1]).any(axis=1)]))
     texts = []
+    trust = [told for told in episode.reasons[:1] if told.startswith("plan trusted")]
     for row in changes.tolist():
-        parts = []
+        parts = [f"*{told.split(';')[0]}*\n" for told in trust]
         for step, (condition, skill) in enumerate(episode.steps):
             truth = None if episode.qaf is None else bool(episode.qaf[row, step])
             line = f"{MARKS[truth]}  {step + 1}.  if {condition}"
             if episode.believed is not None and (believed := bool(episode.believed[row, step])) != truth:
                 line += f"  (evaluator: {MARKS[believed]})"
             leads = episode.in_force is not None and episode.in_force[row] == step
-            parts.append(f"**{line}**\n### → {skill}\n" if leads else f"{line}  \n\u2003\u2003{skill}\n")
+            reason = f"\n*{one_line(episode.reasons[step])}*\n" if episode.reasons and episode.reasons[step] else ""
+            parts.append(f"**{line}**\n### → {skill}\n{reason}" if leads else f"{line}  \n\u2003\u2003{skill}\n")
         texts.append("\n".join(parts))
     documents = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
     stream.send_columns(f"{root}/plan", time_columns(changes), documents)

@@ -1,0 +1,262 @@
+"""python -m benchmarks.any_plans POLICIES: zero-shot policies under plans from anyone, and without any."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+
+import lw_torchrl as lw
+from lw_torchrl._files import read_json, write_json, write_text
+from lw_torchrl.evaluation.statistics import mean_difference, mean_rate, wilson_interval
+from lw_torchrl.evaluation.summary import markdown_table
+from lw_torchrl.language.canonical import canonical_plan, default_plan, most_trusted
+from lw_torchrl.language.plans import ConditionalPlan, Plans
+
+DEVELOPMENT = (
+    "assembly", "bin-picking", "button-press", "button-press-wall", "coffee-pull", "dial-turn", "door-close",
+    "door-unlock", "faucet-open", "hand-insert", "handle-press-side", "handle-pull-side", "peg-unplug-side",
+    "pick-place-wall", "plate-slide-back", "plate-slide-side", "push-wall", "shelf-place", "stick-pull", "sweep",
+)  # fmt: skip
+"""The tasks outside MT10 on which rules and recipes were chosen."""
+TEST = tuple(task for task in lw.MT50 if task not in DEVELOPMENT and task not in lw.MT10)
+"""The other twenty."""
+OURS, NATURAL = lw.load_plans("MT50", skills="MT10"), lw.load_plans("MT50")
+Rows = Literal["default", "ours", "natural", "palm2", "dc", "one-hot", "no-roles", "models", "robustness"]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Evaluate the zero-shot policies of each training seed under plans of different authors.
+
+    Every row is one evaluation of the same policies, "dc", "one-hot" and "no-roles" of their own. The plan "default" is
+    one for all tasks, grasp the first thing and move it to the goal, by every means that plans have. Rates are of the
+    40 tasks outside MT10, in the development tasks, on which all was chosen, and the test tasks.
+    """
+
+    policies: tyro.conf.Positional[Path]
+    """The folder strong of `lw-torchrl reproduce zero-shot`; "no-roles" is beside it."""
+    rows: tuple[Rows, ...] = ("default", "ours", "natural", "palm2", "dc", "one-hot")
+    """Which plans."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Of the trainings."""
+    episodes: int = 20
+    """Of each task, on seed 10000 + that of the training."""
+    palm2: Path | None = None
+    """PaLM 2's plans, a .json file of pairs; for "palm2"."""
+    answers: Path | None = None
+    """Answers of models, a .jsonl file; for "models"."""
+    out: Path = Path("runs/any_plans")
+    """Folder for results.json and table.md; what is there is not done again."""
+
+
+def main(arguments: Arguments) -> None:
+    file = arguments.out / "results.json"
+    found: dict[str, dict[str, Any]] = read_json(file, "out") if file.is_file() else {}
+    for seed in arguments.seeds:
+        for name, method, plans in rows_of(arguments, seed):
+            key = f"{name}, seed {seed}"
+            if key in found:
+                continue
+            policy = lw.load_actor(folder_of(arguments, method) / f"seed{seed}" / "policy.zip").eval()
+            actor = policy if plans is None else policy.with_plans(plans)
+            tasks = [task for task in (*DEVELOPMENT, *TEST) if plans is None or task in plans]
+            how: dict[str, Any] = {"episodes_per_task": arguments.episodes, "noise_scale": 0.1, "progress": False}
+            result = lw.evaluate(actor, tasks, seed=10_000 + seed, stop_at_success=True, **how)
+            trust = {} if plans is None else {task: canonical_plan(plans[task]).trust for task in tasks}
+            found[key] = {"row": name, "seed": seed, "success": result.success_once, "trust": trust}
+            write_json(file, found)
+            print(f"{key}: {result.mean_success:.3f}", flush=True)
+    table = report(list(found.values()), arguments.episodes)
+    write_text(arguments.out / "table.md", table)
+    print(table)
+
+
+def folder_of(arguments: Arguments, method: str) -> Path:
+    return arguments.policies.parent / method / "pcbc" if method == "no-roles" else arguments.policies / method
+
+
+def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans | None]]:
+    """The name, the policy's method and the plans of each row."""
+    outside = (*DEVELOPMENT, *TEST)
+    for row in arguments.rows:
+        if row in ("dc", "one-hot"):
+            yield row, row, None
+        elif row == "no-roles":
+            yield row, row, Plans([OURS[task] for task in outside])
+        elif row == "default":
+            yield row, "pcbc", Plans([default_plan(NATURAL[task]).plan for task in outside])
+        elif row in ("ours", "natural"):
+            yield row, "pcbc", Plans([(OURS if row == "ours" else NATURAL)[task] for task in outside])
+        elif row == "palm2":
+            written = lw.load_plans(required(arguments.palm2, "palm2"))
+            yield row, "pcbc", Plans([written[task] for task in outside if task in written])
+        elif row == "models":
+            for name, plans in of_models(required(arguments.answers, "answers"), seed):
+                yield name, "pcbc", plans
+        else:
+            for name, change in CHANGES.items():
+                drawn = random.Random(f"{name} {seed}")
+                yield name, "pcbc", Plans([change(NATURAL[task], drawn) for task in outside])
+
+
+def required(path: Path | None, name: str) -> Path:
+    if path is None:
+        raise ValueError(f"--{name} must name a file for the rows of {name}")
+    return path
+
+
+def of_models(file: Path, seed: int) -> Iterator[tuple[str, Plans]]:
+    """For each model and format, one answer a task drawn blindly, and the one that is trusted most."""
+    listed: dict[tuple[str, str], dict[str, list[ConditionalPlan | None]]] = {}
+    for line in file.read_text("utf-8").splitlines():
+        one = json.loads(line)
+        if one["task"] in DEVELOPMENT:
+            plan = lw.decode_plan(one["completion"], one["task"], one["format"]).plan
+            listed.setdefault((one["llm"], one["format"]), {}).setdefault(one["task"], []).append(plan)
+    for (model, form), tasks in sorted(listed.items()):
+        drawn = random.Random(f"{model} {form} {seed}")
+        blind = {task: drawn.choice(plans) for task, plans in sorted(tasks.items())}
+        read = {task: [plan for plan in plans if plan is not None] for task, plans in tasks.items()}
+        best = {task: most_trusted(plans) if plans else None for task, plans in read.items()}
+        for how, chosen in (("one drawn", blind), ("most trusted of five", best)):
+            # A model that wrote nothing readable leaves the policy with the default plan.
+            plans = [plan or default_plan(NATURAL[task]).plan for task, plan in chosen.items()]
+            yield f"{model}, {form}, {how}", Plans(plans)
+
+
+WORDS = {
+    "place the gripper": ["put the gripper", "position the gripper", "move the hand", "bring the gripper"],
+    "above": ["over", "above", "on top of"],
+    "lower the gripper": ["drop the gripper", "put the gripper", "bring the hand down"],
+    "around": ["around", "onto", "down on"],
+    "beside": ["next to", "to the side of", "beside"],
+    "close the gripper around": ["grab", "grasp", "grip", "squeeze", "seize", "pick up"],
+    "target location": ["goal", "target", "goal location", "destination"],
+    "move": ["move", "bring", "carry", "take"],
+    "turn": ["rotate", "spin", "twist", "turn"],
+    "push": ["push", "shove", "press", "nudge"],
+    "pull": ["drag", "pull", "tug"],
+    "lift": ["raise", "lift", "pick up"],
+    "toward": ["towards", "toward"],
+    "the ": ["", "the ", "a "],
+}
+"""Words of the shipped plans, and others for them."""
+
+
+def reworded(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
+    """Each step in other words, by rule."""
+    steps = []
+    for step in plan.steps:
+        text = step.skill
+        for words, others in WORDS.items():
+            text = text.replace(words, drawn.choice(others))
+        steps.append((step.condition, text))
+    return ConditionalPlan.from_pairs(plan.definition, steps)
+
+
+def shuffled(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
+    """The clauses of each condition, and the steps, in another order."""
+    steps = [
+        (" and ".join(map(str, drawn.sample(step.condition.clauses, len(step.condition.clauses)))), step.skill)
+        for step in plan.steps
+    ]
+    return ConditionalPlan.from_pairs(plan.definition, drawn.sample(steps, len(steps)))
+
+
+def one_dropped(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
+    steps = [(step.condition, step.skill) for step in plan.steps]
+    if len(steps) > 1:
+        del steps[drawn.randrange(len(steps))]
+    return ConditionalPlan.from_pairs(plan.definition, steps)
+
+
+def two_swapped(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
+    """The skills of two steps in each other's place."""
+    skills = [step.skill for step in plan.steps]
+    if len(skills) > 1:
+        first, second = drawn.sample(range(len(skills)), 2)
+        skills[first], skills[second] = skills[second], skills[first]
+    return ConditionalPlan.from_pairs(
+        plan.definition, [(step.condition, skill) for step, skill in zip(plan.steps, skills, strict=True)]
+    )
+
+
+def one_wrong(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
+    """One step's skill is another task's."""
+    skills = [step.skill for step in plan.steps]
+    skills[drawn.randrange(len(skills))] = drawn.choice(NATURAL.skills)
+    return ConditionalPlan.from_pairs(
+        plan.definition, [(step.condition, skill) for step, skill in zip(plan.steps, skills, strict=True)]
+    )
+
+
+def of_another(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
+    """The skills of another task's plan, under conditions of this one's first steps."""
+    other = NATURAL[drawn.choice([task for task in NATURAL if task != plan.task])]
+    conditions = [step.condition for step in plan.steps]
+    pairs = [(conditions[number % len(conditions)], step.skill) for number, step in enumerate(other.steps)]
+    return ConditionalPlan.from_pairs(plan.definition, pairs)
+
+
+CHANGES: dict[str, Callable[[ConditionalPlan, random.Random], ConditionalPlan]] = {
+    **{f"paraphrase {number}": reworded for number in range(10)},
+    "order shuffled": shuffled,
+    "one step dropped": one_dropped,
+    "two skills swapped": two_swapped,
+    "one skill wrong": one_wrong,
+    "another task's skills": of_another,
+}
+"""What is done to the natural plans, each with its own draws."""
+
+
+def report(found: list[dict[str, Any]], episodes: int) -> str:
+    """Markdown: a line for each row, with the pairwise difference to the default plan."""
+    rows: dict[str, dict[int, dict[str, float]]] = {}
+    trust: dict[str, list[float]] = {}
+    for one in found:
+        rows.setdefault(one["row"], {})[one["seed"]] = one["success"]
+        trust.setdefault(one["row"], []).extend(one["trust"].values())
+    lines = []
+    for name, seeds in rows.items():
+        cells = [name, str(len(seeds))]
+        for tasks in (DEVELOPMENT, TEST):
+            known = [task for task in tasks if all(task in rates for rates in seeds.values())]
+            cells.append(str(mean_rate([[rates[task] for task in known] for rates in seeds.values()])) if known else "")
+        both = sorted({*seeds} & {*rows.get("default", {})})
+        if name != "default" and both:
+            known = [task for task in seeds[both[0]] if task in rows["default"][both[0]]]
+            ours, theirs = ([[of[seed][task] for task in known] for seed in both] for of in (seeds, rows["default"]))
+            better, worse = beyond_chance(ours, theirs, episodes)
+            worse_names = ", ".join(known[number] for number in worse)
+            cells += [str(mean_difference(ours, theirs)), str(len(better)), f"{len(worse)} {worse_names}".strip()]
+        else:
+            cells += ["", "", ""]
+        cells.append(f"{sum(trust[name]) / len(trust[name]):.2f}" if trust[name] else "")
+        lines.append(cells)
+    head = ["plans", "seeds", "20 development tasks", "20 test tasks", "minus default", "better", "worse", "trust"]
+    return markdown_table(head, lines)
+
+
+def beyond_chance(ours: list[list[float]], theirs: list[list[float]], episodes: int) -> tuple[list[int], list[int]]:
+    """The tasks in which the Wilson intervals of the two rates, over all seeds' episodes, do not meet."""
+    better, worse = [], []
+    for number, (one, other) in enumerate(zip(zip(*ours, strict=True), zip(*theirs, strict=True), strict=True)):
+        trials = episodes * len(one)
+        mine, default = (wilson_interval(round(sum(rates) * episodes), trials) for rates in (one, other))
+        if mine[0] > default[1]:
+            better.append(number)
+        elif mine[1] < default[0]:
+            worse.append(number)
+    return better, worse
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main(tyro.cli(Arguments))
