@@ -444,7 +444,7 @@ def most_trusted(plans: Iterable[ConditionalPlan]) -> ConditionalPlan:
     Example:
         >>> import lw_torchrl as lw
         >>> bad = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "ponder")])
-        >>> good = lw.load_plans("MT10")["push"]
+        >>> good = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "put the gripper above the puck")])
         >>> most_trusted([bad, good]) is good
         True
     """

@@ -168,8 +168,11 @@ class DemonstratedActor(Policy):
     def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> DemonstratedActor:
         return cls(*(from_description(found[part], text_encoder) for part in ("demonstrated", "others")))
 
-    def with_plans(self, plans: AnyPlans) -> DemonstratedActor:
-        return DemonstratedActor(self.demonstrated, self.others.with_plans(plans)).train(self.training)
+    def with_plans(self, plans: AnyPlans) -> Policy:
+        others = self.others.with_plans(plans)
+        if others.layout != self.layout:  # no task of another suite was demonstrated
+            return others
+        return DemonstratedActor(self.demonstrated, others).train(self.training)
 
 
 class TransferredActor(Policy):
