@@ -28,7 +28,7 @@ DEVELOPMENT = (
 TEST = tuple(task for task in lw.MT50 if task not in DEVELOPMENT and task not in lw.MT10)
 """The other twenty."""
 OURS, NATURAL = lw.load_plans("MT50", skills="MT10"), lw.load_plans("MT50")
-Rows = Literal["default", "ours", "natural", "palm2", "dc", "one-hot", "no-roles", "models", "robustness"]
+Rows = Literal["default", "ours", "natural", "palm2", "no-points", "dc", "one-hot", "no-roles", "models", "robustness"]
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,12 @@ def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans |
             yield row, "pcbc", Plans([(OURS if row == "ours" else NATURAL)[task] for task in outside])
         elif row == "palm2":
             written = lw.load_plans(required(arguments.palm2, "palm2"))
-            yield row, "pcbc", Plans([written[task] for task in outside if task in written])
+            yield row, "pcbc", Plans([written[task] for task in outside])
+        elif row == "no-points":  # what we named beside the published things is not there
+            bare = {task: lw.TASKS[task].published for task in outside}
+            written = lw.load_plans(required(arguments.palm2, "palm2"), tasks=lw.TASKS | bare)
+            yield "palm2, no points", "pcbc", Plans([written[task] for task in outside])
+            yield "default, no points", "pcbc", Plans([default_plan(written[task]).plan for task in outside])
         elif row == "models":
             for name, plans in of_models(required(arguments.answers, "answers"), seed):
                 yield name, "pcbc", plans

@@ -187,13 +187,13 @@ def compare(
     output = Output(json)
     groups = [
         {"model": model, "format": format, "success": found.mean(model, format)}
-        | {"best_answer": found.best_of(model, format)}
+        | {"trusted_answer": found.trusted(model, format), "best_answer": found.best_of(model, format)}
         for model, format in found.groups
     ]
     output.show("models", groups, f"{found.table()}\n\n{found.task_table()}\n")
     answers = [
         {"model": one.model, "format": one.format, "task": one.task, "attempt": one.attempt, "steps": one.steps}
-        | {"dropped": one.dropped, "reason": one.reason or None, "success": one.rate}
+        | {"dropped": one.dropped, "reason": one.reason or None, "trust": one.worth[1], "success": one.rate}
         for one in found.answers
     ]
     output.show("answers", answers)

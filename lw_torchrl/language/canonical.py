@@ -437,23 +437,27 @@ _USUAL: dict[str, list[_State]] = {
 and the verbs that do there what the motion needs."""
 
 
+def worth(plan: ConditionalPlan) -> tuple[bool, float, float]:
+    """By what plans for a task compare where nobody can try them: whether it says a motion, its trust, and how sure its
+    steps are on average. The larger tuple is the better plan."""
+    found = canonical_plan(plan)
+    sure = sum(step.sure for step in found.read) / (len(found.read) + len(found.left_out))
+    return found.source != "default", found.trust, sure
+
+
 def most_trusted(plans: Iterable[ConditionalPlan]) -> ConditionalPlan:
-    """Of several plans for a task the one to take where nobody can try them: it says a motion, is trusted most, and its
-    steps are surest; of equals the first. :class:`ValueError` if there is none.
+    """Of several plans for a task the one of most :func:`worth`; of equals the first.
+
+    Raises:
+        ValueError: there is none.
 
     Example:
         >>> import lw_torchrl as lw
         >>> bad = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "ponder")])
-        >>> good = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "put the gripper above the puck")])
+        >>> good = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "put the puck at the goal")])
         >>> most_trusted([bad, good]) is good
         True
     """
-
-    def worth(plan: ConditionalPlan) -> tuple[bool, float, float]:
-        found = canonical_plan(plan)
-        sure = sum(step.sure for step in found.read) / (len(found.read) + len(found.left_out))
-        return found.source != "default", found.trust, sure
-
     if not (listed := list(plans)):
         raise ValueError("plans must be at least one, got none")
     return max(listed, key=worth)

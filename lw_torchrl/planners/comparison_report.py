@@ -35,7 +35,8 @@ def write_report(comparison: PlanComparison, folder: Path) -> list[Path]:
 {comparison.table()}
 
 Success is the mean over tasks, each over its answers; an answer without a plan that runs fails. Brackets
-are 95 % intervals over tasks. The best answer of a task is chosen by the even episodes and counted in the odd ones.
+are 95 % intervals over tasks. The most trusted answer of a task is chosen by its words and conditions, without trying
+any; the best by the even episodes, and counted in the odd ones.
 
 {comparison.task_table()}
 
