@@ -68,7 +68,7 @@ def main(arguments: Arguments) -> None:
             actor = policy if plans is None else policy.with_plans(plans)
             tasks = [task for task in (*DEVELOPMENT, *TEST) if plans is None or task in plans]
             how: dict[str, Any] = {"episodes_per_task": arguments.episodes, "noise_scale": 0.1, "progress": False}
-            result = lw.evaluate(actor, tasks, seed=10_000 + seed, stop_at_success=True, **how)
+            result = lw.evaluate(actor, tasks=tasks, seed=10_000 + seed, stop_at_success=True, **how)
             trust = {} if plans is None else {task: canonical_plan(plans[task]).trust for task in tasks}
             found[key] = {"row": name, "seed": seed, "success": result.success_once, "trust": trust}
             write_json(file, found)
