@@ -119,8 +119,8 @@ class DemonstratedActor(Policy):
         >>> import lw_torchrl as lw
         >>> others = lw.PlanConditionedActor(lw.load_plans("MT50"), roles=True, features="none")
         >>> actor = lw.modules.DemonstratedActor(lw.DescriptorConditionedActor("MT10"), others)
-        >>> env = lw.LanguageWorldEnv(["reach", "hammer"], transform=actor.transform())
-        >>> actor(env.reset())["action"].shape
+        >>> state = actor.transform()(lw.LanguageWorldEnv(["reach", "hammer"]).reset())
+        >>> actor(state)["action"].shape
         torch.Size([2, 4])
 
     Source: ours.
