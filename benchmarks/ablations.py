@@ -12,6 +12,7 @@ from unittest.mock import patch
 
 import torch
 import tyro
+from torch import Tensor
 
 import lw_torchrl as lw
 from lw_torchrl._files import write_text
@@ -34,7 +35,7 @@ def _without(setting: Setting, name: str, **changes: Any) -> Preset:
 
 
 def _without_plan_options(setting: Setting) -> Preset:
-    plain = tuple(replace(one, plan_actor={}, any_yaw=False) for one in FULL[setting].members)
+    plain = tuple(replace(one, plan_actor={}, any_yaw=False, plan_yaw=None, tilt=0.0) for one in FULL[setting].members)
     return _without(setting, "roles", members=plain)
 
 
@@ -58,6 +59,11 @@ def _object_itself(task: Task, name: str) -> NamedObject:
     return replace(role_object(task, name), offset=(0.0, 0.0, 0.0))
 
 
+def _fit_without_contacts(roles: PlanRoles, observation: Tensor, weights: Tensor, rows: Tensor) -> None:
+    roles.demonstrated[rows.unique()] = True
+    roles.fitted.fill_(True)
+
+
 ABLATIONS: Mapping[Setting, Mapping[str, Preset]] = MappingProxyType(
     {
         "few-shot": {
@@ -78,9 +84,12 @@ ABLATIONS: Mapping[Setting, Mapping[str, Preset]] = MappingProxyType(
             "all differences instead of roles": _without_plan_options("zero-shot"),
             "no contacts": _zero_shot("contacts"),
             "objects' own places instead of named points": _zero_shot("points"),
-            "the opening shown": _zero_shot("hiding", plan_actor={"hide_opening": 0.0}),
-            "turned by 0.3, whatever the words": _zero_shot("any-yaw", any_yaw=False),
-            "not turned": _zero_shot("yaw", yaw=0.0, any_yaw=False),
+            "the opening shown": _zero_shot("opening", plan_actor={"features": "opening"}),
+            "turned by 0.3": _zero_shot("any-yaw", plan_yaw=0.3),
+            "not turned": _zero_shot("yaw", plan_yaw=0.0, tilt=0.0),
+            "not tilted": _zero_shot("tilt", tilt=0.0),
+            "fingers half open": _zero_shot("deciding", plan_actor={"decided_gripper": False}),
+            "words in demonstrated tasks, too": _without("zero-shot", "seen", demonstrated=()),
             "no jitter": _zero_shot("jitter", plan_actor={"jitter": 0.0}),
             "one member": _without("zero-shot", "members", members=FULL["zero-shot"].members[:1]),
         },
@@ -88,7 +97,7 @@ ABLATIONS: Mapping[Setting, Mapping[str, Preset]] = MappingProxyType(
 )
 PATCHES: Mapping[str, Callable[[], AbstractContextManager[Any]]] = MappingProxyType(
     {
-        "no contacts": lambda: patch.object(PlanRoles, "fit", lambda roles, *rows: roles.fitted.fill_(True)),
+        "no contacts": lambda: patch.object(PlanRoles, "fit", _fit_without_contacts),
         "objects' own places instead of named points": lambda: patch(
             "lw_torchrl.modules.relative_positions.role_object", _object_itself
         ),

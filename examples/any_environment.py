@@ -38,8 +38,8 @@ def main() -> None:
     args = parser.parse_args()
     keys = ["observation", "desired_goal"]
     turned = SuiteTransform(PLANS["fetch/reach"].definition, observe, act=act, in_keys=keys)
-    env = TransformedEnv(GymEnv("FetchReachDense-v4"), Compose(turned, lw.QAFTransform(PLANS)))
     actor = lw.PlanConditionedActor(PLANS, roles=True)
+    env = TransformedEnv(GymEnv("FetchReachDense-v4"), Compose(turned, actor.transform()))
     loss = TD3Loss(actor, lw.PlanConditionedQValue(PLANS, roles=True), bounds=(-1.0, 1.0), num_qvalue_nets=2)
     loss.make_value_estimator(gamma=0.9)
     targets, optimizer = SoftUpdate(loss, eps=0.99), torch.optim.AdamW(loss.parameters(), lr=3e-4)

@@ -37,7 +37,7 @@ for seed in options.seeds:
     torch.manual_seed(seed)
     policy = lw.PlanConditionedActor(plans, roles=True, features="opening")
     replay = lw.LanguageWorldExperienceReplay(
-        folder / "demonstrations", sampler=lw.TaskBalancedSampler(), transform=lw.QAFTransform(plans)
+        folder / "demonstrations", sampler=lw.TaskBalancedSampler(), transform=policy.transform()
     )
     config = lw.BehavioralCloningConfig(steps=options.steps, batch_size=300, seed=seed)
     lw.BehavioralCloningTrainer(policy, replay, config, checkpoint=folder / "policy.zip").train()

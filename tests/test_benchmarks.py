@@ -110,16 +110,19 @@ def test_each_ablation_changes_one_ingredient_and_has_a_folder_of_its_own(settin
 
 def test_patches_leave_out_what_they_say_and_are_undone():
     plans = lw.load_plans("MT50", skills="MT10")
-    tables = PlanTables(plans)
-    seen = torch.rand(4, 39), torch.ones(4, plans.num_steps), torch.arange(4)
-    usual = PlanRoles(plans, tables)
+    canonical = {task: lw.canonical_plan(plan) for task, plan in plans.items()}
+    tables = PlanTables(lw.Plans([found.plan for found in canonical.values()]))
+    rows = torch.tensor([tables.index.row(task) for task in ("door-open", "drawer-open", "push", "window-open")])
+    seen = torch.rand(4, 39), torch.ones(4, tables.mask.shape[-1]), rows
+    usual = PlanRoles(canonical, tables)
     with ablations.PATCHES["objects' own places instead of named points"]():
-        assert not PlanRoles(plans, tables).offset.any()
-    assert torch.equal(PlanRoles(plans, tables).offset, usual.offset)
+        assert not PlanRoles(canonical, tables).offset[rows].any()
+    assert torch.equal(PlanRoles(canonical, tables).offset, usual.offset)
     assert usual.offset.any()
     with ablations.PATCHES["no contacts"]():
         usual.fit(*seen)
         assert usual.fitted
+        assert usual.demonstrated.nonzero().flatten().tolist() == sorted(rows.tolist()), "nothing is lifted there"
     assert not usual.contact.any()
     usual.fit(*seen)
     assert usual.contact.any()

@@ -243,6 +243,7 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
             "max_steps": 1,
             "progress": False,
         },
+        "canonical_plan": {"plan": PLAN},
         "collect_demonstrations": {
             "tasks": "reach",
             "episodes_per_task": 1,

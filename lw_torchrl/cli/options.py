@@ -104,8 +104,14 @@ def simulated(
     return resolve_tasks(names, tasks=TASKS)
 
 
-def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Literal["own", "MT10"] = "own") -> Plans:
-    """The plans of --plans, of which the last for a task counts; shipped ones are carried over to ``tasks``.
+def read_plans(
+    sources: Sequence[str],
+    tasks: Mapping[str, Task],
+    skills: Literal["own", "MT10"] = "own",
+    *,
+    option: str = "--plans",
+) -> Plans:
+    """The plans of an option, of which the last for a task counts; shipped ones are carried over to ``tasks``.
 
     Where these are of a suite, MT10 and MT50 stand for the plans that the suite ships.
     """
@@ -118,17 +124,17 @@ def read_plans(sources: Sequence[str], tasks: Mapping[str, Task], skills: Litera
             else:
                 found.update(load_plans(source, skills=skills) if source in SETS else load_plans(source, tasks=tasks))
         except (PlanError, FileNotFoundError) as error:
-            raise type(error)(f"--plans {source}: {error}") from error
+            raise type(error)(f"{option} {source}: {error}") from error
     if not found:
-        raise ValueError("--plans must name at least one source of plans: MT10, MT50, a file or a folder")
+        raise ValueError(f"{option} must name at least one source of plans: MT10, MT50, a file or a folder")
     for task, plan in found.items():
         if plan.definition != tasks[task]:
             try:
                 found[task] = ConditionalPlan(task, plan.steps, tasks[task])
             except PlanError as error:
                 raise PlanError(
-                    f"--plans {' '.join(sources)}: the plan of {task!r} that counts is the shipped one, which does not "
-                    f"fit the {task!r} of --task-file; name a plan of yours for it, last ({error})"
+                    f"{option} {' '.join(sources)}: the plan of {task!r} that counts is the shipped one, which does "
+                    f"not fit the {task!r} of --task-file; name a plan of yours for it, last ({error})"
                 ) from error
     return Plans(found)
 

@@ -90,16 +90,17 @@ def read(
         plans = [decoded.plan]
     else:
         known = options.read_tasks(task_file, () if task is None else (task,))
-        plans = [plan for plan in options.read_plans([source], known).values() if task in (None, plan.task)]
+        if task is not None:
+            check_task(task, known)
+        found = options.read_plans([source], known, option="FILE")
+        plans = [plan for plan in found.values() if task in (None, plan.task)]
         if not plans:
             raise ValueError(f"--task {task}: {source} has no plan for it")
     output, rows, steps = Output(json), [], []
-    for found in map(canonical_plan, plans):
-        notes = found.notes()
-        rows.append({"task": found.written.task, "source": found.source, "trust": found.trust, "steps": notes})
-        steps += [
-            {"task": found.written.task, "source": f"{found.source}, trust {found.trust:.2f}", **n} for n in notes
-        ]
+    for one in map(canonical_plan, plans):
+        name, notes = one.written.task, one.notes()
+        rows.append({"task": name, "source": one.source, "trust": one.trust, "steps": notes})
+        steps += [{"task": name, "source": f"{one.source}, trust {one.trust:.2f}", **note} for note in notes]
     columns: Columns = {
         "task": "task",
         "plan": "source",

@@ -24,6 +24,7 @@ from lw_torchrl.language.wording import (
     role_object,
     same_thing,
     thing_of,
+    things,
 )
 
 Manner = Literal["grasp", "push", "press", "pull", "reach"]
@@ -203,10 +204,12 @@ def default_plan(plan: ConditionalPlan) -> CanonicalPlan:
     task = plan.definition
     thing = first_thing(task)
     if thing is None:
-        goal = next(name for name in task.object_names if name != GRIPPER and is_goal(task, name))
-        near = check_query(f"the gripper is near the {goal}", task)
-        steps = [CanonicalStep(_negated(near), "reach", GRIPPER, GOAL, "reach")]
-        steps.append(CanonicalStep(near, "hold", GRIPPER, GOAL, "reach"))
+        named = things(task)
+        goal = next((name for name in named if is_goal(task, name)), None)
+        near = check_query(f"the gripper is near the {goal or named[0]}", task)
+        target = GOAL if goal else named[0]
+        steps = [CanonicalStep(_negated(near), "reach", GRIPPER, target, "reach")]
+        steps.append(CanonicalStep(near, "hold", GRIPPER, target, "reach"))
         return CanonicalPlan(plan, tuple(steps), 0.0, "default")
     last = CanonicalStep(check_query("the gripper is closed", task), "move", thing, GOAL, "grasp", sure=0.0)
     return CanonicalPlan(plan, _template(task, (), last), 0.0, "default")

@@ -207,7 +207,9 @@ class _Step:
 
     def _read(self) -> Reading | None:
         if self.first is None:
-            return Reading("hold" if self.verb in _VERBS["hold"] else "reach", GRIPPER, GOAL)
+            elsewhere = self.named and not any(is_goal(self.task, name) for name in things(self.task))
+            target = self.named[-1] if elsewhere else GOAL
+            return Reading("hold" if self.verb in _VERBS["hold"] else "reach", GRIPPER, target)
         thing = self.named[0] if self.named else self.near
         if thing is None:
             return None

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.envs import Transform
 
 from lw_torchrl._checks import checked, shown
-from lw_torchrl._keys import dispatched, write
+from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.tasks import task_id
@@ -68,7 +68,8 @@ class ActorEnsemble(Policy):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         done = [member.act(*member.prepare(tensordict)) for member in self.members]
         action = torch.stack([action for action, *_ in done]).mean(0)
-        written = [decided(action, self.layout, 0.0) if self._decided and not self.training else action]
+        layout = self.acts_in or self.layout
+        written = [decided(action, layout, 0.0) if self._decided and not self.training else action]
         if self.plans is not None:  # exact truth gives every member the same weights
             weights = [weights for _, weights, *_ in done]
             written.append(torch.stack(weights).mean(0) if self._own_evaluators else weights[0])
@@ -118,8 +119,8 @@ class DemonstratedActor(Policy):
         >>> import lw_torchrl as lw
         >>> others = lw.PlanConditionedActor(lw.load_plans("MT50"), roles=True, features="none")
         >>> actor = lw.modules.DemonstratedActor(lw.DescriptorConditionedActor("MT10"), others)
-        >>> env = lw.LanguageWorldEnv(["reach", "hammer"], transform=actor.transform())
-        >>> actor(env.reset())["action"].shape
+        >>> state = actor.transform()(lw.LanguageWorldEnv(["reach", "hammer"]).reset())
+        >>> actor(state)["action"].shape
         torch.Size([2, 4])
 
     Source: ours.
@@ -145,11 +146,13 @@ class DemonstratedActor(Policy):
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action, *extras = (self.others(tensordict.copy()).get(key) for key in self.out_keys_source)
-        task = tensordict.get("task_id")
+        done = self.others(tensordict.copy())
+        action, *extras = (done.get(key) for key in self.out_keys_source)
+        key = self.demonstrated.in_keys[1]
+        (task,) = read(tensordict, [key])
         ids = self._ids.to(task.device)
         known = torch.isin(task, ids)
-        shown = tensordict.copy().set("task_id", torch.where(known, task, ids[0]))
+        shown = tensordict.copy().set(key, torch.where(known, task, ids[0]))
         learned = self.demonstrated(shown).get(self.demonstrated.out_keys_source[0])
         return write(tensordict, self, [torch.where(known.unsqueeze(-1), learned, action), *extras])
 
@@ -169,10 +172,10 @@ class DemonstratedActor(Policy):
         return cls(*(from_description(found[part], text_encoder) for part in ("demonstrated", "others")))
 
     def with_plans(self, plans: AnyPlans) -> Policy:
+        """The same for other plans; for those of another suite, no task of which was demonstrated, ``others`` alone."""
         others = self.others.with_plans(plans)
-        if others.layout != self.layout:  # no task of another suite was demonstrated
-            return others
-        return DemonstratedActor(self.demonstrated, others).train(self.training)
+        elsewhere = others.layout != self.layout
+        return others if elsewhere else DemonstratedActor(self.demonstrated, others).train(self.training)
 
 
 class TransferredActor(Policy):
@@ -216,6 +219,9 @@ class TransferredActor(Policy):
         self.plans, self.tasks, self.layout = actor.plans, actor.tasks, actor.plans.layout
         for layout in (self.trained, self.layout):
             layout.displaced("TransferredActor")
+        for part in actor.modules():
+            if isinstance(part, Policy):
+                part.acts_in = trained
         self.in_keys, self.out_keys = actor.in_keys, actor.out_keys_source
         self.draws, self.config = actor.draws, {}
 

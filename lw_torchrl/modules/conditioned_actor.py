@@ -150,7 +150,7 @@ class ConditionedActor(Policy):
 
     def decide(self, action: Tensor) -> Tensor:
         """The action; with ``decided_gripper``, and when not training, its effort is -1 or 1."""
-        return decided(action, self.layout) if self.decided_gripper and not self.training else action
+        return decided(action, self.acts_in or self.layout) if self.decided_gripper and not self.training else action
 
     def before_sampling(self, *prepared: Tensor) -> tuple[Tensor, ...]:
         """From what :meth:`prepare` gives to the extras, ``loc`` and ``scale``."""

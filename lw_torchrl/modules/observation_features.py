@@ -116,6 +116,8 @@ class ObservationFeatures(nn.Module):
             weights: of each, (R,) float32, with the sum 1; None for equal ones.
         """
         found = self._select(observation.reshape(-1, self.layout.size))
+        if not found.shape[-1]:
+            return  # PyTorch warns of a deviation of nothing
         if weights is None:
             mean, std = found.mean(0), found.std(0, unbiased=False)
         else:

@@ -110,7 +110,8 @@ class PlanConditionedActor(ConditionedActor):
         options = self.config | {"answers": answers, "answer_scale": answer_scale, "in_keys": self.in_keys[:2]}
         text_encoder = self.encoder.text_encoder
         with torch.random.fork_rng(devices=[]):
-            other = PlanConditionedActor(self.plans, evaluator=evaluator, text_encoder=text_encoder, **options)
+            plans = self.encoder.written
+            other = PlanConditionedActor(plans, evaluator=evaluator, text_encoder=text_encoder, **options)
         other.encoder.texts, other.encoder.features, other.head = self.encoder.texts, self.encoder.features, self.head
         return other.train(self.training)
 

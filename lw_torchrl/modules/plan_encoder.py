@@ -60,6 +60,7 @@ class PlanEncoder(ReadsPlans, Encoder):
         latent_size: D.
         encoder_width, encoder_depth: hidden layers of the skill encoder.
         evaluator: answers the conditions in the place of ``qaf``, which is then not read; see :class:`QueryEvaluator`.
+            With ``canonical`` those of the canonical plans.
         answers: what an evaluator's logit counts in the attention's softmax, where exact truth counts 5 and -5:
             "logit", what it is; "tanh", 5·tanh(answer_scale·logit); "hard", 5 or -5 by its sign, with tanh's gradient.
         answer_scale: the scale in "tanh" and "hard"; 0.5 makes "tanh" the paper's 10·p - 5 of the probability p.
@@ -120,6 +121,8 @@ class PlanEncoder(ReadsPlans, Encoder):
             raise ValueError("canonical must be true with roles=True, which are those of canonical plans")
         self.canonical = {task: canonical_plan(plan) for task, plan in self.written.items()} if canonical else {}
         seen_plans = Plans([one.plan for one in self.canonical.values()]) if canonical else self.written
+        if canonical and evaluator is not None and evaluator.plans.fingerprint == self.written.fingerprint:
+            evaluator = evaluator.with_plans(seen_plans)
         self.read_plans(seen_plans, evaluator, in_keys, out_keys, ("encoding",))
         if evaluator is not None and (focus or roles or swap_unmentioned or hide_opening):
             raise ValueError(

@@ -152,6 +152,8 @@ class Policy(Prepared):
         plan_options: whether its class has options about a plan's steps, like ``focus``.
         row_by_row: whether a row's action is the same to the last bit whatever the other rows are: not of networks.
         draws: whether its actions, without exploration, depend on random numbers drawn before, for other episodes too.
+        acts_in: the layout of its actions, where it is not that of its tasks, see
+            :class:`~lw_torchrl.modules.TransferredActor`.
 
     Example:
         Your own way of conditioning, here on nothing at all. With an entry in ``METHODS`` the command line trains and
@@ -187,6 +189,7 @@ class Policy(Prepared):
     plan_options: ClassVar[bool] = False
     row_by_row: ClassVar[bool] = False
     draws: bool = False
+    acts_in: Layout | None = None
 
     @property
     def spec(self) -> Composite:

@@ -47,7 +47,7 @@ WORDS = {
     "skills": "skills push",
     "skills --nearest": "skills --nearest grab",
     "plans": "plans reach",
-    "plans --roles": "plans reach --roles",
+    "plan read": "plan read MT10 --task reach",
     "queries": "queries push",
     "queries TASK TEXT": "queries push touching",
     "query": "query reach",
@@ -75,13 +75,20 @@ def test_numbers_are_those_of_the_library(capsys):
     assert told == {"query": "the robot's gripper is open", "holds": True}
 
 
-def test_a_plan_without_a_known_target_has_null(capsys):
+def test_a_step_that_cannot_be_read_has_nulls(capsys):
     Path("own").mkdir(exist_ok=True)
     Path("own/push.plan").write_text(
-        PLAN.replace("near the puck", "open").replace("close", "wait").replace("the gripper around the puck", "here")
+        PLAN.replace("near the puck", "open").replace("close", "ponder").replace("the gripper around the puck", "here")
     )
-    (step,) = document(capsys, "plans", "push", "--plans", "own", "--roles")["steps"]
-    assert (step["moved"], step["target"], step["told_by"]) == (None, None, "nothing")
+    found = document(capsys, "plan", "read", "own/push.plan")
+    (plan,) = found["plans"]
+    assert (plan["task"], plan["source"], plan["trust"]) == ("push", "default", 0.0)
+    assert plan["steps"][-1] == {
+        **dict.fromkeys(("skill", "verb", "moved", "target", "condition")),
+        **{"written": "ponder here", "sure": 0.0, "seen": False},
+    }
+    assert [step["written"] for step in plan["steps"][:-1]] == [None] * 4, "of the default plan"
+    assert [step["written"] for step in found["read"]] == [step["written"] for step in plan["steps"]]
 
 
 def test_check_tells_the_faults_and_ends_with_2(capsys):

@@ -108,28 +108,6 @@ def test_a_plan_beyond_repair(capsys, tmp_path, text, message):
     assert message in capsys.readouterr().out
 
 
-def test_roles_of_plans(capsys, tmp_path):
-    def told(*arguments):
-        lines = run(capsys, "plans", *arguments, "--roles").splitlines()
-        return [re.split(r" {2,}", line) for line in lines[3:]]
-
-    assert told("coffee-pull")[-1] == [
-        "coffee-pull",
-        "move the mug to the target location",
-        "mug",
-        "target location",
-        "skill",
-    ]
-    assert {row[-1] for row in told("coffee-pull", "--skill-set", "MT10")} == {"condition", "words"}
-    assert len(told()) == 186
-    path = tmp_path / "push.plan"
-    path.write_text(
-        PLAN.replace("not near the puck", "open").replace('place("the gripper above the puck', 'wait("here')
-    )
-    rows = told("push", "--plans", path)
-    assert [row[-3:] for row in rows] == [["?", "?", "nothing"], ["robot's gripper", "puck", "words"]]
-
-
 def test_the_shipped_files_are_valid(capsys, request):
     data = request.config.rootpath / "lw_torchrl" / "language" / "data"
     out = run(capsys, "check", data / "plans")
@@ -191,7 +169,7 @@ def test_tables_are_as_wide_as_the_terminal(capsys, monkeypatch, width):
 
 
 @pytest.mark.parametrize(
-    "command", [["tasks"], ["skills", "push"], ["plans"], ["plans", "--roles"], ["queries", "push"]]
+    "command", [["tasks"], ["skills", "push"], ["plans"], ["plan", "read", "MT50"], ["queries", "push"]]
 )
 def test_a_pipe_gets_whole_lines_without_padding(capsys, monkeypatch, command):
     whole = run(capsys, *command)

@@ -1,6 +1,7 @@
 """``lw-torchrl plan``: the prompt that asks a language model for a plan, and asking one."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -39,6 +40,53 @@ def test_errors_are_in_its_words(capsys):
     assert "error: --format must be one of" in fails(capsys, "plan", "prompt", "reach", "--format", "chain")
     assert "drawer-open" in fails(capsys, "plan", "prompt", "drawer-opne")
     assert "--plans must name" in fails(capsys, "plan", "prompt", "reach", "--plans")
+
+
+def test_read_says_what_became_of_each_step(capsys, tmp_path):
+    def rows(*arguments):
+        lines = run(capsys, "plan", "read", *arguments).splitlines()
+        return [re.split(r" {2,}", line) for line in lines[3:]]
+
+    (tmp_path / "coffee-pull.plan").write_text(
+        """def coffee_pull(robot):
+    if check("the gripper is not above the mug"):
+        robot.put("the gripper over a mug")
+    if check("the gripper is near the mug"):
+        robot.grab("it")
+    if check("the gripper is near the mug"):
+        robot.bring("the mug to the goal")
+    if check("the gripper is closed"):
+        robot.be("careful")
+"""
+    )
+    found = rows(tmp_path / "coffee-pull.plan")
+    assert {tuple(row[:2]) for row in found} == {("coffee-pull", "completed, trust 0.31")}
+    assert [row[2:4] for row in found] == [
+        ["put the gripper over a mug", "place the gripper above the mug rim"],
+        ["grab it", "close the gripper around the mug rim"],
+        ["bring the mug to the goal", "carry the mug to the target location"],
+        ["(lacking)", "place the gripper above the mug rim"],
+        ["(lacking)", "lower the gripper around the mug rim"],
+        ["(lacking)", "close the gripper around the mug rim"],
+        ["bring the mug to the goal", "carry the mug to the target location"],
+        ["be careful", "(left out: it cannot be read)"],
+    ]
+    assert [row[-1] == "yes" for row in found] == [False] * 3 + [True] * 4 + [False]
+    assert len({row[0] for row in rows("MT50")}) == 50
+    assert {row[0] for row in rows("MT50", "--task", "soccer")} == {"soccer"}
+
+
+@pytest.mark.parametrize("format", lw.PLAN_FORMATS)
+def test_read_takes_a_model_s_answer(capsys, tmp_path, format):
+    plan = lw.load_plans("MT10")["reach"]
+    answer = tmp_path / format / "reach-2.txt"
+    answer.parent.mkdir()
+    answer.write_text(lw.encode_plan(plan, format))
+    (found,) = document(capsys, "plan", "read", answer)["plans"]
+    assert (found["task"], found["source"]) == ("reach", "plan")
+    assert [step["written"] for step in found["steps"]] == [step.skill for step in plan.steps]
+    answer.write_text("I cannot help with that.")
+    assert "no plan can be read" in fails(capsys, "plan", "read", answer)
 
 
 # ---- generate

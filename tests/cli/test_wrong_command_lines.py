@@ -126,6 +126,11 @@ WRONG = {
     "plan check nowhere.plan": "FILE: there is no file 'nowhere.plan'",
     "plan check push.plan --task pusch": "--task must be one of",
     "plan check push.plan --format chain": "--format must be one of",
+    "plan read nowhere": "FILE nowhere: no plan file or folder 'nowhere'",
+    "plan read push.plan": "push.plan, line 2: ",
+    "plan read MT10 --task pusch": "--task must be one of",
+    "plan read MT10 --task soccer": "--task soccer: MT10 has no plan for it",
+    "plan read bad.toml --task push": "--format must be given, one of basic_py, ",
     "plan compare nowhere": "SOURCE: there is no file or folder 'nowhere'",
     "plan compare demos": "SOURCE: 'demos' holds no answers",
     f"plan repair raech {MODEL}": "TASKS must be one of",
@@ -207,7 +212,7 @@ def test_help_of_every_command_comes_without_torch(tmp_path):
 
 
 def test_words_are_listed_without_torch(tmp_path):
-    lines = ("tasks", "skills push", "plans", "plans --roles", "queries push", "queries push touching", "check FILE")
+    lines = ("tasks", "skills push", "plans", "queries push", "queries push touching", "check FILE")
     (tmp_path / "FILE").write_text(
         'def push(robot):\n    if check("the gripper is open"):\n        robot.wait("here")\n'
     )

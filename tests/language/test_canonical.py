@@ -38,7 +38,7 @@ def read_one(task, condition, text):
         ("dial-turn", "gripper is open", "turn the dial", "push", G, "dial", "goal"),
         ("dial-turn", "gripper is open", "rotate the dial left", "push", G, "dial", "left"),
         ("drawer-open", "gripper is open", "pull drawer open", "pull", G, "drawer handle", "goal"),
-        ("drawer-close", "gripper is open", "put the gripper in front of the drawer", "beside", G, "drawer handle", "away"),
+        ("drawer-close", "gripper is open", "gripper in front of drawer", "beside", G, "drawer handle", "away"),
         ("handle-press-side", "gripper is open", "press the handle down", "push", G, "handle", "down"),
         ("handle-pull-side", "gripper is open", "lift the handle", "move", "handle", "handle", "up"),
         ("reach", "gripper is open", "reach toward the goal", "reach", G, GOAL, None),
@@ -155,6 +155,18 @@ points."cup rim" = { object = "cup", offset = [0.0, 0.0, 0.05] }
     ]
     found = read_steps(plan_of(tasks["stack-cup"], *steps))
     assert [(one.target, one.moved) for one in found] == [("cup", G), ("cup", G), ("saucer", "cup")]
+
+
+def test_a_hand_goes_to_the_thing_that_is_named_where_a_task_has_no_goal_and_no_first_thing(tmp_path):
+    (tmp_path / "tasks.toml").write_text("""
+[touch-second]
+description = "Touch the second block."
+objects.block = "obs[11:14]"
+""")
+    task = lw.load_tasks(tmp_path / "tasks.toml")["touch-second"]
+    plan = plan_of(task, ("the gripper is not near the block", "move the gripper to the block"))
+    assert [(one.verb, one.target) for one in canonical_plan(plan).steps] == [("reach", "block")]
+    assert [(one.verb, one.target) for one in default_plan(plan).steps] == [("reach", "block"), ("hold", "block")]
 
 
 words = st.text("abcdefghijklmnopqrstuvwxyz '-.,0123456789", min_size=1, max_size=60)

@@ -100,9 +100,9 @@ def test_what_an_actor_on_roles_moves_and_its_target_stay_where_they_are(skills)
     plans = lw.load_plans("MT50", skills=skills)
     options = {"features": "opening", "roles": True, "feature_noise": 0.0}
     actor = lw.PlanConditionedActor(plans, swap_unmentioned=1.0, **options)
-    rows = [(lw.task_id(task), step) for task, plan in plans.items() for step in range(len(plan.steps))]
+    rows = [(lw.task_id(task), step) for task, plan in actor.plans.items() for step in range(len(plan.steps))]
     task_id, step = torch.tensor(rows).T
-    truth = torch.nn.functional.one_hot(step, plans.num_steps).bool()
+    truth = torch.nn.functional.one_hot(step, actor.plans.num_steps).bool()
     generator = torch.Generator().manual_seed(0)
     state = TensorDict(observation=torch.randn(len(rows), 39, generator=generator), task_id=task_id, qaf=truth)
     ways = [mode.prepare(state)[2][:, 1:4] for mode in (actor.eval(), actor.train())]

@@ -92,9 +92,10 @@ def test_a_text_encoder_that_gives_another_number_of_vectors_is_refused(shape):
         make_actor(text_encoder=lambda texts: torch.zeros(shape))
 
 
-def test_one_that_would_see_nothing_of_the_scene_is_refused():
-    with pytest.raises(ValueError, match="features='opening' shows nothing of where things are; only plans with roles"):
-        make_actor(features="opening")
+@pytest.mark.parametrize("features", ["opening", "none"])
+def test_one_that_would_see_nothing_of_the_scene_is_refused(features):
+    with pytest.raises(ValueError, match=f"features='{features}' shows nothing of where .*; only plans with roles"):
+        make_actor(features=features)
 
 
 def test_bc_loss_trains_it_and_the_gradient_reaches_every_weight():

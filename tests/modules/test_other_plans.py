@@ -19,7 +19,7 @@ STEPS = [
     ("the gripper is not above the puck", "place the gripper above the puck"),
     ("the gripper is above the puck", "lower the gripper around the puck"),
 ]
-REFUSED = r"qaf answers other plans than the actor's, for push: give QAFTransform the actor's plans"
+REFUSED = r"qaf answers other plans than the actor's, for push: give QAFTransform actor.plans"
 
 
 def plans_of(pairs, *more):

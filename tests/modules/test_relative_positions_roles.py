@@ -10,6 +10,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import TD3Loss
 
 import lw_torchrl as lw
+from lw_torchrl.language.canonical import canonical_plan
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.modules.relative_positions import PlanRoles
 from lw_torchrl.training.normalization import fit_normalization
@@ -19,12 +20,19 @@ ZERO_SHOT = lw.load_plans("MT50", skills="MT10")
 OPTIONS = {"roles": True, "features": "opening", "feature_noise": 0.0}
 
 
+def seen_of(plans):
+    """The canonical plans, which policies see."""
+    return lw.Plans([canonical_plan(plan).plan for plan in plans.values()])
+
+
 def roles_of(plans=MT10, **options):
-    return PlanRoles(plans, PlanTables(plans), **options).eval()
+    canonical = {task: canonical_plan(plan) for task, plan in plans.items()}
+    return PlanRoles(canonical, PlanTables(seen_of(plans)), **options).eval()
 
 
 def in_step(plans, task, step, number=5, seed=0):
-    """Random observations, with all attention on one step of a task."""
+    """Random observations, with all attention on one step of a task's canonical plan."""
+    plans = seen_of(plans)
     observation = torch.randn(number, 39, generator=torch.Generator().manual_seed(seed))
     weights = torch.zeros(number, plans.num_steps)
     weights[:, step] = 1.0
@@ -37,24 +45,106 @@ def in_step(plans, task, step, number=5, seed=0):
         ("push", 0, lambda o: o[:, 4:7] - o[:, :3]),
         ("push", 3, lambda o: o[:, 36:39] - o[:, 4:7]),
         ("assembly", 3, lambda o: o[:, 36:39] - o[:, 4:7] - torch.tensor([-0.13, 0.0, 0.0])),
-        ("bin-picking", 3, lambda o: torch.tensor([0.12, 0.7, 0.02]) - o[:, 4:7]),
-        ("peg-unplug-side", 2, lambda o: o[:, 36:39] - o[:, 4:7]),  # the goal, which that task has no name for
+        ("peg-unplug-side", 3, lambda o: o[:, 36:39] - o[:, 4:7]),  # the goal, which that task has no name for
     ],
 )
 def test_the_position_is_from_what_is_moved_to_the_target(task, step, way):
-    seen = in_step(ZERO_SHOT, task, step)
-    found = roles_of(ZERO_SHOT).positions(*seen)
-    torch.testing.assert_close(found[:, 0], way(seen[0]))
+    seen, roles = in_step(ZERO_SHOT, task, step), roles_of(ZERO_SHOT)
+    roles.demonstrated.fill_(True)
+    torch.testing.assert_close(roles.positions(*seen)[:, 0], way(seen[0]))
 
 
-def test_a_step_without_roles_has_no_way_and_its_features_are_0():
-    plans = lw.Plans([lw.ConditionalPlan.from_pairs("push", [("gripper is open", "wait")])])
-    assert not roles_of(plans)(*in_step(plans, "push", 0)).any()
+@pytest.mark.parametrize(
+    ("task", "step", "direction"),
+    [("push", 0, (0.0, 0.0, 0.0)), ("drawer-open", 2, (0.0, -1.0, 0.0)), ("window-open", 2, (1.0, 0.0, 0.0)),
+     ("window-open", 0, (1.0, 0.0, 0.0)), ("button-press-topdown", 2, (0.0, 0.0, -1.0))],
+)  # fmt: skip
+def test_a_step_shows_the_direction_that_it_says(task, step, direction):
+    roles, seen = roles_of(), in_step(MT10, task, step)
+    assert torch.equal(roles.directions(*seen), torch.tensor(direction).expand(5, 3))
+    assert torch.equal(roles(*seen)[:, 9:], torch.tensor(direction).expand(5, 3))
+
+
+def test_toward_the_goal_is_from_the_thing_to_it_and_turns_with_the_scene():
+    pairs = [
+        ("gripper is not near the puck", "lower the gripper beside the puck"),
+        ("gripper is near the puck", "push the puck to the target location"),
+    ]
+    plans = lw.Plans([lw.ConditionalPlan.from_pairs("push", pairs)])
+    (number,) = (n for n, one in enumerate(canonical_plan(plans["push"]).steps) if one.verb == "push")
+    roles, (observation, weights, rows) = roles_of(plans), in_step(plans, "push", number)
+    ahead = torch.nn.functional.normalize(observation[:, 36:39] - observation[:, 4:7], dim=-1)
+    torch.testing.assert_close(roles.directions(observation, weights, rows), ahead)
+    turned = lw.RandomYaw(0.7)(TensorDict(observation=observation, action=torch.zeros(5, 4), batch_size=[5]))
+    yaw = turned["observation_yaw"]
+    after = roles.directions(turned["observation"], weights, rows, yaw)
+    now = torch.nn.functional.normalize(turned["observation"][:, 36:39] - turned["observation"][:, 4:7], dim=-1)
+    torch.testing.assert_close(after, now)
+    observation[:, 36:39] = observation[:, 4:7]
+    assert not roles.directions(observation, weights, rows).any(), "there is no way left"
+
+
+def test_what_is_moved_to_a_side_has_a_place_there():
+    pairs = [
+        ("gripper is not near the puck", "lower the gripper around the puck"),
+        ("gripper is near the puck and gripper is open", "close the gripper around the puck"),
+        ("gripper is near the puck and gripper is closed", "lift the puck"),
+    ]
+    plans = lw.Plans([lw.ConditionalPlan.from_pairs("push", pairs)])
+    (number,) = (n for n, one in enumerate(canonical_plan(plans["push"]).steps) if one.verb == "move")
+    seen = in_step(plans, "push", number)
+    torch.testing.assert_close(roles_of(plans).positions(*seen)[:, 0], torch.tensor([0.0, 0.0, 0.15]).expand(5, 3))
+    assert not roles_of(plans).directions(*seen).any()
+
+
+def test_beyond_25_cm_only_the_direction_is_seen():
+    roles = roles_of()
+    observation, weights, rows = in_step(MT10, "push", 0)
+    observation[:, :3] = observation[:, 4:7] + torch.tensor([0.3, -0.4, 0.0])
+    far = roles(observation, weights, rows)
+    torch.testing.assert_close(far[:, :3] * 0.1, torch.tensor([-0.15, 0.2, 0.0]).expand(5, 3))
+    observation[:, :3] = observation[:, 4:7] + torch.tensor([0.15, -0.2, 0.0])
+    torch.testing.assert_close(roles(observation, weights, rows), far)
+    observation[:, :3] = observation[:, 4:7] + torch.tensor([0.1, 0.0, 0.0])
+    torch.testing.assert_close(roles(observation, weights, rows)[:, 0], torch.full((5,), -1.0))
+
+
+def carried(beside, below):
+    """One row in which the puck is carried, so far beside its target and so far below it, metres."""
+    observation, weights, rows = in_step(MT10, "push", 3, number=1)
+    observation[:, 4:7] = observation[:, 36:39] - torch.tensor([beside, 0.0, below])
+    return observation, weights, rows
+
+
+@pytest.mark.parametrize(
+    ("beside", "below", "wanted"),
+    [
+        (0.2, 0.0, (0.0, 0.0, 0.15)),  # far away: first straight up
+        (0.2, -0.13, (0.2, 0.0, 0.02)),  # high: to the side
+        (0.2, -0.11, (0.1, 0.0, 0.04)),  # in between: both
+        (0.02, -0.15, (0.02, 0.0, -0.15)),  # over it: down
+        (0.0, 0.0, (0.0, 0.0, 0.0)),
+    ],
+)
+def test_what_is_carried_in_a_task_without_demonstrations_is_lifted_first(beside, below, wanted):
+    roles, seen = roles_of(), carried(beside, below)
+    torch.testing.assert_close(roles.positions(*seen)[0, 0], torch.tensor(wanted), atol=1e-5, rtol=0)
+    roles.fit(*in_step(MT10, "push", 0))
+    assert roles.demonstrated.tolist() == [task == "push" for task in roles.tables.index.tasks]
+    torch.testing.assert_close(roles.positions(*seen)[0, 0], torch.tensor((beside, 0.0, below)), atol=1e-5, rtol=0)
+
+
+def test_what_is_slid_or_approached_is_not_lifted():
+    roles = roles_of()
+    observation, weights, rows = in_step(MT10, "peg-insert-side", 4)
+    before = roles.positions(observation, weights, rows)
+    roles.demonstrated.fill_(True)
+    assert torch.equal(roles.positions(observation, weights, rows), before)
 
 
 def demonstrations(task, contact):
     """Rows in each step of a task's plan, the hand at the contact with the first object, and their attention."""
-    parts = [in_step(MT10, task, step, seed=step) for step in range(len(MT10[task].steps))]
+    parts = [in_step(MT10, task, step, seed=step) for step in range(len(seen_of(MT10)[task].steps))]
     observation, weights, rows = (torch.cat(column) for column in zip(*parts, strict=True))
     observation[:, :3] = observation[:, 4:7] + torch.tensor(contact)
     return observation, weights, rows
@@ -82,6 +172,7 @@ def test_what_is_pressed_from_above_has_no_contact():
 def test_contacts_do_not_move_the_way_of_what_is_carried_nor_of_named_points():
     roles = roles_of(ZERO_SHOT)
     roles.contact.fill_(1.0)
+    roles.demonstrated.fill_(True)
     carried, point = in_step(ZERO_SHOT, "push", 3), in_step(ZERO_SHOT, "coffee-pull", 0)
     torch.testing.assert_close(roles.positions(*carried)[:, 0], carried[0][:, 36:39] - carried[0][:, 4:7])
     rim = torch.tensor([-0.005, 0.0, 0.05])
@@ -137,8 +228,11 @@ def test_training_takes_contacts_and_they_go_with_the_policy(tmp_path):
     row = PlanTables(MT10).index.row("drawer-open")
     assert contact[row].any()
     lw.save_actor(actor, tmp_path / "policy.zip")
-    assert torch.equal(lw.load_actor(tmp_path / "policy.zip").encoder.roles.contact, contact)
+    loaded = lw.load_actor(tmp_path / "policy.zip").encoder.roles
+    assert torch.equal(loaded.contact, contact)
+    assert loaded.demonstrated.tolist() == [task == "drawer-open" for task in MT10]
     wider = actor.with_plans(ZERO_SHOT).encoder.roles
+    assert wider.demonstrated.tolist() == [task == "drawer-open" for task in ZERO_SHOT]
     assert torch.equal(wider.contact[PlanTables(ZERO_SHOT).index.row("drawer-open")], contact[row])
     assert wider.contact.count_nonzero() == contact.count_nonzero()
     ensemble = lw.modules.ActorEnsemble([lw.PlanConditionedActor(MT10, **OPTIONS) for _ in range(2)])
@@ -166,7 +260,9 @@ def test_actors_with_the_same_weights_have_the_same_contacts_whichever_is_fitted
     assert contact[row].any()
     assert torch.equal(actor.encoder.roles.contact, contact)
     assert torch.equal(wider.encoder.roles.contact[PlanTables(ZERO_SHOT).index.row("drawer-open")], contact[row])
-    assert all(one.encoder.roles.fitted for one in (actor, wider, back))
+    for one in (actor, wider, back):
+        assert one.encoder.roles.fitted
+        assert one.encoder.roles.demonstrated.sum() == 1
     for other in copies:
         assert not other.encoder.roles.fitted
         fit_normalization(other, replay)
@@ -190,8 +286,8 @@ def test_training_without_statistics_wants_contacts_first():
 def test_the_opening_is_hidden_but_where_a_step_closes():
     actor = lw.PlanConditionedActor(MT10, hide_opening=1.0, **OPTIONS)
     row, number = lw.task_id("push"), 200
-    for step, hidden in ((0, True), (2, False)):  # place above; close around
-        qaf = torch.zeros(number, MT10.num_steps, dtype=torch.bool)
+    for step, hidden in ((0, True), (2, False), (3, False)):  # place above; close around; carry
+        qaf = torch.zeros(number, actor.plans.num_steps, dtype=torch.bool)
         qaf[:, step] = True
         observation = torch.rand(number, 39)
         state = TensorDict(observation=observation, task_id=torch.full((number,), row), qaf=qaf, batch_size=[number])
@@ -209,7 +305,12 @@ def test_the_opening_is_hidden_but_where_a_step_closes():
         ({"roles": True, "jitter": -1.0}, "jitter must be finite and at least 0"),
         ({"hide_opening": 1.5}, "hide_opening must be"),
         ({"hide_opening": 0.5, "features": "relative"}, "hide_opening: features='relative' do not show the opening"),
-        ({"features": "opening"}, "features='opening' shows nothing of where things are; it needs roles=True or"),
+        ({"hide_opening": 0.5, "features": "none", "roles": True}, "hide_opening: features='none' do not show"),
+        ({"roles": True, "canonical": False}, "canonical must be true with roles=True, which are those of canonical"),
+        *(
+            ({"features": features}, f"features='{features}' shows nothing of where things are; it needs roles=True or")
+            for features in ("opening", "none")
+        ),
         *(
             ({"roles": True, "distribution": "tanh_normal", name: 0.1}, "jitter, .* must be 0 with a distribution")
             for name in ("jitter", "swap_unmentioned", "hide_opening")

@@ -26,11 +26,11 @@ def make(kind="plan", distribution="tanh_normal", **options):
     return lw.DescriptorConditionedActor("MT10", condition=kind, **options)
 
 
-def make_state(rows=5, seed=0):
+def make_state(rows=5, seed=0, plans=PLANS):
     generator = torch.Generator().manual_seed(seed)
     ids = torch.tensor([lw.task_id(task) for task in PLANS])[torch.randint(10, (rows,), generator=generator)]
     state = TensorDict(observation=torch.rand(rows, 39, generator=generator), task_id=ids)
-    return lw.QAFTransform(PLANS)(state.auto_batch_size_())
+    return lw.QAFTransform(plans)(state.auto_batch_size_())
 
 
 def drawn(actor, state, seed=0):
@@ -173,7 +173,7 @@ def test_a_trained_one_is_evaluated_and_collects(tmp_path):
 
 def test_nothing_random_is_left_in_the_likelihoods_of_one_made_of_a_trained_one():
     trained = make("plan", None, roles=True, focus=True, jitter=0.03, swap_unmentioned=0.5, hide_opening=1.0)
-    actor, state = trained.stochastic().train(), make_state(50)
+    actor, state = trained.stochastic().train(), make_state(50, plans=trained.plans)
     first, second = (actor.get_dist(state).log_prob(torch.zeros(50, 4)) for _ in range(2))
     assert torch.equal(first, second)
 

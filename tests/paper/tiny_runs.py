@@ -14,7 +14,8 @@ PLANS = lw.load_plans("MT50")
 TINY = DataSetting("tiny", "reach", 2)
 TINY_ONE_SHOT = DataSetting("tiny-one-shot", "reach", 2, targets="push")
 ASTRAY = PRESETS["strong"]["few-shot"].base
-MEMBER = Member({"features": "differences", "width": 32, "depth": 1}, {"focus": True, "swap_unmentioned": 0.5})
+FOCUS = {"focus": True, "canonical": True, "swap_unmentioned": 0.5}
+MEMBER = Member({"features": "differences", "width": 32, "depth": 1}, FOCUS)
 PRESET = replace(
     PRESETS["strong"]["few-shot"],
     target=Execution("target", (0.0,)),

@@ -1,0 +1,150 @@
+"""RandomYaw's tilt: rows in which something is moved freely to a place are turned in space, too."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+import lw_torchrl as lw
+from lw_torchrl.transforms.random_yaw import random_rotations
+
+MT10 = lw.load_plans("MT10")
+ACTOR = lw.PlanConditionedActor(MT10, roles=True, features="none", width=8, depth=1)
+PLANS = ACTOR.plans
+NOW = torch.eye(3)
+
+
+def rows(task, step, number=400, reach=0.5, also=None):
+    qaf = torch.zeros(number, PLANS.num_steps, dtype=torch.bool)
+    qaf[:, step] = True
+    if also is not None:
+        qaf[:, also] = True
+    drawn = torch.Generator().manual_seed(0)
+    action = (2 * torch.rand(number, 4, generator=drawn) - 1) * reach
+    ids = torch.full((number,), lw.task_id(task))
+    found = TensorDict(observation=torch.rand(number, 39, generator=drawn), action=action, qaf=qaf, task_id=ids)
+    return found.auto_batch_size_()
+
+
+def tilted(was, tilt=1.0, scale=0.0):
+    torch.manual_seed(0)
+    return lw.RandomYaw(scale, plans=PLANS, tilt=tilt)(was.clone())
+
+
+def number_of(task, words):
+    (found,) = (number for number, step in enumerate(PLANS[task].steps) if step.skill == words)
+    return found
+
+
+def test_rotations_keep_lengths_and_hands_and_have_no_direction_of_their_own():
+    turns = random_rotations(20_000)
+    torch.testing.assert_close(turns @ turns.mT, NOW.expand(20_000, 3, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(turns), torch.ones(20_000), atol=1e-5, rtol=0)
+    assert turns.mean(0).abs().max() < 0.03
+    assert ((turns**2).mean(0) - 1 / 3).abs().max() < 0.02
+
+
+FREE = [("push", "carry the puck to the target location"), ("peg-insert-side", "slide the peg to the hole")]
+BOUND = [
+    ("push", "place the gripper above the puck"),
+    ("push", "close the gripper around the puck"),
+    ("window-open", "push the window handle to the left"),
+    ("drawer-open", "pull the drawer handle toward the robot"),
+    ("button-press-topdown", "push the button down"),
+]
+
+
+@pytest.mark.parametrize(("task", "words"), FREE)
+def test_what_moves_freely_to_a_place_is_tilted_and_keeps_its_length(task, words):
+    was = rows(task, number_of(task, words))
+    now = tilted(was)
+    turns = now["observation_tilt"]
+    assert turns.shape == (400, 3, 3)
+    assert not torch.isclose(turns, NOW).all((-1, -2)).any()
+    moved = now["action"][:, :3]
+    inside = moved.abs().amax(-1) < 0.999
+    torch.testing.assert_close(moved.norm(dim=-1)[inside], was["action"][:, :3].norm(dim=-1)[inside])
+    assert moved.abs().max() <= 1.0
+    direction = torch.nn.functional.normalize
+    yaw = now["observation_yaw"]  # no direction is said: any angle first
+    flat = was["action"][:, :3].clone()
+    flat[:, 0] = yaw.cos() * was["action"][:, 0] - yaw.sin() * was["action"][:, 1]
+    flat[:, 1] = yaw.sin() * was["action"][:, 0] + yaw.cos() * was["action"][:, 1]
+    torch.testing.assert_close(direction(moved, dim=-1), direction((turns @ flat.unsqueeze(-1)).squeeze(-1), dim=-1))
+    assert torch.equal(now["action"][:, 3], was["action"][:, 3])
+    torch.testing.assert_close(now["observation"][:, 2], was["observation"][:, 2])
+
+
+@pytest.mark.parametrize(("task", "words"), BOUND)
+def test_all_else_is_not(task, words):
+    was = rows(task, number_of(task, words))
+    now = tilted(was)
+    assert torch.equal(now["observation_tilt"], NOW.expand(400, 3, 3))
+    torch.testing.assert_close(now["action"][:, 2], was["action"][:, 2])
+
+
+def test_every_step_in_force_has_to_and_one_must_be():
+    free = number_of("push", "carry the puck to the target location")
+    was = rows("push", free, also=0)
+    assert torch.equal(tilted(was)["observation_tilt"], NOW.expand(400, 3, 3))
+    was["qaf"] = torch.zeros_like(was["qaf"])
+    assert torch.equal(tilted(was)["observation_tilt"], NOW.expand(400, 3, 3))
+
+
+def test_slid_to_a_side_is_no_place():
+    pairs = [("the gripper is near the puck and the gripper is open", "close the gripper around the puck")]
+    pairs += [
+        ("the gripper is near the puck and the gripper is closed", f"slide the puck {way}")
+        for way in ("to the left", "to the right", "away from the robot", "up", "to the target location")
+    ]
+    plans = lw.Plans([lw.ConditionalPlan.from_pairs("push", pairs)])
+    was = rows("push", 0)
+    was["qaf"] = torch.zeros(400, 6, dtype=torch.bool)
+    for step in range(6):
+        state = was.clone()
+        state["qaf"][:, step] = True
+        turns = lw.RandomYaw(0.1, plans=plans, tilt=1.0)(state)["observation_tilt"]
+        assert torch.equal(turns, NOW.expand(400, 3, 3)) == (step != 5)
+
+
+def test_so_many_rows_are_tilted_as_it_says():
+    was = rows("push", 3, 4_000)
+    share = (tilted(was, 0.25)["observation_tilt"] != NOW).any((-1, -2)).float().mean()
+    assert share == pytest.approx(0.25, abs=0.03)
+    assert "observation_tilt" not in tilted(was, 0.0)
+
+
+def test_roles_see_what_the_action_does():
+    """The action towards the target stays the one towards what is seen."""
+    was = rows("push", 3, 50)
+    ACTOR.encoder.roles.demonstrated.fill_(True)
+    way = was["observation"][:, 36:39] - was["observation"][:, 4:7]
+    was["action"][:, :3] = way * 0.3
+    now = tilted(was)
+    roles, tables = ACTOR.eval().encoder.roles, ACTOR.encoder.attention.tables
+    weights = torch.nn.functional.one_hot(torch.full((50,), 3), PLANS.num_steps).float()
+    seen = roles(
+        now["observation"], weights, tables.rows(now["task_id"]), now["observation_yaw"], now["observation_tilt"]
+    )
+    direction = torch.nn.functional.normalize
+    torch.testing.assert_close(direction(seen[:, :3], dim=-1), direction(now["action"][:, :3], dim=-1))
+    prepared = ACTOR.prepare(now)[2]
+    torch.testing.assert_close(prepared, seen, atol=0.05, rtol=0)
+    ACTOR.encoder.roles.demonstrated.fill_(False)
+
+
+def test_keys_of_ones_own():
+    was = rows("push", 3)
+    moved = was.select("qaf", "task_id", "action").set(("agent", "observation"), was["observation"])
+    keys = [("agent", "observation"), "action", "expert_action", "unclipped_action"]
+    now = lw.RandomYaw(0.0, plans=PLANS, tilt=1.0, in_keys=keys)(moved)
+    assert now["agent", "observation_tilt"].shape == (400, 3, 3)
+
+
+def test_what_it_refuses():
+    with pytest.raises(
+        ValueError, match=r"tilt needs plans, which say what moves freely, and plans is None; got tilt=0.5"
+    ):
+        lw.RandomYaw(0.3, tilt=0.5)
+    for wrong in (-0.1, 1.5, float("nan")):
+        with pytest.raises(ValueError, match="tilt must be"):
+            lw.RandomYaw(0.3, plans=PLANS, tilt=wrong)
