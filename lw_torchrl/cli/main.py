@@ -21,13 +21,11 @@ from lw_torchrl._checks import nearest, shown
 from lw_torchrl.cli import data, evaluate, language, record, reproduce
 from lw_torchrl.cli import plan as cli_plan
 from lw_torchrl.cli.check import check
-from lw_torchrl.cli.offline import offline
-from lw_torchrl.cli.online import online
+from lw_torchrl.cli.online import offline, online
 from lw_torchrl.cli.options import import_modules
 from lw_torchrl.cli.output import Output, complain, nobody_reads, sound_streams
 from lw_torchrl.cli.parsing import document, in_its_words, parse, unpadded
-from lw_torchrl.cli.train import train
-from lw_torchrl.cli.train_evaluator import train_evaluator
+from lw_torchrl.cli.train import train, train_evaluator
 
 COMMANDS: dict[str, Any] = {
     "demo": reproduce.demo,

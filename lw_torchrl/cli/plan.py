@@ -115,8 +115,7 @@ def compare(
 
     known = options.read_tasks(task_file)
     recorded_answers(source)
-    from lw_torchrl.planners.comparing import compare_plans
-    from lw_torchrl.planners.comparison_report import no_plans, write_report
+    from lw_torchrl.planners.comparing import compare_plans, no_plans, write_report
 
     options.use_one_thread()
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "choose": choose, "noise_scale": noise}
