@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,7 +12,6 @@ from lw_torchrl._checks import check_choice
 from lw_torchrl._files import read_text
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
-from lw_torchrl.cli.plan_models import generate, repair
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.tasks import check_task
 
@@ -173,16 +171,6 @@ def serve(
         print(f"lw-torchrl plan generate MT10 {asked}", flush=True)
 
     serve_model(file, host=host, port=port, context=context, threads=threads, ready=ready)
-
-
-COMMANDS: dict[str, Callable[..., Output | None]] = {
-    "prompt": prompt,
-    "generate": generate,
-    "serve": serve,
-    "check": check,
-    "compare": compare,
-    "repair": repair,
-}
 
 
 def plan() -> None:
