@@ -15,7 +15,7 @@ from lw_torchrl._checks import counted, shown
 from lw_torchrl._files import read_json
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
-from lw_torchrl.cli.runs import Job, Scheduled
+from lw_torchrl.cli.runs import Job, Scheduled, command_line
 from lw_torchrl.language.plans import Plans
 
 if TYPE_CHECKING:
@@ -99,11 +99,9 @@ def online(
     for one in runs:
         stage = starts if one.method == START else others
         stage[str(one.folder)] = partial(execute_run, one, found, out, make_logger=make)
-    command: list[object] = ["online", *tasks, "--demonstrations", demonstrations, "--out", out]
-    command += ["--seeds", *seeds, "--methods", *methods, "--plans", *plans]
-    command += ["--condition", condition, "--episodes", episodes, "--logger", logger]
-    for option, value in (("--frames", frames), ("--start", start), ("--step", step)):
-        command += [] if value is None else [option, value]
+    typed: dict[str, Any] = {"demonstrations": demonstrations, "episodes": episodes, "frames": frames, "start": start}
+    typed |= {"seeds": seeds, "methods": methods, "plans": plans, "condition": condition, "logger": logger}
+    command = command_line("online", *tasks, step=step, out=out, **typed)
     summarize = partial(_summarize, runs, found, out)
     return schedule.execute(Output(json), [], [starts, others], command, summarize, _told_of_step)
 
@@ -242,10 +240,7 @@ def offline(
             summaries[name] = read_json(out / f"{name}.json", "the summary")
         return summaries
 
-    command: list[object] = ["offline", table, "--episodes", episodes, "--out", out]
-    command += ["--plans", *plans, "--seeds", *seeds]
-    for option, value in (("--reward", reward), ("--beta", beta), ("--distance", distance), ("--steps", steps)):
-        command += [] if value is None else [option, value]
-    for option, values in (("--mixtures", mixtures), ("--methods", methods)):
-        command += [option, *values] if values else []
+    typed: dict[str, Any] = {"reward": reward, "beta": beta, "distance": distance, "steps": steps, "mixtures": mixtures}
+    typed |= {"methods": methods, "plans": plans, "seeds": seeds, "episodes": episodes, "out": out}
+    command = command_line("offline", table, **typed)
     return schedule.execute(Output(json), [datasets, advantages], [jobs], command, summarize)
