@@ -4,8 +4,6 @@ It is a zip archive without compression: ``description.json``, and ``<group>.saf
 whose SHA-256 the description states. The sizes that it states are not trusted.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -4,8 +4,6 @@ What an argument is, a comment beside it says, or the docstring if it takes more
 found, an :class:`~lw_torchrl.cli.output.Output`, where it has ``--json``.
 """
 
-from __future__ import annotations
-
 import signal
 import sys
 import threading

@@ -1,7 +1,5 @@
 """A command's arguments: read as values, refused with the nearest that is allowed, and named in errors as options."""
 
-from __future__ import annotations
-
 import io
 import os
 import re

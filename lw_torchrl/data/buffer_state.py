@@ -1,7 +1,5 @@
 """A replay buffer of datasets whose state is one file: the rows stay in their datasets, and no pickle is read."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from hashlib import sha256

@@ -1,7 +1,5 @@
 """The rows that a growing buffer stores: checked, and linked to trajectories."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """compare_plans: recorded answers of models, decoded, carried out by scripted skills, and shown."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress

@@ -8,8 +8,6 @@
 Nothing is unpickled, and what the file says of sizes is held against what it holds before anything is made.
 """
 
-from __future__ import annotations
-
 import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence

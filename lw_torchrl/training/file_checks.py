@@ -1,7 +1,5 @@
 """What weights, texts and sizes a module and its file must have, so that one can be made of the other."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 Fetch's x points away from the robot, its y to the left, its z up from the floor; lengths are metres in both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import redirect_stderr
 from functools import cache
