@@ -27,7 +27,7 @@ from rerun.experimental import ViewerClient
 
 import lw_torchrl as lw
 from lw_torchrl.envs.seeding import episode_seed
-from lw_torchrl.record.mujoco_scene import Motion, log_model, log_motion, model_geometry
+from lw_torchrl.record.scene import Motion, log_model, log_motion, model_geometry
 from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
 
 EYE, TARGET = np.array([0.75, 0.0, 0.65]), np.array([-0.05, 0.6, 0.15])

@@ -4,8 +4,6 @@ Names are imported when they are first used: ``import lw_torchrl`` loads neither
 What a first project needs is here. The rest is in the rooms: losses in ``lw.objectives``, for example.
 """
 
-from __future__ import annotations
-
 import re
 from importlib import import_module
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checks of arguments, shared by every room: the error names the argument, what was given and what is allowed."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import math

@@ -1,7 +1,5 @@
 """How networks run: on which device, with which random numbers, and on how many rows at once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import chain

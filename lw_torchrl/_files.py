@@ -1,7 +1,5 @@
 """Files that are replaced whole or not at all, and JSON that is read whole or refused."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import io

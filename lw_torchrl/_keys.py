@@ -1,7 +1,5 @@
 """Keys of tensordicts as arguments, and modules that are called with a tensordict or with tensors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import wraps
 from inspect import Parameter, Signature

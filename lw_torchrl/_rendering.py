@@ -1,7 +1,5 @@
 """Which cameras and sizes pictures have, and an error that names a missing rendering library, which MuJoCo loads."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Random numbers of an episode: a function of (purpose, task, seed, episode), for every room."""
 
-from __future__ import annotations
-
 from hashlib import blake2b
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The versions of the packages that results depend on: what was recorded is compared with what is installed."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterable, Mapping
 from importlib.metadata import version

@@ -1,7 +1,5 @@
 """``lw-torchrl check``: what is wrong with plans, skills, tasks or a suite of one's own."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path

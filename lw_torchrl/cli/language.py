@@ -1,7 +1,5 @@
 """Commands about words: tasks, skills, plans and queries are listed, and a query is answered in a state."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 

@@ -4,13 +4,13 @@ What an argument is, a comment beside it says, or the docstring if it takes more
 found, an :class:`~lw_torchrl.cli.output.Output`, where it has ``--json``.
 """
 
-from __future__ import annotations
-
 import signal
 import sys
 import threading
+from collections import UserDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
+from importlib import import_module
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -18,39 +18,47 @@ import tyro
 
 from lw_torchrl import __version__
 from lw_torchrl._checks import nearest, shown
-from lw_torchrl.cli import data, evaluate, language, record, reproduce
-from lw_torchrl.cli import plan as cli_plan
-from lw_torchrl.cli.check import check
-from lw_torchrl.cli.offline import offline
-from lw_torchrl.cli.online import online
-from lw_torchrl.cli.options import import_modules
 from lw_torchrl.cli.output import Output, complain, nobody_reads, sound_streams
-from lw_torchrl.cli.parsing import document, in_its_words, parse, unpadded
-from lw_torchrl.cli.train import train
-from lw_torchrl.cli.train_evaluator import train_evaluator
+from lw_torchrl.cli.parsing import document, import_modules, in_its_words, parse, unpadded
 
-COMMANDS: dict[str, Any] = {
-    "demo": reproduce.demo,
-    "collect": data.collect,
-    "data": data.data,
-    "train": train,
-    "train-evaluator": train_evaluator,
-    "evaluate": evaluate.evaluate,
-    "record": record.record,
-    "view": record.view,
-    "query": language.query,
-    "scripted": evaluate.scripted,
-    "tasks": language.tasks,
-    "queries": language.queries,
-    "skills": language.skills,
-    "plans": language.plans,
-    "plan": cli_plan.plan,
-    "check": check,
-    "reproduce": reproduce.reproduce,
-    "offline": offline,
-    "online": online,
-}
-GROUPS: dict[str, dict[str, Any]] = {"plan": cli_plan.COMMANDS}
+
+class Commands(UserDict[str, Any]):
+    """Commands by name. One that is given by its module's name is imported when it is asked for: words take longer to
+    load than all else here."""
+
+    def __getitem__(self, name: str) -> Any:
+        found = super().__getitem__(name)
+        if isinstance(found, str):
+            found = self[name] = getattr(import_module(f"lw_torchrl.cli.{found}"), name.replace("-", "_"))
+        return found
+
+
+COMMANDS = Commands(
+    {
+        "demo": "reproduce",
+        "collect": "data",
+        "data": "data",
+        "train": "train",
+        "train-evaluator": "train",
+        "evaluate": "evaluate",
+        "record": "record",
+        "view": "record",
+        "query": "language",
+        "scripted": "evaluate",
+        "tasks": "language",
+        "queries": "language",
+        "skills": "language",
+        "plans": "language",
+        "plan": "plan",
+        "check": "check",
+        "reproduce": "reproduce",
+        "offline": "online",
+        "online": "online",
+    }
+)
+_OF_PLAN = dict(prompt="plan", generate="plan_models", serve="plan", read="plan", check="plan", compare="plan")
+_OF_PLAN |= dict(repair="plan_models")
+GROUPS = {"plan": Commands(_OF_PLAN)}
 """Commands that have commands of their own."""
 ABOUT = """Language-World with TorchRL: policies carried by plans in English. --version tells which.
 
@@ -104,7 +112,7 @@ def _run(given: Sequence[str]) -> None:
             with unpadded():
                 for command in table.values():
                     document(command)
-                tyro.extras.subcommand_cli_from_dict(table, prog=prog, description=about, args=args)
+                tyro.extras.subcommand_cli_from_dict(dict(table), prog=prog, description=about, args=args)
         else:
             name = _command(prog, args, table)
             command = parse(f"{prog} {name}", table[name], args[1:])
@@ -120,13 +128,13 @@ def _run(given: Sequence[str]) -> None:
         sys.stdout.flush()
 
 
-def _group(given: Sequence[str]) -> tuple[str, list[str], dict[str, Any]]:
+def _group(given: Sequence[str]) -> tuple[str, list[str], Commands]:
     """The command that has commands of its own, if that is given; what follows it; the commands to choose from."""
     group = given[0] if given and given[0] in GROUPS else ""
     return group, [*given[1:]] if group else [*given], GROUPS.get(group, COMMANDS)
 
 
-def _command(prog: str, args: Sequence[str], table: dict[str, Any]) -> str:
+def _command(prog: str, args: Sequence[str], table: Commands) -> str:
     """The name of the command that is given; else :class:`ValueError` with the nearest."""
     known = ", ".join(table)
     if not args or args[0].startswith("-"):

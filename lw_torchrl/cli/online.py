@@ -1,4 +1,4 @@
-"""``lw-torchrl online``: RL from demonstrations, run by run."""
+"""``lw-torchrl online``, RL from demonstrations, and ``offline``, what policies learn from spoilt data, run by run."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from tyro.conf import Positional
 
 import lw_torchrl as lw
 from lw_torchrl._checks import counted, shown
+from lw_torchrl._files import read_json
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
-from lw_torchrl.cli.runs import Job, Scheduled
+from lw_torchrl.cli.runs import Job, Scheduled, command_line
 from lw_torchrl.language.plans import Plans
 
 if TYPE_CHECKING:
@@ -98,11 +99,9 @@ def online(
     for one in runs:
         stage = starts if one.method == START else others
         stage[str(one.folder)] = partial(execute_run, one, found, out, make_logger=make)
-    command: list[object] = ["online", *tasks, "--demonstrations", demonstrations, "--out", out]
-    command += ["--seeds", *seeds, "--methods", *methods, "--plans", *plans]
-    command += ["--condition", condition, "--episodes", episodes, "--logger", logger]
-    for option, value in (("--frames", frames), ("--start", start), ("--step", step)):
-        command += [] if value is None else [option, value]
+    typed: dict[str, Any] = {"demonstrations": demonstrations, "episodes": episodes, "frames": frames, "start": start}
+    typed |= {"seeds": seeds, "methods": methods, "plans": plans, "condition": condition, "logger": logger}
+    command = command_line("online", *tasks, step=step, out=out, **typed)
     summarize = partial(_summarize, runs, found, out)
     return schedule.execute(Output(json), [], [starts, others], command, summarize, _told_of_step)
 
@@ -163,3 +162,85 @@ def _summarize(runs: Sequence[OnlineRun], plans: Plans, out: Path) -> dict[str, 
     lw.evaluation.plot_learning_curves(curves, folder / "curves.png", starts=starts)
     print(f"summary.md, summary.json and curves.png are in {folder}")
     return {str(runs[0].group): summary}
+
+
+Table = Literal["methods", "conditioning", "mt10", "quick", "all"]
+Mixture = Literal["B", "W", "C"]
+OfflineMethod = Literal["advantage", "filtered-bc", "best-bc", "bc", "iql", "td3-bc", "cql"]
+
+
+def offline(
+    table: Positional[Table],
+    /,
+    schedule: Scheduled,  # which runs are done, and where
+    seeds: tuple[int, ...] = (0, 1, 2),  # of the data, the initial weights and the minibatches
+    mixtures: tuple[Mixture, ...] = (),  # only these of the table's, B, W, C
+    methods: tuple[OfflineMethod, ...] = (),  # only these of the table's
+    plans: options.PlanSources = ("MT10",),
+    reward: Literal["sparse", "cost", "dense_cost"] | None = None,
+    beta: float | None = None,  # how sharply advantages weigh, instead of the recipe's
+    distance: Literal["l1", "l2"] | None = None,  # between actions, in methods that imitate, instead of the recipe's
+    steps: int | None = None,  # minibatches of each network, instead of the recipe's
+    episodes: int = 20,  # evaluated for each task, on seeds that no data has, action noise 0.1
+    out: Path = Path("runs/offline"),  # where everything goes; on a cluster, a folder that all its machines share
+    json: options.Json = False,
+) -> Output:
+    """Learn policies offline, from scripts that were spoilt, and compare the methods.
+
+    If it is stopped, the same command resumes it.
+
+    The data are mixtures: B, of each task 20 episodes of plans carried out by scripts that are right in 30 of 100
+    pieces, 20 in 60 of 100, 20 in none and 10 of chance; W, B without the second; C, 5 clean demonstrations, 20 in none
+    and 10 of chance. A run is a dataset, the advantages of a mixture's rows, or a policy with its evaluation. With
+    --run any scheduler can do each by a command of its own; datasets first, then advantages.
+
+    Example: lw-torchrl offline methods --jobs 2
+
+    Args:
+        table: methods, seven of them on plans, in five tasks; conditioning, plans, descriptions or numbers of tasks,
+            for the policy and for its critic; mt10, the best method in all of MT10; quick, two tasks, to try it; or all
+            but the last.
+        reward: what values are of, instead of the recipe's: sparse, the success; cost, of each step; dense_cost, what
+            Meta-World's dense reward lacks.
+    """
+    schedule.check(out)
+    known = options.read_plans(plans, options.read_tasks(None))
+    from lw_torchrl.paper.offline import OfflineRun, offline_runs, write_table
+    from lw_torchrl.paper.recipes import OFFLINE_TABLES, OfflineRecipe
+    from lw_torchrl.paper.runs import execute_run
+
+    changed = {"reward": reward, "beta": beta, "distance": distance, "steps": steps, "value_steps": steps}
+    recipe = replace(OfflineRecipe(), **{name: value for name, value in changed.items() if value is not None})  # type: ignore[arg-type]
+    tables: dict[str, list[OfflineRun]] = {}
+    for name in [name for name in OFFLINE_TABLES if name != "quick"] if table == "all" else [table]:
+        for one in offline_runs(OFFLINE_TABLES[name], seeds, recipe, episodes):
+            if (not mixtures or one.mixture in mixtures) and (not methods or one.method in methods):
+                tables.setdefault(name, []).append(one)
+    if not tables:
+        raise ValueError(f"--mixtures and --methods leave nothing of {table}")
+    runs = [one for wanted in tables.values() for one in wanted]
+    for one in () if schedule.list else runs:
+        known.require(one.scope)
+    datasets: dict[str, Job] = {
+        str(dataset.folder): partial(dataset.collect, out, progress=True) for one in runs for dataset in one.datasets
+    }
+    advantages: dict[str, Job] = {
+        str(own.folder): partial(own.make, known, out, progress=True)
+        for one in runs
+        if (own := one.advantages) is not None
+    }
+    jobs: dict[str, Job] = {str(one.folder): partial(execute_run, one, known, out) for one in runs}
+
+    def summarize() -> dict[str, Any]:
+        summaries = {}
+        for name, wanted in tables.items():
+            results = {one: execute_run(one, known, out) for one in wanted}
+            print(f"\n{name}\n{write_table(name, wanted, results, out)}")
+            print(f"\n{name}.md, {name}.json and {name}.png are in {out}")
+            summaries[name] = read_json(out / f"{name}.json", "the summary")
+        return summaries
+
+    typed: dict[str, Any] = {"reward": reward, "beta": beta, "distance": distance, "steps": steps, "mixtures": mixtures}
+    typed |= {"methods": methods, "plans": plans, "seeds": seeds, "episodes": episodes, "out": out}
+    command = command_line("offline", table, **typed)
+    return schedule.execute(Output(json), [datasets, advantages], [jobs], command, summarize)

@@ -6,19 +6,17 @@ What names and files alone can tell is checked without torch.
 from __future__ import annotations
 
 import os
-import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from tyro.conf import arg
 
 import lw_torchrl as lw
 from lw_torchrl._checks import unknown_name
+from lw_torchrl.cli.parsing import own_module
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
@@ -204,35 +202,13 @@ def check_actor(argument: str, who: str) -> None:
         check_saved(argument, Path(who))
 
 
-def _own_module(name: str) -> ModuleType:
-    """A module of the user's; the working folder is searched first."""
-    if "" not in sys.path:
-        sys.path.insert(0, "")
-    return import_module(name)
-
-
 def _imported(option: str, name: str, kind: str) -> Any:
     """What "package.module:name" names."""
     module, _, attribute = name.partition(":")
     try:
-        return getattr(_own_module(module), attribute)
+        return getattr(own_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise ValueError(f"{option} {name!r} names no {kind}: {error}") from error
-
-
-def import_modules(given: Sequence[str]) -> list[str]:
-    """The command line without each ``--import MODULE``, which is imported."""
-    rest, words = [], iter(given)
-    for word in words:
-        if word != "--import" and not word.startswith("--import="):
-            rest.append(word)
-            continue
-        name = next(words, "") if word == "--import" else word.removeprefix("--import=")
-        try:
-            _own_module(name)
-        except (ImportError, ValueError) as error:
-            raise ValueError(f"--import {name!r} names no module: {error}") from error
-    return rest
 
 
 def read_encoder(name: str | None) -> TextEncoder | None:

@@ -1,7 +1,5 @@
 """A command's arguments: read as values, refused with the nearest that is allowed, and named in errors as options."""
 
-from __future__ import annotations
-
 import io
 import os
 import re
@@ -10,8 +8,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import MISSING, fields, is_dataclass
 from functools import partial, wraps
+from importlib import import_module
 from inspect import Parameter, cleandoc, getsource, signature
 from itertools import pairwise
+from types import ModuleType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import tyro
@@ -168,6 +168,28 @@ def _refusal(prog: str, known: Mapping[str, Parameter], box: str) -> str:
         absent = [name for name in needed if name in text.split()] or needed
         return f"{' and '.join(absent)} must be given; `{prog} --help` says what there is"
     return re.sub(r"^Missing value for argument '(\S+)'.*", r"\1 must be given a value", text)
+
+
+def own_module(name: str) -> ModuleType:
+    """A module of the user's; the working folder is searched first."""
+    if "" not in sys.path:
+        sys.path.insert(0, "")
+    return import_module(name)
+
+
+def import_modules(given: Sequence[str]) -> list[str]:
+    """The command line without each ``--import MODULE``, which is imported."""
+    rest, words = [], iter(given)
+    for word in words:
+        if word != "--import" and not word.startswith("--import="):
+            rest.append(word)
+            continue
+        name = next(words, "") if word == "--import" else word.removeprefix("--import=")
+        try:
+            own_module(name)
+        except (ImportError, ValueError) as error:
+            raise ValueError(f"--import {name!r} names no module: {error}") from error
+    return rest
 
 
 # Names in the library's errors, and the options that they become, of which a command has one.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,7 +13,6 @@ from lw_torchrl._checks import check_choice, counted
 from lw_torchrl._files import read_text
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Columns, Output
-from lw_torchrl.cli.plan_models import generate, repair
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.tasks import Task, check_task
 
@@ -68,7 +67,8 @@ def read(
     """Show what policies with roles see of a plan: what became of each step, and how far the plan is trusted.
 
     Trust is the share of usual states of the plan's motion in which the plan, as written, does what the motion needs.
-    Below 0.75 the plan is completed: its motion, things and directions stay, and its conditions are ours. A plan that
+    Below 0.75, or if it moves a thing without closing the gripper around it, or pulls what is no handle, the plan is
+    completed: its motion, things and directions stay, and its conditions are ours. A plan that
     says no motion becomes the default plan: grasp the first thing and move it to the goal.
 
     Example: lw-torchrl plan read my-plans/coffee-pull.plan
@@ -179,8 +179,7 @@ def compare(
 
     known = options.read_tasks(task_file)
     recorded_answers(source)
-    from lw_torchrl.planners.comparing import compare_plans
-    from lw_torchrl.planners.comparison_report import no_plans, write_report
+    from lw_torchrl.planners.comparing import compare_plans, no_plans, write_report
 
     options.use_one_thread()
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "choose": choose, "noise_scale": noise}
@@ -238,17 +237,6 @@ def serve(
         print(f"lw-torchrl plan generate MT10 {asked}", flush=True)
 
     serve_model(file, host=host, port=port, context=context, threads=threads, ready=ready)
-
-
-COMMANDS: dict[str, Callable[..., Output | None]] = {
-    "prompt": prompt,
-    "generate": generate,
-    "serve": serve,
-    "read": read,
-    "check": check,
-    "compare": compare,
-    "repair": repair,
-}
 
 
 def plan() -> None:

@@ -1,7 +1,5 @@
 """``lw-torchrl record`` and ``view``: episodes of any policy, recorded and looked at in rerun."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

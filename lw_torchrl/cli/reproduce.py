@@ -13,7 +13,7 @@ from tyro.conf import Positional
 import lw_torchrl as lw
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
-from lw_torchrl.cli.runs import Job, Scheduled
+from lw_torchrl.cli.runs import Job, Scheduled, command_line
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import MT50, Task
@@ -122,11 +122,9 @@ def reproduce(
         str(dataset.folder): partial(dataset.collect, out, progress=True) for one in runs for dataset in one.datasets
     }
     jobs: dict[str, Job] = {str(one.folder): partial(execute_run, one, load(one.skills), out, **where) for one in runs}
-    command: list[object] = ["reproduce", experiment, "--preset", preset, "--episodes", episodes, "--out", out]
-    command += ["--seeds", *seeds, "--methods", *methods, "--device", device]
-    for option, given in (("--passes", passes), ("--text-encoder", text_encoder), ("--task-file", task_file)):
-        command += [] if given is None else [option, given]
-    command += ["--plans", *plans] if plans else []
+    typed: dict[str, Any] = {"preset": preset, "episodes": episodes, "seeds": seeds, "methods": methods, "plans": plans}
+    typed |= {"passes": passes, "text_encoder": text_encoder, "task_file": task_file, "device": device, "out": out}
+    command = command_line("reproduce", experiment, **typed)
     return schedule.execute(Output(json), [datasets], [jobs], command, lambda: _summarize(runs, load, out))
 
 

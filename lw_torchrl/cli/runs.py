@@ -46,7 +46,7 @@ class Schedule:
         output: Output,
         shared: Sequence[Mapping[str, Job]],
         runs: Sequence[Mapping[str, Job]],
-        command: Sequence[object],
+        command: Sequence[str],
         summarize: Callable[[], Mapping[str, Any]],
         told: Callable[[lw.EvaluationResult], str] = lambda result: "",
     ) -> Output:
@@ -80,7 +80,7 @@ class Schedule:
             _report(len(names), (line(name)[1] for name in names))
         else:
             for stage in map(list, (*shared, *runs)):
-                commands = [[*map(str, command), "--run", name] for name in stage]
+                commands = [[*command, "--run", name] for name in stage]
                 ended = run_commands(commands, self.launcher, self.jobs)
                 _report(len(stage), (printed.strip() or stage[index] for index, printed in ended))
         return output.show("summaries", summarize())
@@ -88,6 +88,15 @@ class Schedule:
 
 Scheduled = Annotated[Schedule, OmitArgPrefixes]
 """The options of a :class:`Schedule`, of a command."""
+
+
+def command_line(*words: str, **options: Any) -> list[str]:
+    """A command as it is typed; options that are None, or lists of nothing, are left out."""
+    found = [*words]
+    for name, value in options.items():
+        values = value if isinstance(value, tuple) else () if value is None else (value,)
+        found += [f"--{name.replace('_', '-')}", *map(str, values)] if values else []
+    return found
 
 
 def _report(total: int, lines: Iterator[str]) -> None:

@@ -1,7 +1,5 @@
 """A replay buffer of datasets whose state is one file: the rows stay in their datasets, and no pickle is read."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
@@ -15,8 +13,7 @@ from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers.storages import Storage
 
 from lw_torchrl._files import AnyPath, reading
-from lw_torchrl._state_tree import join, split
-from lw_torchrl._tensor_archive import TensorArchive, write_archive
+from lw_torchrl._tensor_archive import TensorArchive, join, split, write_archive
 from lw_torchrl.data.dataset import Demonstrations, read_metadata
 from lw_torchrl.data.memory_map import verify
 from lw_torchrl.data.selection import JoinedDemonstrations

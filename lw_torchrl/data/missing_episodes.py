@@ -1,7 +1,5 @@
 """The episodes of an unfinished dataset: a file for each one that was run, and running the missing ones."""
 
-from __future__ import annotations
-
 import errno
 import stat
 import zipfile

@@ -1,7 +1,5 @@
 """Passes over groups of rows, updated as rows come and go; their state, checked."""
 
-from __future__ import annotations
-
 from reprlib import repr as short
 from typing import Any
 

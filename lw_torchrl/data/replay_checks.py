@@ -1,7 +1,5 @@
 """What a replay buffer of demonstrations refuses, and a training on any buffer, since it would go wrong silently."""
 
-from __future__ import annotations
-
 import inspect
 import warnings
 from collections.abc import Iterable, Mapping, Sequence

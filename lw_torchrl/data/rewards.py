@@ -1,7 +1,5 @@
 """The rewards that rows are shown with, and their discounted sums over n steps."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

@@ -1,7 +1,5 @@
 """The rows that a growing buffer stores: checked, and linked to trajectories."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -9,7 +7,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._state_tree import check_like
+from lw_torchrl._tensor_archive import check_like
 from lw_torchrl.data.rewards import STEPS
 from lw_torchrl.data.storage import DONE, TRAJECTORY, column_name
 from lw_torchrl.language.value_checks import finite

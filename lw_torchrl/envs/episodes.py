@@ -1,7 +1,5 @@
 """Running exactly the requested episodes, on any number of rows: what collecting and evaluating share."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Which of TorchRL's workers makes an environment, found on the call stack; and a lock for one thread at a time."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Mapping
 from functools import wraps

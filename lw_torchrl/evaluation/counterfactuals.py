@@ -1,7 +1,5 @@
 """Counterfactuals: failed episodes run again with one part of what acted replaced by a sound one."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import deepcopy

@@ -1,8 +1,6 @@
 """What the states of a failed episode tell: which answers were wrong, where the plan departs from a reference, which
 step it ended in."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """How evaluations run episodes: what stands between environment and actor, which explores nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from typing import Any

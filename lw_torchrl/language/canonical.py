@@ -70,6 +70,7 @@ class CanonicalStep:
         moved, target: what is to arrive where: names of the task's objects, or "target location", the goal.
         manner: what it is done for.
         direction: where a thing is pushed, pulled or moved to; of a hand that comes to do so, too.
+        toward: what a direction "goal" is to; None for the task's goal.
         written: the skill's own words; "" for a step that the plan lacked.
         sure: from 0, a guess, to 1, said in words.
     """
@@ -82,13 +83,14 @@ class CanonicalStep:
     direction: Direction | None = None
     written: str = ""
     sure: float = 1.0
+    toward: str | None = None
 
     @property
     def skill(self) -> str:
         """The step in one wording for all plans, "carry the mug to the target location"."""
         said = _SAID[self.verb].format(moved=self.moved, target=self.target)
         way = "" if self.direction is None else _WAYS.get(self.direction, self.direction)
-        way = "toward the target location" if way == "goal" else way
+        way = f"toward the {self.toward or GOAL}" if way == "goal" else way
         if self.verb == "move" and way:
             return f"slide the {self.moved} {way}"
         if self.verb in ("push", "pull"):
@@ -250,10 +252,19 @@ def _steps(plan: ConditionalPlan, read: Sequence[Reading | None]) -> tuple[Canon
             manner = _manner(one)
         target, moved = str(one.target), str(one.moved)
         if moved == GRIPPER and first is not None and same_thing(task, target, first):
-            target = point_on(task, target)
+            target = _compared_point(step, task, target) or point_on(task, target)
         condition = _at_points(step.condition, task)
-        steps.append(CanonicalStep(condition, verb, moved, target, manner, direction, step.skill, one.sure))
+        toward = purpose.toward if direction == "goal" and purpose is not None else None
+        steps.append(CanonicalStep(condition, verb, moved, target, manner, direction, step.skill, one.sure, toward))
     return tuple(_over_walls(steps, task))
+
+
+def _compared_point(step: PlanStep, task: Task, thing: str) -> str | None:
+    """The point on a thing that a step's condition compares with the gripper; None if there is none."""
+    pairs = [(clause.subject, clause.object) for clause in step.condition.clauses if clause.object is not None]
+    near = [b if a == GRIPPER else a for a, b in pairs if GRIPPER in (a, b)]
+    points = (one for one in near if any(role_object(task, one).offset) and same_thing(task, one, thing))
+    return next(points, None)
 
 
 def _purpose(ahead: Sequence[Reading]) -> Reading | None:
@@ -308,7 +319,7 @@ def _is_complete(steps: Sequence[CanonicalStep]) -> bool:
     moving = [number for number, verb in enumerate(verbs) if verb in ("carry", "move")]
     if any(one.verb == "pull" and "handle" not in one.target.split() for one in steps):
         return False  # a handle can be hooked; anything else is held better in closed fingers
-    if _motion(steps) is None and "hold" not in verbs:
+    if _motion(steps) is None:
         return False
     if not moving:
         return True
@@ -364,12 +375,18 @@ def _touched(task: Task, steps: Sequence[CanonicalStep]) -> str:
     return point_on(task, found)
 
 
+def _has_sides(steps: Sequence[CanonicalStep]) -> bool:
+    """Whether a plan pushes a thing from several sides, and says for each how to come there."""
+    sides = {one.target for one in steps if one.verb == "push"}
+    return len(sides) > 1 and all(any(one.target == side and one.verb in _BY_HAND for one in steps) for side in sides)
+
+
 def _trust(task: Task, steps: Sequence[CanonicalStep]) -> float:
     """In which share of usual states of a motion a step is in force, and all that are do what the motion needs."""
     last = _motion(steps)
     if last is None:
         return 0.0
-    if last.manner == "reach":
+    if last.manner == "reach" or _has_sides(steps):
         return 1.0
     import torch  # here, since words alone should not wait for it
 

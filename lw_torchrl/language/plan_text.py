@@ -1,7 +1,5 @@
 """Plans as text: what chain_py, the format of .plan files, is written with, and how it is read, strictly."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from typing import Any

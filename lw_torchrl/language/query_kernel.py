@@ -1,7 +1,5 @@
 """The compiled path of :class:`~lw_torchrl.QueryProgram`: one pass over a batch; needs Numba, ``lw_torchrl[fast]``."""
 
-from __future__ import annotations
-
 from math import sqrt
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What the relations mean: comparisons of d = first position - second position, in metres, of data/relations.toml."""
 
-from __future__ import annotations
-
 import re
 from collections import ChainMap, UserDict
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """SkillProgram: the scripted skills of many tasks as index tensors, run for a mixed batch in one call."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 

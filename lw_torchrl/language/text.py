@@ -1,7 +1,5 @@
 """Text encoders: English to vectors. Those of the shipped texts come with the package; other texts need the extra."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from functools import lru_cache

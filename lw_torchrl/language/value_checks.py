@@ -1,7 +1,5 @@
 """Checks of tensors' values: at once where Python may look at the numbers, by the device itself where it may not."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -42,7 +42,8 @@ class Reading:
         verb: what is done.
         moved: what is to arrive at the target: the robot's gripper, or a thing that it holds; None if unknown.
         target: the object or point to go to; None if unknown.
-        direction: where a thing is pushed, pulled or moved to; "goal" from the thing to the task's goal.
+        direction: where a thing is pushed, pulled or moved to; "goal" from the thing to what it is brought to.
+        toward: what that is; None for the task's goal.
         lifted: whether what is carried goes through the air.
         sure: 1 where the words say it, less where the condition, or what is usual, had to.
     """
@@ -53,6 +54,7 @@ class Reading:
     direction: Direction | None = None
     lifted: bool = False
     sure: float = 1.0
+    toward: str | None = None
 
 
 def role_object(task: Task, name: str) -> NamedObject:
@@ -155,7 +157,15 @@ def read_steps(plan: ConditionalPlan) -> tuple[Reading | None, ...]:
     read = [
         _Step(step, task, text, one, grasping).read() for step, text, one in zip(plan.steps, texts, facts, strict=True)
     ]
+    if not any(one and one.verb not in ("approach", "descend", "beside") for one in read):
+        read = [_sent(one, text) for one, text in zip(read, texts, strict=True)]
     return tuple(_pushed_or_pulled(read))
+
+
+def _sent(read: Reading | None, text: str) -> Reading | None:
+    """ "move the gripper to the block", in a plan that does nothing with it, is all that there is to do."""
+    to_it = read is not None and read.verb == "descend" and re.match(rf"\w+ <{GRIPPER}> (?:to|at|toward|onto) <", text)
+    return replace(read, verb="reach") if read is not None and to_it else read
 
 
 def _grasps(text: str, facts: _Facts) -> bool:
@@ -285,8 +295,11 @@ class _Step:
         if self.verb in _VERBS["pull"] or direction == "toward" or "out" in self.words:
             return Reading("pull", GRIPPER, moved, direction or "goal")
         pushed = self.verb in _VERBS["push"] or direction is not None
+        toward = None if direction is not None or target is None or is_goal(self.task, target) else target
         lifted = self.verb in _VERBS["carry"]
-        return Reading("push", GRIPPER, moved, direction or "goal", lifted=lifted, sure=1.0 if pushed else 0.5)
+        return Reading(
+            "push", GRIPPER, moved, direction or "goal", lifted=lifted, sure=1.0 if pushed else 0.5, toward=toward
+        )
 
     def _target(self, thing: str) -> str | None:
         """Where a thing is moved to, by the words, or by what the condition compares it with."""

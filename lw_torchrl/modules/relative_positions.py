@@ -15,7 +15,7 @@ from lw_torchrl.language.layout import places
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, coordinate_indices
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.language.wording import role_object
+from lw_torchrl.language.wording import GOAL, role_object
 from lw_torchrl.modules.observation_features import squash
 from lw_torchrl.transforms.random_yaw import turn_observation, turn_vectors
 
@@ -137,7 +137,6 @@ class PlanRoles(RelativePositions):
     pushes: Tensor
     lifts: Tensor
     direction: Tensor
-    to_goal: Tensor
 
     def __init__(
         self, canonical: Mapping[str, CanonicalPlan], tables: PlanTables, noise: float = 0.0, jitter: float = 0.0
@@ -146,13 +145,22 @@ class PlanRoles(RelativePositions):
             steps = canonical[plan.task].steps
             return [[tuple(role_object(plan.definition, name) for name in (one.moved, one.target))] for one in steps]  # type: ignore[list-item]
 
+        def ahead(plan: ConditionalPlan) -> list[list[Pair]]:
+            task = plan.definition
+            x, y, z = places(task.layout.positions[1])
+            thing = NamedObject("first thing", (x, y, z))
+            return [
+                [(thing, role_object(task, step.toward or GOAL))] if step.direction == "goal" else []
+                for step in canonical[plan.task].steps
+            ]
+
         plans = Plans([one.plan for one in canonical.values()])
         super().__init__(plans, tables, moved_to_target, 1, noise)
         self.width += 3
         self.jitter = check_scale("jitter", jitter)
         self.tables = tables
         shape = len(plans), plans.num_steps
-        at_contact, acts, pushes, lifts, to_goal = (torch.zeros(shape, dtype=torch.bool) for _ in range(5))
+        at_contact, acts, pushes, lifts = (torch.zeros(shape, dtype=torch.bool) for _ in range(4))
         direction = torch.zeros(*shape, 3)
         for task, found in canonical.items():
             for number, step in enumerate(found.steps):
@@ -163,7 +171,6 @@ class PlanRoles(RelativePositions):
                 acts[at] = _is_first(found.written, step.moved) or (at_contact[at] and touches)
                 pushes[at] = step.verb in ("push", "pull")
                 lifts[at] = step.verb == "carry"
-                to_goal[at] = step.direction == "goal"
                 if step.verb == "move":  # a place beside where it is
                     self.offset[at] += _AWAY * way
                 else:
@@ -171,7 +178,7 @@ class PlanRoles(RelativePositions):
         for name, table in (("at_contact", at_contact), ("acts", acts), ("pushes", pushes), ("lifts", lifts)):
             self.register_buffer(name, table, persistent=False)
         self.register_buffer("direction", direction, persistent=False)
-        self.register_buffer("to_goal", to_goal, persistent=False)
+        self.ahead = RelativePositions(plans, tables, ahead, 1)
         self.register_buffer("contact", torch.zeros(len(plans), 3))
         self.register_buffer("demonstrated", torch.zeros(len(plans), dtype=torch.bool))
         self.register_buffer("fitted", torch.tensor(False))
@@ -237,10 +244,8 @@ class PlanRoles(RelativePositions):
         """As :meth:`positions`, to (..., 3) float32, the direction of the step in force."""
         if yaw is not None:
             observation = turn_observation(observation, -yaw, self.layout)
-        _, thing, *_, goal = self.layout.positions
-        ahead = observation[..., goal] - observation[..., thing]
-        ahead = ahead / ahead.norm(dim=-1, keepdim=True).clamp(min=0.02)
-        each = self.direction[rows] + self.to_goal[rows].unsqueeze(-1) * ahead.unsqueeze(-2)
+        ahead = self.ahead.of_steps(observation, rows).squeeze(-2)
+        each = self.direction[rows] + ahead / ahead.norm(dim=-1, keepdim=True).clamp(min=0.02)
         found = (weights.unsqueeze(-1) * each).sum(-2)
         return found if yaw is None else turn_vectors(found, yaw)
 

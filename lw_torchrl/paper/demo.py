@@ -1,7 +1,5 @@
 """The demo: demonstrations, a plan-conditioned policy, its evaluation and a recording, in one go."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any

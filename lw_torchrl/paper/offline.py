@@ -1,7 +1,5 @@
 """Offline runs: advantages and policies that are learned from mixtures of behaviours, and the tables of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs: what every run of an experiment is, how it is executed, and how results are compared."""
 
-from __future__ import annotations
-
 import json
 import time
 from abc import ABC, abstractmethod

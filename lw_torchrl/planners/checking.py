@@ -1,7 +1,5 @@
 """check_plan: what a plan was taken for, and which of its conditions hold in the states of episodes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from torch import Tensor

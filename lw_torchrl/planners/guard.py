@@ -1,7 +1,5 @@
 """What a model on this machine may be asked, and the guard before its server: few kinds of requests, one by one."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import Callable, Collection

@@ -1,7 +1,5 @@
 """repair_plans: the model that wrote a plan is told what became of it, and writes another."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any

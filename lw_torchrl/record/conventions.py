@@ -1,7 +1,5 @@
 """What all parts of a recording share: entity paths, timelines, colours."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

@@ -1,7 +1,5 @@
 """What training logs: curves, histograms, images, videos and hyperparameters, checked and sent to a recording."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterable, Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """The program ``rerun``, which recording is meant, and what of it a viewer opens: a whole file, at a tab and a step."""
 
-from __future__ import annotations
-
 import os
 import re
 import socket

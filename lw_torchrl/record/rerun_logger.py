@@ -27,8 +27,8 @@ from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.record import metrics
 from lw_torchrl.record.conventions import CONTROL_PERIOD, METRIC_TIMELINE, entity_path, rr, time_columns
 from lw_torchrl.record.metrics import check_name
-from lw_torchrl.record.mujoco_scene import Motion
 from lw_torchrl.record.recorded_episode import PlanLike, RecordedEpisode
+from lw_torchrl.record.scene import Motion
 from lw_torchrl.record.tabs import TABS, Layout, send_page
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.record.writer import RecordingWriter, check_address, check_path

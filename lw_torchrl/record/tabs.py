@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 
 from lw_torchrl._checks import unknown_name
 from lw_torchrl.record.conventions import EPISODE_TIMELINE, METRIC_TIMELINE, SECONDS_TIMELINE, entity_path, rr, rrb
-from lw_torchrl.record.mujoco_scene import Motion
 from lw_torchrl.record.recorded_episode import RecordedEpisode
-from lw_torchrl.record.scene import log_scene
+from lw_torchrl.record.scene import Motion, log_scene
 from lw_torchrl.record.verdict import Heading, decisive_step, log_curves, log_plan, log_timeline, telling_steps, verdict
 
 Point = tuple[float, float, float]

@@ -1,7 +1,5 @@
 """What a page says of an episode: heading and verdict, the timeline, the plan at the cursor, and the curves."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -4,8 +4,6 @@ Rerun's own file sink is not used, for a flush never returns where its disk is f
 that ours does), nor its connection, which waits for a viewer, seconds at each call.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -8,8 +8,6 @@
 Nothing is unpickled, and what the file says of sizes is held against what it holds before anything is made.
 """
 
-from __future__ import annotations
-
 import json
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -22,8 +20,7 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import differences, shown
 from lw_torchrl._files import AnyPath
-from lw_torchrl._state_tree import join, split
-from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
+from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, join, split, write_archive
 from lw_torchrl._versions import LIBRARIES, warn_of_other_versions
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.training.file_checks import check_integers, check_size, check_texts, copy_weights, first_line

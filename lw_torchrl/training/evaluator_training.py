@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import checked_but, passes_on
-from lw_torchrl._state_tree import check_like, check_optimizer_state
+from lw_torchrl._tensor_archive import check_like, check_optimizer_state
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator

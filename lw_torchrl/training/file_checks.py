@@ -1,7 +1,5 @@
 """What weights, texts and sizes a module and its file must have, so that one can be made of the other."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -9,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from lw_torchrl._state_tree import check_like
+from lw_torchrl._tensor_archive import check_like
 from lw_torchrl.language.text import TEXT_DIMENSION, TextEncoder
 
 _TEXT_TOLERANCE = 0.01  # of numbers of size 1: more than machines differ, far less than encoders do

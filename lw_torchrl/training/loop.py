@@ -21,7 +21,7 @@ from lw_torchrl._checks import check_int, checked
 from lw_torchrl._devices import CPU, drawn_on
 from lw_torchrl._files import AnyPath, held, sweep
 from lw_torchrl._progress import Progress
-from lw_torchrl._state_tree import check_like, check_optimizer_state, check_same
+from lw_torchrl._tensor_archive import check_like, check_optimizer_state, check_same
 from lw_torchrl._versions import LIBRARIES
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.training.envelope import Envelope

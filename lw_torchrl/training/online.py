@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from lw_torchrl._checks import checked_but, passes_on
 from lw_torchrl._devices import CPU, drawn_on
 from lw_torchrl._progress import Progress
-from lw_torchrl._state_tree import check_like
+from lw_torchrl._tensor_archive import check_like
 from lw_torchrl._versions import LIBRARIES, SIMULATORS
 from lw_torchrl.data.co_learning_sampler import GROWN, CoLearningSampler
 from lw_torchrl.data.growing import GrowingStorage

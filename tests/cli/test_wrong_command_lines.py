@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from lw_torchrl.cli import offline, online, options
+from lw_torchrl.cli import online, options
 from lw_torchrl.cli.main import COMMANDS, GROUPS
 
 HEAVY = ("torch", "torchrl", "mujoco", "metaworld", "rerun", "matplotlib")
@@ -245,6 +245,6 @@ def test_the_words_of_the_command_line_are_those_of_the_library():
 
     assert tuple(BEHAVIOURS) == options.ACTORS
     assert tuple(METHODS) == get_args(options.Condition)
-    assert get_args(offline.Mixture) == tuple(MIXTURES)
-    assert get_args(offline.OfflineMethod) == tuple(OFFLINE_METHODS)
+    assert get_args(online.Mixture) == tuple(MIXTURES)
+    assert get_args(online.OfflineMethod) == tuple(OFFLINE_METHODS)
     assert online.WEAKEST == WEAKEST

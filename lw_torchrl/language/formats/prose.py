@@ -1,7 +1,5 @@
 """Plans in prose, "- When C, the robot should S.", written, and read as models really write them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import replace

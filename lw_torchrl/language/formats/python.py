@@ -1,7 +1,5 @@
 """Plans that look like Python, written, and read as models really write them; never executed."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

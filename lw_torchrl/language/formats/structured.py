@@ -1,7 +1,5 @@
 """Plans as JSON: what a model writes that is held to a schema, and what else looks like it."""
 
-from __future__ import annotations
-
 import json
 import re
 from typing import Any

@@ -1,14 +1,56 @@
-"""gymnasium-robotics' Fetch tasks: an arm with a parallel gripper reaches, pushes, slides and picks up."""
+"""gymnasium-robotics' Fetch tasks: an arm with a parallel gripper reaches, pushes, slides and picks up;
+what its numbers mean, its words, and what simulates it.
+"""
 
+from importlib.resources import files
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from lw_torchrl.suites.fetch.words import FETCH, TASKS, load_plans, load_skills
+from lw_torchrl._files import read_toml
+from lw_torchrl.language import plan_files, skills
+from lw_torchrl.language.layout import Layout, Slot
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.skills import Skills
+from lw_torchrl.language.tasks import Task, TaskError, Tasks
 from lw_torchrl.suites.suite import Suite
 
 if TYPE_CHECKING:
     from lw_torchrl.suites.fetch.engine import FetchEngine
 
 __all__ = ["FETCH", "TASKS", "FetchEngine", "load_plans", "load_skills", "make_suite"]
+
+_DATA = files("lw_torchrl.suites.fetch") / "data"
+
+HELD = 0.55
+"""The opening below which the fingers hold the puck, with edges of 5 cm; their pads reach it at 0.48."""
+FETCH = Layout(
+    "fetch",
+    25,
+    hand=0,
+    opening=3,
+    things=(Slot(4, 7),),
+    goal=22,
+    past=11,
+    reach=0.032,
+    binary_gripper=True,
+    thresholds={"open": HELD, "closed": HELD},
+)
+"""The 25 numbers of an observation: hand, opening, puck and its quaternion, the same 11 a step before, goal."""
+
+TASKS: Tasks = MappingProxyType(
+    {name: Task.from_json(name, row, FETCH) for name, row in sorted(read_toml(_DATA / "tasks.toml", TaskError).items())}
+)
+"""The four names, sorted, to their :class:`~lw_torchrl.language.tasks.Task`."""
+
+
+def load_skills() -> Skills:
+    """The scripted skills by their text: Fetch's, and Meta-World's under other texts."""
+    return skills.load_skills(str(_DATA / "skills.toml"), tasks=TASKS)
+
+
+def load_plans() -> Plans:
+    """A plan for each task, every step with a scripted skill of :func:`load_skills`."""
+    return plan_files.load_plans(str(_DATA / "plans"), tasks=TASKS)
 
 
 def make_suite() -> Suite:

@@ -1,6 +1,7 @@
-"""The Fetch engine: gymnasium-robotics bit for bit, its physics in threads."""
+"""The Fetch engine: gymnasium-robotics bit for bit, its physics in threads, its numbers in our axes.
 
-from __future__ import annotations
+Fetch's x points away from the robot, its y to the left, its z up from the floor; lengths are metres in both.
+"""
 
 from collections.abc import Sequence
 from contextlib import redirect_stderr
@@ -16,12 +17,43 @@ from numpy.typing import NDArray
 from lw_torchrl._checks import check_choice
 from lw_torchrl._rendering import naming_absent_renderer
 from lw_torchrl.suites.engine import BodyPoses, RowModel
-from lw_torchrl.suites.fetch import frame
-from lw_torchrl.suites.fetch.words import FETCH
+from lw_torchrl.suites.fetch import FETCH
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
 from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask
 from lw_torchrl.suites.metaworld.vectorized.simulated_rows import ThreadedEngine
 from lw_torchrl.suites.metaworld.vectorized.task_programs import WARNED_ALREADY
+
+HAND_HEIGHT = 0.03
+"""Metres of the hand above Fetch's grip site, which is between the finger pads. Meta-World's hand is as high above what
+it holds, so "near" and the other relations mean the same."""
+OPEN = 0.1
+"""Metres between the fingers, of an open gripper."""
+
+
+def our_positions(positions: Array, origin: Array) -> Array:
+    """Positions in Fetch's axes, (..., 3) float64, seen from ``origin`` (..., 3), which is in Fetch's axes too."""
+    way = positions - origin
+    return np.stack((-way[..., 1], way[..., 0], way[..., 2]), -1)
+
+
+def our_quaternions(quaternions: Array) -> Array:
+    """Fetch's quaternions (..., 4) float64, w first, with the axis of rotation in our axes. So that of a thing which
+    was not turned stays (1, 0, 0, 0)."""
+    w, x, y, z = np.moveaxis(quaternions, -1, 0)
+    return np.stack((w, -y, x, z), -1)
+
+
+def turned_quaternions(quaternions: Array) -> Array:
+    """Orientations of bodies (..., 4) float64, w first, in Fetch's axes, as they are in ours: turned by a quarter."""
+    w, x, y, z = np.moveaxis(quaternions, -1, 0)
+    return np.sqrt(0.5) * np.stack((w - z, x - y, x + y, w + z), -1)
+
+
+def fetch_actions(action: NDArray[Any]) -> NDArray[Any]:
+    """The actions of gymnasium-robotics that equal ours, (..., 4) of the same dtype: displacement x, y, z, where 1 asks
+    for 5 cm, and the gripper's effort, where +1 opens. Ours go to the right, away and up, and +1 closes."""
+    return np.stack((action[..., 1], -action[..., 0], action[..., 2], -action[..., 3]), -1)
+
 
 CAMERAS = ("external_camera_0", "head_camera_rgb", "gripper_camera_rgb", "lidar")
 """The cameras of Fetch's scenes."""
@@ -135,7 +167,7 @@ class FetchEngine(ThreadedEngine):
 
     Observations have 25 numbers (:data:`~lw_torchrl.suites.fetch.FETCH`), in metres and in Meta-World's axes. Reach has
     no thing: its numbers are zeros, and its goal is where the hand shall be, 3 cm above the grip site's goal. A
-    quaternion has its axis in our axes, see :func:`~lw_torchrl.suites.fetch.frame.our_quaternions`.
+    quaternion has its axis in our axes, see :func:`~lw_torchrl.suites.fetch.engine.our_quaternions`.
 
     A row faults when its action is not finite, or when its simulation becomes unstable. It then repeats its last stable
     observation and is not simulated until it is reset.
@@ -175,13 +207,13 @@ class FetchEngine(ThreadedEngine):
 
     def _observe_first(self, rows: Index) -> None:
         now = self._now(rows)
-        goal = frame.our_positions(self._goal[rows], self._origin[rows])
-        goal[:, 2] += np.where(self._has_thing[rows], 0.0, frame.HAND_HEIGHT)
+        goal = our_positions(self._goal[rows], self._origin[rows])
+        goal[:, 2] += np.where(self._has_thing[rows], 0.0, HAND_HEIGHT)
         self._observation[rows] = np.concatenate((now, now, goal), axis=1)
 
     def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
         warnings = np.full((len(action), 3), WARNED_ALREADY, dtype=np.int32)
-        theirs = frame.fetch_actions(np.clip(action, -1, 1))
+        theirs = fetch_actions(np.clip(action, -1, 1))
         displacement = (theirs[:, :3] * _METRES).astype(np.float64)  # multiplied in the action's own precision
         effort = theirs[:, 3].astype(np.float64)
 
@@ -205,18 +237,18 @@ class FetchEngine(ThreadedEngine):
         """The first 11 numbers of the rows' observations."""
         read, origin = self._read[rows], self._origin[rows]
         now = np.zeros((len(rows), _NOW))
-        now[:, :3] = frame.our_positions(read[:, :3], origin)
-        now[:, 2] += frame.HAND_HEIGHT
-        now[:, 3] = np.clip((read[:, 3] + read[:, 4]) / frame.OPEN, 0.0, 1.0)
+        now[:, :3] = our_positions(read[:, :3], origin)
+        now[:, 2] += HAND_HEIGHT
+        now[:, 3] = np.clip((read[:, 3] + read[:, 4]) / OPEN, 0.0, 1.0)
         thing = self._has_thing[rows]
-        now[thing, 4:7] = frame.our_positions(read[thing, 5:8], origin[thing])
-        now[thing, 7:] = frame.our_quaternions(read[thing, 8:])
+        now[thing, 4:7] = our_positions(read[thing, 5:8], origin[thing])
+        now[thing, 7:] = our_quaternions(read[thing, 8:])
         return now
 
     def poses(self, row: int) -> BodyPoses:
         """Where all bodies of a row are now, in our axes."""
         position, quaternion = super().poses(row)
-        return BodyPoses(frame.our_positions(position, self._origin[row]), frame.turned_quaternions(quaternion))
+        return BodyPoses(our_positions(position, self._origin[row]), turned_quaternions(quaternion))
 
     def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
         """As :meth:`SeenRows.render`, by one of Fetch's own cameras."""

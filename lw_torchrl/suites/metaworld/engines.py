@@ -1,7 +1,5 @@
 """The simulators: Meta-World's own environments in a loop, and the fast engine with the same numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The plain engine: Meta-World's own environments, one per row, stepped in a loop."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Literal
 

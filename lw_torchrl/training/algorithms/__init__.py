@@ -40,14 +40,6 @@ def method_config(method: str, given: OnlineConfig | None = None) -> OnlineConfi
 
 
 __all__ = [
-    "LEARNERS",
-    "AdvantageConfig",
-    "ExpertIterationConfig",
-    "Learner",
-    "OnlineConfig",
-    "PPOConfig",
-    "ResidualConfig",
-    "SACConfig",
-    "TD3Config",
-    "method_config",
-]
+    "LEARNERS", "AdvantageConfig", "ExpertIterationConfig", "Learner", "OnlineConfig", "PPOConfig", "ResidualConfig",
+    "SACConfig", "TD3Config", "method_config",
+]  # fmt: skip

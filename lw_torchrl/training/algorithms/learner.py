@@ -15,7 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule, SoftUpdate
 
 from lw_torchrl._checks import Count, Natural, Probability, Scale, check_fields
-from lw_torchrl._state_tree import check_like, check_optimizer_state
+from lw_torchrl._tensor_archive import check_like, check_optimizer_state
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.critics import QValue
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorEncoder

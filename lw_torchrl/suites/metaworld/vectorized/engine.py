@@ -1,7 +1,5 @@
 """The fast engine: Meta-World bit for bit, at nearly the speed of its physics."""
 
-from __future__ import annotations
-
 import weakref
 from collections.abc import Sequence
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """What is read from the states after each step, and the observations and successes made of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Simulated rows, each a MuJoCo state on a shared model, and engines whose threads work through groups of rows."""
 
-from __future__ import annotations
-
 import os
 from abc import abstractmethod
 from collections import defaultdict, deque

@@ -1,7 +1,5 @@
 """The tables of all tasks: data/simulation.toml (observation, success) and data/rewards.toml, read and checked."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Mapping

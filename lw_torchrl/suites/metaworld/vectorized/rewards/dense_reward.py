@@ -1,7 +1,5 @@
 """Meta-World's dense reward of many rows at once, bit for bit."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

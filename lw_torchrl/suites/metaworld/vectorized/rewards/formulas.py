@@ -1,7 +1,5 @@
 """The formula of each kind of reward, and the lifts: how well a held object is on its way to the goal."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.suites.metaworld.vectorized import observation as at
+from lw_torchrl.suites.metaworld.vectorized import tables
 from lw_torchrl.suites.metaworld.vectorized.observation import Array, Mask, row_norm
 from lw_torchrl.suites.metaworld.vectorized.tables import FIRST_DISTANCE, POINTS, Cage, Funnel, Held, TaskReward, Term
 
@@ -28,7 +29,7 @@ COLUMNS = {point: list(range(FEATURES)[columns]) for point, columns in zip(POINT
 
 NEAR, PLACED, VIA, ACROSS = range(4)
 
-_DTYPES = {"bool": np.bool_, "int": np.intp, "float": np.float64, "Vector": np.float64, "Pair": np.float64}
+_DTYPES = {bool: np.bool_, int: np.intp, float: np.float64, tables.Vector: np.float64, tables.Pair: np.float64}
 _NO_CAGE = Cage(radius=0.0, pad=0.0, across=0.0)
 _NO_FUNNEL = Funnel(over="hand", about=("object",), rim=0.0, slope=0.0, height=0.0)
 
