@@ -21,8 +21,7 @@ def test_every_step_has_a_scripted_skill_and_is_read():
         assert {step.skill for step in plan.steps} <= set(allowed)
         found = canonical_plan(plan)
         assert found.left_out == ()
-        four_sides = plan.task in ("fetch/push", "fetch/slide")  # which is no usual way to push
-        assert found.source == ("completed" if four_sides else "plan")
+        assert (found.source, found.trust) == ("plan", 1.0)
 
 
 def test_plans_and_tasks_can_be_saved(tmp_path):
