@@ -49,7 +49,7 @@ def reproduce(
     schedule: Scheduled,  # which runs are done, and where
     seeds: tuple[int, ...] = (0, 1, 2),  # of the demonstrations, the initial weights and the minibatches
     methods: tuple[Method, ...] | None = None,
-    preset: Literal["strong", "paper", "evaluator"] = "strong",
+    preset: Literal["strong", "paper", "evaluator", "no-roles"] = "strong",
     passes: int | None = None,  # over the rows, fewer than the 500 of the preset paper
     plans: tuple[str, ...] = (),
     task_file: options.TaskFile = None,
@@ -74,8 +74,8 @@ def reproduce(
             each MT10 task and 1 of the target; scripted, plans with scripted skills; or all of them.
         methods: conditioned on plans, on the task's description, on the task's number; plans with scripted skills. By
             default all; with --plans, those that are trained.
-        preset: strong, ours; paper, the published recipe, which takes hours; or evaluator, in few-shot, ours with
-            conditions answered by a network that is trained inside the policy.
+        preset: strong, ours; paper, the published recipe, which takes hours; evaluator, in few-shot, ours with
+            conditions answered by a network that is trained inside the policy; or no-roles, in zero-shot.
         plans: of all 50 tasks, instead of ours: .plan files, .json files of pairs, folders, or MT50. If several have a
             plan for a task, the last one counts.
     """
@@ -95,11 +95,11 @@ def reproduce(
     from lw_torchrl.paper.runs import execute_run
 
     recipes = PRESETS[preset]
-    if preset == "evaluator":
+    if preset in ("evaluator", "no-roles"):
         if experiment not in recipes:
-            raise ValueError(f"--preset evaluator is for {', '.join(recipes)}, got {experiment}")
+            raise ValueError(f"--preset {preset} is for {', '.join(recipes)}, got {experiment}")
         if methods not in (None, ("pcbc",)):
-            raise ValueError("--methods must be pcbc with --preset evaluator: others ask no conditions")
+            raise ValueError(f"--methods must be pcbc with --preset {preset}: others have no plans")
         methods = ("pcbc",)
     if passes is not None:
         recipes = {name: replace(recipe, passes=passes) for name, recipe in recipes.items()}
