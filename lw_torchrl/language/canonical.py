@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal, get_args
 
 from lw_torchrl._checks import checked
@@ -11,12 +12,14 @@ from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.skills import WORDS
-from lw_torchrl.language.tasks import Task, task_id
+from lw_torchrl.language.tasks import Task
+from lw_torchrl.language.usual_states import covered
 from lw_torchrl.language.wording import (
     GOAL,
     Direction,
     Reading,
     Verb,
+    compared_with_gripper,
     first_thing,
     is_goal,
     point_on,
@@ -121,7 +124,7 @@ class CanonicalPlan:
     read: tuple[CanonicalStep, ...] = ()
     left_out: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def plan(self) -> ConditionalPlan:
         """The steps as a plan, whose reasons hold what was written, and of the first the plan's trust."""
         steps = []
@@ -231,25 +234,9 @@ def _steps(plan: ConditionalPlan, read: Sequence[Reading | None]) -> tuple[Canon
     for number, (step, one) in enumerate(told):
         verb, direction = one.verb, one.direction
         purpose = _purpose([other for _, other in told[number:]] + [other for _, other in told[:number][::-1]])
+        manner = _manner(one)
         if verb in _BY_HAND:
-            pushes = purpose is not None and purpose.verb in ("push", "pull")
-            manner: Manner = "grasp"
-            if not grasping and purpose is not None:
-                manner = "reach" if purpose.verb in ("reach", "hold") else _manner(purpose)
-            if manner in ("push", "press"):
-                direction = purpose.direction if purpose is not None else None
-            elif direction is None and pushes and not grasping and purpose is not None:
-                direction = purpose.direction
-            elif manner == "grasp":
-                direction = None
-            if verb == "descend" and manner == "push":
-                verb = "beside"
-            elif verb == "descend" and manner == "press":
-                verb = "push"
-            elif verb == "beside" and manner not in ("push", "press"):
-                verb = "descend"
-        else:
-            manner = _manner(one)
+            verb, manner, direction = _coming(one, purpose if not grasping else None)
         target, moved = str(one.target), str(one.moved)
         if moved == GRIPPER and first is not None and same_thing(task, target, first):
             target = _compared_point(step, task, target) or point_on(task, target)
@@ -259,10 +246,22 @@ def _steps(plan: ConditionalPlan, read: Sequence[Reading | None]) -> tuple[Canon
     return tuple(_over_walls(steps, task))
 
 
+def _coming(one: Reading, purpose: Reading | None) -> tuple[Verb, Manner, Direction | None]:
+    """How a hand comes, with which verb, manner and direction, for a ``purpose``; None for one that grasps."""
+    if purpose is None:
+        return ("descend" if one.verb == "beside" else one.verb), "grasp", None
+    manner = _manner(purpose)
+    if manner == "push":
+        return ("beside" if one.verb == "descend" else one.verb), manner, purpose.direction
+    if manner == "press":
+        return ("push" if one.verb == "descend" else one.verb), manner, purpose.direction
+    direction = one.direction or (purpose.direction if manner == "pull" else None)
+    return ("descend" if one.verb == "beside" else one.verb), manner, direction
+
+
 def _compared_point(step: PlanStep, task: Task, thing: str) -> str | None:
     """The point on a thing that a step's condition compares with the gripper; None if there is none."""
-    pairs = [(clause.subject, clause.object) for clause in step.condition.clauses if clause.object is not None]
-    near = [b if a == GRIPPER else a for a, b in pairs if GRIPPER in (a, b)]
+    near = compared_with_gripper(step)
     points = (one for one in near if any(role_object(task, one).offset) and same_thing(task, one, thing))
     return next(points, None)
 
@@ -388,73 +387,8 @@ def _trust(task: Task, steps: Sequence[CanonicalStep]) -> float:
         return 0.0
     if last.manner == "reach" or _has_sides(steps):
         return 1.0
-    import torch  # here, since words alone should not wait for it
-
-    from lw_torchrl.language.query_program import QueryProgram
-
-    point = role_object(task, _touched(task, steps))
-    states, wanted = [], []
-    layout = task.layout
-    for offset, opening, lift, verbs in _USUAL["pull" if last.verb == "pull" else last.manner]:
-        state = torch.zeros(layout.size)
-        for place, xyz in zip(layout.positions[1:-1], _THINGS, strict=False):
-            state[place] = torch.tensor(xyz)
-        state[layout.positions[-1]] = torch.tensor((0.1, 0.8, 0.2))
-        at = [number for number in point.position if isinstance(number, int)]
-        if at:
-            state[at[-1]] += lift
-        where = [state[number] if isinstance(number, int) else torch.tensor(number) for number in point.position]
-        state[layout.positions[0]] = torch.stack(where) + torch.tensor(point.offset) + torch.tensor(offset)
-        state[layout.opening] = opening
-        states.append(state)
-        wanted.append(verbs)
-    program = QueryProgram({task: [step.condition for step in steps]})
-    truth = program(torch.stack(states), torch.full((len(states),), task_id(task.name)))
-    good = 0
-    for holds, verbs in zip(truth.tolist(), wanted, strict=True):
-        in_force = [step.verb for step, true in zip(steps, holds, strict=True) if true]
-        good += bool(in_force) and set(in_force) <= verbs
-    return good / len(states)
-
-
-_THINGS = ((0.0, 0.6, 0.02), (0.2, 0.7, 0.02), (-0.2, 0.7, 0.02), (0.0, 0.8, 0.02))
-_State = tuple[tuple[float, float, float], float, float, frozenset[str]]
-
-
-def _usual(*rows: tuple[Sequence[tuple[float, float, float]], float, float, str]) -> list[_State]:
-    return [(at, opening, lift, frozenset(verbs.split())) for hands, opening, lift, verbs in rows for at in hands]
-
-
-_COMING = (
-    ([(0.1, 0.1, 0.15), (-0.1, -0.05, 0.1)], 1.0, 0.0, "approach"),
-    ([(0.0, 0.0, 0.12), (0.008, 0.0, 0.06)], 1.0, 0.0, "descend"),
-)
-_USUAL: dict[str, list[_State]] = {
-    "grasp": _usual(
-        *_COMING,
-        ([(0.0, 0.0, 0.01), (0.01, -0.01, 0.02), (0.0, 0.01, 0.0)], 1.0, 0.0, "close"),
-        ([(0.0, 0.0, 0.01), (0.01, 0.0, 0.02), (0.0, 0.0, -0.01)], 0.4, 0.0, "close carry move"),
-        ([(0.0, 0.0, 0.01), (0.01, 0.0, 0.02), (0.0, 0.0, -0.01)], 0.4, 0.1, "carry move"),
-    ),
-    "pull": _usual(*_COMING, ([(0.0, 0.0, -0.01), (0.01, -0.01, -0.02), (0.0, 0.01, -0.03)], 1.0, 0.0, "pull")),
-    "press": _usual(
-        ([(0.1, 0.1, 0.15)], 0.3, 0.0, "approach"),
-        ([(0.0, 0.0, 0.1)], 0.3, 0.0, "push approach"),
-        ([(0.005, 0.0, 0.06), (0.005, 0.0, 0.03), (0.005, 0.0, 0.01)], 0.3, 0.0, "push"),
-    ),
-    "push": _usual(
-        ([(0.15, 0.1, 0.15)], 0.3, 0.0, "approach beside"),
-        ([(0.0, 0.0, 0.12)], 0.3, 0.0, "beside descend approach"),
-        (
-            [(0.0, 0.0, 0.0), (0.01, 0.0, 0.01), (0.0, 0.015, 0.0), (-0.015, 0.0, 0.0), (0.0, 0.0, 0.02)],
-            0.3,
-            0.0,
-            "push",
-        ),
-    ),
-}
-"""Where the hand may be from where it touches, metres; the gripper's opening; how far the thing was lifted, metres;
-and the verbs that do there what the motion needs."""
+    motion = "pull" if last.verb == "pull" else last.manner
+    return covered(task, _touched(task, steps), motion, [(step.condition, step.verb) for step in steps])
 
 
 def worth(plan: ConditionalPlan) -> tuple[bool, float, float]:

@@ -173,8 +173,8 @@ def _shipped_for(task: Task) -> Skills:
 
 WORDS: Mapping[str, Any] = read_toml(files("lw_torchrl.language") / "data" / "words.toml", ValueError)
 """The tables of data/words.toml."""
-_BEFORE_NOUN, _PUSHES, _CLOSES, _DIRECTIONS = (
-    frozenset(WORDS["in_skills"][name]) for name in ("before_noun", "pushes", "closes", "directions")
+_BEFORE_NOUN, _CLOSES, _DIRECTIONS = (
+    frozenset(WORDS["in_skills"][name]) for name in ("before_noun", "closes", "directions")
 )
 _LONGEST_BEFORE = max(map(len, _BEFORE_NOUN))
 
@@ -200,16 +200,6 @@ def _with_articles(details: str, task: Task) -> str:
     nouns = sorted({*task.object_names, "gripper"}, key=len, reverse=True)
     pattern = "|".join(re.escape(noun) for noun in nouns)
     return re.sub(rf"(?<![\w'-])(?:{pattern})(?![\w'-])", article, details)
-
-
-def pushes(skill: str) -> bool:
-    """Whether a skill pushes or pulls: "turn the dial to the right" does, "place the gripper above the dial" not."""
-    return skill.split()[0] in _PUSHES
-
-
-def presses(skill: str) -> bool:
-    """Whether a skill pushes straight down: "push the button down"."""
-    return pushes(skill) and "down" in skill.split()
 
 
 def closes(skill: str) -> bool:

@@ -28,9 +28,8 @@ _KNOWN = frozenset().union(*_VERBS.values()) | {"align", "slide", "sweep"}
 _NO_NAME = {"location", "target", "reach", "other", "side", "top", "edge"}  # words of names that name nothing alone
 _GOAL = r"(?:the )?(?:reach |reacher )?(?:goal|target|destination)(?: (?:location|position|area|place|point|bin|spot))?"
 _HANDS = {GRIPPER: GRIPPER, "gripper": GRIPPER, "hand": GRIPPER, "fingers": GRIPPER}
-_PURPOSE = re.compile(
-    r"(?<=>) (?:in order )?to \w+ it\b.*"
-)  # "above the dial to turn it left": a later step's business
+# "above the dial to turn it left": a later step's business
+_PURPOSE = re.compile(r"(?<=>) (?:in order )?to \w+ it\b.*")
 _TOOL = re.compile(r"(?<!line )(?<!level )(?<!aligned )\bwith <([^>]*)>")
 
 
@@ -44,15 +43,13 @@ class Reading:
         target: the object or point to go to; None if unknown.
         direction: where a thing is pushed, pulled or moved to; "goal" from the thing to what it is brought to.
         toward: what that is; None for the task's goal.
-        lifted: whether what is carried goes through the air.
         sure: 1 where the words say it, less where the condition, or what is usual, had to.
     """
 
-    verb: Verb
+    verb: Verb  # "carry" goes through the air, "move" straight
     moved: str | None
     target: str | None
     direction: Direction | None = None
-    lifted: bool = False
     sure: float = 1.0
     toward: str | None = None
 
@@ -101,7 +98,7 @@ def point_on(task: Task, name: str) -> str:
 
 @lru_cache(maxsize=256)
 def _names(task: Task) -> dict[str, str]:
-    """What may be called by which words, the longest first."""
+    """Regular expressions of words to the name of what they call, the longest first."""
     found = {name: name for name in task.object_names} | _HANDS
     words: dict[str, str] = {}
     for name in things(task):
@@ -109,17 +106,26 @@ def _names(task: Task) -> dict[str, str]:
             if word not in _NO_NAME:
                 words.setdefault(word, name)
     longest = sorted(found, key=len, reverse=True)
-    return {name: found[name] for name in longest} | {_GOAL: GOAL} | {f"{word}(?:'s)?": words[word] for word in words}
+    return (
+        {re.escape(name): found[name] for name in longest}
+        | {_GOAL: GOAL}
+        | {f"{word}(?:'s)?": words[word] for word in words}
+    )
 
 
 def mark(text: str, task: Task) -> str:
     """A text with each thing that it names in <>: "put the gripper above <mug>"."""
     text = text.lower()
-    for words, name in _names(task).items():
-        pattern = words if name in (GOAL,) or "(?" in words else re.escape(words)
+    for pattern, name in _names(task).items():
         text = re.sub(rf"(?<![\w<'-])(?:the )?(?:{pattern})(?![\w-])(?![^<]*>)", f"<{name}>", text)
     text = re.sub(r"(<[^>]*>) ?(?:handle|side|top|edge)\b", r"\1", text)
     return re.sub(r"(<[^>]*>)(?: \1)+", r"\1", text)
+
+
+def compared_with_gripper(step: PlanStep) -> tuple[str, ...]:
+    """What a step's condition compares with the gripper, in its order."""
+    pairs = [(one.subject, one.object) for one in step.condition.clauses if one.object is not None]
+    return tuple(second if first == GRIPPER else first for first, second in pairs if GRIPPER in (first, second))
 
 
 @dataclass(frozen=True)
@@ -137,15 +143,13 @@ class _Facts:
     @classmethod
     def of(cls, step: PlanStep) -> _Facts:
         said = {name: False for name in ("at", "not_at", "aligned", "not_aligned", "open", "closed")}
-        near = []
         for clause in step.condition.clauses:
             if clause.subject == GRIPPER and clause.object is None:
                 said["open" if (clause.predicate == "open") != clause.negated else "closed"] = True
             elif clause.object is not None and GRIPPER in (clause.subject, clause.object):
-                near.append(clause.object if clause.subject == GRIPPER else clause.subject)
                 relation = "at" if clause.predicate in ("near", "around") else "aligned"
                 said[f"not_{relation}" if clause.negated else relation] = True
-        return cls(near=tuple(near), **said)
+        return cls(near=compared_with_gripper(step), **said)
 
 
 def read_steps(plan: ConditionalPlan) -> tuple[Reading | None, ...]:
@@ -207,10 +211,9 @@ class _Step:
         self.near = facts.near[-1] if facts.near else self.first
 
     def read(self) -> Reading | None:
-        found = self._read()
-        if found is None or (self.verb in _KNOWN | _VERBS["open"] and self.named):
+        found, known = self._read(), self.verb in _KNOWN
+        if found is None or (known and self.named):
             return found
-        known = self.verb in _KNOWN | _VERBS["open"]
         if not known and not self.named and not self.by_hand:
             return None
         return replace(found, sure=min(found.sure, 0.8 if known else 0.6))
@@ -249,12 +252,12 @@ class _Step:
         holds = self.grasping and (self.facts.closed or self.facts.at)
         if is_goal(self.task, target):
             if holds:
-                return Reading("carry", self.first, target, lifted=True)
+                return Reading("carry", self.first, target)
             return Reading("hold" if self.verb in _VERBS["hold"] else "reach", GRIPPER, target)
         above = bool(self.words & _PLACES["above"])
         if self.grasping and self.facts.closed and self.facts.at and (above or "to" in self.words):
             elsewhere = self.near is None or not same_thing(self.task, target, self.near)
-            return Reading("carry", self.first, target if elsewhere else GOAL, lifted=True)
+            return Reading("carry", self.first, target if elsewhere else GOAL)
         if above or self.verb == "raise":
             return Reading("approach", GRIPPER, target)
         if "front" in self.words:
@@ -276,15 +279,14 @@ class _Step:
             moved = self._compared_point(moved, target)
         if self.grasping:
             if target is not None:
-                lifted = self.verb in _VERBS["carry"] or bool(self.words & _PLACES["above"])
-                return Reading("carry" if lifted else "move", moved, target, lifted=lifted)
+                lifted = self.verb in _VERBS["carry"] or self.words & _PLACES["above"]
+                return Reading("carry" if lifted else "move", moved, target)
             direction: Direction | None = self.direction if self.direction != "down" else None
             if self.verb in _VERBS["lift"]:
                 direction = "up"
             if direction is not None:
                 return Reading("move", moved, moved, direction)
-            lifted = self.verb in _VERBS["carry"]
-            return Reading("carry" if lifted else "move", moved, GOAL, lifted=lifted, sure=0.7)
+            return Reading("carry" if self.verb in _VERBS["carry"] else "move", moved, GOAL, sure=0.7)
         direction = self.direction
         if direction == "down" and self.verb not in ("push", "press"):
             direction = None
@@ -296,10 +298,7 @@ class _Step:
             return Reading("pull", GRIPPER, moved, direction or "goal")
         pushed = self.verb in _VERBS["push"] or direction is not None
         toward = None if direction is not None or target is None or is_goal(self.task, target) else target
-        lifted = self.verb in _VERBS["carry"]
-        return Reading(
-            "push", GRIPPER, moved, direction or "goal", lifted=lifted, sure=1.0 if pushed else 0.5, toward=toward
-        )
+        return Reading("push", GRIPPER, moved, direction or "goal", sure=1.0 if pushed else 0.5, toward=toward)
 
     def _target(self, thing: str) -> str | None:
         """Where a thing is moved to, by the words, or by what the condition compares it with."""

@@ -241,10 +241,8 @@ class TransferredActor(Policy):
         moved = action[..., old.displaced("TransferredActor")] * (self.speed * old.reach / new.reach)
         turned[..., new.displaced("TransferredActor")] = moved.clamp(-1.0, 1.0)
         effort = action[..., old.effort].sum(-1, keepdim=True) * old.closes
-        if new.binary_gripper:
-            effort = torch.where(effort > new.closes_above, 1.0, -1.0)
         turned[..., new.effort] = effort * new.closes
-        return turned
+        return decided(turned, new) if new.binary_gripper else turned
 
     def describe(self) -> dict[str, Any]:
         trained = {"trained": self.trained.to_json(), "speed": self.speed}
