@@ -115,6 +115,7 @@ class CanonicalPlan:
             its own do not cover the usual states; "default", the plan for all tasks, where it says no motion.
         read: the plan's own steps as they were read, also where ``steps`` are others.
         left_out: the skills that could not be read.
+        reserve: steps that are tried when ``steps`` get nowhere, those of the default plan; none unless asked for.
     """
 
     written: ConditionalPlan
@@ -123,13 +124,25 @@ class CanonicalPlan:
     source: Literal["plan", "completed", "default"]
     read: tuple[CanonicalStep, ...] = ()
     left_out: tuple[str, ...] = ()
+    reserve: tuple[CanonicalStep, ...] = ()
+
+    def with_reserve(self) -> CanonicalPlan:
+        """The same with :func:`default_plan` in reserve, unless that is what it is."""
+        other = default_plan(self.written).steps
+        return self if self.source == "default" else replace(self, reserve=other)
+
+    @property
+    def every_step(self) -> tuple[CanonicalStep, ...]:
+        """Its steps, and behind them those in reserve."""
+        return self.steps + self.reserve
 
     @cached_property
     def plan(self) -> ConditionalPlan:
         """The steps as a plan, whose reasons hold what was written, and of the first the plan's trust."""
         steps = []
-        for number, step in enumerate(self.steps):
+        for number, step in enumerate(self.every_step):
             told = [f"plan trusted {self.trust:.2f}, {_SOURCES[self.source]}"] if number == 0 else []
+            told += ["in reserve"] if number >= len(self.steps) else []
             told += [f"as written: {step.written}"] if step.written and step.written != step.skill else []
             steps.append(PlanStep(step.condition, step.skill, "; ".join(told)))
         return ConditionalPlan(self.written.task, tuple(steps), self.written.definition)
@@ -188,10 +201,10 @@ def canonical_plan(plan: ConditionalPlan) -> CanonicalPlan:
 def step_vectors(plan: CanonicalPlan) -> list[list[float]]:
     """For each step, what is told of it beside its roles: ones for its verb, its manner and, if MT10 demonstrates the
     plan's motion in a way of its own, for that. Verbs of the same motion share theirs."""
-    last = _motion(plan.steps)
-    own = [float(last is not None and [last.moved, last.target] == pair) for pair in _OWN]
     found = []
-    for step in plan.steps:
+    for step, all_steps in [(one, steps) for steps in (plan.steps, plan.reserve) for one in steps]:
+        last = _motion(all_steps)
+        own = [float(last is not None and [last.moved, last.target] == pair) for pair in _OWN]
         verb = _SAME_MOTION.get(step.verb, step.verb)
         ones = [float(verb == one) for one in _VERBS], [float(step.manner == one) for one in get_args(Manner)]
         found.append([*ones[0], *ones[1], *own])

@@ -91,10 +91,11 @@ class PlanAttention(TensorDictModuleBase):
         self.tables = PlanTables(self.plans)
         self.register_buffer("mask", self.tables.mask, persistent=False)
 
-    def over_steps(self, qaf: Tensor, rows: Tensor) -> Tensor:
-        """(B, S) truth and rows (B,) int64, as from :meth:`PlanTables.rows`, to (B, S) float32 attention."""
+    def over_steps(self, qaf: Tensor, rows: Tensor, steps: Tensor | None = None) -> Tensor:
+        """(B, S) truth and rows (B,) int64, as from :meth:`PlanTables.rows`, to (B, S) float32 attention, over
+        ``steps`` (B, S) bool, or all that there are."""
         check_truth(qaf, (*rows.shape, self.mask.shape[-1]))
-        return attend(10.0 * qaf.to(torch.float32) - 5.0, self.mask[rows])
+        return attend(10.0 * qaf.to(torch.float32) - 5.0, self.mask[rows] if steps is None else steps)
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.envs import Compose, Transform
 
 from lw_torchrl._checks import check_probability, check_scale, checked
 from lw_torchrl.language.canonical import RULES, CanonicalPlan, canonical_plan, step_vectors
@@ -27,6 +28,7 @@ from lw_torchrl.modules.query_evaluator import QueryEvaluator, ReadsPlans
 from lw_torchrl.modules.relative_positions import PlanFocus, PlanRoles, RelativePositions
 from lw_torchrl.transforms.qaf import plan_number_key, plan_program
 from lw_torchrl.transforms.random_yaw import tilt_key, yaw_key
+from lw_torchrl.transforms.take_turns import TakeTurns, turn_key
 
 _HOLDING = ("slide the", "carry the")  # in canonical plans
 IN_FORCE = 0.01  # a step whose condition does not hold beside one that does has a weight of 1e-4
@@ -52,6 +54,8 @@ class PlanEncoder(ReadsPlans, Encoder):
         canonical: see each plan in its canonical form, see :func:`~lw_torchrl.canonical_plan`: verbs and manners in the
             place of the texts, conditions that cover the usual states. ``plans`` are then these. None for ``roles``,
             which need it.
+        reserve: when the plan's own steps get nowhere, try the default plan's, see
+            :class:`~lw_torchrl.transforms.TakeTurns`; ``plans`` then end with these. It needs ``canonical``.
         jitter: standard deviation, in metres, of noise on that position while training, where the gripper pushes.
         swap_unmentioned: the probability, in training, that an object or the goal is put where it is in another row,
             if no step in force mentions it, or with ``roles`` moves it or to it.
@@ -90,6 +94,7 @@ class PlanEncoder(ReadsPlans, Encoder):
     skill_index: Tensor
     mentioned: Tensor
     closing: Tensor
+    turns: Tensor
 
     @checked
     def __init__(
@@ -101,6 +106,7 @@ class PlanEncoder(ReadsPlans, Encoder):
         focus: bool = False,
         roles: bool = False,
         canonical: bool | None = None,
+        reserve: bool = False,
         jitter: float = 0.0,
         swap_unmentioned: float = 0.0,
         hide_opening: float = 0.0,
@@ -119,7 +125,11 @@ class PlanEncoder(ReadsPlans, Encoder):
         canonical = roles if canonical is None else canonical
         if roles and not canonical:
             raise ValueError("canonical must be true with roles=True, which are those of canonical plans")
+        if reserve and not canonical:
+            raise ValueError("canonical must be true with reserve=True, which holds canonical steps")
         self.canonical = {task: canonical_plan(plan) for task, plan in self.written.items()} if canonical else {}
+        if reserve:
+            self.canonical = {task: plan.with_reserve() for task, plan in self.canonical.items()}
         seen_plans = Plans([one.plan for one in self.canonical.values()]) if canonical else self.written
         if canonical and evaluator is not None and evaluator.plans.fingerprint == self.written.fingerprint:
             evaluator = evaluator.with_plans(seen_plans)
@@ -139,7 +149,7 @@ class PlanEncoder(ReadsPlans, Encoder):
         if evaluator is None and (answers, answer_scale) != ("logit", 0.5):
             raise ValueError("answers and answer_scale are of an evaluator's logits, and evaluator is None")
         seen: dict[str, Any] = dict(features=features, feature_noise=feature_noise, focus=focus, roles=roles)
-        seen |= dict(canonical=canonical, jitter=jitter)
+        seen |= dict(canonical=canonical, reserve=reserve, jitter=jitter)
         texts = dict(latent_size=latent_size, encoder_width=encoder_width, encoder_depth=encoder_depth)
         altered = dict(swap_unmentioned=swap_unmentioned, hide_opening=hide_opening)
         altered = {name: check_probability(name, given) for name, given in altered.items()}
@@ -151,6 +161,7 @@ class PlanEncoder(ReadsPlans, Encoder):
         vectors = None if self.canonical else encoded(self.skills, text_encoder)
         self.attention = PlanAttention(self.plans)
         # The tables come from the plans, not from training: they are not part of the state that is saved.
+        self.register_buffer("turns", _turns(self.canonical, self.attention.tables), persistent=False)
         index = self.attention.tables.skill_index
         if vectors is None:
             index, vectors = _canonical_skills(self.canonical, self.attention.tables)
@@ -182,9 +193,9 @@ class PlanEncoder(ReadsPlans, Encoder):
         rows = self.attention.tables.rows(task)
         if self.evaluator is not None:
             asked = [tensordict.get(key) for key in self.evaluator.in_keys]
-            return self.attention.mask[rows], self.skill_index[rows], self.features(observation), *asked
+            return self._in_turn(tensordict, rows), self.skill_index[rows], self.features(observation), *asked
         self.attention.tables.refuse_others(tensordict.get(plan_number_key(self.in_keys[2]), None), rows)
-        weights = self.attention.over_steps(rest[0], rows)
+        weights = self.attention.over_steps(rest[0], rows, self._in_turn(tensordict, rows))
         if self.training:
             observation = self._augmented(observation, weights, rows)
         yaw = tensordict.get(yaw_key(self.in_keys[0]), None)
@@ -194,6 +205,20 @@ class PlanEncoder(ReadsPlans, Encoder):
             relative.append(self.roles(observation, weights, rows, yaw, tilt))
         seen = torch.cat((self.features(observation), *relative), -1) if relative else self.features(observation)
         return weights, self.skill_index[rows], seen
+
+    def transform(self) -> Transform | None:
+        asked = super().transform()
+        if not self.config["reserve"]:
+            return asked
+        turns = TakeTurns(self.plans.layout, in_keys=self.own_keys[:1])
+        return turns if asked is None else Compose(*getattr(asked, "transforms", [asked]), turns)
+
+    def _in_turn(self, tensordict: TensorDictBase, rows: Tensor) -> Tensor:
+        """(B, S) bool, the steps whose turn it is: the plan's own, or those in reserve."""
+        if not self.config["reserve"]:
+            return self.attention.mask[rows]
+        turn = tensordict.get(turn_key(self.in_keys[0]), None)
+        return self.turns[rows, torch.zeros_like(rows) if turn is None else turn % 2]
 
     def _augmented(self, observation: Tensor, weights: Tensor, rows: Tensor) -> Tensor:
         in_force = weights > IN_FORCE
@@ -211,7 +236,7 @@ class PlanEncoder(ReadsPlans, Encoder):
             truth = plan_program(self.plans)(observation, task_id)
             rows = self.attention.tables.rows(task_id)
             observation, truth, rows = (found.to(self.closing.device) for found in (observation, truth, rows))
-            self.roles.fit(observation, self.attention.over_steps(truth, rows), rows)
+            self.roles.fit(observation, self.attention.over_steps(truth, rows, self.turns[rows, 0]), rows)
 
     def check_rules(self, found: Mapping[str, Any]) -> None:
         """Raise :class:`ValueError` if a description is of a policy that saw plans by other rules than these."""
@@ -259,6 +284,16 @@ class PlanEncoder(ReadsPlans, Encoder):
         if self.roles is not None and other.roles is not None:
             other.roles.share_contact(self.roles)
         return other.train(self.training)
+
+
+def _turns(plans: Mapping[str, CanonicalPlan], tables: PlanTables) -> Tensor:
+    """(T, 2, S) bool, the steps of a plan's own turn, and of that in reserve."""
+    found = tables.mask.unsqueeze(1).repeat(1, 2, 1)
+    for task, plan in plans.items():
+        if plan.reserve:
+            found[tables.index.row(task), 0, len(plan.steps) :] = False
+            found[tables.index.row(task), 1, : len(plan.steps)] = False
+    return found
 
 
 def _canonical_skills(plans: Mapping[str, CanonicalPlan], tables: PlanTables) -> tuple[Tensor, Tensor]:

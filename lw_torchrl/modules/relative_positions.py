@@ -142,7 +142,7 @@ class PlanRoles(RelativePositions):
         self, canonical: Mapping[str, CanonicalPlan], tables: PlanTables, noise: float = 0.0, jitter: float = 0.0
     ) -> None:
         def moved_to_target(plan: ConditionalPlan) -> list[list[Pair]]:
-            steps = canonical[plan.task].steps
+            steps = canonical[plan.task].every_step
             return [[tuple(role_object(plan.definition, name) for name in (one.moved, one.target))] for one in steps]  # type: ignore[list-item]
 
         def ahead(plan: ConditionalPlan) -> list[list[Pair]]:
@@ -151,7 +151,7 @@ class PlanRoles(RelativePositions):
             thing = NamedObject("first thing", (x, y, z))
             return [
                 [(thing, role_object(task, step.toward or GOAL))] if step.direction == "goal" else []
-                for step in canonical[plan.task].steps
+                for step in canonical[plan.task].every_step
             ]
 
         plans = Plans([one.plan for one in canonical.values()])
@@ -163,7 +163,7 @@ class PlanRoles(RelativePositions):
         at_contact, acts, pushes, lifts = (torch.zeros(shape, dtype=torch.bool) for _ in range(4))
         direction = torch.zeros(*shape, 3)
         for task, found in canonical.items():
-            for number, step in enumerate(found.steps):
+            for number, step in enumerate(found.every_step):
                 at = (tables.index.row(task), number)
                 by_hand, way = step.moved == GRIPPER, torch.tensor(VECTORS.get(step.direction or "", (0.0,) * 3))
                 at_contact[at] = by_hand and _is_first(found.written, step.target)

@@ -7,5 +7,6 @@ from lw_torchrl.transforms.environment import EnvState
 from lw_torchrl.transforms.qaf import QAFTransform
 from lw_torchrl.transforms.random_yaw import RandomYaw
 from lw_torchrl.transforms.suite_transform import SuiteTransform
+from lw_torchrl.transforms.take_turns import TakeTurns
 
-__all__ = ["CameraTransform", "CorruptQAF", "EnvState", "QAFTransform", "RandomYaw", "SuiteTransform"]
+__all__ = ["CameraTransform", "CorruptQAF", "EnvState", "QAFTransform", "RandomYaw", "SuiteTransform", "TakeTurns"]
