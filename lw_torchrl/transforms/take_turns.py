@@ -27,8 +27,8 @@ class TakeTurns(Transform):
     A turn ends when neither the hand nor a thing has moved farther than ``still`` for ``patience`` steps, and at the
     latest after ``longest`` steps. Nobody has to tell it whether the task was done.
 
-    In an environment it reads ``observation`` (B, 39) float32, metres, and writes ``observation_turn`` (B,) int64. To
-    rows of a replay buffer it does nothing: they keep the turn with which they were collected.
+    In an environment it reads ``observation`` (B, 39) float32, metres, and writes ``observation_turn`` (B,) int64. Rows
+    of a replay buffer keep the turn with which they were collected, and have 0 without one.
 
     Args:
         layout: where the hand and the things are in an observation.
@@ -100,6 +100,10 @@ class TakeTurns(Transform):
         return next_tensordict.set(self.out_keys[0], self._turn.clone())
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        for rows in (tensordict, tensordict.get("next", None)):
+            if rows is not None and rows.get(self.out_keys[0], None) is None:
+                none = torch.zeros(rows.batch_size, dtype=torch.int64, device=tensordict.device)
+                rows.set(self.out_keys[0], none)
         return tensordict
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:

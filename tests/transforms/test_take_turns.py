@@ -94,6 +94,17 @@ def test_an_environment_with_it_has_right_specs():
 def test_rows_of_a_buffer_keep_what_they_have():
     rows = TensorDict(observation=torch.zeros(2, 39), observation_turn=torch.tensor([0, 3]), batch_size=[2])
     assert TakeTurns()(rows.clone())["observation_turn"].tolist() == [0, 3]
+    assert TakeTurns()(rows.exclude("observation_turn"))["observation_turn"].tolist() == [0, 0]
+
+
+def test_demonstrations_train_a_policy_that_has_plans_in_reserve(tmp_path):
+    lw.collect_demonstrations("reach", root=tmp_path, episodes_per_task=1, seed=0, progress=False)
+    actor = lw.PlanConditionedActor(lw.load_plans("MT10"), reserve=True, roles=True, features="none", width=8)
+    replay = lw.LanguageWorldExperienceReplay(tmp_path, transform=actor.transform(), batch_size=4)
+    assert replay.sample()["observation_turn"].tolist() == [0] * 4
+    lw.BehavioralCloningTrainer(
+        actor, replay, lw.BehavioralCloningConfig(steps=2, batch_size=4), progress=False
+    ).train()
 
 
 def test_what_is_wrong_is_named():
