@@ -1,17 +1,16 @@
-"""Canonical plans: what policies see of a plan in anyone's words, and how far it can be trusted."""
+"""canonical_plan: from a plan in anyone's words to what policies see of it, completed where it says too little."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Literal, get_args
+from dataclasses import replace
+from typing import Any
 
 from lw_torchrl._checks import checked
+from lw_torchrl.language.canonical_steps import BY_HAND, VECTORS, CanonicalPlan, CanonicalStep, Manner, motion_of
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import Query, check_query
-from lw_torchrl.language.skills import WORDS
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.usual_states import covered
 from lw_torchrl.language.wording import (
@@ -30,140 +29,10 @@ from lw_torchrl.language.wording import (
     things,
 )
 
-Manner = Literal["grasp", "push", "press", "pull", "reach"]
-"""What a step is done for, which says how the hand comes: to grasp from above, to push from the side."""
-VECTORS: dict[str, tuple[float, float, float]] = {
-    "left": (1.0, 0.0, 0.0),
-    "right": (-1.0, 0.0, 0.0),
-    "away": (0.0, 1.0, 0.0),
-    "toward": (0.0, -1.0, 0.0),
-    "up": (0.0, 0.0, 1.0),
-    "down": (0.0, 0.0, -1.0),
-}
-"""Directions as unit vectors in the suites' frame; "left" and "right" are those of the query language."""
 RULES = 1
 """The version of the rules by which plans are read, which a policy's file keeps; raised when they change."""
 TRUSTED = 0.75
 """A plan keeps its own conditions if in this share of usual states it does what its motion needs."""
-_SOURCES = {"plan": "its own steps", "completed": "completed", "default": "the default plan in its place"}
-_BY_HAND = ("approach", "descend", "beside", "open")
-_SAID: dict[Verb, str] = {
-    "approach": "place the gripper above the {target}",
-    "descend": "lower the gripper around the {target}",
-    "beside": "move the gripper beside the {target}",
-    "open": "open the gripper above the {target}",
-    "close": "close the gripper around the {target}",
-    "push": "push the {target}",
-    "pull": "pull the {target}",
-    "carry": "carry the {moved} to the {target}",
-    "move": "slide the {moved} to the {target}",
-    "reach": "move the gripper to the {target}",
-    "hold": "hold the gripper at the {target}",
-}
-_WAYS = {"left": "to the left", "right": "to the right", "away": "away from the robot", "toward": "toward the robot"}
-
-
-@dataclass(frozen=True)
-class CanonicalStep:
-    """One step as policies see it.
-
-    Attributes:
-        condition: when it is done, with the points at which things are touched in place of the things.
-        verb: what is done.
-        moved, target: what is to arrive where: names of the task's objects, or "target location", the goal.
-        manner: what it is done for.
-        direction: where a thing is pushed, pulled or moved to; of a hand that comes to do so, too.
-        toward: what a direction "goal" is to; None for the task's goal.
-        written: the skill's own words; "" for a step that the plan lacked.
-        sure: from 0, a guess, to 1, said in words.
-    """
-
-    condition: Query
-    verb: Verb
-    moved: str
-    target: str
-    manner: Manner
-    direction: Direction | None = None
-    written: str = ""
-    sure: float = 1.0
-    toward: str | None = None
-
-    @property
-    def skill(self) -> str:
-        """The step in one wording for all plans, "carry the mug to the target location"."""
-        said = _SAID[self.verb].format(moved=self.moved, target=self.target)
-        way = "" if self.direction is None else _WAYS.get(self.direction, self.direction)
-        way = f"toward the {self.toward or GOAL}" if way == "goal" else way
-        if self.verb == "move" and way:
-            return f"slide the {self.moved} {way}"
-        if self.verb in ("push", "pull"):
-            return f"{said} {way}"
-        if self.verb in _BY_HAND and self.manner != "grasp":
-            return f"{said} to {self.manner} it {way}".rstrip()
-        return said
-
-
-@dataclass(frozen=True)
-class CanonicalPlan:
-    """What became of a plan.
-
-    Attributes:
-        written: the plan as it was given.
-        steps: what policies see.
-        trust: in which share of usual states the plan, as written, does what its motion needs; in [0, 1].
-        source: "plan", its own steps; "completed", its motion, things and direction with conditions of ours, where
-            its own do not cover the usual states; "default", the plan for all tasks, where it says no motion.
-        read: the plan's own steps as they were read, also where ``steps`` are others.
-        left_out: the skills that could not be read.
-        reserve: steps that are tried when ``steps`` get nowhere, those of the default plan; none unless asked for.
-    """
-
-    written: ConditionalPlan
-    steps: tuple[CanonicalStep, ...]
-    trust: float
-    source: Literal["plan", "completed", "default"]
-    read: tuple[CanonicalStep, ...] = ()
-    left_out: tuple[str, ...] = ()
-    reserve: tuple[CanonicalStep, ...] = ()
-
-    def with_reserve(self) -> CanonicalPlan:
-        """The same with :func:`default_plan` in reserve, unless that is what it is."""
-        other = default_plan(self.written).steps
-        return self if self.source == "default" else replace(self, reserve=other)
-
-    @property
-    def every_step(self) -> tuple[CanonicalStep, ...]:
-        """Its steps, and behind them those in reserve."""
-        return self.steps + self.reserve
-
-    @cached_property
-    def plan(self) -> ConditionalPlan:
-        """The steps as a plan, whose reasons hold what was written, and of the first the plan's trust."""
-        steps = []
-        for number, step in enumerate(self.every_step):
-            told = [f"plan trusted {self.trust:.2f}, {_SOURCES[self.source]}"] if number == 0 else []
-            told += ["in reserve"] if number >= len(self.steps) else []
-            told += [f"as written: {step.written}"] if step.written and step.written != step.skill else []
-            steps.append(PlanStep(step.condition, step.skill, "; ".join(told)))
-        return ConditionalPlan(self.written.task, tuple(steps), self.written.definition)
-
-    def notes(self) -> list[dict[str, Any]]:
-        """What became of each step as written, then the steps that policies see instead, if they do, as JSON.
-
-        The keys are ``written``, None for a step that the plan lacked; ``skill``, ``verb``, ``moved``, ``target`` and
-        ``condition``, None for what was left out; ``sure``; and ``seen``, whether policies see it.
-        """
-        own = self.source == "plan"
-        told = [_told(step, step.written, own) for step in self.read]
-        told += [] if own else [_told(step, step.written or None, True) for step in self.steps]
-        nothing = dict.fromkeys(("skill", "verb", "moved", "target", "condition"))
-        return told + [{"written": skill, **nothing, "sure": 0.0, "seen": False} for skill in self.left_out]
-
-
-def _told(step: CanonicalStep, written: str | None, seen: bool) -> dict[str, Any]:
-    names = ("skill", "verb", "moved", "target")
-    told = {name: getattr(step, name) for name in names} | {"condition": str(step.condition), "sure": step.sure}
-    return {"written": written, **told, "seen": seen}
 
 
 @checked
@@ -191,29 +60,11 @@ def canonical_plan(plan: ConditionalPlan) -> CanonicalPlan:
     trust = _trust(plan.definition, steps)
     if trust >= TRUSTED and _is_complete(steps):
         return CanonicalPlan(plan, steps, trust, "plan", steps, left_out)
-    last = _motion(steps)
+    last = motion_of(steps)
     if last is None:
         return replace(default_plan(plan), trust=trust, read=steps, left_out=left_out)
     completed = _template(plan.definition, steps, last)
     return CanonicalPlan(plan, completed, trust, "completed", steps, left_out)
-
-
-def step_vectors(plan: CanonicalPlan) -> list[list[float]]:
-    """For each step, what is told of it beside its roles: ones for its verb, its manner and, if MT10 demonstrates the
-    plan's motion in a way of its own, for that. Verbs of the same motion share theirs."""
-    found = []
-    for step, all_steps in [(one, steps) for steps in (plan.steps, plan.reserve) for one in steps]:
-        last = _motion(all_steps)
-        own = [float(last is not None and [last.moved, last.target] == pair) for pair in _OWN]
-        verb = _SAME_MOTION.get(step.verb, step.verb)
-        ones = [float(verb == one) for one in _VERBS], [float(step.manner == one) for one in get_args(Manner)]
-        found.append([*ones[0], *ones[1], *own])
-    return found
-
-
-_OWN: list[list[str]] = WORDS["canonical"]["own"]
-_SAME_MOTION: dict[str, Verb] = {"carry": "move", "open": "descend", "hold": "reach"}
-_VERBS = [verb for verb in get_args(Verb) if verb not in _SAME_MOTION]
 
 
 def default_plan(plan: ConditionalPlan) -> CanonicalPlan:
@@ -233,6 +84,11 @@ def default_plan(plan: ConditionalPlan) -> CanonicalPlan:
     return CanonicalPlan(plan, _template(task, (), last), 0.0, "default")
 
 
+def with_reserve(plan: CanonicalPlan) -> CanonicalPlan:
+    """The same plan with :func:`default_plan` in reserve, unless that is what it is."""
+    return plan if plan.source == "default" else replace(plan, reserve=default_plan(plan.written).steps)
+
+
 def _negated(query: Query) -> Query:
     return Query(tuple(replace(clause, negated=not clause.negated) for clause in query.clauses))
 
@@ -248,7 +104,7 @@ def _steps(plan: ConditionalPlan, read: Sequence[Reading | None]) -> tuple[Canon
         verb, direction = one.verb, one.direction
         purpose = _purpose([other for _, other in told[number:]] + [other for _, other in told[:number][::-1]])
         manner = _manner(one)
-        if verb in _BY_HAND:
+        if verb in BY_HAND:
             verb, manner, direction = _coming(one, purpose if not grasping else None)
         target, moved = str(one.target), str(one.moved)
         if moved == GRIPPER and first is not None and same_thing(task, target, first):
@@ -281,7 +137,7 @@ def _compared_point(step: PlanStep, task: Task, thing: str) -> str | None:
 
 def _purpose(ahead: Sequence[Reading]) -> Reading | None:
     """The next step, or else the last before, that moves something."""
-    return next((one for one in ahead if one.verb not in _BY_HAND), None)
+    return next((one for one in ahead if one.verb not in BY_HAND), None)
 
 
 def _manner(one: Reading) -> Manner:
@@ -320,18 +176,13 @@ def _over_walls(steps: Sequence[CanonicalStep], task: Task) -> list[CanonicalSte
     return found
 
 
-def _motion(steps: Sequence[CanonicalStep]) -> CanonicalStep | None:
-    """The last step that moves something."""
-    return next((one for one in reversed(steps) if one.verb in ("carry", "move", "push", "pull", "reach")), None)
-
-
 def _is_complete(steps: Sequence[CanonicalStep]) -> bool:
     """Whether a plan moves something and, if it grasps, comes to the thing and closes the gripper before."""
     verbs = [one.verb for one in steps]
     moving = [number for number, verb in enumerate(verbs) if verb in ("carry", "move")]
     if any(one.verb == "pull" and "handle" not in one.target.split() for one in steps):
         return False  # a handle can be hooked; anything else is held better in closed fingers
-    if _motion(steps) is None:
+    if motion_of(steps) is None:
         return False
     if not moving:
         return True
@@ -390,12 +241,12 @@ def _touched(task: Task, steps: Sequence[CanonicalStep]) -> str:
 def _has_sides(steps: Sequence[CanonicalStep]) -> bool:
     """Whether a plan pushes a thing from several sides, and says for each how to come there."""
     sides = {one.target for one in steps if one.verb == "push"}
-    return len(sides) > 1 and all(any(one.target == side and one.verb in _BY_HAND for one in steps) for side in sides)
+    return len(sides) > 1 and all(any(one.target == side and one.verb in BY_HAND for one in steps) for side in sides)
 
 
 def _trust(task: Task, steps: Sequence[CanonicalStep]) -> float:
     """In which share of usual states of a motion a step is in force, and all that are do what the motion needs."""
-    last = _motion(steps)
+    last = motion_of(steps)
     if last is None:
         return 0.0
     if last.manner == "reach" or _has_sides(steps):

@@ -13,7 +13,8 @@ from torch import Tensor
 from torchrl.envs import Compose, Transform
 
 from lw_torchrl._checks import check_probability, check_scale, checked
-from lw_torchrl.language.canonical import RULES, CanonicalPlan, canonical_plan, step_vectors
+from lw_torchrl.language.canonical import RULES, canonical_plan, with_reserve
+from lw_torchrl.language.canonical_steps import CanonicalPlan, step_vectors
 from lw_torchrl.language.layout import METAWORLD, Layout, places
 from lw_torchrl.language.plans import AnyPlans, Plans, PlanStep, as_plans
 from lw_torchrl.language.skills import closes
@@ -129,7 +130,7 @@ class PlanEncoder(ReadsPlans, Encoder):
             raise ValueError("canonical must be true with reserve=True, which holds canonical steps")
         self.canonical = {task: canonical_plan(plan) for task, plan in self.written.items()} if canonical else {}
         if reserve:
-            self.canonical = {task: plan.with_reserve() for task, plan in self.canonical.items()}
+            self.canonical = {task: with_reserve(plan) for task, plan in self.canonical.items()}
         seen_plans = Plans([one.plan for one in self.canonical.values()]) if canonical else self.written
         if canonical and evaluator is not None and evaluator.plans.fingerprint == self.written.fingerprint:
             evaluator = evaluator.with_plans(seen_plans)

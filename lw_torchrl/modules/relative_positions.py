@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import check_scale
-from lw_torchrl.language.canonical import VECTORS, CanonicalPlan
+from lw_torchrl.language.canonical_steps import VECTORS, CanonicalPlan
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, coordinate_indices
 from lw_torchrl.language.plans import ConditionalPlan, Plans

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from lw_torchrl.language import canonical, wording
-from lw_torchrl.language.canonical import TRUSTED, canonical_plan, default_plan, step_vectors
+from lw_torchrl.language.canonical import TRUSTED, canonical_plan, default_plan
+from lw_torchrl.language.canonical_steps import step_vectors
 from lw_torchrl.language.wording import GOAL, first_thing, mark, read_steps, role_object
 
 OWN, MT10_SKILLS = lw.load_plans("MT50"), lw.load_plans("MT50", skills="MT10")

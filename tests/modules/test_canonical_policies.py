@@ -10,7 +10,8 @@ from tensordict import TensorDict
 
 import lw_torchrl as lw
 from lw_torchrl.language import canonical
-from lw_torchrl.language.canonical import RULES, canonical_plan, step_vectors
+from lw_torchrl.language.canonical import RULES, canonical_plan
+from lw_torchrl.language.canonical_steps import step_vectors
 from lw_torchrl.training.file_checks import text_vectors
 from lw_torchrl.training.files import read_description
 

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 import lw_torchrl as lw
-from lw_torchrl.language.canonical import canonical_plan, default_plan
+from lw_torchrl.language.canonical import canonical_plan, default_plan, with_reserve
 from lw_torchrl.transforms import QAFTransform, TakeTurns
 
 MT10, MT50 = lw.load_plans("MT10"), lw.load_plans("MT50")
@@ -35,7 +35,7 @@ def test_its_plans_end_with_the_default_plans_steps():
 
 def test_what_is_the_default_plan_already_has_none():
     wrong = lw.ConditionalPlan.from_pairs("push", [("the gripper is open", "ponder")])
-    assert canonical_plan(wrong).with_reserve().reserve == ()
+    assert with_reserve(canonical_plan(wrong)).reserve == ()
 
 
 @pytest.mark.parametrize("turn", [None, 0, 1, 2, 3])
@@ -49,9 +49,9 @@ def test_only_the_steps_of_the_turn_have_weight(turn):
 
 
 def test_in_its_own_turn_a_policy_does_what_it_does_without():
-    with_reserve, without = make(reserve=True), make()
-    with_reserve.load_state_dict(without.state_dict(), strict=False)
-    own, alone = (actor(states(actor))["action"] for actor in (with_reserve, without))
+    reserved, without = make(reserve=True), make()
+    reserved.load_state_dict(without.state_dict(), strict=False)
+    own, alone = (actor(states(actor))["action"] for actor in (reserved, without))
     assert torch.allclose(own, alone, atol=1e-6)
 
 
