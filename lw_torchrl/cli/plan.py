@@ -99,7 +99,7 @@ def read(
     output, rows, steps = Output(json), [], []
     for one in map(canonical_plan, plans):
         name, notes = one.written.task, one.notes()
-        rows.append({"task": name, "source": one.source, "trust": one.trust, "steps": notes})
+        rows.append({"task": name, "source": one.source, "trust": one.trust})
         steps += [{"task": name, "source": f"{one.source}, trust {one.trust:.2f}", **note} for note in notes]
     columns: Columns = {
         "task": "task",

@@ -81,9 +81,9 @@ def test_read_takes_a_model_s_answer(capsys, tmp_path, format):
     answer = tmp_path / format / "reach-2.txt"
     answer.parent.mkdir()
     answer.write_text(lw.encode_plan(plan, format))
-    (found,) = document(capsys, "plan", "read", answer)["plans"]
-    assert (found["task"], found["source"]) == ("reach", "plan")
-    assert [step["written"] for step in found["steps"]] == [step.skill for step in plan.steps]
+    told = document(capsys, "plan", "read", answer)
+    assert told["plans"] == [{"task": "reach", "source": "plan", "trust": 1.0}]
+    assert [step["written"] for step in told["read"]] == [step.skill for step in plan.steps]
     answer.write_text("I cannot help with that.")
     assert "no plan can be read" in fails(capsys, "plan", "read", answer)
 
