@@ -1,0 +1,110 @@
+"""python -m benchmarks.demonstrations: success by the number of demonstrations a task, with plans and without."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+
+import lw_torchrl as lw
+from lw_torchrl._files import write_json, write_text
+from lw_torchrl.evaluation import EvaluationResult
+from lw_torchrl.evaluation.figures import COLORS, new_figure, saved, trim
+from lw_torchrl.evaluation.statistics import mean_rate
+from lw_torchrl.evaluation.summary import markdown_table
+from lw_torchrl.paper.imitation import ImitationRun
+from lw_torchrl.paper.recipes import PRESETS, SETTINGS
+from lw_torchrl.paper.runs import execute_run
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Train and evaluate the recipes of `lw-torchrl reproduce` on fewer demonstrations of each task.
+
+    Zero-shot's rates are of the 40 tasks that were not demonstrated, few-shot's of all 50. The number of training steps
+    is the recipe's whatever the number of demonstrations. What is done already is not done again.
+    """
+
+    settings: tuple[str, ...] = ("zero-shot", "few-shot")
+    """Of zero-shot and few-shot."""
+    methods: tuple[str, ...] = ("pcbc", "dc")
+    """Of pcbc, dc and one-hot."""
+    numbers: tuple[int, ...] = (1, 2, 5, 10, 100)
+    """Of demonstrations a task."""
+    seeds: tuple[int, ...] = (0,)
+    """Of demonstrations, weights and minibatches."""
+    episodes: int = 20
+    """Evaluated of each task."""
+    out: Path = Path("runs/demonstrations")
+    """Folder for the runs, results.json, table.md and figure.png."""
+
+
+Rates = dict[str, dict[str, dict[int, list[list[float]]]]]
+
+
+def main(arguments: Arguments) -> None:
+    found: Rates = {}
+    for number in arguments.numbers:
+        for seed in arguments.seeds:
+            for setting in arguments.settings:
+                for method in arguments.methods:
+                    result = executed(arguments, setting, method, number, seed)
+                    rates = [rate for task, rate in result.success_once.items() if counts(setting, task)]
+                    known = found.setdefault(setting, {}).setdefault(method, {})
+                    known.setdefault(number, []).append([float(rate or 0.0) for rate in rates])
+                    report(arguments, found)
+
+
+def executed(arguments: Arguments, setting: str, method: str, number: int, seed: int) -> EvaluationResult:
+    """The result of one run, trained or read; its folder says the number of demonstrations."""
+    fewer = replace(SETTINGS[setting], episodes=number)
+    run = ImitationRun(fewer, method, seed, PRESETS["strong"][setting], arguments.episodes)
+    plans = lw.load_plans("MT50", skills=run.skills)
+    result = execute_run(run, plans, arguments.out / str(number))
+    print(f"{setting}, {method}, {number} demonstrations, seed {seed}: {result.mean_success:.3f}", flush=True)
+    return result
+
+
+def counts(setting: str, task: str) -> bool:
+    return setting != "zero-shot" or task not in lw.MT10
+
+
+def report(arguments: Arguments, found: Rates) -> None:
+    """Write the numbers, the table and the figure of what there is."""
+    lines, numbers = [], list(arguments.numbers)
+    for setting, methods in found.items():
+        for method, each in methods.items():
+            cells = [str(mean_rate(each[number])) if number in each else "" for number in numbers]
+            lines.append([setting, method, str(len(arguments.seeds)), *cells])
+    write_json(arguments.out / "results.json", found)
+    write_text(arguments.out / "table.md", markdown_table(["setting", "method", "seeds", *map(str, numbers)], lines))
+    draw(arguments, found)
+
+
+def draw(arguments: Arguments, found: Rates) -> None:
+    figure = new_figure(4.2 * len(found), 3.6)
+    panels: Any = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
+    for axes, (setting, methods) in zip(panels, found.items(), strict=True):
+        for color, (method, each) in zip(COLORS, methods.items(), strict=False):
+            means = {number: [sum(rates) / len(rates) for rates in seeds] for number, seeds in each.items()}
+            axes.plot([*means], [sum(one) / len(one) for one in means.values()], color=color, marker="o", label=method)
+            lows, highs = ([pick(one) for one in means.values()] for pick in (min, max))
+            axes.fill_between([*means], lows, highs, color=color, alpha=0.16, linewidth=0)
+        axes.set_xscale("log")
+        axes.set_xticks(arguments.numbers, [str(number) for number in arguments.numbers])
+        axes.minorticks_off()
+        axes.set_xlabel("demonstrations of each demonstrated task")
+        axes.set_title(f"{setting}, {'40 tasks outside MT10' if setting == 'zero-shot' else '50 tasks'}", fontsize=10)
+        axes.set_ylim(0.0, 1.02)
+        trim(axes, "y")
+    panels[0].set_ylabel("success")
+    panels[0].legend(frameon=False)
+    saved(figure, arguments.out / "figure.png")
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main(tyro.cli(Arguments))
