@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -47,15 +48,12 @@ Rates = dict[str, dict[str, dict[int, list[list[float]]]]]
 
 def main(arguments: Arguments) -> None:
     found: Rates = {}
-    for number in arguments.numbers:
-        for seed in arguments.seeds:
-            for setting in arguments.settings:
-                for method in arguments.methods:
-                    result = executed(arguments, setting, method, number, seed)
-                    rates = [rate for task, rate in result.success_once.items() if counts(setting, task)]
-                    known = found.setdefault(setting, {}).setdefault(method, {})
-                    known.setdefault(number, []).append([float(rate or 0.0) for rate in rates])
-                    report(arguments, found)
+    each = product(arguments.numbers, arguments.seeds, arguments.settings, arguments.methods)
+    for number, seed, setting, method in each:
+        result = executed(arguments, setting, method, number, seed)
+        rates = [float(rate or 0.0) for task, rate in result.success_once.items() if counts(setting, task)]
+        found.setdefault(setting, {}).setdefault(method, {}).setdefault(number, []).append(rates)
+        report(arguments, found)
 
 
 def executed(arguments: Arguments, setting: str, method: str, number: int, seed: int) -> EvaluationResult:
@@ -78,7 +76,7 @@ def report(arguments: Arguments, found: Rates) -> None:
     for setting, methods in found.items():
         for method, each in methods.items():
             cells = [str(mean_rate(each[number])) if number in each else "" for number in numbers]
-            lines.append([setting, method, str(len(arguments.seeds)), *cells])
+            lines.append([setting, method, str(max(map(len, each.values()))), *cells])
     write_json(arguments.out / "results.json", found)
     write_text(arguments.out / "table.md", markdown_table(["setting", "method", "seeds", *map(str, numbers)], lines))
     draw(arguments, found)

@@ -148,12 +148,13 @@ def step_vectors(plan: CanonicalPlan) -> list[list[float]]:
     """For each step, what is told of it beside its roles: ones for its verb, its manner and, if MT10 demonstrates the
     plan's motion in a way of its own, for that. Verbs of the same motion share theirs."""
     found = []
-    for step, all_steps in [(one, steps) for steps in (plan.steps, plan.reserve) for one in steps]:
-        last = motion_of(all_steps)
+    for steps in (plan.steps, plan.reserve):
+        last = motion_of(steps)
         own = [float(last is not None and [last.moved, last.target] == pair) for pair in _OWN]
-        verb = _SAME_MOTION.get(step.verb, step.verb)
-        ones = [float(verb == one) for one in _VERBS], [float(step.manner == one) for one in get_args(Manner)]
-        found.append([*ones[0], *ones[1], *own])
+        for step in steps:
+            verb = _SAME_MOTION.get(step.verb, step.verb)
+            ones = [float(verb == one) for one in _VERBS], [float(step.manner == one) for one in get_args(Manner)]
+            found.append([*ones[0], *ones[1], *own])
     return found
 
 

@@ -128,9 +128,8 @@ class PlanEncoder(ReadsPlans, Encoder):
             raise ValueError("canonical must be true with roles=True, which are those of canonical plans")
         if reserve and not canonical:
             raise ValueError("canonical must be true with reserve=True, which holds canonical steps")
-        self.canonical = {task: canonical_plan(plan) for task, plan in self.written.items()} if canonical else {}
-        if reserve:
-            self.canonical = {task: with_reserve(plan) for task, plan in self.canonical.items()}
+        found = map(canonical_plan, self.written.values() if canonical else ())
+        self.canonical = {one.written.task: with_reserve(one) if reserve else one for one in found}
         seen_plans = Plans([one.plan for one in self.canonical.values()]) if canonical else self.written
         if canonical and evaluator is not None and evaluator.plans.fingerprint == self.written.fingerprint:
             evaluator = evaluator.with_plans(seen_plans)
@@ -212,7 +211,7 @@ class PlanEncoder(ReadsPlans, Encoder):
         if not self.config["reserve"]:
             return asked
         turns = TakeTurns(self.plans.layout, in_keys=self.own_keys[:1])
-        return turns if asked is None else Compose(*getattr(asked, "transforms", [asked]), turns)
+        return turns if asked is None else Compose(asked, turns)
 
     def _in_turn(self, tensordict: TensorDictBase, rows: Tensor) -> Tensor:
         """(B, S) bool, the steps whose turn it is: the plan's own, or those in reserve."""

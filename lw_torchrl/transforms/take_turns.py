@@ -1,6 +1,7 @@
 """TakeTurns: whose turn it is, the plan's own steps or those in reserve, by whether anything still moves."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -18,6 +19,15 @@ from lw_torchrl.transforms.environment import reset_rows
 def turn_key(observation: NestedKey) -> NestedKey:
     """Where :class:`TakeTurns` writes the turn: beside ``observation``, ``observation_turn``."""
     return key_beside(observation, "_turn")
+
+
+class _Rows(NamedTuple):
+    """What is kept of each row's episode."""
+
+    turn: Tensor  # B int64
+    waited: Tensor  # B int64, steps without motion
+    lasted: Tensor  # B int64, steps of the turn
+    stood: Tensor  # (B, P, 3), where everything was when it last moved
 
 
 class TakeTurns(Transform):
@@ -65,10 +75,7 @@ class TakeTurns(Transform):
         super().__init__(in_keys=read, out_keys=[turn_key(read[0])])
         check_apart(self.in_keys, self.out_keys)
         self.layout, self.patience, self.longest, self.still = layout, patience, longest, still
-        self._turn: Tensor | None = None  # (B,) int64
-        self._waited: Tensor | None = None  # (B,), steps without motion
-        self._lasted: Tensor | None = None  # (B,), steps of the turn
-        self._stood: Tensor | None = None  # (B, P, 3), where everything was when it last moved
+        self._rows: _Rows | None = None
 
     def _positions(self, tensordict: TensorDictBase) -> Tensor:
         observation = tensordict.get(self.in_keys[0], None)
@@ -76,28 +83,28 @@ class TakeTurns(Transform):
             raise missing_keys(tensordict.keys(True, True), str(self.in_keys[0]))
         return torch.stack([observation[..., part] for part in self.layout.positions[:-1]], -2)
 
+    def _keep(self, tensordict: TensorDictBase, now: _Rows, which: Tensor | None) -> TensorDictBase:
+        """Keep the state of the rows ``which``, B bool or None for all, and write whose turn it is."""
+        before = self._rows or [None] * len(now)
+        kept = (reset_rows(old, new, which, new.dim() - now.turn.dim()) for old, new in zip(before, now, strict=True))
+        self._rows = _Rows(*kept)
+        return tensordict.set(self.out_keys[0], self._rows.turn.clone())
+
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        begun, now = tensordict.get("_reset", None), self._positions(tensordict_reset)
+        now = self._positions(tensordict_reset)
         none = torch.zeros(now.shape[:-2], dtype=torch.int64, device=now.device)
-        self._turn, self._waited = reset_rows(self._turn, none, begun), reset_rows(self._waited, none, begun)
-        self._lasted, self._stood = reset_rows(self._lasted, none, begun), reset_rows(self._stood, now, begun, 2)
-        return tensordict_reset.set(self.out_keys[0], self._turn.clone())
+        return self._keep(tensordict_reset, _Rows(none, none, none, now), tensordict.get("_reset", None))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        now = self._positions(next_tensordict)
-        if self._turn is None or self._waited is None or self._lasted is None or self._stood is None:
+        if self._rows is None:
             raise RuntimeError("rows have begun no episode: reset the environment")
-        every = torch.ones_like(self._turn, dtype=torch.bool)
-        stepping = tensordict.get("_step", every).reshape(every.shape)
-        moved = ((now - self._stood).norm(dim=-1) > self.still).any(-1)
-        waited, lasted = torch.where(moved, 0, self._waited + 1), self._lasted + 1
+        now, (turn, waited, lasted, stood) = self._positions(next_tensordict), self._rows
+        moved = ((now - stood).norm(dim=-1) > self.still).any(-1)
+        waited, lasted = torch.where(moved, 0, waited + 1), lasted + 1
         over = (waited >= self.patience) | (lasted >= self.longest)
-        anew, count = stepping & (moved | over), torch.where(over, 0, 1)
-        self._stood = torch.where(anew[..., None, None], now, self._stood)
-        self._waited = torch.where(stepping, waited * count, self._waited)
-        self._lasted = torch.where(stepping, lasted * count, self._lasted)
-        self._turn = self._turn + (stepping & over)
-        return next_tensordict.set(self.out_keys[0], self._turn.clone())
+        stood = torch.where((moved | over)[..., None, None], now, stood)
+        after = _Rows(turn + over, torch.where(over, 0, waited), torch.where(over, 0, lasted), stood)
+        return self._keep(next_tensordict, after, tensordict.get("_step", None))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         for rows in (tensordict, tensordict.get("next", None)):

@@ -68,7 +68,7 @@ def test_its_transform_counts_turns_and_answers_queries():
 
 def test_a_policy_that_gets_nowhere_comes_to_its_reserve():
     actor = make(MT10, reserve=True)
-    torch.nn.init.zeros_(next(iter(reversed(list(actor.head.parameters())))))
+    torch.nn.init.zeros_([*actor.head.parameters()][-1])
     seen = []
     lw.evaluate(
         actor,
