@@ -22,9 +22,13 @@ _LOOKS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  #
 
 
 def _open_gl() -> Any:
-    """A context of OpenGL without a window; of EGL without a display and MUJOCO_GL."""
+    """A context of OpenGL without a window: MUJOCO_GL's, or EGL's where there is no display either.
+
+    MuJoCo reads MUJOCO_GL when it is imported; robosuite sets it later.
+    """
     headless = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    if headless and not os.environ.get("MUJOCO_GL"):
+    backend = os.environ.get("MUJOCO_GL", "").lower().strip() or ("egl" if headless else "")
+    if backend == "egl":
         before = os.environ.get("PYOPENGL_PLATFORM")
         from mujoco.egl import GLContext  # which says "egl" to processes started from here, too
 

@@ -249,3 +249,12 @@ def test_without_open_gl_the_error_says_what_to_install(backend):
     assert f"MUJOCO_GL={backend}" in done.stdout
     assert "MUJOCO_GL=egl" in done.stdout
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_a_library_may_ask_for_egl_after_mujoco_was_imported():
+    asking_late = "import mujoco, os\nos.environ['MUJOCO_GL'] = 'egl'  # as robosuite does\n" + _SHOW
+    environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
+    done = subprocess.run([sys.executable, "-c", asking_late], env=environment, capture_output=True, text=True)
+    assert "pictures need OpenGL" not in done.stdout + done.stderr
+    assert not done.returncode
