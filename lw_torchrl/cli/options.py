@@ -233,10 +233,11 @@ def is_suite(name: str) -> bool:
 def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite | None:
     """The suite of --suite: a name, or "package.module:object", for which the working folder is searched first; without
     one that of ``tasks``, fetch or fetch/push. None for Meta-World."""
-    from lw_torchrl.suites.suite import SUITES, Suite, find_suite, load_suite
+    from lw_torchrl.suites.suite import Suite, find_suite, load_suite, suite_name
 
     if name is None:
-        return find_suite(tasks) if any("/" in task or task in SUITES for task in tasks) else None
+        other = any("/" in task or task == "metaworld" or suite_name(task) != "metaworld" for task in tasks)
+        return find_suite(tasks) if other else None
     if ":" not in name:
         return load_suite(name)
     found = _imported("suite", name, "object")

@@ -91,13 +91,13 @@ def train(
 
     from lw_torchrl._devices import check_device
     from lw_torchrl.data.dataset import read_metadata
-    from lw_torchrl.modules.policy import METHODS, make_policy, policy_class
+    from lw_torchrl.modules.tables import METHODS, make_policy
 
     options.use_one_thread()
     there, held = check_device("device", device), read_metadata(data).config
     encoder = options.read_encoder(text_encoder)
     actor_options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
-    reads_plans = policy_class(METHODS[method].policy).plan_options
+    reads_plans = METHODS[method].reads_plans
     if reads_plans:
         actor_options["mix"] = mix or "latents"
     for option, value in (("mix", mix), ("latent-consistency", latent_consistency), ("evaluator", evaluator)):

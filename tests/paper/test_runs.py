@@ -26,7 +26,7 @@ from tiny_runs import (
 )
 
 import lw_torchrl as lw
-from lw_torchrl.modules.policy import METHODS
+from lw_torchrl.modules import METHODS
 from lw_torchrl.paper import imitation, runs
 from lw_torchrl.paper.imitation import SCRIPTED, ImitationRun
 from lw_torchrl.paper.recipes import PRESETS, SETTINGS, Member

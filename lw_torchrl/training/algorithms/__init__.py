@@ -1,6 +1,7 @@
 """The methods of ``lw-torchrl online``: a file each, with what it reads and does, and a line in :data:`LEARNERS`."""
 
 from lw_torchrl._checks import check_choice
+from lw_torchrl._tables import Classes
 from lw_torchrl.training.algorithms.advantage import AdvantageConfig, AdvantageLearner
 from lw_torchrl.training.algorithms.expert_iteration import ExpertIterationConfig, ExpertIterationLearner
 from lw_torchrl.training.algorithms.learner import Learner, OnlineConfig
@@ -8,14 +9,19 @@ from lw_torchrl.training.algorithms.ppo import PPOConfig, PPOLearner
 from lw_torchrl.training.algorithms.sac import SACConfig, SACLearner
 from lw_torchrl.training.algorithms.td3 import ResidualConfig, ResidualLearner, TD3Config, TD3Learner
 
-LEARNERS: dict[str, type[Learner]] = {
-    "advantage": AdvantageLearner,
-    "td3": TD3Learner,
-    "sac": SACLearner,
-    "residual": ResidualLearner,
-    "ppo": PPOLearner,
-    "expert-iteration": ExpertIterationLearner,
-}
+LEARNERS = Classes(
+    "algorithm",
+    Learner,
+    "lw_torchrl.algorithms",
+    {
+        "advantage": AdvantageLearner,
+        "td3": TD3Learner,
+        "sac": SACLearner,
+        "residual": ResidualLearner,
+        "ppo": PPOLearner,
+        "expert-iteration": ExpertIterationLearner,
+    },
+)
 """Name to method; yours can be added."""
 
 
