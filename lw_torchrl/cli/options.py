@@ -6,16 +6,19 @@ What names and files alone can tell is checked without torch.
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from tyro.conf import arg
 
 import lw_torchrl as lw
-from lw_torchrl._checks import unknown_name
+from lw_torchrl._checks import check_choice, unknown_name
+from lw_torchrl._tables import plugins_of
 from lw_torchrl.cli.parsing import own_module
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
@@ -29,8 +32,12 @@ Loaded = TypeVar("Loaded")
 SETS = ("MT10", "MT50")
 ACTORS = ("expert", "scripted", "spoilt-60", "spoilt-30", "wrong", "random")
 """The names of :data:`lw_torchrl.data.BEHAVIOURS`."""
-Condition = Literal["pcbc", "dc", "one-hot"]
-"""The names of :data:`lw_torchrl.modules.METHODS`."""
+CONDITIONS = ("pcbc", "dc", "one-hot")
+"""Our names of :data:`lw_torchrl.modules.METHODS`."""
+_METHODS = (
+    "pcbc, by plan; or a baseline: dc, by description, one-hot, by number; or a class of yours (docs/extending.md)."
+)
+Condition = Annotated[str, arg(metavar="NAME", help=f"how policies are conditioned: {_METHODS}")]
 
 Json = Annotated[bool, arg(help="print one JSON document instead, see docs/cli.md.")]
 TaskFile = Annotated[Path | None, arg(help="a file of your tasks, which replace ours of the same name or join them.")]
@@ -97,7 +104,7 @@ def simulated(
     if own := [name for name in given if name not in (*SETS, *TASKS) and name in known]:
         raise ValueError(
             f"{argument}: the simulator has no {', '.join(own)}; "
-            "tasks of your own run in an engine of yours, in Python: docs/training.md"
+            "tasks of your own run in a suite of yours: docs/extending.md"
         )
     return resolve_tasks(names, tasks=TASKS)
 
@@ -174,6 +181,24 @@ def check_dataset(argument: str, folder: Path) -> None:
     """Raise :class:`FileNotFoundError` where there is no dataset's folder."""
     if not folder.is_dir():
         raise FileNotFoundError(f"{argument}: no dataset folder {str(folder)!r}; make one with `lw-torchrl collect`")
+
+
+def check_condition(argument: str, *names: str) -> None:
+    """Refuse the first name of a method that is neither ours nor added by a module or a package."""
+    groups = ("methods", "policies", "encoders")
+    for name in names:
+        check_listed(argument, name, CONDITIONS, "lw_torchrl.modules:METHODS", groups)
+
+
+def check_listed(argument: str, name: str, ours: Sequence[str], place: str, groups: Sequence[str]) -> None:
+    """Refuse a name that is neither ours nor in the table at ``place``, which is imported only if users may have added
+    to it: a module that --import names, or an installed package, by an entry point in one of ``groups``."""
+    module, _, table = place.partition(":")
+    if name in ours:
+        return
+    if module not in sys.modules and not any(plugins_of(f"lw_torchrl.{group}") for group in groups):
+        raise unknown_name(argument, name, ours)
+    check_choice(argument, name, getattr(import_module(module), table))
 
 
 def check_reference(sources: Sequence[str], attribute: bool) -> None:

@@ -11,7 +11,7 @@ from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.modules.plan_attention import PlanAttention
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
-from lw_torchrl.modules.policy import Encoder, Policy
+from lw_torchrl.modules.policy import Encoder, Encoding, Policy
 from lw_torchrl.modules.query_evaluator import EVALUATORS, QueryEvaluator
 from lw_torchrl.modules.relative_positions import PlanFocus
 from lw_torchrl.modules.residual_actor import ResidualActor
@@ -21,9 +21,8 @@ from lw_torchrl.modules.tables import ENCODERS, METHODS, POLICIES, Method, make_
 
 __all__ = [
     "ENCODERS", "EVALUATORS", "IMAGE_ENCODERS", "METHODS", "POLICIES", "ActorEnsemble", "ConditionedActor",
-    "DemonstratedActor",
-    "DescriptorConditionedActor", "DescriptorEncoder", "Encoder", "HeldEvaluator", "ImageQueryEvaluator", "Method",
-    "ObservationFeatures", "PlanAttention", "PlanConditionedActor", "PlanConditionedQValue", "PlanConditionedValue",
+    "DemonstratedActor", "DescriptorConditionedActor", "DescriptorEncoder", "Encoder", "Encoding", "HeldEvaluator",
+    "ImageQueryEvaluator", "Method", "ObservationFeatures", "PlanAttention", "PlanConditionedActor", "PlanConditionedQValue", "PlanConditionedValue",
     "PlanEncoder", "PlanFocus", "Policy", "QValue", "QueryEvaluator", "ResidualActor", "ScriptedSkillActor",
     "StateQueryEvaluator", "TransferredActor", "Value", "make_policy", "plan_actor_value",
 ]  # fmt: skip

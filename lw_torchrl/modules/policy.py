@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs import Compose, Transform
 
+from lw_torchrl._checks import check_choice
 from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import AnyPlans, Plans
@@ -65,6 +66,10 @@ class Prepared(TensorDictModuleBase):
         """One for the tasks of ``plans``, ``cls(plans, **options)``; a class that takes a ``text_encoder`` gets it."""
         if text_encoder is not None and "text_encoder" in signature(cls).parameters:
             options["text_encoder"] = text_encoder
+        known = signature(cls).parameters
+        if not any(one.kind is one.VAR_KEYWORD for one in known.values()):
+            for name in options:
+                check_choice(f"option of {cls.__name__}", name, [*known][1:])
         return cls(plans, **options)
 
     def transform(self) -> Transform | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from inspect import signature
 from typing import Any
 
 from lw_torchrl._checks import check_choice, checked, shown, unknown_name
@@ -62,9 +63,19 @@ class Method:
     @property
     def reads_plans(self) -> bool:
         """Whether what it makes is conditioned on plans."""
+        return self._made.plan_options
+
+    def takes(self, option: str) -> bool:
+        """Whether what it makes has an option of that name."""
+        known = signature(self._made).parameters
+        of_head = "encoder" in self.options and option in signature(POLICIES[self.policy]).parameters
+        return option in known or of_head or any(one.kind is one.VAR_KEYWORD for one in known.values())
+
+    @property
+    def _made(self) -> type[Prepared]:
         encoder = self.options.get("encoder")
         made: type[Prepared] = ENCODERS[encoder] if encoder else POLICIES[self.policy]
-        return made.plan_options
+        return made
 
 
 class Methods(Table[Method]):

@@ -62,8 +62,9 @@ class _Trained:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Of its actor."""
-        return {**self.member.actor, **(self.member.plan_actor if self.reads_plans else {})}
+        """Of its actor; a method of the user's may not have all."""
+        given = {**self.member.actor, **(self.member.plan_actor if self.reads_plans else {})}
+        return {name: value for name, value in given.items() if METHODS[self.method].takes(name)}
 
     @property
     def yaw(self) -> float:

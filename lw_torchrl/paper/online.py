@@ -164,10 +164,11 @@ class OnlineRun(Run):
 
         def train(checkpoint: Path) -> dict[str, Any]:
             torch.manual_seed(self.seed)
-            actor = make_policy(self.condition, self.own_plans(work.plans), feature_noise=self.recipe.feature_noise)
+            noise: dict[str, Any] = {"feature_noise": self.recipe.feature_noise}
+            options = noise if METHODS[self.condition].takes("feature_noise") else {}
+            actor = make_policy(self.condition, self.own_plans(work.plans), **options)
             replay, config = self._replay(work, actor), replace(self.recipe.cloning, seed=self.seed)
-            options: dict[str, Any] = {"checkpoint": checkpoint, "progress": work.progress}
-            BehavioralCloningTrainer(actor, replay, config, **options).train()
+            BehavioralCloningTrainer(actor, replay, config, checkpoint=checkpoint, progress=work.progress).train()
             return {"actor": actor, "replay": replay}
 
         file = work.out / self.begin.folder / "policy.zip"

@@ -242,9 +242,11 @@ def test_the_words_of_the_command_line_are_those_of_the_library():
     from lw_torchrl.modules import METHODS
     from lw_torchrl.paper.online import WEAKEST
     from lw_torchrl.paper.recipes import MIXTURES, OFFLINE_METHODS
+    from lw_torchrl.training import LEARNERS
 
     assert tuple(BEHAVIOURS) == options.ACTORS
-    assert tuple(METHODS) == get_args(options.Condition)
+    assert tuple(METHODS) == options.CONDITIONS
+    assert tuple(LEARNERS) == online.ALGORITHMS
     assert get_args(online.Mixture) == tuple(MIXTURES)
     assert get_args(online.OfflineMethod) == tuple(OFFLINE_METHODS)
     assert online.WEAKEST == WEAKEST

@@ -7,7 +7,7 @@ from typing import Any
 
 from lw_torchrl._checks import check_choice, checked, shown
 from lw_torchrl._tables import Table
-from lw_torchrl.language.formats.base import STYLES, PlanFormat
+from lw_torchrl.language.formats.base import STYLES, Clause, PlanFormat, Reading
 from lw_torchrl.language.formats.prose import md
 from lw_torchrl.language.formats.python import py, py_md
 from lw_torchrl.language.plans import ConditionalPlan
@@ -48,3 +48,6 @@ gripper above the window handle.
     Source: paper section 'Conditional Plan Generation'.
     """
     return PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].encode(plan)
+
+
+__all__ = ["PLAN_FORMATS", "Clause", "PlanFormat", "Reading", "encode_plan"]
