@@ -1,6 +1,6 @@
 """TorchRL's IQL, TD3+BC and CQL with what our method has: imitation by l1, and values standardised by task.
 
-Both are done in each minibatch, in which every task has as many rows. TorchRL's own losses stand beside them in the tables.
+Both are done in each minibatch, in which every task has as many rows.
 """
 
 from typing import Any
