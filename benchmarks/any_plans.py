@@ -19,6 +19,7 @@ from lw_torchrl.evaluation.statistics import mean_difference, mean_rate, wilson_
 from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.canonical import canonical_plan, default_plan, most_trusted
 from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.suites import find_points
 
 DEVELOPMENT = (
     "assembly", "bin-picking", "button-press", "button-press-wall", "coffee-pull", "dial-turn", "door-close",
@@ -103,11 +104,12 @@ def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans |
         elif row == "palm2":
             written = lw.load_plans(required(arguments.palm2, "palm2"))
             yield row, "pcbc", Plans([written[task] for task in outside])
-        elif row == "no-points":  # what we named beside the published things is not there
+        elif row == "no-points":  # what we named beside the published things is not there; or shapes tell it
             bare = {task: lw.TASKS[task].published for task in outside}
-            written = lw.load_plans(required(arguments.palm2, "palm2"), tasks=lw.TASKS | bare)
-            yield "palm2, no points", "pcbc", Plans([written[task] for task in outside])
-            yield "default, no points", "pcbc", Plans([default_plan(written[task]).plan for task in outside])
+            for points, tasks in {"no points": bare, "points of shapes": find_points(outside)}.items():
+                written = lw.load_plans(required(arguments.palm2, "palm2"), tasks=lw.TASKS | tasks)
+                yield f"palm2, {points}", "pcbc", Plans([written[task] for task in outside])
+                yield f"default, {points}", "pcbc", Plans([default_plan(written[task]).plan for task in outside])
         elif row == "models":
             for name, plans in of_models(required(arguments.answers, "answers"), seed):
                 yield name, "pcbc", plans
