@@ -48,7 +48,7 @@ def reproduce(
     schedule: Scheduled,  # which runs are done, and where
     seeds: tuple[int, ...] = (0, 1, 2),  # of the demonstrations, the initial weights and the minibatches
     methods: tuple[str, ...] | None = None,
-    preset: Literal["strong", "paper", "evaluator", "no-roles"] = "strong",
+    preset: Literal["strong", "paper", "one-network", "evaluator", "no-roles"] = "strong",
     passes: int | None = None,  # over the rows, fewer than the 500 of the preset paper
     plans: tuple[str, ...] = (),
     task_file: options.TaskFile = None,
@@ -75,7 +75,8 @@ def reproduce(
             plans with scripted skills; or yours, of lw.modules.METHODS, POLICIES or ENCODERS. By default all of ours;
             with --plans, those that are trained.
         preset: strong, ours; paper, the published recipe, which takes hours; evaluator, in few-shot, ours with
-            conditions answered by a network that is trained inside the policy; or no-roles, in zero-shot.
+            conditions answered by a network that is trained inside the policy; one-network, in few-shot, the policy that
+            lw.load_actor("few-shot-mt50") gives; or no-roles, in zero-shot.
         plans: of all 50 tasks, instead of ours: .plan files, .json files of pairs, folders, or MT50. If several have a
             plan for a task, the last one counts.
     """
@@ -96,9 +97,9 @@ def reproduce(
     from lw_torchrl.paper.runs import execute_run
 
     recipes = PRESETS[preset]
+    if preset in ("one-network", "evaluator", "no-roles") and experiment not in recipes:
+        raise ValueError(f"--preset {preset} is for {', '.join(recipes)}, got {experiment}")
     if preset in ("evaluator", "no-roles"):
-        if experiment not in recipes:
-            raise ValueError(f"--preset {preset} is for {', '.join(recipes)}, got {experiment}")
         if methods not in (None, ("pcbc",)):
             raise ValueError(f"--methods must be pcbc with --preset {preset}: others have no plans")
         methods = ("pcbc",)

@@ -22,7 +22,8 @@ from lw_torchrl.modules.tables import ENCODERS, METHODS, POLICIES, Method, make_
 __all__ = [
     "ENCODERS", "EVALUATORS", "IMAGE_ENCODERS", "METHODS", "POLICIES", "ActorEnsemble", "ConditionedActor",
     "DemonstratedActor", "DescriptorConditionedActor", "DescriptorEncoder", "Encoder", "Encoding", "HeldEvaluator",
-    "ImageQueryEvaluator", "Method", "ObservationFeatures", "PlanAttention", "PlanConditionedActor", "PlanConditionedQValue", "PlanConditionedValue",
-    "PlanEncoder", "PlanFocus", "Policy", "QValue", "QueryEvaluator", "ResidualActor", "ScriptedSkillActor",
-    "StateQueryEvaluator", "TransferredActor", "Value", "make_policy", "plan_actor_value",
+    "ImageQueryEvaluator", "Method", "ObservationFeatures", "PlanAttention", "PlanConditionedActor",
+    "PlanConditionedQValue", "PlanConditionedValue", "PlanEncoder", "PlanFocus", "Policy", "QValue", "QueryEvaluator",
+    "ResidualActor", "ScriptedSkillActor", "StateQueryEvaluator", "TransferredActor", "Value", "make_policy",
+    "plan_actor_value",
 ]  # fmt: skip
