@@ -255,6 +255,8 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "encode_plan": {"plan": PLAN, "format": "chain_py"},
         "evaluate": {"actor": actor, **run},
         "evaluate_plans": {"plans": [PLAN], "episodes": 1, "seed": 1, "max_steps": 1, "progress": False},
+        "from_pretrained": {"source": folder},
+        "push_to_hub": {"policy": folder / "actor.zip", "repo": "me/mine"},
         "load_actor": {"path": lw_saved(lw.save_actor, actor, folder / "actor.zip")},
         "load_evaluator": {
             "path": lw_saved(lw.training.save_evaluator, evaluator, folder / "asked.zip"),

@@ -12,7 +12,7 @@ from tyro.conf import Positional
 
 import lw_torchrl as lw
 from lw_torchrl._checks import counted, shown
-from lw_torchrl._files import read_json
+from lw_torchrl._files import read_json, shipped_policy
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled, command_line
@@ -76,6 +76,7 @@ def online(
         raise ValueError(f"--step is of the method residual, --methods are {', '.join(methods)}")
     if start is not None:
         options.check_saved("start", start)
+        start = shipped_policy(start) or start
     tuned = None if step is None else _read_step(step)
     table = options.read_tasks(task_file, tasks)
     chosen = options.simulated("tasks", options.one_or_many(tasks), table)

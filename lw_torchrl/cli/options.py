@@ -18,6 +18,7 @@ from tyro.conf import arg
 
 import lw_torchrl as lw
 from lw_torchrl._checks import check_choice, unknown_name
+from lw_torchrl._files import shipped_policy
 from lw_torchrl._tables import plugins_of
 from lw_torchrl.cli.parsing import own_module
 from lw_torchrl.language.plan_files import load_plans
@@ -215,13 +216,13 @@ def check_saved(argument: str, path: Path, what: str = "policy", writer: str = "
     """Refuse a path where there is no file of a policy, or of what else a command writes."""
     if path.is_dir():
         raise ValueError(f"{argument}: {str(path)!r} is a folder; a {what} is one file")
-    if not path.exists():
+    if not path.exists() and (what != "policy" or shipped_policy(path) is None):
         raise FileNotFoundError(f"{argument}: no file {str(path)!r}; `lw-torchrl {writer}` writes one")
 
 
 def check_actor(argument: str, who: str) -> None:
     """Raise :class:`ValueError` for who is neither one of :data:`ACTORS` nor a policy's file."""
-    if who not in ACTORS:
+    if who not in ACTORS and shipped_policy(who) is None:
         if not who.endswith(".zip") and not Path(who).exists():
             raise unknown_name(argument, who, [*ACTORS, "a policy's file"])
         check_saved(argument, Path(who))

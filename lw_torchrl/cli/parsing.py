@@ -213,7 +213,12 @@ _OPTIONS = {
     "task": ("tasks", "names"),
     "tasks": ("names",),
 }
-_OPTIONS_OF = {"collect": {"checkpoint": "policy"}, "train": {"root": "data"}, "check": {"plans": "file"}}
+_OPTIONS_OF = {
+    "collect": {"checkpoint": "policy"},
+    "card": {"checkpoint": "policy"},
+    "train": {"root": "data"},
+    "check": {"plans": "file"},
+}
 """Where a command differs, or has an option of that name that means something else."""
 
 

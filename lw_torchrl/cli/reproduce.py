@@ -75,8 +75,8 @@ def reproduce(
             plans with scripted skills; or yours, of lw.modules.METHODS, POLICIES or ENCODERS. By default all of ours;
             with --plans, those that are trained.
         preset: strong, ours; paper, the published recipe, which takes hours; evaluator, in few-shot, ours with
-            conditions answered by a network that is trained inside the policy; one-network, in few-shot, the policy that
-            lw.load_actor("few-shot-mt50") gives; or no-roles, in zero-shot.
+            conditions answered by a network that is trained inside the policy; one-network, in few-shot, the policy
+            that lw.load_actor("few-shot-mt50") gives; or no-roles, in zero-shot.
         plans: of all 50 tasks, instead of ours: .plan files, .json files of pairs, folders, or MT50. If several have a
             plan for a task, the last one counts.
     """

@@ -91,6 +91,8 @@ WRONG = {
     "evaluate my.zip --evaluator nowhere.zip": "--evaluator: no file 'nowhere.zip'",
     "evaluate my.zip --attribute --reference nowhere": "--reference: no plan file or folder 'nowhere'",
     "evaluate my.zip --out file": "--out must be a folder, 'file' is none",
+    "card nowhere.zip": "POLICY: no file 'nowhere.zip'",
+    "card my.zip --result nowhere.json": "--result: no file 'nowhere.json'",
     "record raech": "NAMES must be one of",
     "record reach --policy expret": "--policy must be one of 'expert', ",
     "record reach --compare nowhere.zip": "--compare: no file 'nowhere.zip'",
