@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -95,7 +94,7 @@ def evaluate(
     result = lw.evaluate(policy or lw.ExpertActor(chosen), reference=trusted, **how, **where)
     output = Output(json).result(result)
     if attribute:
-        failures = [asdict(one) for one in result.failures or ()]
+        failures = [one.to_json() for one in result.failures or ()]
         output.show("failures", failures, f"\n{result.failure_table()}")
     if out is not None:
         with held(out, "out", folder=True, wait=True):

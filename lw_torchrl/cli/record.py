@@ -3,7 +3,6 @@
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -81,7 +80,7 @@ def record(
                 ended += "" if failure is None else f", {failure.cause}: {failure.why}"
                 print(f"{one.task}, episode {one.episode}, {who}: {ended}")
                 row = {"task": one.task, "episode": one.episode, "policy": who, "first_success": first}
-                rows.append(row | {"failure": None if failure is None else asdict(failure)})
+                rows.append(row | {"failure": None if failure is None else failure.to_json()})
                 name = None if compare is None else f"{one.task}-{one.episode}-{len(recorded) + 1}"
                 told: dict[str, Any] = {"seed": seed, "policy": who, "failure": failure, "name": name}
                 pages.append(lw.log_rollout(logger, one.steps, shown, **told))

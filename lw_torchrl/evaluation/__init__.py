@@ -4,7 +4,7 @@ import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.evaluation.attribution import attribute_failures
 from lw_torchrl.evaluation.evaluator_figures import WrongAnswer, plot_reliability, plot_wrong_answers, wrong_answers
 from lw_torchrl.evaluation.evaluator_report import Drift, EvaluatorReport, condition_drift, drift_table, score_evaluator
-from lw_torchrl.evaluation.failure_records import CAUSES, Failure
+from lw_torchrl.evaluation.failure_records import CAUSES, Failure, MendedEpisode
 from lw_torchrl.evaluation.figures import (
     plot_failures,
     plot_learning_curves,
@@ -29,7 +29,7 @@ from lw_torchrl.evaluation.summary import MethodComparison, Pair, Summary, TaskS
 
 __all__ = [
     "CAUSES", "Drift", "EpisodeResult", "Estimate", "EvaluationResult", "EvaluatorReport", "Failure",
-    "MethodComparison", "Pair", "PlanUse", "StuckStep", "Summary", "TaskSummary", "WrongAnswer",
+    "MendedEpisode", "MethodComparison", "Pair", "PlanUse", "StuckStep", "Summary", "TaskSummary", "WrongAnswer",
     "attribute_failures", "condition_drift", "count_solved", "drift_table", "evaluate", "evaluate_plans",
     "interquartile_mean", "mean_difference", "mean_rate", "plot_failures", "plot_learning_curves", "plot_methods",
     "plot_reliability", "plot_sorted_tasks", "plot_success", "plot_wrong_answers", "probability_of_improvement",

@@ -235,22 +235,26 @@ def _by_counterfactuals(
 ) -> Failure:
     """What the counterfactuals tell, explained by the states."""
     first = {name: results[one.which] for name, results in tried.found.items() if one.which in results}
-    mended = [name for name, hit in first.items() if hit is not None]
+    mended = {name: hit for name, hit in first.items() if hit is not None}
     replaced: dict[str, bool] = {}
     for name in first:
         part = "skill" if name == "skills" else name
         replaced[part] = replaced.get(part, False) or name in mended
     cause: Cause = "undecided"
     also: Cause | None = None
+    decided: tuple[str, str] | None = None  # the counterfactual, and what it replaces, in words
     same = told.evidence.get("plan_departs") == 0.0
     best = choose_cause([name for name in mended if not (same and name == "plan")], shares)
     if best is not None:
         cause, part = _COUNTERFACTUALS[best]
-        words = f"With {part} the same episode succeeds, at step {first[best]}"
+        decided = best, part
+        words = f"With {part} the same episode succeeds, at step {len(mended[best].steps) - 1}"
         if others := [name for name in mended if name in _COUNTERFACTUALS and name not in ("time", best)]:
             words += f"; with {_listed(others, 'and')} too, which replaces more or mends less of the task"
     elif (pair := choose_cause_pair(mended, shares)) is not None:
         cause, also = pair
+        both = next(name for name in mended if set(name.split(" + ")) == {cause, also})
+        decided = both, f"{_PARTS[cause]} and {_PARTS[also]}"
         words = f"Neither {_PARTS[cause]} nor {_PARTS[also]} alone mend it, both together do"
     elif same and "plan" in mended:
         words = "With the reference plan it succeeds, though in no state that asks for anything else"
@@ -268,7 +272,8 @@ def _by_counterfactuals(
         at, why = stall_step(one, step, plan.definition.layout), one.active_time(plan, step)
     by = {f"mended_by_{name.replace(' + ', '_and_')}": share for name, share in shares.items()}
     evidence = {**told.evidence, **by}
-    return Failure(one.task, seed, one.episode, cause, also, step, at, _text(why, words), evidence, replaced)
+    how = None if decided is None else tried.mended(decided[0], one.which, decided[1])
+    return Failure(one.task, seed, one.episode, cause, also, step, at, _text(why, words), evidence, replaced, how)
 
 
 def _listed(names: Iterable[str], joint: str) -> str:

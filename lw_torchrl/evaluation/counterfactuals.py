@@ -10,10 +10,13 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
+from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.explanation import EpisodeStates, Scripts, attended, candidates, unlike_scripts
+from lw_torchrl.evaluation.failure_records import MendedEpisode
 from lw_torchrl.evaluation.running import ROWS, Acts, answered_by, make_env, running
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.task_index import PlanTables
@@ -24,6 +27,7 @@ from lw_torchrl.suites.metaworld.experts import ExpertActor
 from lw_torchrl.transforms.qaf import plan_program
 
 EpisodeId = tuple[str, int]  # task, episode
+_KEPT: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next", "success"), ("next", "reward")]
 _TRIED_STEPS = 3  # in which a skill is replaced, one at a time, before it is in all steps
 
 
@@ -125,17 +129,20 @@ class EpisodeRepeater:
 
     def __call__(
         self, what: str, which: Sequence[EpisodeId], actor: Any, plans: Plans, evaluator: Any = None, longer: int = 1
-    ) -> dict[EpisodeId, int | None]:
-        """Each episode's first successful step, from 0, or None; episodes may be ``longer`` by this factor."""
+    ) -> dict[EpisodeId, FinishedEpisode | None]:
+        """Each episode up to its first success, None of one that fails again; they may be ``longer`` by this factor."""
         wanted = {task: [k for _, k in listed] for task, listed in groupby(sorted(which), itemgetter(0))}
         rows = len(wanted) * max(1, min(max(map(len, wanted.values())), ROWS // len(wanted)))
         rows = max(len(wanted), min(rows, self.num_envs or rows))
         tasks = [self.tasks[task] for task in wanted]
         base = LanguageWorldEnv(tasks, num_envs=rows, max_steps=self.max_steps * longer, strict=True, **self.env)
-        env = make_env(actor.actor if isinstance(actor, WithScripts) else actor, plans, base, evaluator)
-        found: dict[EpisodeId, int | None] = {}
+        acts = actor.actor if isinstance(actor, WithScripts) else actor
+        env = make_env(acts, plans, base, evaluator)
+        found: dict[EpisodeId, FinishedEpisode | None] = {}
+        told = [key for key in ("qaf",) if key in env.full_observation_spec.keys()]
+        told += [key for key in ("skill_weights",) if key in getattr(acts, "out_keys", ())]
         how: dict[str, Any] = {"noise_scale": self.noise_scale, "device": self.device, "progress": self.progress}
-        how |= {"keys": ["observation", ("next", "success")], "after_success": 0}
+        how |= {"keys": [*_KEPT, *told], "after_success": 0}
         with running(f"again with {what}", env, answered_by(actor, evaluator), wanted, **how) as episodes:
             for one in episodes:
                 if not torch.equal(one.steps.get("observation")[0], self.firsts[one.task, one.episode]):
@@ -144,8 +151,7 @@ class EpisodeRepeater:
                         f"seed={self.env['seed']} does; give the seed and the engine that it was run with, and the "
                         "episode from its first state on"
                     )
-                first = one.first_success
-                found[one.task, one.episode] = None if first is None else first - 1
+                found[one.task, one.episode] = None if one.first_success is None else one
         return found
 
 
@@ -157,7 +163,7 @@ class Counterfactuals:
     ) -> None:
         self.actor, self.evaluator, self.scripts, self.repeat = actor, evaluator, scripts, repeat
         self.plans = plans = scripts.plans
-        self.found: dict[str, dict[EpisodeId, int | None]] = {}  # counterfactual to episodes and their first success
+        self.found: dict[str, dict[EpisodeId, FinishedEpisode | None]] = {}  # counterfactual to episodes that it mends
         self.step: dict[EpisodeId, int] = {}  # in which a script mends the episode
         self.reference: Plans | None = None
         self.other = self.other_evaluator = None  # that carry out the reference
@@ -231,6 +237,12 @@ class Counterfactuals:
         which = self._unmended([w for w in ranked if len(self.plans[w[0]].steps) > 1], "skill")
         scripted = self._scripted(self.actor, self.plans)
         self._run("skills", "scripts in all steps", which, scripted, self.plans, self.evaluator)
+
+    def mended(self, name: str, which: EpisodeId, what: str) -> MendedEpisode | None:
+        """The episode as it goes with this counterfactual, under the plan that it carries out."""
+        episode = self.found[name].get(which)
+        plans = self.reference if "plan" in name.split(" + ") and self.reference is not None else self.plans
+        return None if episode is None else MendedEpisode(what, plans[which[0]], episode.steps)
 
     def shares(self) -> dict[str, dict[str, float]]:
         """Task to the share of its failed episodes that each mends, of those it was tried in."""

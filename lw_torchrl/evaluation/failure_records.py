@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from reprlib import repr as short
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from lw_torchrl._checks import Natural, check_fields
+
+if TYPE_CHECKING:
+    from tensordict import TensorDictBase
+
+    from lw_torchrl.language.plans import ConditionalPlan
 
 
 def is_number(value: Any) -> bool:
@@ -44,6 +49,23 @@ CAUSES: dict[str, str] = {
 """Each cause, and what it means."""
 
 
+class MendedEpisode(NamedTuple):
+    """A failed episode as it goes with a part replaced: it succeeds.
+
+    Attributes:
+        by: what was replaced, in words: "the reference plan".
+        plan: the plan that was carried out, and that ``steps["qaf"]`` answers.
+        steps: of batch (T,), up to the first success: ``observation`` (T, 39) float32, ``action`` (T, 4) float32 as
+            executed, ``task_id`` (T,) and ``episode`` (T,) int64, ``("next", "success")`` (T, 1) bool and
+            ``("next", "reward")`` (T, 1) float32; where there are any, ``qaf`` (T, S) bool and ``skill_weights`` (T, S)
+            float32.
+    """
+
+    by: str
+    plan: ConditionalPlan
+    steps: TensorDictBase
+
+
 @dataclass(frozen=True)
 class Failure:
     """Why one episode failed.
@@ -58,6 +80,7 @@ class Failure:
         evidence: name to number, what ``why`` rests on.
         counterfactuals: what was replaced, "query", "plan", "skill", "time", or two as "query + plan", and whether
             the same episode then succeeded; empty where none was tried.
+        mended: the same episode with the cause replaced, where it then succeeds; it is not saved.
     """
 
     task: str
@@ -70,6 +93,12 @@ class Failure:
     why: str
     evidence: Mapping[str, float] = field(default_factory=dict)
     counterfactuals: Mapping[str, bool] = field(default_factory=dict)
+    mended: MendedEpisode | None = field(default=None, compare=False, repr=False)
+
+    def to_json(self) -> dict[str, Any]:
+        """All but :attr:`mended`, as JSON holds it."""
+        found = {one.name: getattr(self, one.name) for one in fields(self) if one.compare}
+        return {name: dict(value) if isinstance(value, Mapping) else value for name, value in found.items()}
 
 
 PARTS = ("query", "plan", "skill", "time")

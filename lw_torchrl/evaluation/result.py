@@ -127,7 +127,7 @@ class EvaluationResult:
         told |= {k: getattr(self, k) for k in ("success_once", "success_at_end", "first_success", "mean_return")}
         told["episodes"] = [{k: v for k, v in asdict(e).items() if k != "actions"} for e in self.episodes]
         if self.failures is not None:
-            told["failures"] = [asdict(failure) for failure in self.failures]
+            told["failures"] = [failure.to_json() for failure in self.failures]
         write_json(path, told)
 
     @classmethod

@@ -16,6 +16,7 @@ from lw_torchrl.evaluation import attribute_failures
 from lw_torchrl.evaluation.attribution import choose_cause, choose_cause_pair
 from lw_torchrl.evaluation.counterfactuals import own_evaluators, with_true_answers
 from lw_torchrl.evaluation.explanation import attended, chosen, last_stay_start, stall_step
+from lw_torchrl.record.rollouts import simulate_again
 from lw_torchrl.transforms.qaf import plan_program
 
 TASK, SEED, STEPS = "drawer-open", 7, 80
@@ -316,3 +317,17 @@ def test_where_nothing_failed_there_is_nothing_to_say():
     result = evaluated(lw.ScriptedSkillActor(PLANS))
     assert result.failures == ()
     assert result.success_once == {TASK: 1.0}
+
+
+def test_the_mended_episode_is_kept_and_can_be_simulated_again():
+    [failure] = evaluated(lw.ScriptedSkillActor(hopeless()), reference=REFERENCE).failures
+    mended = failure.mended
+    assert (mended.by, mended.plan) == ("the reference plan", REFERENCE[TASK])
+    success = mended.steps["next", "success"].flatten().tolist()
+    assert success == [False] * (len(success) - 1) + [True]
+    assert mended.steps["qaf"].shape == mended.steps["skill_weights"].shape == (len(success), 3)
+    shown = [mended.steps[key].numpy() for key in ("action", "observation")]
+    assert simulate_again(TASK, SEED, 0, *shown) is not None, "bit for bit"
+    assert "mended" not in failure.to_json()
+    [failure] = evaluated(lw.ScriptedSkillActor(hopeless())).failures
+    assert failure.mended is None, "nothing mends it"
