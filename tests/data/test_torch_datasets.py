@@ -31,10 +31,8 @@ def test_rows_are_those_of_the_buffer(replay):
     every = replay[:]
     for key, own in (("observation", "observation"), ("qaf", "qaf"), ("next.reward", ("next", "reward"))):
         assert torch.equal(torch.cat([batch[key] for batch in batches]), every[own])
-    assert (
-        sum((batch["task"] for batch in batches), [])
-        == [lw.TASKS["drawer-open"].description] * 8 + [lw.TASKS["push"].description] * 13
-    )
+    told = [text for batch in batches for text in batch["task"]]
+    assert told == 8 * [lw.TASKS["drawer-open"].description] + 13 * [lw.TASKS["push"].description]
 
 
 def test_a_loader_shuffles_and_has_workers(replay):
