@@ -24,7 +24,6 @@ from lw_torchrl.evaluation import attribute_failures as attribute_failures
 from lw_torchrl.evaluation import evaluate as evaluate
 from lw_torchrl.evaluation import from_pretrained as from_pretrained
 from lw_torchrl.evaluation import plot_success as plot_success
-from lw_torchrl.evaluation import push_to_hub as push_to_hub
 from lw_torchrl.language.canonical import canonical_plan as canonical_plan
 from lw_torchrl.language.formats import PLAN_FORMATS as PLAN_FORMATS
 from lw_torchrl.language.formats import encode_plan as encode_plan

@@ -23,7 +23,7 @@ from lw_torchrl.language.relations import Comparison
 from lw_torchrl.modules import DescriptorEncoder
 from lw_torchrl.training.algorithms import TD3Learner
 
-class Blind(lw.Policy):
+class Unseeing(lw.Policy):
     def __init__(self, tasks, width=8):
         super().__init__()
         self.tasks, self.config = tuple(tasks), {"width": width}
@@ -57,7 +57,7 @@ def make_suite():
 """
 POINTS = """
 [lw_torchrl.policies]
-Blind = my_plugin:Blind
+Unseeing = my_plugin:Unseeing
 Broken = no_such_module:Broken
 NoClass = my_plugin:FAR
 [lw_torchrl.evaluators]
@@ -95,12 +95,12 @@ def plugin(tmp_path, monkeypatch):
 
 
 def test_plugins_are_listed_without_being_imported_and_loaded_by_name(plugin):
-    assert "Blind" in POLICIES
-    assert POLICIES.names()[-3:] == ["Blind", "Broken", "NoClass"]
-    assert "Blind" not in list(POLICIES)
+    assert "Unseeing" in POLICIES
+    assert POLICIES.names()[-3:] == ["Unseeing", "Broken", "NoClass"]
+    assert "Unseeing" not in list(POLICIES)
     assert "my_plugin" not in sys.modules
-    assert POLICIES["Blind"].__name__ == "Blind"
-    assert "Blind" in list(POLICIES)
+    assert POLICIES["Unseeing"].__name__ == "Unseeing"
+    assert "Unseeing" in list(POLICIES)
     assert LEARNERS["patient"].config_type is LEARNERS["td3"].config_type
     assert lw.PLAN_FORMATS["loud"].extension == "txt"
     assert lw.suites.load_suite("again").tasks.keys() == lw.TASKS.keys()
@@ -117,9 +117,9 @@ def test_plugins_are_listed_without_being_imported_and_loaded_by_name(plugin):
 def test_a_plugin_that_cannot_be_loaded_is_named_and_others_work(plugin, name, says):
     with pytest.raises(ImportError, match=says):
         make_policy(name, lw.load_plans("MT10"))
-    assert make_policy("Blind", lw.load_plans("MT10")).tasks == lw.MT10
-    with pytest.raises(ValueError, match=r"method must be one of .*'Blind'.*got 'Blimd'; did you mean 'Blind'"):
-        make_policy("Blimd", lw.load_plans("MT10"))
+    assert make_policy("Unseeing", lw.load_plans("MT10")).tasks == lw.MT10
+    with pytest.raises(ValueError, match=r"method must be one of .*'Unseeing'.*got 'Unseeng'; did you mean 'Unseeing'"):
+        make_policy("Unseeng", lw.load_plans("MT10"))
 
 
 def test_a_plugins_relation_is_known_to_queries_and_one_that_fails_is_a_warning(plugin):
@@ -136,7 +136,7 @@ def test_a_plugins_relation_is_known_to_queries_and_one_that_fails_is_a_warning(
 
 def test_an_encoder_and_a_policy_of_plugins_are_kept_in_files(plugin, tmp_path):
     plans = lw.load_plans("MT10")
-    for method in ("Blind", "Shouted"):
+    for method in ("Unseeing", "Shouted"):
         torch.manual_seed(0)
         actor = make_policy(method, plans)
         lw.save_actor(actor, tmp_path / "policy.zip")

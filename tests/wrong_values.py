@@ -262,7 +262,6 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "export_dataset": {"root": root, "format": "parquet", "out": folder / "none"},
         "import_dataset": {"source": theirs(folder / "theirs.parquet"), "out": folder / "none"},
         "from_pretrained": {"source": folder},
-        "push_to_hub": {"policy": folder / "actor.zip", "repo": "me/mine"},
         "load_actor": {"path": lw_saved(lw.save_actor, actor, folder / "actor.zip")},
         "load_evaluator": {
             "path": lw_saved(lw.training.save_evaluator, evaluator, folder / "asked.zip"),

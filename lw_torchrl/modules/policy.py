@@ -185,6 +185,7 @@ class Policy(Prepared):
         >>> POLICIES["Blind"] = Blind
         >>> lw.evaluate(Blind(["reach"]), tasks="reach", episodes_per_task=1, seed=1_000, max_steps=5).mean_success
         0.0
+        >>> del POLICIES["Blind"]
 
     Source: the contract that ``torchrl.objectives`` and :func:`lw_torchrl.evaluate` rely on.
     """

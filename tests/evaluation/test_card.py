@@ -150,7 +150,7 @@ def test_a_policy_goes_to_the_hub_and_comes_back(result, tmp_path, monkeypatch):
         return str(tmp_path / file)
 
     monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(HfApi=Api, hf_hub_download=download))
-    assert lw.push_to_hub(SHIPPED, "me/mine", result, private=True, token="t") == "hub:me/mine"
+    assert lw.evaluation.push_to_hub(SHIPPED, "me/mine", result, private=True, token="t") == "hub:me/mine"
     assert 'lw.from_pretrained("me/mine")' in (tmp_path / "README.md").read_text("utf-8")
     assert same(lw.from_pretrained("me/mine", revision="v1"), lw.load_actor(SHIPPED))
     assert said == ["t", ("me/mine", True, True), ("me/mine", "v1")]
