@@ -37,7 +37,7 @@ class Behaviour:
 
     Attributes:
         name: the label of its episodes.
-        kind: "expert", Meta-World's script; "segments"; or "policy", a trained one.
+        kind: "expert", Meta-World's script; "segments"; "policy", a trained one; or "imported", of others' episodes.
         right, shortest, longest: of "segments", the probability that a piece follows the plan, and a piece's steps.
         otherwise: of "segments", what it does elsewhere: "skill", any one of the plan's, or "action", one in [-1, 1].
         fingerprint: of the plans of "segments", or of a policy's description and weights; None until it is known.
@@ -48,7 +48,7 @@ class Behaviour:
     """
 
     name: str
-    kind: Literal["expert", "segments", "policy"] = "segments"
+    kind: Literal["expert", "segments", "policy", "imported"] = "segments"
     right: float = 1.0
     otherwise: Literal["skill", "action"] = "skill"
     shortest: int = 8
