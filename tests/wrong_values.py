@@ -83,7 +83,7 @@ WRONG: dict[str, list[Any]] = {
     "tuple[int, int]": [3, (0,), (2, 1), ("0", 1), (0, 0), "01", (0.5, 2)],
     "tuple[()]": [3, (2,), "x"],
     "AnyPath | Sequence[AnyPath]": [3, None, [], [3], [None], 1.5],
-    "str | Behaviour | Policy": [3, None, "expart", [], object()],
+    "str | Behaviour | TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase]": [3, None, "expart", [], {}],
     "str | Sequence[str]": CAMERAS,
     "Sequence[int]": [3, "0", [-1], ["0"], [0.5]],
     "Sequence[str]": ["gripper", 3, [3], ["no such"]],

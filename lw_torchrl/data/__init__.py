@@ -12,10 +12,11 @@ from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.data.samplers import TaskBalancedSampler
 from lw_torchrl.data.selection import EpisodeFilter, JoinedDemonstrations
 from lw_torchrl.data.storage import JoinedStorage
+from lw_torchrl.data.torch_datasets import RowDataset, WindowDataset
 
 __all__ = [
     "BEHAVIOURS", "Behaviour", "CoLearningSampler", "CollectConfig", "DatasetError", "Demonstrations", "EpisodeFilter",
     "ExchangeError", "GrowingStorage", "GrowingWriter", "JoinedDemonstrations", "JoinedStorage",
-    "LanguageWorldExperienceReplay", "TaskBalancedSampler", "add_pictures", "collect_demonstrations", "export_dataset",
-    "import_dataset", "load_pictures",
+    "LanguageWorldExperienceReplay", "RowDataset", "TaskBalancedSampler", "WindowDataset", "add_pictures",
+    "collect_demonstrations", "export_dataset", "import_dataset", "load_pictures",
 ]  # fmt: skip
