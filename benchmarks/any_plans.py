@@ -232,12 +232,12 @@ def of_another(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
 
 CHANGES: dict[str, Callable[[ConditionalPlan, random.Random], ConditionalPlan]] = {
     "paraphrased by rules": reworded,
-    "paraphrased by the small model": by_small_model,
     "order shuffled": shuffled,
     "one step dropped": one_dropped,
     "two skills swapped": two_swapped,
     "one skill wrong": one_wrong,
     "another task's skills": of_another,
+    "paraphrased by the small model": by_small_model,
 }
 """What is done to the natural plans, each with its own draws."""
 
