@@ -164,7 +164,8 @@ class Counterfactuals:
             if self.plans.layout.gripper is not None:
                 scripted = self._scripted(self.actor, self.plans, part=part)
                 self._run(name, left, scripted, self.plans, self.evaluator)
-        left = self._unmended(left, "skill", "gripper", "actuation")
+        parts = self._unmended(left, "skill", "gripper", "actuation")
+        left = [one for one in ranked if one in parts or self._mends("plan", one)]  # can scripts follow this plan?
         self._run("policy", left, self._scripted(self.actor, self.plans), self.plans, self.evaluator)
 
     def mended(self, decision: Decision, which: EpisodeId) -> MendedEpisode | None:

@@ -50,10 +50,10 @@ def decide(mended: Collection[str], shares: Mapping[str, float], null: float = 0
     """The cause of a failed episode.
 
     What was shown or answered wrongly comes first, if that put right mends. Of the other replacements the one that
-    mends most of the task's failed episodes counts; of those about as good, the smallest: the plan, a script in one
-    step, the gripper or the motion alone. Where two that do not contain each other are about as good, or none leads
-    clearly over running the episode again as it was, it is the policy, not told which part. Time comes last, then
-    pairs.
+    mends most of the task's failed episodes counts; of those about as good the first: the plan, unless scripts that
+    follow it succeed; a script in one step; the gripper or the motion alone. Where two that do not contain each other
+    are about as good, or none leads clearly over running the episode again as it was, it is the policy, not told which
+    part. Time comes last, then pairs.
 
     Args:
         mended: the replacements that mend the episode.
@@ -67,6 +67,8 @@ def decide(mended: Collection[str], shares: Mapping[str, float], null: float = 0
             return Decision("out of time", by="time")
         pair = choose_pair(mended, shares)
         return Decision("undecided") if pair is None else Decision(*pair)
+    if "policy" in led and any(name in led for name in ("skill", "gripper", "actuation")):
+        led.pop("plan", None)  # scripts that follow the plan succeed
     best = _best(led)
     rivals = {name: share for name, share in led.items() if name != best and name not in _WIDER.get(best, ())}
     rival = max(rivals, key=rivals.__getitem__, default=None)

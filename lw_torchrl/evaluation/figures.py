@@ -134,7 +134,8 @@ def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, titl
     episodes = counted(trials * len(counts), "episode")
     axes.set_title(f"{title}\n{len(failures)} of {episodes} failed".strip())
     trim(axes)
-    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    if failures:
+        figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=9)
     return saved(figure, path)
 
 
