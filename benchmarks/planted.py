@@ -47,9 +47,9 @@ def swapped(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
 
 
 def with_extra(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
-    """The plan with a step too many in front: where a step's condition holds, the skill of the one after it."""
+    """The plan with a step too many in front: where a step's condition holds, the skill of the one before it."""
     pairs = [(str(one.condition), one.skill) for one in plan.steps]
-    extra = (pairs[step][0], pairs[(step + 1) % len(pairs)][1])
+    extra = (pairs[step][0], pairs[step - 1][1])
     return lw.ConditionalPlan.from_pairs(plan.definition, [extra, *pairs])
 
 

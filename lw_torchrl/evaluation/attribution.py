@@ -46,8 +46,8 @@ def attribute_failures(
     device: str | torch.device | None = None,
     progress: bool = True,
 ) -> list[Failure]:
-    """Say of each failed episode whether a query was answered wrongly, the plan led astray, a skill was clumsy, or it
-    only lacked time.
+    """Say of each failed episode what is to blame: what the policy was shown, the answers, the plan, a skill, another
+    part of what it does, or the time; or that it does not fail again.
 
     **A rule explains.** *Query*, if the policy acted on other answers than the query answering function gives in the
     same states; else *plan*, if late in the episode the plan's true step asks for something else than the reference
@@ -55,13 +55,16 @@ def attribute_failures(
     tells wrong answers, a plan of which no condition holds, and a skill that stays far from where it goes; the rest is
     undecided. Without ``actor`` that is all.
 
-    **A counterfactual decides**, with ``actor``: the very same episode, its noise too, is run again with true answers,
-    where they were wrong; with scripted skills in one step of the plan, or, if that mends nothing, in all (where a text
-    is no scripted skill, with the expert's actions); with the reference plan; with twice the time. What alone mends the
-    episode is its cause. Where several do, the smallest replacement counts: answers, a skill in one step, the plan,
-    skills in all steps, unless a larger one mends clearly more of the task's failed episodes; time counts last. Where
-    none mends, pairs are tried, which give ``cause`` and ``also``. One mended episode may be luck: ``evidence`` holds
-    how much of the task's failed episodes each mended.
+    **A counterfactual decides**, with ``actor``. First the null control: the very same episode, its noise too, is run
+    again with nothing replaced. If it succeeds it is *not reproducible*, and ``why`` says what differs. Else it is run
+    with one part replaced by a sound one: the observations, if the policy was shown others than the environment told
+    (*perception*); the answers, where they were wrong (*query*); the *plan*, by the reference; what scripted skills do
+    (where a text is no scripted skill, the expert's actions) in one step of the plan (*skill*), for the *gripper* or
+    the hand's motion (*actuation*) alone, or in all steps (*policy*, not told which part); twice the time (*out of
+    time*). Where none mends, pairs are tried, which give ``cause`` and ``also``. Where several do, that counts which
+    mends most of the task's failed episodes, and of those as good the smallest. One mended episode may be luck:
+    ``evidence`` and ``why`` hold how much of the task's failed episodes each mended, nothing replaced among them. A
+    policy without plans is told of no step.
 
     Args:
         rollouts: episodes as :func:`evaluate` gives them to ``on_episode``, or TensorDicts of batch (T,), each one
@@ -78,7 +81,8 @@ def attribute_failures(
             evaluator inside the policy is found there.
         skills: the scripted skills by text that are trusted; None for the suite's, :func:`load_skills` of
             Meta-World.
-        seed, noise_scale, max_steps, suite, engine: with which the episodes were run.
+        seed, noise_scale, max_steps, suite, engine: with which the episodes were run. One that was cut before
+            ``max_steps`` is run on: if it then succeeds, it is not reproducible.
         num_envs, num_threads, device, progress: as for :func:`evaluate`.
 
     Returns:

@@ -12,7 +12,6 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import RenameTransform, TransformedEnv
 
-from lw_torchrl._checks import counted
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.running import ROWS, answered_by, make_env, running
@@ -25,18 +24,16 @@ _KEPT: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next"
 _TOLD = "told_observation"  # the environment's own, before anything that stands between it and the policy
 
 
-@dataclass
-class Misled:
-    """In how many states a policy was shown another observation than the true one, and by how much at most."""
+class Misled(NamedTuple):
+    """By how much an observation that a policy was shown was off, at most, and which of its numbers."""
 
-    states: int = 0
-    most: float = 0.0
-    number: int = 0  # of the observation, which was off by the most
+    most: float
+    number: int
 
     @property
     def words(self) -> str:
-        often = f"in {counted(self.states, 'state')} the policy was shown another observation than the true one"
-        return f"{often}: number {self.number} was off by up to {self.most:.2g}"
+        off = f"number {self.number} was off by up to {self.most:.2g}"
+        return f"the policy was shown another observation than the true one: {off}"
 
 
 class Perception:
@@ -75,10 +72,8 @@ class Perception:
         off = (shown - told).abs()
         for row in (off.amax(-1) > 0).logical_and(self._now.get("_step")).nonzero().flatten().tolist():
             which = int(self._now.get("task_id")[row]), int(self._now.get("episode")[row])
-            found = self.misled.setdefault(which, Misled())
-            found.states += 1
-            if float(off[row].max()) > found.most:
-                found.most, found.number = float(off[row].max()), int(off[row].argmax())
+            most = Misled(float(off[row].max()), int(off[row].argmax()))
+            self.misled[which] = max(self.misled.get(which, most), most)
         if self.put_right:
             given.set("observation", told.clone())
 
