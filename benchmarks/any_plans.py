@@ -7,6 +7,7 @@ import random
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Literal
 
 import torch
@@ -18,6 +19,7 @@ from lw_torchrl.evaluation.statistics import mean_difference, mean_rate, wilson_
 from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.canonical import canonical_plan, default_plan, most_trusted
 from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.suites import find_points
 
 DEVELOPMENT = (
     "assembly", "bin-picking", "button-press", "button-press-wall", "coffee-pull", "dial-turn", "door-close",
@@ -27,6 +29,7 @@ DEVELOPMENT = (
 """The tasks outside MT10 on which rules and recipes were chosen."""
 TEST = tuple(task for task in lw.MT50 if task not in DEVELOPMENT and task not in lw.MT10)
 """The other twenty."""
+PARAPHRASES = 10  # of each plan
 OURS, NATURAL = lw.load_plans("MT50", skills="MT10"), lw.load_plans("MT50")
 Rows = Literal["default", "ours", "natural", "palm2", "no-points", "dc", "one-hot", "no-roles", "models", "robustness"]
 
@@ -67,10 +70,14 @@ def main(arguments: Arguments) -> None:
             policy = lw.load_actor(folder_of(arguments, method) / f"seed{seed}" / "policy.zip").eval()
             actor = policy if plans is None else policy.with_plans(plans)
             tasks = [task for task in (*DEVELOPMENT, *TEST) if plans is None or task in plans]
-            how: dict[str, Any] = {"episodes_per_task": arguments.episodes, "noise_scale": 0.1, "progress": False}
-            result = lw.evaluate(actor, tasks=tasks, seed=10_000 + seed, stop_at_success=True, **how)
+            row, _, number = name.partition(", number ")
+            # Of each of ten paraphrases fewer episodes, each with its own initial states.
+            episodes = max(1, 2 * arguments.episodes // PARAPHRASES) if number else arguments.episodes
+            how: dict[str, Any] = {"episodes_per_task": episodes, "noise_scale": 0.1, "progress": False}
+            fixes = 10_000 + seed + 100 * int(number or 0)
+            result = lw.evaluate(actor, tasks=tasks, seed=fixes, stop_at_success=True, **how)
             trust = {} if plans is None else {task: canonical_plan(plans[task]).trust for task in tasks}
-            found[key] = {"row": name, "seed": seed, "success": result.success_once, "trust": trust}
+            found[key] = {"row": row, "seed": seed, "success": result.success_once, "trust": trust}
             write_json(file, found)
             print(f"{key}: {result.mean_success:.3f}", flush=True)
     table = report(list(found.values()), arguments.episodes)
@@ -97,18 +104,24 @@ def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans |
         elif row == "palm2":
             written = lw.load_plans(required(arguments.palm2, "palm2"))
             yield row, "pcbc", Plans([written[task] for task in outside])
-        elif row == "no-points":  # what we named beside the published things is not there
+        elif row == "no-points":  # what we named beside the published things is not there; or shapes tell it
             bare = {task: lw.TASKS[task].published for task in outside}
-            written = lw.load_plans(required(arguments.palm2, "palm2"), tasks=lw.TASKS | bare)
-            yield "palm2, no points", "pcbc", Plans([written[task] for task in outside])
-            yield "default, no points", "pcbc", Plans([default_plan(written[task]).plan for task in outside])
+            for points, tasks in {"no points": bare, "points of shapes": find_points(outside)}.items():
+                written = lw.load_plans(required(arguments.palm2, "palm2"), tasks=lw.TASKS | tasks)
+                yield f"palm2, {points}", "pcbc", Plans([written[task] for task in outside])
+                yield f"default, {points}", "pcbc", Plans([default_plan(written[task]).plan for task in outside])
         elif row == "models":
             for name, plans in of_models(required(arguments.answers, "answers"), seed):
                 yield name, "pcbc", plans
         else:
             for name, change in CHANGES.items():
                 drawn = random.Random(f"{name} {seed}")
-                yield name, "pcbc", Plans([change(NATURAL[task], drawn) for task in outside])
+                if name.startswith("paraphrased"):
+                    for number in range(PARAPHRASES):
+                        plans = Plans([change(NATURAL[task], drawn) for task in outside])
+                        yield f"{name}, number {number}", "pcbc", plans
+                else:
+                    yield name, "pcbc", Plans([change(NATURAL[task], drawn) for task in outside])
 
 
 def required(path: Path | None, name: str) -> Path:
@@ -166,6 +179,13 @@ def reworded(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
     return ConditionalPlan.from_pairs(plan.definition, steps)
 
 
+def by_small_model(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
+    """Each step in the words of `benchmarks.paraphrases`, whatever the model made of it."""
+    others = read_json(Path(__file__).parent / "data" / "paraphrases.json", "paraphrases")
+    steps = [(step.condition, drawn.choice(others[step.skill])) for step in plan.steps]
+    return ConditionalPlan.from_pairs(plan.definition, steps)
+
+
 def shuffled(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
     """The clauses of each condition, and the steps, in another order."""
     steps = [
@@ -211,7 +231,8 @@ def of_another(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
 
 
 CHANGES: dict[str, Callable[[ConditionalPlan, random.Random], ConditionalPlan]] = {
-    **{f"paraphrase {number}": reworded for number in range(10)},
+    "paraphrased by rules": reworded,
+    "paraphrased by the small model": by_small_model,
     "order shuffled": shuffled,
     "one step dropped": one_dropped,
     "two skills swapped": two_swapped,
@@ -223,11 +244,15 @@ CHANGES: dict[str, Callable[[ConditionalPlan, random.Random], ConditionalPlan]] 
 
 def report(found: list[dict[str, Any]], episodes: int) -> str:
     """Markdown: a line for each row, with the pairwise difference to the default plan."""
-    rows: dict[str, dict[int, dict[str, float]]] = {}
+    several: dict[str, dict[int, list[dict[str, float]]]] = {}
     trust: dict[str, list[float]] = {}
     for one in found:
-        rows.setdefault(one["row"], {})[one["seed"]] = one["success"]
+        several.setdefault(one["row"], {}).setdefault(one["seed"], []).append(one["success"])
         trust.setdefault(one["row"], []).extend(one["trust"].values())
+    rows = {
+        name: {seed: {task: fmean(one[task] for one in each) for task in each[0]} for seed, each in seeds.items()}
+        for name, seeds in several.items()
+    }
     lines = []
     for name, seeds in rows.items():
         cells = [name, str(len(seeds))]

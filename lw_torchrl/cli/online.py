@@ -166,7 +166,9 @@ def _summarize(runs: Sequence[OnlineRun], plans: Plans, out: Path) -> dict[str, 
 
 Table = Literal["methods", "conditioning", "mt10", "quick", "all"]
 Mixture = Literal["B", "W", "C"]
-OfflineMethod = Literal["advantage", "filtered-bc", "best-bc", "bc", "iql", "td3-bc", "cql"]
+OfflineMethod = Literal[
+    "advantage", "filtered-bc", "best-bc", "bc", "iql", "td3-bc", "cql", "iql-l1", "td3-bc-l1", "cql-l1"
+]  # fmt: skip
 
 
 def offline(
@@ -197,7 +199,7 @@ def offline(
     Example: lw-torchrl offline methods --jobs 2
 
     Args:
-        table: methods, seven of them on plans, in five tasks; conditioning, plans, descriptions or numbers of tasks,
+        table: methods, ten of them on plans, in five tasks; conditioning, plans, descriptions or numbers of tasks,
             for the policy and for its critic; mt10, the best method in all of MT10; quick, two tasks, to try it; or all
             but the last.
         reward: what values are of, instead of the recipe's: sparse, the success; cost, of each step; dense_cost, what

@@ -20,6 +20,7 @@ from lw_torchrl.modules import DescriptorEncoder, PlanEncoder, QValue, Value
 from lw_torchrl.modules.policy import METHODS, Encoder, Policy, make_policy
 from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
 from lw_torchrl.paper import recipes
+from lw_torchrl.paper.offline_losses import L1CQLLoss, L1IQLLoss, L1TD3BCLoss
 from lw_torchrl.paper.recipes import OfflineMethod, OfflineRecipe, OfflineTable, Portion
 from lw_torchrl.paper.runs import Dataset, Run, Work, compare, kept_policy, own_tasks, plain, write_summary
 from lw_torchrl.training import OfflineConfig, OfflineTrainer
@@ -227,7 +228,10 @@ def _encoder(condition: str, plans: Plans, noise: float = 0.0) -> Encoder:
     return DescriptorEncoder(tuple(plans), feature_noise=noise, **METHODS[condition].options)
 
 
-DISTRIBUTIONS = {"advantage": None, "bc": None, "td3-bc": None, "iql": "normal", "cql": "tanh_normal"}
+DISTRIBUTIONS = {
+    "advantage": None, "bc": None, "td3-bc": None, "td3-bc-l1": None, "iql": "normal", "iql-l1": "normal",
+    "cql": "tanh_normal", "cql-l1": "tanh_normal",
+}  # fmt: skip
 """By name: the distribution that the loss wants of its actor."""
 
 
@@ -236,20 +240,24 @@ def _make_loss(run: OfflineRun, actor: Policy, plans: Plans) -> LossModule:
     if name == "bc":
         return bc_loss(actor, recipe.distance)
     if name == "advantage":
-        options: dict[str, Any] = {"beta": recipe.beta, "max_weight": recipe.max_weight}
-        return AdvantageWeightedLoss(actor, loss_function=recipe.distance, **options)
+        weighted: dict[str, Any] = {"beta": recipe.beta, "max_weight": recipe.max_weight}
+        return AdvantageWeightedLoss(actor, loss_function=recipe.distance, **weighted)
     critic: dict[str, Any] = {"width": recipe.width, "depth": recipe.critic_depth}
     # The order in which networks are made decides their initial weights.
-    value = Value(_encoder(run.critic, plans), **critic) if name == "iql" else None
+    value = Value(_encoder(run.critic, plans), **critic) if name in ("iql", "iql-l1") else None
     q = QValue(_encoder(run.critic, plans), **critic)
-    if value is not None:
-        options = {"expectile": recipe.expectile, "temperature": recipe.temperature}
-        return IQLLoss(actor, q, value, num_qvalue_nets=2, loss_function="l2", **options)
-    if name == "td3-bc":
-        options = {"bounds": (-1.0, 1.0), "alpha": recipe.alpha, "delay_actor": True}
-        return TD3BCLoss(actor, q, num_qvalue_nets=2, loss_function="l2", **options)
+    pair: dict[str, Any] = {"num_qvalue_nets": 2, "loss_function": "l2"}
+    if name == "iql":
+        return IQLLoss(actor, q, value, expectile=recipe.expectile, temperature=recipe.temperature, **pair)
+    if name == "iql-l1":
+        weights: dict[str, Any] = {"temperature": recipe.beta, "max_weight": recipe.max_weight}
+        return L1IQLLoss(actor, q, value, expectile=recipe.expectile, **weights, **pair)
+    if name in ("td3-bc", "td3-bc-l1"):
+        kind, alpha = (TD3BCLoss, recipe.alpha) if name == "td3-bc" else (L1TD3BCLoss, recipe.alpha_l1)
+        return kind(actor, q, bounds=(-1.0, 1.0), alpha=alpha, delay_actor=True, **pair)
     # TorchRL makes rows of the actions that it draws: one or ten, each soft maximum is of three actions.
-    return CQLLoss(actor, q, loss_function="l2", min_q_weight=recipe.cql_weight, num_random=1)
+    options: dict[str, Any] = {"loss_function": "l2", "min_q_weight": recipe.cql_weight, "num_random": 1}
+    return CQLLoss(actor, q, **options) if name == "cql" else L1CQLLoss(actor, q, alpha=recipe.alpha_l1, **options)
 
 
 def offline_runs(
