@@ -149,7 +149,9 @@ OUTSIDE: dict[str, Fault] = {
     ),
     "rollouts cut at 40 steps": Fault("outside", ("not reproducible",), setting(told_steps=40)),
     "other noise than told": Fault("outside", ("not reproducible",), setting(noise=1.0)),
-    "all actions a tenth, fingers too": Fault("outside", ("policy",), setting(done=planted.scaled(0.1, 0.1, 0.1, 0.0))),
+    "all actions a tenth, fingers too": Fault(
+        "outside", ("policy", "actuation"), setting(done=planted.scaled(0.1, 0.1, 0.1, 0.0))
+    ),
 }
 TWO: dict[str, Fault] = {
     "opposite answers, wrong condition": Fault("two", ("query", "plan"), both(in_plan(planted.denied), lie())),
@@ -261,7 +263,7 @@ def table(found: Mapping[str, Mapping[str, list[dict[str, Any]]]]) -> str:
 
 
 def is_right(fault: Fault, failure: Mapping[str, Any]) -> bool:
-    return failure["cause"] in (HARMLESS if fault.kind == "outside" else fault.causes)
+    return failure["cause"] in (*fault.causes, *(HARMLESS if fault.kind == "outside" else ()))
 
 
 def main(args: Arguments) -> None:

@@ -101,7 +101,8 @@ def attribute_failures(
         >>> import lw_torchrl as lw
         >>> from dataclasses import replace
         >>> plans = lw.Plans({"reach": lw.load_plans("MT10")["reach"]})
-        >>> spoilt = {text: replace(skill, offset=(0.1, 0.0, 0.0)) for text, skill in lw.load_skills().items()}
+        >>> skills, text = lw.load_skills(), plans["reach"].steps[1].skill
+        >>> spoilt = {**skills, text: replace(skills[text], offset=(0.1, 0.0, 0.0))}
         >>> actor, episodes = lw.ScriptedSkillActor(plans, skills=spoilt), []
         >>> run, keys = {"seed": 1_000, "max_steps": 100}, ["observation", "task_id", "qaf", "skill_weights"]
         >>> told = {"also_record": keys, "on_episode": episodes.append}
@@ -214,7 +215,8 @@ def _by_counterfactuals(
     first = {name: results[which] for name, results in tried.found.items() if which in results}
     mended = [name for name, hit in first.items() if hit is not None]
     same = told.evidence.get("plan_departs") == 0.0
-    decision = decide([name for name in mended if not (same and name == "plan")], shares, share)
+    counting = [name for name in tried.mending(one) if not (same and name == "plan")]
+    decision = decide(counting, shares, share)
     cause, also, how = decision.cause, decision.also, tried.mended(decision, which)
     if also is not None:
         words = f"Neither {PAIR_WORDS[cause]} nor {PAIR_WORDS[also]} alone mend it, both together do"

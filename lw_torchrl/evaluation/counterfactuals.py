@@ -11,7 +11,14 @@ from torchrl.envs import Transform
 
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.deciding import PAIR_WORDS, REPLACEMENTS, Decision
-from lw_torchrl.evaluation.explanation import EpisodeStates, Scripts, candidates, unlike_scripts
+from lw_torchrl.evaluation.explanation import (
+    EpisodeStates,
+    Scripts,
+    candidates,
+    script_gaps,
+    unlike_scripts,
+    wrong_elsewhere,
+)
 from lw_torchrl.evaluation.failure_records import MendedEpisode
 from lw_torchrl.evaluation.repeating import EpisodeId, EpisodeRepeater, NullControl, Perception
 from lw_torchrl.evaluation.scripts_in_charge import WithScripts
@@ -78,6 +85,7 @@ class Counterfactuals:
         self.plans = plans = scripts.plans
         self.found: dict[str, dict[EpisodeId, FinishedEpisode | None]] = {}  # counterfactual to episodes that it mends
         self.step: dict[EpisodeId, int] = {}  # in which a script mends the episode
+        self.gaps: dict[EpisodeId, Tensor] = {}  # from the actions of scripts
         self.reference: Plans | None = None
         self.other = self.other_evaluator = None  # that carry out the reference
         different = [] if reference is None else [reference[task] for task in reference.differences(plans)]
@@ -148,7 +156,10 @@ class Counterfactuals:
         """Scripts in one step, for the likeliest steps in turn; for the gripper or the motion alone; for all."""
         ranked, one_step = {}, set()
         for one in seen:
-            unlike = unlike_scripts(self.actor, one, self.scripts)
+            gaps = script_gaps(self.actor, one, self.scripts)
+            unlike = None if gaps is None else unlike_scripts(gaps)
+            if gaps is not None:
+                self.gaps[one.which] = gaps
             if unlike is None or unlike.any():
                 ranked[one.which] = candidates(one, unlike)
             if unlike is not None and len(one.in_force[unlike].unique()) == 1:
@@ -167,6 +178,19 @@ class Counterfactuals:
         parts = self._unmended(left, "skill", "gripper", "actuation")
         left = [one for one in ranked if one in parts or self._mends("plan", one)]  # can scripts follow this plan?
         self._run("policy", left, self._scripted(self.actor, self.plans), self.plans, self.evaluator)
+
+    def mending(self, one: EpisodeStates) -> list[str]:
+        """What mends an episode. A script in one step does not count where the policy is as wrong in another one, and
+        scripts for a part of the action in all steps mend too."""
+        found = [name for name, results in self.found.items() if results.get(one.which) is not None]
+        gaps, step, layout = self.gaps.get(one.which), self.step.get(one.which), self.plans.layout
+        if gaps is None or step is None or layout.gripper is None:
+            return found
+        fingers = torch.arange(gaps.shape[-1]) == layout.gripper
+        parts = {"gripper": gaps[:, fingers], "actuation": gaps[:, ~fingers]}
+        if any(wrong_elsewhere(of, one, step) for name, of in parts.items() if name in found):
+            found.remove("skill")
+        return found
 
     def mended(self, decision: Decision, which: EpisodeId) -> MendedEpisode | None:
         """The episode as it goes with what counts replaced, under the plan that is then carried out."""

@@ -75,7 +75,7 @@ def test_a_policy_that_is_shown_another_state_is_told(inside):
     run = {**RUN, "evaluator": evaluator}
     [failure] = attribute_failures(ran(actor, evaluator=evaluator), PLANS, actor=actor, **run)
     assert (failure.cause, failure.counterfactuals) == ("perception", {"perception": True})
-    assert "the policy was shown another observation than the true one: number " in failure.why
+    assert "policy was shown another observation than the true one: number " in failure.why
     assert "was off by up to 0.1" in failure.why
     assert failure.mended.by == "true observations"
     assert not any(module._forward_pre_hooks for module in actor.modules()), "nothing stays on the policy"
