@@ -80,7 +80,7 @@ def record(
         for actor, shown, who in cast:
             found = run_recorded(actor, tasks, plans=shown, episodes=episodes, progress=True, **episode_options)
             why: Mapping[tuple[str, int], lw.evaluation.Failure] = {}
-            if attribute and shown is not None and (hasattr(actor, "with_plans") or objects.is_object(who)):
+            if attribute and shown is not None and hasattr(actor, "with_plans"):
                 failures = lw.attribute_failures(found, shown, actor=actor, reference=trusted, **episode_options)
                 why = {(one.task, one.episode): one for one in failures}
             pages = []
