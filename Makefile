@@ -3,6 +3,7 @@
 # make test-all    the fast tests and the slow ones
 # make check   ruff and mypy
 # make bench   what everything costs, against rivals (docs/performance.md)
+# make docs    the documentation as a site, in site/
 # make setup   the environment alone (.venv)
 # make test-python PYTHON=python3.13   the suite under another interpreter, in an environment of its own
 #
@@ -18,7 +19,7 @@ READY := $(VENV)/.ready
 
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-slow test-all test-python check setup bench robosuite clean
+.PHONY: demo test test-slow test-all test-python check docs setup bench robosuite clean
 demo: $(READY)
 	$(BIN)/lw-torchrl demo
 test: $(READY)
@@ -32,6 +33,8 @@ check: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 setup: $(READY)
 # Without what robosuite 1.5.2 asks for, numpy below 2 and keyboards that are compiled: its arms need neither. Where it
 # cannot be had, its tests are skipped.
@@ -48,4 +51,4 @@ $(READY): pyproject.toml constraints.txt
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-* runs
+	rm -rf .venv .venv-* runs site

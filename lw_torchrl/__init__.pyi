@@ -15,6 +15,8 @@ from lw_torchrl.data import EpisodeFilter as EpisodeFilter
 from lw_torchrl.data import LanguageWorldExperienceReplay as LanguageWorldExperienceReplay
 from lw_torchrl.data import TaskBalancedSampler as TaskBalancedSampler
 from lw_torchrl.data import collect_demonstrations as collect_demonstrations
+from lw_torchrl.data import export_dataset as export_dataset
+from lw_torchrl.data import import_dataset as import_dataset
 from lw_torchrl.envs import ExpertActor as ExpertActor
 from lw_torchrl.envs import LanguageWorldEnv as LanguageWorldEnv
 from lw_torchrl.evaluation import EvaluationResult as EvaluationResult

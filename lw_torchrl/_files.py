@@ -7,6 +7,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 import sys
 import time
 import tomllib
@@ -67,6 +68,46 @@ def _temporary(target: Path) -> Iterator[Path]:
         yield path
     finally:
         path.unlink(missing_ok=True)
+        os.close(handle)
+
+
+@contextmanager
+def replacing_folder(path: AnyPath) -> Iterator[Path]:
+    """A temporary folder beside ``path``, which is new or empty, whose name it takes when the block ends without error.
+
+    As with :func:`replacing`, a killed process leaves nothing under the name, and the next write removes the rest.
+    """
+    target = Path(path).absolute()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    pattern = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{16}}\.tmp")
+    for left in filter(Path.is_dir, map(target.with_name, filter(pattern.fullmatch, os.listdir(target.parent)))):
+        with suppress(BlockingIOError), _held_folder(left):
+            shutil.rmtree(left)
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
+    temporary.mkdir()
+    try:
+        with _held_folder(temporary):
+            yield temporary
+            for one in [*sorted(temporary.rglob("*"), reverse=True), temporary]:
+                flush(one)
+            os.replace(temporary, target)
+            flush(target.parent)
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(target)
+        raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def _held_folder(path: Path) -> Iterator[None]:
+    """Lock a folder while the block lasts; :class:`BlockingIOError` where another process holds it."""
+    handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
         os.close(handle)
 
 

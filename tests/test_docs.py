@@ -5,10 +5,15 @@ from __future__ import annotations
 import doctest
 import importlib
 import inspect
+import os
 import pkgutil
 import re
+import subprocess
+import sys
 import warnings
+from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote, urlsplit
 
 import pytest
 from pictures import why_no_pictures
@@ -16,7 +21,7 @@ from pictures import why_no_pictures
 import lw_torchrl
 
 ROOT = Path(__file__).parent.parent
-FAST_PAGES = {"README.md", "training.md", "queries.md", "plans.md"}
+FAST_PAGES = {"README.md", "concepts.md", "training.md", "queries.md", "plans.md"}
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("**/*.md"))]
 BLOCK = re.compile(
     r"(?P<skip><!--\s*no-run\s*-->\s*\n)?"
@@ -101,12 +106,69 @@ def test_the_readme_shows_python():
     assert any(blocks(ROOT / "README.md"))
 
 
+def anchors(page):
+    """What a link may name after its #: the headings, as GitHub and the site write them."""
+    text = re.sub(r"^ *```.*?^ *```", "", page.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
+    headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_a_pages_links_lead_somewhere(page):
     text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
-    for target in re.findall(r"\]\(([^)#\s]+)", text):
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]+))?\)", text):
         if "://" not in target and not target.startswith("mailto:"):
-            assert (page.parent / target).exists(), target
+            there = page.parent / target if target else page
+            assert there.exists(), target
+            assert not anchor or there.suffix != ".md" or anchor in anchors(there), f"{target}#{anchor}"
+
+
+def test_every_page_has_a_place_in_the_site():
+    told = (ROOT / "mkdocs.yml").read_text("utf-8")
+    listed = re.findall(r"^ +- (?:.+: )?(\S+\.md)$", told[told.index("\nnav:") :], re.MULTILINE)
+    lost = {page.name for page in (ROOT / "docs").glob("*.md")} - set(listed)
+    assert not lost, f"add to the nav of mkdocs.yml: {', '.join(sorted(lost))}"
+
+
+class Page(HTMLParser):
+    """The links of a page of the site, and what links to it may name."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.links, self.names = set(), set()
+        self.feed(path.read_text("utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        attrs = dict(attrs)
+        self.names |= {attrs[key] for key in ("id", "name") if attrs.get(key)}
+        self.links |= {attrs[key] for key in ("href", "src") if attrs.get(key)}
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning_and_its_links_lead_somewhere(tmp_path):
+    pytest.importorskip("mkdocs")
+    site = tmp_path / "site"
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(site)],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    pages = {path: Page(path) for path in site.rglob("*.html") if path.name != "404.html"}
+    assert len(pages) > 50
+    lost = []
+    for path, page in pages.items():
+        for link in page.links:
+            parts = urlsplit(link)
+            if parts.scheme or parts.netloc:
+                continue
+            there = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            there = there / "index.html" if there.is_dir() else there
+            if not there.is_file() or (parts.fragment and unquote(parts.fragment) not in pages[there].names):
+                lost.append(f"{path.relative_to(site)}: {link}")
+    assert lost == []
 
 
 def test_blocks_are_found_numbered_and_skipped(tmp_path):

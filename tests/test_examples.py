@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import os
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import lw_torchrl as lw
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 TRAIN_BC = EXAMPLES / "train_bc.py"
+TOUR = EXAMPLES / "tour.ipynb"
 
 
 def names(path):
@@ -174,3 +176,30 @@ def test_train_bc_runs(tmp_path):
         assert any(line.startswith(f"{task}: ") for line in done.stdout.splitlines()), "the skills"
     left = {path.name for path in tmp_path.iterdir() if not path.name.startswith("torchinductor")}
     assert not left, "it leaves nothing behind"
+
+
+def shown(path):
+    """What the cells of a notebook show: the kinds of their outputs, and their text."""
+    cells = json.loads(path.read_text("utf-8"))["cells"]
+    outputs = [output for cell in cells for output in cell.get("outputs", ())]
+    return [kind for output in outputs for kind in output.get("data", [output["output_type"]])], str(outputs)
+
+
+def test_the_tour_is_kept_with_what_it_shows():
+    kinds, text = shown(TOUR)
+    assert kinds.count("image/png") == 4
+    assert "error" not in kinds
+    assert "WebPage" in text
+    assert "stderr" not in text
+    assert TOUR.stat().st_size < 300_000
+
+
+@pytest.mark.slow
+def test_the_tour_runs_from_top_to_bottom(tmp_path):
+    pytest.importorskip("nbclient")
+    script = EXAMPLES.parent / "docs" / "hooks" / "tour.py"
+    done = subprocess.run(
+        [sys.executable, str(script), "shown.ipynb"], cwd=tmp_path, capture_output=True, text=True, timeout=400
+    )
+    assert done.returncode == 0, done.stderr
+    assert shown(tmp_path / "shown.ipynb")[0] == shown(TOUR)[0]

@@ -1,8 +1,9 @@
-"""What is handed out: a source distribution that can be tested, a wheel with all its data, and one version."""
+"""What is handed out: a source distribution that can be tested, a wheel with all its data, one version, and types."""
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from setuptools import build_meta
 folder = sys.argv[1]  # setuptools writes its own arguments into sys.argv
 build_meta.build_sdist(folder)
 build_meta.build_wheel(folder)
+build_meta.build_editable(folder + "/editable")
 """
 
 
@@ -43,11 +45,16 @@ def built(kept, tmp_path_factory) -> tuple[set[str], set[str]]:
         (clone / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(ROOT / name, clone / name)
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    (dist / "editable").mkdir()
     done = subprocess.run(
         [sys.executable, "-c", BUILD, str(dist)], cwd=clone, env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    sdist, wheel = sorted(dist.iterdir(), key=lambda path: path.suffix)
+    sdist, wheel = sorted(dist.glob("lw_torchrl-*"), key=lambda path: path.suffix)
+    (editable,) = (dist / "editable").glob("*.whl")
+    with zipfile.ZipFile(editable) as archive:
+        (path,) = (name for name in archive.namelist() if name.endswith(".pth"))
+        assert archive.read(path).decode().strip() == str(clone), "type checkers follow a path, and no import hook"
     assert sdist.name == f"lw_torchrl-{lw_torchrl.__version__}.tar.gz"
     with tarfile.open(sdist) as archive:
         sources = {member.name.split("/", 1)[1] for member in archive if member.isfile()}
@@ -69,7 +76,7 @@ def test_the_wheel_is_the_package_with_its_data(kept, built):
 def test_every_dependency_has_a_tested_version():
     stated = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     extras = stated["optional-dependencies"]
-    needed = [*stated["dependencies"], *(one for name in ("text", "ray", "dev") for one in extras[name])]
+    needed = [*stated["dependencies"], *(one for name in ("text", "ray", "docs", "dev") for one in extras[name])]
     pinned = {
         line.split("==")[0].lower().replace("_", "-")
         for line in (ROOT / "constraints.txt").read_text("utf-8").splitlines()
@@ -77,3 +84,38 @@ def test_every_dependency_has_a_tested_version():
     }
     names = {one.split(">")[0].split("[")[0].lower().replace("_", "-") for one in needed} - {"lw-torchrl"}
     assert sorted(names - pinned) == []
+
+
+def extras(text: str) -> set[str]:
+    """The extras that a text says to install."""
+    return {one for found in re.findall(r"lw_torchrl\[([a-z,-]+)\]|extra `?\[([a-z]+)\]", text) for one in found if one}
+
+
+def test_extras_have_one_name_in_errors_and_pages():
+    stated = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+    readme = (ROOT / "README.md").read_text("utf-8")
+    listed = re.findall(r"^\| `([a-z]+)` \|", readme, re.MULTILINE)
+    assert sorted(listed) == sorted(set(stated) - {"dev"})
+    said = {path: extras(path.read_text("utf-8")) for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]}
+    said |= {path: extras(path.read_text("utf-8")) for path in (ROOT / "lw_torchrl").rglob("*.py")}
+    assert {name for path, names in said.items() if path.suffix == ".py" for name in names} >= {"fetch", "llm", "text"}
+    assert {path.name: sorted(names - set(stated)) for path, names in said.items() if names - set(stated)} == {}
+
+
+@pytest.mark.slow
+def test_mypy_finds_a_user_s_mistakes_outside_the_checkout(tmp_path):
+    """The package is found as it is installed, with ``make setup`` as a path."""
+    script = shutil.copy(Path(__file__).with_name("planted_errors.py"), tmp_path / "script.py")
+    lines = Path(script).read_text("utf-8").splitlines()
+    planted = [number for number, line in enumerate(lines, 1) if line.endswith("# planted")]
+    assert len(lines) == 60
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "--config-file=", "--no-error-summary", "script.py"],
+        cwd=tmp_path,
+        env={name: value for name, value in os.environ.items() if name != "MYPYPATH"},
+        capture_output=True,
+        text=True,
+    )
+    found = re.findall(r"^script\.py:(\d+): error: .*\[([a-z-]+)\]$", done.stdout, re.MULTILINE)
+    assert [int(line) for line, _ in found] == planted, done.stdout
+    assert [kind for _, kind in found] == ["attr-defined", "arg-type", "attr-defined"]

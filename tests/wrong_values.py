@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import torch
 
 import lw_torchrl as lw
@@ -81,7 +83,7 @@ WRONG: dict[str, list[Any]] = {
     "tuple[int, int]": [3, (0,), (2, 1), ("0", 1), (0, 0), "01", (0.5, 2)],
     "tuple[()]": [3, (2,), "x"],
     "AnyPath | Sequence[AnyPath]": [3, None, [], [3], [None], 1.5],
-    "str | Behaviour | Policy": [3, None, "expart", [], object()],
+    "str | Behaviour | TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase]": [3, None, "expart", [], {}],
     "str | Sequence[str]": CAMERAS,
     "Sequence[int]": [3, "0", [-1], ["0"], [0.5]],
     "Sequence[str]": ["gripper", 3, [3], ["no such"]],
@@ -106,6 +108,8 @@ WRONG: dict[str, list[Any]] = {
     "TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase]": [None, 3, "expert", []],
     "TensorDictModuleBase | list[TensorDictModuleBase]": [3, "a", [], [3], None],
     "Mapping[str, Any]": [3, "one", ["one"]],
+    "ExchangeFormat": ["no such", 3, None, []],
+    "str | Mapping[str, str]": [3, "reech", [], {"theirs": "reech"}, {"theirs": 3}],
 }
 for name in [
     "TensorDictModuleBase",
@@ -255,6 +259,8 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "encode_plan": {"plan": PLAN, "format": "chain_py"},
         "evaluate": {"actor": actor, **run},
         "evaluate_plans": {"plans": [PLAN], "episodes": 1, "seed": 1, "max_steps": 1, "progress": False},
+        "export_dataset": {"root": root, "format": "parquet", "out": folder / "none"},
+        "import_dataset": {"source": theirs(folder / "theirs.parquet"), "out": folder / "none"},
         "load_actor": {"path": lw_saved(lw.save_actor, actor, folder / "actor.zip")},
         "load_evaluator": {
             "path": lw_saved(lw.training.save_evaluator, evaluator, folder / "asked.zip"),
@@ -277,6 +283,13 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "standardize_by_task": {"advantage": torch.zeros(2, 1), "task_id": torch.zeros(2).long()},
         "supported_queries": {"task": "reach"},
     }
+
+
+def theirs(path: Any) -> Any:
+    """A file of somebody else's rows of a task in their own words."""
+    rows = {"obs": [[0.0] * 39], "action": [[0.0] * 4], "episode_index": [0], "task": ["theirs"]}
+    pq.write_table(pa.table(rows), path)
+    return path
 
 
 def lw_saved(save: Any, what: Any, path: Any) -> Any:

@@ -1,4 +1,4 @@
-"""``lw-torchrl collect`` makes datasets; ``lw-torchrl data`` shows what they hold, and whether they are whole."""
+"""``lw-torchrl collect`` makes datasets; ``lw-torchrl data show`` says what they hold, and whether they are whole."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from itertools import groupby
 from pathlib import Path
 from statistics import median, quantiles
 from textwrap import TextWrapper
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from tyro.conf import Positional, arg
 
@@ -69,8 +69,11 @@ def collect(
     return output.show("steps", made.num_steps, f"{counted(made.num_steps, 'step')} in {made.root}")
 
 
-def data(
-    action: Positional[Annotated[Literal["show"], arg(metavar="show")]],  # the word show
+def data() -> None:
+    """Datasets: what they hold, and how others read them and theirs are read."""
+
+
+def show(
     folders: Positional[Annotated[tuple[Path, ...], arg(metavar="FOLDERS ...")]],  # of `lw-torchrl collect`
     /,
     check: bool = False,  # also read them through against their checksums
@@ -145,8 +148,8 @@ def _about(part: Demonstrations) -> list[str]:
 def _acted(who: Behaviour, layout: Layout) -> str:
     if who.kind == "expert":
         return "Meta-World's scripts" if layout.name == "metaworld" else f"the expert of {layout.name}"
-    if who.kind == "policy":
-        return f"a policy, fingerprint {who.fingerprint}"
+    if who.kind in ("policy", "imported"):
+        return f"a policy, fingerprint {who.fingerprint}" if who.kind == "policy" else "others, imported"
     pieces = f"{who.shortest} to {who.longest} steps"
     other = {"skill": "any skill of the plan", "action": "one action"}[who.otherwise]
     if who.right == 0.0:

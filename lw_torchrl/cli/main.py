@@ -11,6 +11,7 @@ from collections import UserDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from importlib import import_module
+from keyword import iskeyword
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -29,7 +30,8 @@ class Commands(UserDict[str, Any]):
     def __getitem__(self, name: str) -> Any:
         found = super().__getitem__(name)
         if isinstance(found, str):
-            found = self[name] = getattr(import_module(f"lw_torchrl.cli.{found}"), name.replace("-", "_"))
+            function = name.replace("-", "_") + "_" * iskeyword(name)
+            found = self[name] = getattr(import_module(f"lw_torchrl.cli.{found}"), function)
         return found
 
 
@@ -58,7 +60,8 @@ COMMANDS = Commands(
 )
 _OF_PLAN = dict(prompt="plan", generate="plan_models", serve="plan", read="plan", check="plan", compare="plan")
 _OF_PLAN |= dict(repair="plan_models")
-GROUPS = {"plan": Commands(_OF_PLAN)}
+_OF_DATA = {"show": "data", "export": "exchange", "import": "exchange"}
+GROUPS = {"plan": Commands(_OF_PLAN), "data": Commands(_OF_DATA)}
 """Commands that have commands of their own."""
 ABOUT = """Language-World with TorchRL: policies carried by plans in English. --version tells which.
 

@@ -153,6 +153,13 @@ def check_folder(option: str, path: Path) -> Path:
     return path
 
 
+def check_new_folder(option: str, path: Path) -> Path:
+    """Return ``path`` if it can be made as a folder, or is one without files."""
+    if check_folder(option, path).is_dir() and any(path.iterdir()):
+        raise ValueError(f"{option} must be a new folder, or an empty one, {str(path)!r} holds files")
+    return path
+
+
 def check_file(option: str, path: Path, ending: str = "") -> Path:
     """Return ``path`` if it is a file that can be written to, or one could be made there."""
     if path.is_dir():

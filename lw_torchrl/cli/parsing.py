@@ -201,7 +201,7 @@ _OPTIONS = {
     "path": ("recording",),
     "policy": ("behaviours",),
     "resume": ("out",),
-    "root": ("folders", "out"),
+    "root": ("folders", "folder", "out"),
     "skills": ("skill_file",),
     "source": ("plans",),
     "task": ("tasks", "names"),
@@ -228,7 +228,7 @@ def in_its_words(command: str, function: Callable[..., object], message: str) ->
     def shown(match: re.Match[str]) -> str:
         given = match[1]
         if given == "collect_demonstrations":
-            return f"`lw-torchrl {'collect' if command in ('train', 'data') else command}`"
+            return f"`lw-torchrl {'collect' if command in ('train', 'show', 'export') else command}`"
         name = next((one for one in (own.get(given), given, *_OPTIONS.get(given, ())) if one in known), "")
         if not name:
             return match[0]

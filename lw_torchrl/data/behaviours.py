@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from lw_torchrl._checks import check_choice, check_fields, check_int, check_probability, shown
 from lw_torchrl._seeding import episode_generator
@@ -37,10 +37,11 @@ class Behaviour:
 
     Attributes:
         name: the label of its episodes.
-        kind: "expert", Meta-World's script; "segments"; or "policy", a trained one.
+        kind: "expert", Meta-World's script; "segments"; "policy", a trained one; or "imported", of others' episodes.
         right, shortest, longest: of "segments", the probability that a piece follows the plan, and a piece's steps.
         otherwise: of "segments", what it does elsewhere: "skill", any one of the plan's, or "action", one in [-1, 1].
-        fingerprint: of the plans of "segments", or of a policy's description and weights; None until it is known.
+        fingerprint: of the plans of "segments", or of a policy's description and weights; None until it is known, and
+            of a function.
 
     Example:
         >>> Behaviour("half-right", right=0.5).otherwise
@@ -48,7 +49,7 @@ class Behaviour:
     """
 
     name: str
-    kind: Literal["expert", "segments", "policy"] = "segments"
+    kind: Literal["expert", "segments", "policy", "imported"] = "segments"
     right: float = 1.0
     otherwise: Literal["skill", "action"] = "skill"
     shortest: int = 8
@@ -120,32 +121,38 @@ def behaviour_of(
     policy: Any, tasks: Iterable[str], name: str | None = None, suite: str | Suite = "metaworld"
 ) -> Behaviour:
     """The behaviour in these tasks of ``suite`` that an argument ``policy`` stands for, perhaps under another name."""
-    if isinstance(policy, Policy):
+    if not isinstance(policy, (str, Behaviour, type)) and callable(policy):
         if name is None:
             raise ValueError("behaviour must name the policy in the dataset, behaviour='my-policy' say, got None")
-        if policy.draws:
+        if not isinstance(policy, nn.Module):
+            return Behaviour(name, "policy")
+        if isinstance(policy, Policy) and policy.draws:
             why = "so its episodes would depend on num_envs and on interruptions"
             raise ValueError(f"policy: this {type(policy).__name__} draws in the order in which it is called, {why}")
         return Behaviour(name, "policy", fingerprint=policy_fingerprint(policy))
     if isinstance(policy, str):
         policy = BEHAVIOURS[check_choice("policy", policy, BEHAVIOURS)]
     if not isinstance(policy, Behaviour):
-        raise TypeError(f"policy must be a name, a Behaviour or a Policy, got {type(policy).__name__}")
+        raise TypeError(f"policy must be a name, a Behaviour, a module or a function, got {type(policy).__name__}")
     found: Behaviour = policy
-    if found.kind == "policy":
-        raise ValueError(f"policy: the Behaviour {found.name!r} is of a trained policy; give the policy itself")
+    if found.kind in ("policy", "imported"):
+        of = "of a trained policy; give the policy itself" if found.kind == "policy" else "of others: import_dataset"
+        raise ValueError(f"policy: the Behaviour {found.name!r} is {of}")
     if found.kind == "segments":
         found = replace(found, fingerprint=segment_plans(tasks, suite).fingerprint)
     return found if name is None else replace(found, name=name)
 
 
-def policy_fingerprint(policy: Policy) -> str:
-    """A digest of a policy's description, weights and text vectors, which show another text encoder."""
-    digest = sha256(json.dumps(policy.describe(), sort_keys=True).encode())
+def policy_fingerprint(policy: nn.Module) -> str:
+    """A digest of a policy's description, or any module's class, of its weights and text vectors, which show another
+    text encoder."""
+    described = policy.describe() if isinstance(policy, Policy) else type(policy).__qualname__
+    digest = sha256(json.dumps(described, sort_keys=True).encode())
     # Their signs, since the scale that they are brought to may round otherwise elsewhere.
     named = policy.named_buffers(remove_duplicate=False)
     texts = {name: vectors.sign() for name, vectors in named if name.rpartition(".")[2] == "text_vectors"}
-    for key, value in sorted({**policy.state_dict(), **texts}.items()):
+    stated = {key: value for key, value in policy.state_dict().items() if isinstance(value, Tensor)}
+    for key, value in sorted({**stated, **texts}.items()):
         digest.update(f"{key} {value.dtype} {tuple(value.shape)}".encode())
         digest.update(value.detach().cpu().reshape(-1).view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()[:16]

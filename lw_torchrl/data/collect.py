@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import shutil
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext, suppress
 from numbers import Real
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
 
 from lw_torchrl._checks import checked, differences, shown
 from lw_torchrl._files import AnyPath, flush, held, write_json
@@ -141,7 +144,7 @@ def _assemble(
 
 
 def _made(
-    root: Path, config: CollectConfig, policy: Policy | None, num_envs: int | None, suite: Suite, progress: bool
+    root: Path, config: CollectConfig, policy: Any, num_envs: int | None, suite: Suite, progress: bool
 ) -> Demonstrations:
     """The dataset, finished or repaired if need be; the folder must be held, and another call may have come first."""
     finished = (root / dataset.METADATA).is_file()
@@ -168,7 +171,7 @@ def collect_demonstrations(
     episodes_per_task: int,
     root: AnyPath,
     suite: str | Suite | None = None,
-    policy: str | Behaviour | Policy = "expert",
+    policy: str | Behaviour | TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase] = "expert",
     behaviour: str | None = None,
     seed: int = 0,
     noise_scale: float | Sequence[float] = 0.0,
@@ -199,9 +202,13 @@ def collect_demonstrations(
         root: the dataset's folder, new or left by an earlier call.
         suite: the :class:`~lw_torchrl.suites.Suite` that has the tasks; None for the one that their names begin with.
         policy: who acts in the whole dataset; mixtures are lists of datasets. A name in :data:`BEHAVIOURS`: "expert",
-            Meta-World's script, "scripted", "spoilt-60", "spoilt-30", "wrong" or "random"; a :class:`Behaviour`; or a
-            trained :class:`Policy`, run as :func:`evaluate` runs it.
-        behaviour: the label of its episodes, for :class:`EpisodeFilter`; None for its name. A Policy needs one.
+            Meta-World's script, "scripted", "spoilt-60", "spoilt-30", "wrong" or "random"; a :class:`Behaviour`; a
+            trained :class:`Policy`, any TensorDictModule or a function, run as :func:`evaluate` runs it: it reads
+            ``observation`` (N, 39) float32, ``task_id`` and ``episode`` (N,) int64, and ``qaf`` if it has ``plans``,
+            and writes ``action`` (N, 4) float32. What it does in a row must depend on that row alone. Of a function
+            nothing but its label is kept: continued with another of the same label, a dataset is of both.
+        behaviour: the label of its episodes, for :class:`EpisodeFilter`; None for its name. What is no name and no
+            :class:`Behaviour` needs one.
         seed: evaluate on another one.
         noise_scale: standard deviation of the noise on the executed action; of a sequence, each episode's in turn.
         noise_hold: steps for which each draw of the noise is kept; the longer, the further it leads the expert astray.
@@ -235,8 +242,8 @@ def collect_demonstrations(
     except TypeError as error:
         why = "Meta-World's experts demonstrate its own 50 tasks; docs/training.md shows demonstrations in others"
         raise TypeError(f"{error}. {why}") from error
-    actor = policy if isinstance(policy, Policy) else None
-    if actor is not None and (unknown := [task for task in names if task not in actor.tasks]):
+    actor = None if isinstance(policy, (str, Behaviour)) else policy
+    if isinstance(actor, Policy) and (unknown := [task for task in names if task not in actor.tasks]):
         raise ValueError(f"tasks must be among the policy's, it was not made for {', '.join(unknown)}")
     config = CollectConfig(
         tasks=names,
@@ -261,6 +268,6 @@ def collect_demonstrations(
         raise DatasetError(f"root: {str(folder)!r} is not empty and holds no dataset; choose another folder")
     if found is None or partial.is_dir():
         lock = held(folder, "root", "collect_demonstrations", folder=True, error=DatasetError)
-        with lock, nullcontext() if actor is None else evaluating(actor):
+        with lock, evaluating(actor) if isinstance(actor, nn.Module) else nullcontext():
             found = _made(folder, config, actor, num_envs, found_suite, progress)
     return found

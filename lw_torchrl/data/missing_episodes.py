@@ -24,7 +24,7 @@ from lw_torchrl.envs.episodes import policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.policy import Policy, plans_of, transform_of
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.suites.suite import Suite
 from lw_torchrl.transforms.qaf import QAFTransform
@@ -148,7 +148,7 @@ def _clipped(policy: _Actor, size: int) -> _Actor:
     return run
 
 
-def _env_and_actor(config: CollectConfig, policy: Policy | None, env: LanguageWorldEnv) -> tuple[EnvBase, _Actor]:
+def _env_and_actor(config: CollectConfig, policy: Any, env: LanguageWorldEnv) -> tuple[EnvBase, _Actor]:
     if config.policy.kind == "expert":
         expert = suite_expert(env.suite, config.tasks)
         if not isinstance(expert, Policy):
@@ -159,7 +159,7 @@ def _env_and_actor(config: CollectConfig, policy: Policy | None, env: LanguageWo
         actor: _Actor = SegmentActor(config.policy, plans, config.seed, config.max_steps, skills=env.suite.skills)
         transform: Transform | None = QAFTransform(plans)
     else:
-        actor, transform = policy_of(policy), policy.transform()
+        actor, transform = policy_of(policy), transform_of(policy, plans_of(policy))
     seen = env if transform is None else TransformedEnv(env, transform)
     return seen, _clipped(actor, env.layout.action_size)
 
@@ -176,7 +176,7 @@ def suite_expert(suite: Suite, tasks: Sequence[str]) -> Any:
 
 def run_missing_episodes(
     config: CollectConfig,
-    policy: Policy | None,
+    policy: Any,
     files: EpisodeFiles,
     num_envs: int | None,
     suite: Suite,

@@ -34,14 +34,14 @@ _LARGEST = 64 * 2**20  # bytes of a file of pictures
 
 
 @dataclass(frozen=True)
-class _Pictures:
+class Pictures:
     cameras: tuple[str, ...]
     height: int
     width: int
     every: int
 
     @classmethod
-    def of(cls, cameras: str | Sequence[str], height: int, width: int, every: int) -> _Pictures:
+    def of(cls, cameras: str | Sequence[str], height: int, width: int, every: int) -> Pictures:
         return cls(check_cameras(cameras, height, width), height, width, check_int("every", every, minimum=1))
 
     @property
@@ -120,7 +120,7 @@ def add_pictures(
         ...     replay.sample()["pixels"].shape
         torch.Size([8, 64, 64, 3])
     """
-    wanted, found = _Pictures.of(cameras, height, width, every), read_metadata(Path(root))
+    wanted, found = Pictures.of(cameras, height, width, every), read_metadata(Path(root))
     verify(found, found.episodes)
     rows = load_rows(found)
     missing = [one for one in found.episodes if wanted.missing(found.root, one)]
@@ -134,7 +134,7 @@ def add_pictures(
 
 
 def _taken(
-    found: Demonstrations, rows: TensorDictBase, episodes: Sequence[EpisodeInfo], wanted: _Pictures
+    found: Demonstrations, rows: TensorDictBase, episodes: Sequence[EpisodeInfo], wanted: Pictures
 ) -> list[list[np.ndarray[Any, Any]]]:
     task, seed, steps = episodes[0].task, found.config.seed, found.config.max_steps
     base = LanguageWorldEnv(task, num_envs=len(episodes), seed=seed, max_steps=steps)
@@ -186,7 +186,7 @@ def load_pictures(
     ``cameras``, ``height``, ``width`` and ``every`` are as given to :func:`add_pictures`. Without such pictures, or if
     they are damaged, a :class:`DatasetError`, which is a ValueError, is raised.
     """
-    wanted = _Pictures.of(cameras, height, width, every)
+    wanted = Pictures.of(cameras, height, width, every)
     _, lengths = torch.unique_consecutive(replay.storage.column(("collector", "traj_ids")), return_counts=True)
     listed = [(part.root, episode) for part in replay.parts for episode in part.episodes]
     found = torch.empty((int(lengths.sum()), *wanted.shape), dtype=torch.uint8)

@@ -228,6 +228,12 @@ class LanguageWorldExperienceReplay(RestorableReplay):
             raise RuntimeError(ONE_PROCESS)
         return super().share(shared)
 
+    def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Any]]:
+        """The rows at ``indices``, for PyTorch's ``DataLoader``: see :class:`RowDataset`, of all columns."""
+        from lw_torchrl.data.torch_datasets import RowDataset
+
+        return RowDataset(self, keys=None).__getitems__(indices)
+
     def add_column(self, name: str, values: Tensor, *, of: LanguageWorldExperienceReplay | None = None) -> None:
         """Give samples a new column ``name``, held in memory: each row's advantage, say.
 
@@ -247,6 +253,11 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         own = values.detach().clone()
         self.columns = {**self.columns, name: sha256(own.cpu().contiguous().numpy().tobytes()).hexdigest()}
         self.storage.add_column(name, own)
+
+    @property
+    def grows(self) -> bool:
+        """Whether it was made with ``grow``."""
+        return self._grows
 
     @property
     def tasks(self) -> tuple[str, ...]:

@@ -67,7 +67,8 @@ def write_html(path: AnyPath, page: AnyPath, *, episode: str | None = None, step
 class WebPage(AbstractContextManager["WebPage"]):
     """A recording as a page at ``address``, served until :meth:`close`.
 
-    The recording is read once; where it still grows, make another page. The rest is as for :func:`open_viewer`.
+    The recording is read once; where it still grows, make another page. In a notebook, a page that is the last value of
+    a cell shows itself, while the kernel runs. The rest is as for :func:`open_viewer`.
 
     Args:
         port: of this machine, 127.0.0.1; 0 takes a free one. Another machine reaches it through a tunnel,
@@ -99,10 +100,17 @@ class WebPage(AbstractContextManager["WebPage"]):
         self._server = ThreadingHTTPServer((LOCAL, port), _handler(files))
         self._server.daemon_threads = True
         self.address = f"http://{LOCAL}:{self._server.server_address[1]}/"
+        self._shown = False
 
     def serve(self) -> None:
         """Answer until Ctrl-C, or until another thread calls :meth:`close`."""
         self._server.serve_forever(poll_interval=0.2)
+
+    def _repr_html_(self) -> str:
+        if not self._shown:
+            self._shown = True
+            threading.Thread(target=self.serve, daemon=True).start()
+        return f'<iframe src="{self.address}" width="100%" height="700" style="border: 0"></iframe>'
 
     def close(self) -> None:
         """Answer no more."""

@@ -129,6 +129,10 @@ def test_data(capsys, folder):
     assert (found["all"]["episodes"], found["all"]["steps"], found["all"]["success"]) == (2, 1000, 1.0)
     assert found["datasets"][0]["config"]["seed"] == 0
     assert document(capsys, "data", "show", "demos", "--check")["damaged"] == []
+    check_documented("data export", document(capsys, "data", "export", "demos", "--to", "parquet", "--out", "others"))
+    found = document(capsys, "data", "import", "others", "--out", "back")
+    check_documented("data import", found)
+    assert (found["steps"], found["lacking"], found["tasks"][0]["success"]) == (1000, [], 1.0)
     path = folder / "demos" / "data" / "action.memmap"
     content = path.read_bytes()
     path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
@@ -182,7 +186,7 @@ def test_lists_of_runs(capsys, args):
 def test_all_that_print_a_table_have_it():
     every = {**COMMANDS, **{f"{group} {name}": one for group, names in GROUPS.items() for name, one in names.items()}}
     without = {name for name, function in every.items() if "json" not in function.__annotations__}
-    assert without == {"view", "plan", "plan prompt", "plan serve"}
+    assert without == {"view", "data", "plan", "plan prompt", "plan serve"}
 
 
 def test_what_json_cannot_hold_is_null_or_text():

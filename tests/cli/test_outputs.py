@@ -14,6 +14,8 @@ FOLDERS = {
     "demo": ["--quick", "--out"],
     "collect": ["reach", "--out"],
     "train-evaluator": ["reach", "--out"],
+    "data export": ["demos", "--to", "parquet", "--out"],
+    "data import": ["demos", "--out"],
     "evaluate": ["expert", "--out"],
     "scripted": ["reach", "--out"],
     "reproduce": ["few-shot", "--out"],

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from lw_torchrl.cli import online, options
+from lw_torchrl.cli import exchange, online, options
 from lw_torchrl.cli.main import COMMANDS, GROUPS
 
 HEAVY = ("torch", "torchrl", "mujoco", "metaworld", "rerun", "matplotlib")
@@ -40,8 +40,8 @@ WRONG = {
     "generate": "there is no command 'generate'; did you mean 'plan generate'?",
     "plan": "a command must come first, one of prompt, generate,",
     "plan promt": "there is no command 'promt'; did you mean 'prompt'?",
-    "data": "ACTION and FOLDERS must be given",
-    "data shw demos": "ACTION must be one of 'show', got 'shw'; did you mean 'show'?",
+    "data": "a command must come first, one of show, export, import",
+    "data shw demos": "there is no command 'shw'; did you mean 'show'?",
     "data show demos --chek": "there is no option --chek; did you mean --check?",
     "evaluate x --episode 3": "there is no option --episode; did you mean --episodes? `lw-torchrl evaluate --help`",
     "collect reach --out o --tsks 3": "there is no option --tsks",
@@ -68,6 +68,11 @@ WRONG = {
     "collect reach --out o --policy expret": "--policy must be one of 'expert', 'scripted', ",
     "collect reach --out o --policy nowhere.zip": "--policy: no file 'nowhere.zip'; `lw-torchrl train` writes one",
     "collect reach --out o --policy demos": "--policy: 'demos' is a folder; a policy is one file",
+    "data export nowhere --to parquet --out o": "FOLDER: no dataset folder 'nowhere'",
+    "data export demos --to lerobt --out o": "--to must be one of 'parquet', 'lerobot', 'hdf5', 'minari', got 'lerobt'",
+    "data export demos --to parquet --out .": "--out must be a new folder, or an empty one, '.' holds files",
+    "data import nowhere --out o": "SOURCE: there is no file or folder 'nowhere'",
+    "data import demos --out o --episodes 0": "--episodes must be at least 1, got 0",
     "data show nowhere": "FOLDERS: no dataset folder 'nowhere'; make one with `lw-torchrl collect`",
     "train nowhere --out o.zip": "DATA: no dataset folder 'nowhere'; make one with `lw-torchrl collect`",
     "train demos --out demos": "--out must be a file, 'demos' is a folder",
@@ -239,11 +244,13 @@ def test_the_words_of_the_command_line_are_those_of_the_library():
     from typing import get_args
 
     from lw_torchrl.data import BEHAVIOURS
+    from lw_torchrl.data.exchange import FORMATS
     from lw_torchrl.modules import METHODS
     from lw_torchrl.paper.online import WEAKEST
     from lw_torchrl.paper.recipes import MIXTURES, OFFLINE_METHODS
 
     assert tuple(BEHAVIOURS) == options.ACTORS
+    assert get_args(exchange.ExchangeFormat) == FORMATS
     assert tuple(METHODS) == get_args(options.Condition)
     assert get_args(online.Mixture) == tuple(MIXTURES)
     assert get_args(online.OfflineMethod) == tuple(OFFLINE_METHODS)

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mutations import mutated
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 
 import lw_torchrl as lw
 from lw_torchrl._seeding import episode_generator
@@ -365,8 +366,10 @@ class Odd(lw.Policy):
         (Behaviour("wrong", right=0.9), dict(behaviour=None), ValueError, "label of its own"),
         (Behaviour("mine", "policy"), {}, ValueError, "give the policy itself"),
         ("raondm", {}, ValueError, "policy must be one of 'expert'.*did you mean 'random'"),
-        (None, {}, TypeError, "policy must be a name, a Behaviour or a Policy, got NoneType"),
-        (lambda state: state, {}, TypeError, "policy must be a name"),
+        (None, {}, TypeError, "policy must be a name, a Behaviour, a module or a function, got NoneType"),
+        (lambda state: state, {}, ValueError, "must write 'action'"),
+        (lambda state: state, dict(behaviour=None), ValueError, "behaviour must name the policy in the dataset"),
+        (Behaviour("theirs", "imported"), {}, ValueError, "is of others: import_dataset"),
         (trained("description"), dict(tasks=("push", "drawer-open")), ValueError, "not made for drawer-open"),
         (nan(trained()), {}, ValueError, "NaN"),
         (Odd("key"), {}, ValueError, "must write 'action'"),
@@ -381,6 +384,35 @@ def test_what_is_refused(tmp_path, policy, options, error, message):
     with pytest.raises(error, match=message):
         collect(tmp_path / "demos", policy=policy, num_envs=2, **{"behaviour": "mine", **options})
     assert not (tmp_path / "demos" / "metadata.json").exists()
+
+
+def test_a_module_and_a_function_act_as_the_same_policy_does(tmp_path):
+    """A TensorDictModule of any network, a function, and a module with plans, which is shown their answers."""
+    torch.manual_seed(0)
+    network = torch.nn.Sequential(torch.nn.Linear(39, 4), torch.nn.Tanh())
+    module = TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
+
+    def function(tensordict):
+        return tensordict.set("action", network(tensordict["observation"]))
+
+    by_module = collect(tmp_path / "module", policy=module, behaviour="mine")
+    assert same_rows(by_module, collect(tmp_path / "function", policy=function, behaviour="mine", num_envs=2))
+    rows = load_rows(by_module)
+    torch.testing.assert_close(rows["unclipped_action"], network(rows["observation"]).detach())
+    assert by_module.config.policy.fingerprint == policy_fingerprint(module)
+    assert read_metadata(tmp_path / "function").config.policy == Behaviour("mine", "policy")
+    network[0].weight.data *= 2
+    with pytest.raises(DatasetError, match="another configuration"):
+        collect(tmp_path / "module", policy=module, behaviour="mine")
+
+    class Planned(TensorDictModule):
+        plans = PLANS
+
+    shown = lambda observation, qaf: observation[..., :4].tanh() * qaf[..., :1]  # noqa: E731
+    planned = Planned(shown, in_keys=["observation", "qaf"], out_keys=["action"])
+    made = collect(tmp_path / "planned", policy=planned, behaviour="planned")
+    rows = lw.QAFTransform(PLANS)(load_rows(made).select("observation", "task_id", "expert_action").clone())
+    torch.testing.assert_close(rows["expert_action"], rows["observation"][:, :4].tanh() * rows["qaf"][:, :1])
 
 
 def test_an_expert_of_another_name_is_one(tmp_path):

@@ -99,6 +99,18 @@ def test_a_page_is_served_until_it_is_closed(tmp_path, recording):
         urllib.request.urlopen(page.address, timeout=5)
 
 
+def test_a_page_shows_itself_in_a_notebook(recording):
+    page = WebPage(recording)
+    try:
+        shown = page._repr_html_()
+        assert f'<iframe src="{page.address}"' in shown
+        assert page._repr_html_() == shown, "and is served once"
+        with urllib.request.urlopen(page.address, timeout=20) as answer:
+            assert answer.status == 200
+    finally:
+        page.close()
+
+
 @pytest.mark.parametrize("begun", [b"", b"G", b"GET / HTTP/1.1\r\nX: ", b"GET /wasm.gz HTTP/1.0\r\n\r\n"])
 def test_who_asks_or_takes_too_slowly_holds_no_thread(monkeypatch, recording, begun):
     monkeypatch.setattr("lw_torchrl.record.web_page.ASKING_SECONDS", 0.5)

@@ -1,0 +1,128 @@
+"""The reference: the API by room, and the tables of what stands in the package's data files."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from lw_torchrl.cli.main import COMMANDS, GROUPS
+from lw_torchrl.language.layout import METAWORLD, Layout
+from lw_torchrl.language.relations import PREDICATES, PUBLISHED, STATES, Comparison
+from lw_torchrl.language.tasks import MT10, TASKS, Task
+from lw_torchrl.suites.fetch import FETCH
+from lw_torchrl.suites.fetch import TASKS as FETCH_TASKS
+
+ROOT = Path(__file__).parents[2]
+NAMES = re.findall(r"^from (\S+) import (\S+) as", (ROOT / "lw_torchrl/__init__.pyi").read_text("utf-8"), re.MULTILINE)
+ROOMS = [name for module, name in NAMES if module == "lw_torchrl"]
+WORDS = (
+    "tasks queries relations query_program plans plan_files formats plan_decoding canonical skills nearest text layout"
+)
+"""The modules of ``language``, whose room names nothing itself."""
+
+
+def pages() -> dict[str, str]:
+    found = {f"api/{room}.md": room_page(room) for room in ROOMS}
+    return {"api/index.md": top_level(), "commands.md": commands(), "tables.md": tables(), **found}
+
+
+def room_page(room: str) -> str:
+    inner = {"language": WORDS.split(), "paper": ["recipes", "runs"]}.get(room)
+    modules = [f"::: lw_torchrl.{room}.{word}\n" for word in inner or ()]
+    whole = f"::: lw_torchrl.{room}\n    options: {{show_root_heading: false, show_root_toc_entry: false}}\n"
+    return "\n".join([f"# lw.{room}", "", *(modules or [whole])])
+
+
+def commands() -> str:
+    """What ``--help`` says of each command."""
+    names = [(name, *inner) for name in COMMANDS for inner in ([(), *((one,) for one in GROUPS.get(name, ()))])]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NO_COLOR": "1"}
+    parts = ["# Commands", "", "What `lw-torchrl COMMAND --help` says. [Exit status, pipes and JSON](cli.md)", ""]
+    for name in names:
+        line = [sys.executable, "-m", "lw_torchrl", *name, "--help"]
+        told = subprocess.run(line, env=environment, capture_output=True, text=True, check=True).stdout
+        parts += [f"## {' '.join(name)}", "", "```text", told.strip(), "```", ""]
+    return "\n".join(parts)
+
+
+def top_level() -> str:
+    rows = [
+        f'| <autoref identifier="{module}.{name}" optional>`lw.{name}`</autoref> | [{room}]({room}.md) |'
+        for module, name in NAMES
+        if module != "lw_torchrl"
+        for room in [module.split(".")[1]]
+    ]
+    about = "`import lw_torchrl as lw` gives these names, and the rooms: `lw.data`, for example."
+    return "\n".join(["# API", "", about, "", "| name | room |", "|---|---|", *rows, ""])
+
+
+RELATIONS = """# Relations, layouts, tasks
+
+Made from the library's data when the site is built.
+
+## Relations
+
+x, y, z are the first position minus the second, in metres; ‖·‖ is the length over the named axes. An opening is from 0,
+closed, to 1, open. A logit is the distance to the threshold divided by the temperature.
+[More](queries.md#what-the-relations-mean).
+
+| predicate | holds where | temperature | published |
+|---|---|---|---|"""
+LAYOUTS = """
+## Layouts
+
+Indices of the numbers of an observation and of an action. [Suites](suites.md).
+
+| | metaworld | fetch |
+|---|---|---|"""
+
+
+def tables() -> str:
+    """What relations, layouts and tasks are, as the library reads them."""
+    parts = [RELATIONS]
+    for name, comparisons in PREDICATES.items():
+        holds = " and ".join(written(one, name in STATES) for one in comparisons)
+        degree = ", ".join(sorted({f"{one.temperature:g}" for one in comparisons}))
+        parts.append(f"| {name} | {holds} | {degree} | {'yes' if name in PUBLISHED else ''} |")
+    both = zip(told(METAWORLD).items(), told(FETCH).values(), strict=True)
+    parts += [LAYOUTS, *(f"| {what} | {one} | {other} |" for (what, one), other in both)]
+    for heading, tasks in (("Meta-World's tasks", TASKS), ("Fetch's tasks", FETCH_TASKS)):
+        parts += ["", f"## {heading}", "", "| task | description | things | our points |", "|---|---|---|---|"]
+        parts += [task_row(task) for _, task in sorted(tasks.items())]
+    return "\n".join([*parts, ""])
+
+
+def written(one: Comparison, opening: bool) -> str:
+    value = f"‖{one.axes}‖" if one.length else "opening" if opening else one.axes
+    return f"{value} {one.sense} {one.threshold:g}" + (f", z raised by {one.raise_z:g}" if one.raise_z else "")
+
+
+def told(layout: Layout) -> dict[str, str]:
+    places = [(span(thing.position, 3), thing.quaternion) for thing in layout.things]
+    things = [place if turned is None else f"{place}, quaternion {span(turned, 4)}" for place, turned in places]
+    moved = "none" if layout.displacement is None else f"{span(layout.displacement, 3)}, {layout.reach:g} m at 1"
+    return {
+        "numbers of an observation": f"{layout.size}",
+        "the hand's position": span(layout.hand, 3),
+        "its opening": f"{layout.opening}",
+        "the things' positions": "; ".join(things),
+        "the goal's position": span(layout.goal, 3),
+        "the step before": "none" if layout.past is None else f"each index + {layout.past}",
+        "numbers of an action": f"{layout.action_size}",
+        "displacement of the hand": moved,
+        "effort of the gripper": "none" if layout.gripper is None else f"{layout.gripper}, {layout.closes:+d} closes",
+        "thresholds of its own": ", ".join(f"{name} {at:g}" for name, at in layout.thresholds.items()) or "none",
+    }
+
+
+def span(start: int, length: int) -> str:
+    return f"{start} to {start + length - 1}"
+
+
+def task_row(task: Task) -> str:
+    mark = " (MT10)" if task.name in MT10 else ""
+    things, points = (", ".join(one.name for one in task.objects if one.ours == ours) for ours in (False, True))
+    return f"| {task.name}{mark} | {task.description} | {things} | {points} |"

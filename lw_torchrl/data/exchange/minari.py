@@ -1,0 +1,122 @@
+"""Minari's datasets, written and read by Minari itself.
+
+data/main_data.hdf5    a group for each episode: observations (T + 1, 39), actions (T, 4), rewards, the dense ones,
+                       terminations and truncations (T,), infos/... (T + 1, ...): success and reward_sparse tell of the
+                       step before, and are zero in the first row; the others of the step after, and zero in the last
+data/metadata.json     Minari's description, and the metadata of a dataset of ours
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lw_torchrl._files import parse_json
+from lw_torchrl._progress import Progress
+from lw_torchrl.data.exchange.table import ABOUT, EPISODES, HOLDS, NAMES, Array, ExchangeError, Table, check_rows
+
+_AFTER = ("success", "reward_sparse")
+_BEFORE = ("expert_action", "unclipped_action", HOLDS, "next_observation")
+_OF_STEP = {*NAMES["success"], *NAMES["reward_sparse"], *NAMES["reward_dense"]}
+
+
+def _infos(table: Table, start: int, end: int) -> dict[str, Array]:
+    """The other columns of an episode, a row longer; the next observations only where they are not the next rows."""
+    found = {}
+    observation, after = (table.columns[name][start:end] for name in ("observation", "next_observation"))
+    for name in (*_AFTER, *_BEFORE):
+        column = table.columns.get(name)
+        if column is None or (name == "next_observation" and observation[1:].tobytes() == after[:-1].tobytes()):
+            continue
+        empty, part = np.zeros_like(column[:1]), column[start:end]
+        found[name] = np.concatenate([empty, part] if name in _AFTER else [part, empty])
+    return found
+
+
+def write(table: Table, folder: Path, bar: Progress) -> None:
+    """Write a table as a dataset; its id is the name of its folder, and -v0 where that has no version."""
+    import minari
+    from gymnasium.spaces import Box
+    from minari.data_collector import EpisodeBuffer
+    from minari.dataset.minari_storage import MinariStorage
+
+    observation, action, after = (table.columns[name] for name in ("observation", "action", "next_observation"))
+    storage = MinariStorage.new(
+        folder / "data",
+        observation_space=Box(-np.inf, np.inf, observation.shape[1:], np.float32),
+        action_space=Box(-1.0, 1.0, action.shape[1:], np.float32),
+        data_format="hdf5",
+    )
+
+    def episodes() -> Iterator[Any]:
+        for start, end in table.spans():
+            rows = slice(start, end)
+            yield EpisodeBuffer(
+                observations=np.concatenate([observation[rows], after[end - 1 : end]]),
+                actions=action[rows],
+                rewards=table.columns["reward_dense"][rows],
+                terminations=table.columns["terminated"][rows],
+                truncations=table.columns["truncated"][rows],
+                infos=_infos(table, start, end),
+            )
+            bar.update(end - start)
+
+    storage.update_episodes(episodes())
+    storage.update_episode_metadata(
+        {"task": task, "task_description": table.words[task], "plan": table.plans.get(task, "")} for task in table.tasks
+    )
+    name = re.sub(r"[^-\w]", "-", re.sub(r"^\.|\.[0-9a-f]{16}\.tmp$", "", folder.name))
+    about = "Demonstrations of tasks whose descriptions and plans are in the episodes' metadata."
+    versioned = name if re.search(r"-v\d+$", name) else f"{name}-v0"
+    told = {"dataset_id": versioned, "minari_version": minari.__version__, "description": about}
+    storage.update_metadata({**told, ABOUT: json.dumps(table.about)})
+
+
+def _flat(name: str, value: Any) -> dict[str, Array]:
+    """The arrays in nested ones, by their names joined by dots."""
+    if isinstance(value, Mapping):
+        return {key: one for inner, part in value.items() for key, one in _flat(f"{name}.{inner}", part).items()}
+    return {name: np.asarray(value)}
+
+
+def _columns(episode: Mapping[str, Any]) -> dict[str, Array]:
+    """The columns of an episode's rows."""
+    steps = len(episode["rewards"])
+    found = {name: np.asarray(episode[name]) for name in ("rewards", "terminations", "truncations")}
+    found |= _flat("actions", episode["actions"])
+    for name, values in _flat("observations", episode["observations"]).items():
+        found[name] = values[:-1]
+        if name in NAMES["observation"]:
+            found["next_observations"] = values[1:]
+    for name, values in _flat("infos", episode["infos"] or {}).items():
+        if len(values) == steps + 1 and values.dtype.kind in "biuf":
+            found[name] = values[1:] if name in _OF_STEP else values[:-1]
+    return found
+
+
+def read(source: Path) -> Table:
+    """Read a dataset with Minari; ExchangeError if it is damaged, or none."""
+    import minari  # noqa: F401
+    from minari.dataset.minari_storage import MinariStorage
+
+    where = f"source: {str(source)!r}"
+    place = source / "data" if (source / "data").is_dir() else source
+    try:
+        storage = MinariStorage.read(place)
+        every = range(storage.total_episodes)
+        parts = [_columns(episode) for episode in storage.get_episodes(every)]
+        told = [*storage.get_episode_metadata(every)]
+        about = parse_json(stated.encode()) if (stated := storage.metadata.get(ABOUT)) else None
+        columns = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
+    except ImportError:
+        raise
+    except Exception as error:  # a damaged file may raise anything
+        raise ExchangeError(f"{where} is no dataset of Minari, or damaged ({type(error).__name__}: {error})") from error
+    check_rows(source, columns, storage.total_steps)
+    tasks = (next((str(one[name]) for name in EPISODES["task"] if name in one), "") for one in told)
+    return Table(columns, tuple(len(part["rewards"]) for part in parts), tuple(tasks), about=about)
