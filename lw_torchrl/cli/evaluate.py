@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
 from lw_torchrl._checks import counted
-from lw_torchrl._files import held, write_json
+from lw_torchrl._files import held, write_json, write_text
 from lw_torchrl.cli import objects, options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.language.plans import Plans
@@ -65,7 +65,7 @@ def evaluate(
     from lw_torchrl._devices import check_device
     from lw_torchrl.data.missing_episodes import suite_expert
     from lw_torchrl.record.rollouts import run_recorded, write_recording
-    from lw_torchrl.training.files import demonstrated_tasks
+    from lw_torchrl.training.files import demonstrated_tasks, policy_file
 
     options.use_one_thread()
     there = check_device("device", device)
@@ -99,7 +99,7 @@ def evaluate(
     if out is not None:
         with held(out, "out", folder=True, wait=True):
             told: dict[str, Any] = {"plans": None if own is None else own.fingerprint, "evaluator": evaluator}
-            told["checkpoint"] = None if who == "expert" or objects.is_object(who) else checkpoint
+            told["checkpoint"] = None if who == "expert" or objects.is_object(who) else policy_file(checkpoint)
             result.save(out / "results.json", **told)
             lw.plot_success(result, out / "success.png", title=f"{checkpoint}, {episodes} episodes a task")
             if attribute:
@@ -130,6 +130,31 @@ def _default_tasks(policy: lw.Policy, shown: set[str], suite: lw.suites.Suite | 
     if own:
         print(f"without {', '.join(own)}, which the simulator lacks")
     return tuple(task for task in chosen if task not in own)
+
+
+def card(
+    policy: Positional[Annotated[Path, arg(metavar="POLICY")]],  # of `lw-torchrl train`, or few-shot-mt50
+    /,
+    result: Path | None = None,  # results.json of `lw-torchrl evaluate`, for the table of success
+    repo: str = "",  # where the policy can be had, me/my-policy
+    out: Path | None = None,  # the file to write, README.md for example; by default the card is printed
+    json: options.Json = False,
+) -> Output:
+    """Write a model card of a policy: what it was trained on, its success, its limits, how to load and cite it.
+
+    Example: lw-torchrl card few-shot-mt50
+    Example: lw-torchrl card runs/mt10.zip --result runs/mt10/results.json --out README.md
+    """
+    options.check_saved("policy", policy)
+    if out is not None:
+        options.check_file("--out", out)
+    if result is not None and not result.is_file():
+        raise FileNotFoundError(f"--result: no file {str(result)!r}; `lw-torchrl evaluate --out` writes results.json")
+    measured = None if result is None else lw.EvaluationResult.load(result)
+    text = lw.evaluation.policy_card(policy, measured, repo=repo)
+    if out is not None:
+        write_text(out, text)
+    return Output(json).show("card", text, text if out is None else f"written to {out}")
 
 
 def scripted(
