@@ -235,7 +235,7 @@ def check_actor(argument: str, who: str) -> None:
         check_saved(argument, Path(who))
 
 
-def _imported(option: str, name: str, kind: str) -> Any:
+def imported(option: str, name: str, kind: str) -> Any:
     """What "package.module:name" names."""
     module, _, attribute = name.partition(":")
     try:
@@ -249,7 +249,7 @@ def read_encoder(name: str | None) -> TextEncoder | None:
     if name is None:
         return None
     check_encoder(name)
-    found = _imported("--text-encoder", name, "function")
+    found = imported("--text-encoder", name, "function")
     if not callable(found):
         raise ValueError(f"--text-encoder {name!r} must name a function, it names {type(found).__name__}")
     return found
@@ -273,7 +273,7 @@ def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite |
         return find_suite(tasks) if other else None
     if ":" not in name:
         return load_suite(name)
-    found = _imported("suite", name, "object")
+    found = imported("suite", name, "object")
     if not isinstance(found, Suite):
         raise ValueError(f"suite {name!r} must name a Suite, it names {type(found).__name__}")
     return found
