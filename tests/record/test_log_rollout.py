@@ -226,7 +226,7 @@ def test_an_overview_lists_failures_first_and_counts_causes(tmp_path, pushed):
         "| ✗ | push-0-2 · episode 0 | mine | skill | 60 | 0.75 |",
         "| ✓ | push · episode 0 | mine |  | 40 | 0.50 |",
     ]
-    assert found.front()[0] == "Overview"
+    assert next(iter(found.shown_tabs())) == "Overview"
     assert found.shown_tabs()["Overview"] == ["Episodes", "Causes"]
     assert found.values("/overview/causes", "EncodedImage:media_type") == [["image/png"]]
     assert opening_step(tmp_path / "a.rrd") == 33
