@@ -13,8 +13,8 @@ from torchrl.envs import Compose, TransformedEnv
 
 import lw_torchrl as lw
 from benchmarks.report import Row, Settings, timed, under
+from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.rollouts import read_rollout, simulate_again
-from lw_torchrl.record.scene import Motion
 
 TASK, SEED = "pick-place", 0
 EPISODES = 10

@@ -27,7 +27,7 @@ from rerun.experimental import ViewerClient
 
 import lw_torchrl as lw
 from lw_torchrl.envs.seeding import episode_seed
-from lw_torchrl.record.scene import Motion, log_model, log_motion, model_geometry
+from lw_torchrl.record.meshes import Motion, log_motion
 from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
 
 EYE, TARGET = np.array([0.75, 0.0, 0.65]), np.array([-0.05, 0.6, 0.15])
@@ -79,10 +79,15 @@ def _our_picture(client: Any, task: str, motion: Motion, folder: str) -> Any:
     stream = rr.RecordingStream(f"scene-of-{task}")  # an application has one layout
     stream.save(file)
     stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    log_model(stream, "", model_geometry(motion.model))
-    log_motion(stream, "", motion)
+    frames = log_motion(stream, "/bodies", motion, {})
     eye = rrb.EyeControls3D(position=EYE, look_target=TARGET, eye_up=(0.0, 0.0, 1.0))
-    view = rrb.Spatial3DView(origin="/", eye_controls=eye, line_grid=False, background=(90, 120, 160))
+    view = rrb.Spatial3DView(
+        origin="/",
+        eye_controls=eye,
+        line_grid=False,
+        background=(90, 120, 160),
+        overrides={mesh: rr.CoordinateFrame(f"tf#{body}") for mesh, body in frames.items() if body},
+    )
     stream.send_blueprint(rrb.Blueprint(view, collapse_panels=True))
     stream.flush()
     stream.disconnect()

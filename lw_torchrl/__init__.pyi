@@ -22,6 +22,7 @@ from lw_torchrl.envs import LanguageWorldEnv as LanguageWorldEnv
 from lw_torchrl.evaluation import EvaluationResult as EvaluationResult
 from lw_torchrl.evaluation import attribute_failures as attribute_failures
 from lw_torchrl.evaluation import evaluate as evaluate
+from lw_torchrl.evaluation import from_pretrained as from_pretrained
 from lw_torchrl.evaluation import plot_success as plot_success
 from lw_torchrl.language.canonical import canonical_plan as canonical_plan
 from lw_torchrl.language.formats import PLAN_FORMATS as PLAN_FORMATS

@@ -27,6 +27,12 @@ _KEY = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DOTTED = re.compile(rf"{_KEY}(?:[ \t]*+\.[ \t]*+{_KEY})*+")
 
 
+def shipped_policy(name: AnyPath) -> Path | None:
+    """The file of a policy that is shipped under a name, "few-shot-mt50", unless there is a file of that name."""
+    found = Path(__file__).with_name("training") / "data" / f"{name}.zip"
+    return found if Path(name).name == str(name) and not Path(name).exists() and found.is_file() else None
+
+
 @contextmanager
 def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
     """A temporary path beside ``path`` to write to; it takes the name when the block ends without an error.

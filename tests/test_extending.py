@@ -75,10 +75,6 @@ class LearnedTaskActor(lw.Policy):
         self.features = ObservationFeatures()
         self.head = ActionHead(size + self.features.width, width, 1)
 
-    @classmethod
-    def for_plans(cls, plans, *, text_encoder=None, **options):
-        return cls(plans, **options)
-
     def prepare(self, tensordict):
         observation, task_id = self.read(tensordict)
         return self.index.rows(task_id, "tasks unknown to this actor"), self.features(observation)
@@ -187,7 +183,13 @@ def test_a_kind_that_is_not_there_is_named(plans, replay, tmp_path, monkeypatch)
     monkeypatch.setitem(POLICIES, "LearnedTaskActor", LearnedTaskActor)
     lw.save_actor(LearnedTaskActor(plans), tmp_path / "policy.zip")
     monkeypatch.delitem(POLICIES, "LearnedTaskActor")
-    with pytest.raises(ValueError, match=r"kind of policy must be one of .*got 'LearnedTaskActor'"):
+    with pytest.raises(ValueError, match=r"'LearnedTaskActor' is not known here.*--import test_extending"):
+        lw.load_actor(tmp_path / "policy.zip")
+    monkeypatch.setattr(LearnedTaskActor, "__module__", "__main__")
+    monkeypatch.setitem(POLICIES, "LearnedTaskActor", LearnedTaskActor)
+    lw.save_actor(LearnedTaskActor(plans), tmp_path / "policy.zip")
+    monkeypatch.delitem(POLICIES, "LearnedTaskActor")
+    with pytest.raises(ValueError, match="is of a script; add it to its table in a module"):
         lw.load_actor(tmp_path / "policy.zip")
 
 

@@ -261,6 +261,7 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "evaluate_plans": {"plans": [PLAN], "episodes": 1, "seed": 1, "max_steps": 1, "progress": False},
         "export_dataset": {"root": root, "format": "parquet", "out": folder / "none"},
         "import_dataset": {"source": theirs(folder / "theirs.parquet"), "out": folder / "none"},
+        "from_pretrained": {"source": folder},
         "load_actor": {"path": lw_saved(lw.save_actor, actor, folder / "actor.zip")},
         "load_evaluator": {
             "path": lw_saved(lw.training.save_evaluator, evaluator, folder / "asked.zip"),

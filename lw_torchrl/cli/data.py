@@ -40,6 +40,8 @@ def collect(
     redraw_failures: bool = False,  # keep successful episodes only
     policy: str = "expert",
     behaviour: str | None = None,  # the label of its episodes; by default the name of who acts, or of the policy's file
+    task_file: options.TaskFile = None,
+    suite: options.SuiteName = None,
     num_envs: int | None = None,  # environments stepped together; the dataset does not depend on it
     json: options.Json = False,
 ) -> Output:
@@ -54,13 +56,14 @@ def collect(
     """
     options.check_folder("--out", out)
     options.check_actor("policy", policy)
-    chosen = options.simulated("tasks", options.one_or_many(tasks), options.read_tasks(None, tasks))
+    elsewhere = options.read_suite(suite, tasks)
+    chosen = options.simulated("tasks", options.one_or_many(tasks), options.read_tasks(task_file, tasks), elsewhere)
     acts: Any = policy
     if policy not in options.ACTORS:
         options.use_one_thread()
         acts, behaviour = lw.load_actor(policy), behaviour or Path(policy).stem
     how: dict[str, Any] = {"policy": acts, "behaviour": behaviour, "redraw_failures": redraw_failures, "seed": seed}
-    how |= {"noise_scale": noise, "noise_hold": noise_hold, "gripper_noise_factor": gripper_noise}
+    how |= {"noise_scale": noise, "noise_hold": noise_hold, "gripper_noise_factor": gripper_noise, "suite": elsewhere}
     made = lw.data.collect_demonstrations(chosen, episodes_per_task=episodes, root=out, num_envs=num_envs, **how)
     rates, runs = made.success_rate, made.attempts
     rows = [{"task": task, "success": rate, "episodes_run": runs[task]} for task, rate in rates.items()]

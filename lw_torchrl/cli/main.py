@@ -43,6 +43,7 @@ COMMANDS = Commands(
         "train": "train",
         "train-evaluator": "train",
         "evaluate": "evaluate",
+        "card": "evaluate",
         "record": "record",
         "view": "record",
         "query": "language",

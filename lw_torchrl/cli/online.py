@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
 import lw_torchrl as lw
 from lw_torchrl._checks import counted, shown
-from lw_torchrl._files import read_json
+from lw_torchrl._files import read_json, shipped_policy
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled, command_line
@@ -21,24 +21,23 @@ from lw_torchrl.language.plans import Plans
 if TYPE_CHECKING:
     from lw_torchrl.paper.online import OnlineRun
 
-OnlineMethod = Literal["advantage", "td3", "sac", "residual", "ppo", "expert-iteration", "start"]
 WEAKEST = "weakest"
-_TRAINING: tuple[str, ...] = tuple(method for method in get_args(OnlineMethod) if method != "start")
-_READ_BY = {"frames": _TRAINING, "logger": _TRAINING, "step": ("residual",)}
-"""The methods that read an option; every one reads the others."""
+ALGORITHMS = ("advantage", "td3", "sac", "residual", "ppo", "expert-iteration")
+"""Our names of :data:`lw_torchrl.training.LEARNERS`."""
 
 
 def online(
     tasks: Positional[tuple[str, ...]],  # each gets a policy of its own: names, MT10 or MT50
     /,
     schedule: Scheduled,  # which runs are done, and where
-    methods: tuple[OnlineMethod, ...] = ("td3", "expert-iteration"),
+    methods: tuple[str, ...] = ("td3", "expert-iteration"),
     seeds: tuple[int, ...] = (0, 1, 2),  # of demonstrations, weights, episodes and minibatches
     frames: int | None = None,
     demonstrations: int = 1,  # of each task, without noise
     start: Path | None = None,  # a policy to begin with, of train; by default one is cloned from the demonstrations
-    condition: options.Condition = "pcbc",  # that one is conditioned on plans, descriptions or numbers
+    condition: options.Condition = "pcbc",
     plans: options.PlanSources = ("MT50",),
+    task_file: options.TaskFile = None,
     episodes: int = 40,  # evaluated, on seeds that no training used, action noise 0.1
     step: str | None = None,
     logger: Literal["none", "csv", "tensorboard", "wandb"] = "none",
@@ -56,7 +55,8 @@ def online(
     Args:
         methods: td3, sac and residual (a small network that corrects the start), half of each minibatch demonstrations;
             ppo; expert-iteration, behavioral cloning of demonstrations and of own successes; advantage, which learns
-            online as offline; start, nothing. The first is compared with the others, and with the start.
+            online as offline; start, nothing; or yours, of lw.training.LEARNERS. The first is compared with the others,
+            and with the start.
         frames: steps of the environment, the same for every method, of which start reads none; 60000 by default.
         step: of residual, correct the actions in this step of the task's plan alone, by 1 at most, and leave all others
             as they are: its number, from 1, or weakest, the one that failed episodes reached and did not pass. No other
@@ -64,17 +64,23 @@ def online(
         logger: of success and losses, to logs/ beside each policy, of every method but start.
     """
     schedule.check(out)
+    options.check_condition("condition", condition)
+    for method in methods:
+        known = (*ALGORITHMS, "start")
+        options.check_listed("methods", method, known, "lw_torchrl.training:LEARNERS", ("algorithms",))
     logged = None if logger == "none" else logger
-    for option, given in {"step": step, "frames": frames, "logger": logged}.items():
-        if given is not None and not {*_READ_BY[option]} & {*methods}:
-            of = f"the method{'s' * (len(_READ_BY[option]) > 1)} {', '.join(_READ_BY[option])}"
-            raise ValueError(f"--{option} is of {of}, --methods are {', '.join(methods)}")
+    for option, given in {"frames": frames, "logger": logged}.items():
+        if given is not None and {*methods} == {"start"}:
+            raise ValueError(f"--{option} is of the methods {', '.join(ALGORITHMS)}, --methods are start")
+    if step is not None and "residual" not in methods:
+        raise ValueError(f"--step is of the method residual, --methods are {', '.join(methods)}")
     if start is not None:
         options.check_saved("start", start)
+        start = shipped_policy(start) or start
     tuned = None if step is None else _read_step(step)
-    known = options.read_tasks(None, tasks)
-    chosen = options.simulated("tasks", options.one_or_many(tasks), known)
-    found = options.read_plans(plans, known)
+    table = options.read_tasks(task_file, tasks)
+    chosen = options.simulated("tasks", options.one_or_many(tasks), table)
+    found = options.read_plans(plans, table)
     found.require(chosen)
     if isinstance(tuned, int) and start is None:
         for task in chosen:
@@ -87,7 +93,7 @@ def online(
     if frames is not None:
         recipe = replace(recipe, config=replace(recipe.config, frames=frames))
     runs = [
-        OnlineRun(task, method, seed, recipe, condition, start, episodes, tuned if method in _READ_BY["step"] else None)
+        OnlineRun(task, method, seed, recipe, condition, start, episodes, tuned if method == "residual" else None)
         for stage in ((START,), tuple(method for method in dict.fromkeys(methods) if method != START))
         for seed in seeds
         for task in chosen
@@ -101,7 +107,7 @@ def online(
         stage[str(one.folder)] = partial(execute_run, one, found, out, make_logger=make)
     typed: dict[str, Any] = {"demonstrations": demonstrations, "episodes": episodes, "frames": frames, "start": start}
     typed |= {"seeds": seeds, "methods": methods, "plans": plans, "condition": condition, "logger": logger}
-    command = command_line("online", *tasks, step=step, out=out, **typed)
+    command = command_line("online", *tasks, step=step, task_file=task_file, out=out, **typed)
     summarize = partial(_summarize, runs, found, out)
     return schedule.execute(Output(json), [], [starts, others], command, summarize, _told_of_step)
 

@@ -6,16 +6,20 @@ What names and files alone can tell is checked without torch.
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from tyro.conf import arg
 
 import lw_torchrl as lw
-from lw_torchrl._checks import unknown_name
+from lw_torchrl._checks import check_choice, unknown_name
+from lw_torchrl._files import shipped_policy
+from lw_torchrl._tables import plugins_of
 from lw_torchrl.cli.parsing import own_module
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
@@ -29,8 +33,12 @@ Loaded = TypeVar("Loaded")
 SETS = ("MT10", "MT50")
 ACTORS = ("expert", "scripted", "spoilt-60", "spoilt-30", "wrong", "random")
 """The names of :data:`lw_torchrl.data.BEHAVIOURS`."""
-Condition = Literal["pcbc", "dc", "one-hot"]
-"""The names of :data:`lw_torchrl.modules.METHODS`."""
+CONDITIONS = ("pcbc", "dc", "one-hot")
+"""Our names of :data:`lw_torchrl.modules.METHODS`."""
+_METHODS = (
+    "pcbc, by plan; or a baseline: dc, by description, one-hot, by number; or a class of yours (docs/extending.md)."
+)
+Condition = Annotated[str, arg(metavar="NAME", help=f"how policies are conditioned: {_METHODS}")]
 
 Json = Annotated[bool, arg(help="print one JSON document instead, see docs/cli.md.")]
 TaskFile = Annotated[Path | None, arg(help="a file of your tasks, which replace ours of the same name or join them.")]
@@ -97,7 +105,7 @@ def simulated(
     if own := [name for name in given if name not in (*SETS, *TASKS) and name in known]:
         raise ValueError(
             f"{argument}: the simulator has no {', '.join(own)}; "
-            "tasks of your own run in an engine of yours, in Python: docs/training.md"
+            "tasks of your own run in a suite of yours: docs/extending.md"
         )
     return resolve_tasks(names, tasks=TASKS)
 
@@ -183,6 +191,24 @@ def check_dataset(argument: str, folder: Path) -> None:
         raise FileNotFoundError(f"{argument}: no dataset folder {str(folder)!r}; make one with `lw-torchrl collect`")
 
 
+def check_condition(argument: str, *names: str) -> None:
+    """Refuse the first name of a method that is neither ours nor added by a module or a package."""
+    groups = ("methods", "policies", "encoders")
+    for name in names:
+        check_listed(argument, name, CONDITIONS, "lw_torchrl.modules:METHODS", groups)
+
+
+def check_listed(argument: str, name: str, ours: Sequence[str], place: str, groups: Sequence[str]) -> None:
+    """Refuse a name that is neither ours nor in the table at ``place``, which is imported only if users may have added
+    to it: a module that --import names, or an installed package, by an entry point in one of ``groups``."""
+    module, _, table = place.partition(":")
+    if name in ours:
+        return
+    if module not in sys.modules and not any(plugins_of(f"lw_torchrl.{group}") for group in groups):
+        raise unknown_name(argument, name, ours)
+    check_choice(argument, name, getattr(import_module(module), table))
+
+
 def check_reference(sources: Sequence[str], attribute: bool) -> None:
     """Refuse sources of --reference without --attribute, and one that is neither a set of plans nor there."""
     if sources and not attribute:
@@ -197,19 +223,19 @@ def check_saved(argument: str, path: Path, what: str = "policy", writer: str = "
     """Refuse a path where there is no file of a policy, or of what else a command writes."""
     if path.is_dir():
         raise ValueError(f"{argument}: {str(path)!r} is a folder; a {what} is one file")
-    if not path.exists():
+    if not path.exists() and (what != "policy" or shipped_policy(path) is None):
         raise FileNotFoundError(f"{argument}: no file {str(path)!r}; `lw-torchrl {writer}` writes one")
 
 
 def check_actor(argument: str, who: str) -> None:
     """Raise :class:`ValueError` for who is neither one of :data:`ACTORS` nor a policy's file."""
-    if who not in ACTORS:
+    if who not in ACTORS and shipped_policy(who) is None:
         if not who.endswith(".zip") and not Path(who).exists():
             raise unknown_name(argument, who, [*ACTORS, "a policy's file"])
         check_saved(argument, Path(who))
 
 
-def _imported(option: str, name: str, kind: str) -> Any:
+def imported(option: str, name: str, kind: str) -> Any:
     """What "package.module:name" names."""
     module, _, attribute = name.partition(":")
     try:
@@ -223,7 +249,7 @@ def read_encoder(name: str | None) -> TextEncoder | None:
     if name is None:
         return None
     check_encoder(name)
-    found = _imported("--text-encoder", name, "function")
+    found = imported("--text-encoder", name, "function")
     if not callable(found):
         raise ValueError(f"--text-encoder {name!r} must name a function, it names {type(found).__name__}")
     return found
@@ -240,13 +266,14 @@ def is_suite(name: str) -> bool:
 def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite | None:
     """The suite of --suite: a name, or "package.module:object", for which the working folder is searched first; without
     one that of ``tasks``, fetch or fetch/push. None for Meta-World."""
-    from lw_torchrl.suites.suite import SUITES, Suite, find_suite, load_suite
+    from lw_torchrl.suites.suite import Suite, find_suite, load_suite, suite_name
 
     if name is None:
-        return find_suite(tasks) if any("/" in task or task in SUITES for task in tasks) else None
+        other = any("/" in task or task == "metaworld" or suite_name(task) != "metaworld" for task in tasks)
+        return find_suite(tasks) if other else None
     if ":" not in name:
         return load_suite(name)
-    found = _imported("suite", name, "object")
+    found = imported("suite", name, "object")
     if not isinstance(found, Suite):
         raise ValueError(f"suite {name!r} must name a Suite, it names {type(found).__name__}")
     return found

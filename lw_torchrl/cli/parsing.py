@@ -177,9 +177,14 @@ def own_module(name: str) -> ModuleType:
     return import_module(name)
 
 
+IMPORTED: list[str] = []
+"""The modules that this command line's ``--import`` names, for commands that start others."""
+
+
 def import_modules(given: Sequence[str]) -> list[str]:
     """The command line without each ``--import MODULE``, which is imported."""
     rest, words = [], iter(given)
+    IMPORTED.clear()
     for word in words:
         if word != "--import" and not word.startswith("--import="):
             rest.append(word)
@@ -189,6 +194,7 @@ def import_modules(given: Sequence[str]) -> list[str]:
             own_module(name)
         except (ImportError, ValueError) as error:
             raise ValueError(f"--import {name!r} names no module: {error}") from error
+        IMPORTED.append(name)
     return rest
 
 
@@ -207,7 +213,12 @@ _OPTIONS = {
     "task": ("tasks", "names"),
     "tasks": ("names",),
 }
-_OPTIONS_OF = {"collect": {"checkpoint": "policy"}, "train": {"root": "data"}, "check": {"plans": "file"}}
+_OPTIONS_OF = {
+    "collect": {"checkpoint": "policy"},
+    "card": {"checkpoint": "policy"},
+    "train": {"root": "data"},
+    "check": {"plans": "file"},
+}
 """Where a command differs, or has an option of that name that means something else."""
 
 

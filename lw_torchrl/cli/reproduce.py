@@ -6,11 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-import lw_torchrl as lw
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.cli.runs import Job, Scheduled, command_line
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from lw_torchrl.paper.imitation import ImitationRun
 
 Experiment = Literal["zero-shot", "few-shot", "one-shot", "scripted", "all"]
-Method = Literal["pcbc", "dc", "one-hot", "scripted"]
+SCRIPTED = "scripted"
 
 
 def demo(out: Path | None = None, quick: bool = False, json: options.Json = False) -> Output:
@@ -48,8 +47,8 @@ def reproduce(
     /,
     schedule: Scheduled,  # which runs are done, and where
     seeds: tuple[int, ...] = (0, 1, 2),  # of the demonstrations, the initial weights and the minibatches
-    methods: tuple[Method, ...] | None = None,
-    preset: Literal["strong", "paper", "evaluator", "no-roles"] = "strong",
+    methods: tuple[str, ...] | None = None,
+    preset: Literal["strong", "paper", "one-network", "evaluator", "no-roles"] = "strong",
     passes: int | None = None,  # over the rows, fewer than the 500 of the preset paper
     plans: tuple[str, ...] = (),
     task_file: options.TaskFile = None,
@@ -72,15 +71,18 @@ def reproduce(
     Args:
         experiment: zero-shot, 100 demonstrations of each MT10 task; few-shot, 10 of each MT50 task; one-shot, 100 of
             each MT10 task and 1 of the target; scripted, plans with scripted skills; or all of them.
-        methods: conditioned on plans, on the task's description, on the task's number; plans with scripted skills. By
-            default all; with --plans, those that are trained.
+        methods: pcbc, dc, one-hot, conditioned on plans, on the task's description, on the task's number; scripted,
+            plans with scripted skills; or yours, of lw.modules.METHODS, POLICIES or ENCODERS. By default all of ours;
+            with --plans, those that are trained.
         preset: strong, ours; paper, the published recipe, which takes hours; evaluator, in few-shot, ours with
-            conditions answered by a network that is trained inside the policy; or no-roles, in zero-shot.
+            conditions answered by a network that is trained inside the policy; one-network, in few-shot, the policy
+            that lw.load_actor("few-shot-mt50") gives; or no-roles, in zero-shot.
         plans: of all 50 tasks, instead of ours: .plan files, .json files of pairs, folders, or MT50. If several have a
             plan for a task, the last one counts.
     """
     schedule.check(out)
     options.check_encoder(text_encoder)
+    options.check_condition("methods", *(name for name in methods or () if name != SCRIPTED))
     if schedule.launcher == "ray" and device != "cpu":
         raise ValueError(f"--device {device} is for the launcher local: the tasks of ray have a CPU core each")
     if passes is not None and preset != "paper":
@@ -90,23 +92,23 @@ def reproduce(
     if plans:
         load("own")
     from lw_torchrl._devices import check_device
-    from lw_torchrl.paper.imitation import SCRIPTED, ImitationRun
+    from lw_torchrl.paper.imitation import ImitationRun
     from lw_torchrl.paper.recipes import PRESETS, SETTINGS
     from lw_torchrl.paper.runs import execute_run
 
     recipes = PRESETS[preset]
+    if preset in ("one-network", "evaluator", "no-roles") and experiment not in recipes:
+        raise ValueError(f"--preset {preset} is for {', '.join(recipes)}, got {experiment}")
     if preset in ("evaluator", "no-roles"):
-        if experiment not in recipes:
-            raise ValueError(f"--preset {preset} is for {', '.join(recipes)}, got {experiment}")
         if methods not in (None, ("pcbc",)):
             raise ValueError(f"--methods must be pcbc with --preset {preset}: others have no plans")
         methods = ("pcbc",)
     if passes is not None:
         recipes = {name: replace(recipe, passes=passes) for name, recipe in recipes.items()}
     if methods is None:
-        methods = cast("tuple[Method, ...]", (*lw.modules.METHODS, *([] if plans else [SCRIPTED])))
+        methods = (*options.CONDITIONS, *([] if plans else [SCRIPTED]))
     if experiment == SCRIPTED:
-        methods = ("scripted",)
+        methods = (SCRIPTED,)
     plans_name = "+".join(map(_plans_name, plans))
     runs = [
         ImitationRun(SETTINGS[name], method, seed, recipes[name], episodes, plans_name, text_encoder or "")

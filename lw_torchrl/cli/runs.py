@@ -19,6 +19,7 @@ import lw_torchrl as lw
 from lw_torchrl._checks import check_choice
 from lw_torchrl.cli.options import check_folder, use_one_thread
 from lw_torchrl.cli.output import Output
+from lw_torchrl.cli.parsing import IMPORTED
 
 Job = Callable[[], Any]
 """Does a run, whose :class:`EvaluationResult` it returns, or makes what several runs share."""
@@ -92,7 +93,7 @@ Scheduled = Annotated[Schedule, OmitArgPrefixes]
 
 def command_line(*words: str, **options: Any) -> list[str]:
     """A command as it is typed; options that are None, or lists of nothing, are left out."""
-    found = [*words]
+    found = [*words, *(word for name in IMPORTED for word in ("--import", name))]
     for name, value in options.items():
         values = value if isinstance(value, tuple) else () if value is None else (value,)
         found += [f"--{name.replace('_', '-')}", *map(str, values)] if values else []

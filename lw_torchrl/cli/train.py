@@ -28,11 +28,11 @@ def train(
     plans: options.PlanSources = ("MT10",),
     task_file: options.TaskFile = None,
     text_encoder: options.EncoderName = None,
-    method: options.Condition = "pcbc",  # pcbc, by plan; or a baseline: dc, by description, one-hot, by number
+    method: options.Condition = "pcbc",
     mix: Literal["latents", "actions"] | None = None,
-    features: Literal["raw", "differences", "relative", "both"] = "differences",
-    width: int = 256,  # of the action decoder's hidden layers
-    depth: int = 3,  # number of them
+    features: Literal["raw", "differences", "relative", "both"] | None = None,
+    width: int | None = None,  # of the action decoder's hidden layers; by default the method's, 256
+    depth: int | None = None,  # number of them; by default the method's, 3
     steps: int = 8000,  # minibatches
     batch_size: int = 500,  # rows of a minibatch, equally many of each task
     learning_rate: float = 1e-3,  # at the start; a cosine brings it to 0
@@ -55,15 +55,18 @@ def train(
 
     Args:
         mix: of a policy with plans, mix the skills' latents, as in the paper and by default, or their actions.
-        features: what the policy sees: the raw observation; differences between hand, objects and goal; relative, these
-            without the hand's height and the gripper's opening; or both the first and the second.
+        features: what the policy sees: the raw observation; differences between hand, objects and goal, the default of
+            our methods; relative, these without the hand's height and the gripper's opening; or both the first and the
+            second.
         evaluator: a network that answers the conditions inside the policy and is trained with it: a file of
-            `lw-torchrl train-evaluator`, or the word new. If it reads pictures, they are drawn beside DATA.
+            `lw-torchrl train-evaluator`; the word new; or a class of yours, of lw.modules.EVALUATORS. If it reads
+            pictures, they are drawn beside DATA.
         answers: how its answers enter the attention, see docs/evaluators.md; by default tanh, with --begin hard.
         qaf_anchor: weight of the error of its answers, beside the error of the actions. Without it conditions may drift
             from their words; a new evaluator needs it.
     """
     options.check_file("--out", out)
+    options.check_condition("method", method)
     if begin is not None and out.resolve() == begin.resolve():
         raise ValueError("--out must be another file than --begin, which is only read")
     if answers is not None and evaluator is None:
@@ -84,20 +87,23 @@ def train(
         for name, one in given.items():
             if one != signature(train).parameters[name].default:
                 raise ValueError(f"--{name} is that of the policy that --begin names; leave it out")
-    if evaluator not in (None, "new"):
-        options.check_saved("evaluator", Path(evaluator), "network", "train-evaluator")
+    if evaluator not in (None, "new") and not Path(evaluator).exists():
+        if evaluator.endswith(".zip"):
+            options.check_saved("evaluator", Path(evaluator), "network", "train-evaluator")
+        options.check_listed("evaluator", evaluator, (), "lw_torchrl.modules:EVALUATORS", ("evaluators",))
     loaded = options.read_plans(plans, known)
     import torch
 
     from lw_torchrl._devices import check_device
     from lw_torchrl.data.dataset import read_metadata
-    from lw_torchrl.modules.policy import METHODS, make_policy, policy_class
+    from lw_torchrl.modules.tables import METHODS, make_policy
 
     options.use_one_thread()
     there, held = check_device("device", device), read_metadata(data).config
     encoder = options.read_encoder(text_encoder)
-    actor_options: dict[str, Any] = {"features": features, "width": width, "depth": depth}
-    reads_plans = policy_class(METHODS[method].policy).plan_options
+    asked: dict[str, Any] = {"features": features, "width": width, "depth": depth}
+    actor_options = {name: value for name, value in asked.items() if value is not None}
+    reads_plans = METHODS[method].reads_plans
     if reads_plans:
         actor_options["mix"] = mix or "latents"
     for option, value in (("mix", mix), ("latent-consistency", latent_consistency), ("evaluator", evaluator)):
@@ -163,6 +169,8 @@ def _told_tasks(folder: Path) -> tuple[str, ...]:
 def _evaluator(named: str, plans: Plans, encoder: Any) -> lw.QueryEvaluator:
     if named == "new":
         return lw.StateQueryEvaluator(plans)
+    if not Path(named).exists():
+        return lw.modules.EVALUATORS[named].from_options(plans, {}, encoder)
     return lw.training.load_evaluator(named, plans, text_encoder=encoder)
 
 

@@ -1,15 +1,16 @@
 """What the relations mean: comparisons of d = first position - second position, in metres, of data/relations.toml."""
 
 import re
-from collections import ChainMap, UserDict
+from collections import ChainMap
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 from lw_torchrl._checks import check_choice, shown
 from lw_torchrl._files import read_toml
+from lw_torchrl._tables import Table
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.named_objects import is_number
 
@@ -59,39 +60,39 @@ PREDICATES = ChainMap[str, tuple[Comparison, ...]]()
 """All that a clause can say: the relations, also those that are added, then the predicates of one object."""
 
 
-class Relations(UserDict[str, tuple[Comparison, ...]]):
+class Relations(Table[tuple[Comparison, ...]]):
     """Relations by name, to which others may be added; a name that a query cannot hold is a ValueError."""
 
-    def __setitem__(self, name: str, parts: tuple[Comparison, ...]) -> None:
+    def check(self, name: str, parts: Any) -> tuple[Comparison, ...]:
         words = name.split() if isinstance(name, str) else []
         if not words or name != " ".join(words) or not re.fullmatch(r"[a-z][a-z '-]*", name):
             raise ValueError(f"a relation must be named by lower-case words, like 'left of', got {shown(name)}")
-        taken = name in PREDICATES and name not in self
+        taken = name not in self.data and any(name in list(table) for table in PREDICATES.maps)
         if taken or words[0] in ("is", "isn't", "not") or {"and", "the", "a", "an"} & set(words):
             raise ValueError(f"a relation may not be named {name!r}, which has a meaning of its own in a query")
         if isinstance(parts, Comparison) or not parts or not all(isinstance(part, Comparison) for part in parts):
             raise ValueError(f"relation {name!r} must be a tuple of Comparison, at least one, got {shown(parts)}")
-        super().__setitem__(name, tuple(parts))
+        return tuple(parts)
 
 
 class States(Relations):
     """What is said of an object's opening, by name; comparisons of anything but that number are a ValueError."""
 
-    def __setitem__(self, name: str, parts: tuple[Comparison, ...]) -> None:
+    def check(self, name: str, parts: Any) -> tuple[Comparison, ...]:
         for one in parts if isinstance(parts, tuple) else ():
             if isinstance(one, Comparison) and (one.axes, one.length) != ("z", False):
                 asked = "compare the opening, Comparison('z', ..., length=False)"
                 raise ValueError(f"state {name!r} must {asked}, got {shown(one)}")
-        super().__setitem__(name, parts)
+        return super().check(name, parts)
 
 
-STATES = States(_predicates("states"))
+STATES = States("state", "lw_torchrl.states", _predicates("states"))
 """What is said of an opening, a number from 0, closed, to 1, open: "open", "closed", and what you add,
 ``STATES["on"] = STATES["open"]``. It stands in place of z."""
 _OF_POSITION: Mapping[str, tuple[Comparison, ...]] = MappingProxyType(_predicates("unary"))
 UNARY = ChainMap[str, tuple[Comparison, ...]](STATES, _OF_POSITION)  # type: ignore[arg-type]
 """The predicates of one object: "touching the table" compares its z with the table's, :data:`STATES` its opening."""
-RELATIONS = Relations(_predicates("relations"))
+RELATIONS = Relations("relation", "lw_torchrl.relations", _predicates("relations"))
 """The relations between two objects: the 13 published ones, and those that you add (docs/queries.md shows how).
 
 Source: paper section 'Query Answering Function'; the thresholds are the published ones.

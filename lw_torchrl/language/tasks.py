@@ -215,9 +215,13 @@ def named_tasks(tasks: TaskList, *, known: Tasks = TASKS) -> dict[str, Task]:
     """Task names, sorted, to the tasks of a set, a name, a Task, or a list of names and Tasks.
 
     Args:
-        tasks: as for :func:`resolve_tasks`; a :class:`Task` counts for itself, whatever else has its name.
+        tasks: as for :func:`resolve_tasks`; a :class:`Task` counts for itself, whatever else has its name. Plans stand
+            for the tasks that they are for.
         known: the tasks that names stand for, as from :func:`~lw_torchrl.load_tasks`.
     """
+    if isinstance(tasks, Mapping):
+        plans: Mapping[str, Any] = tasks
+        tasks = [getattr(one, "definition", one) for one in plans.values()]
     if isinstance(tasks, str) or not isinstance(tasks, (Task, Iterable)):
         return {name: known[name] for name in resolve_tasks(tasks, tasks=known)}
     listed = [tasks] if isinstance(tasks, Task) else list(tasks)

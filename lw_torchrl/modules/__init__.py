@@ -11,18 +11,19 @@ from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.modules.plan_attention import PlanAttention
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
-from lw_torchrl.modules.policy import METHODS, POLICIES, Encoder, Method, Policy, make_policy
+from lw_torchrl.modules.policy import Encoder, Encoding, Policy
 from lw_torchrl.modules.query_evaluator import EVALUATORS, QueryEvaluator
 from lw_torchrl.modules.relative_positions import PlanFocus
 from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
+from lw_torchrl.modules.tables import ENCODERS, METHODS, POLICIES, Method, make_policy
 
 __all__ = [
-    "EVALUATORS", "IMAGE_ENCODERS", "METHODS", "POLICIES", "ActorEnsemble", "ConditionedActor",
-    "DemonstratedActor",
-    "DescriptorConditionedActor", "DescriptorEncoder", "Encoder", "HeldEvaluator", "ImageQueryEvaluator", "Method",
-    "ObservationFeatures", "PlanAttention", "PlanConditionedActor", "PlanConditionedQValue", "PlanConditionedValue",
-    "PlanEncoder", "PlanFocus", "Policy", "QValue", "QueryEvaluator", "ResidualActor", "ScriptedSkillActor",
-    "StateQueryEvaluator", "TransferredActor", "Value", "make_policy", "plan_actor_value",
+    "ENCODERS", "EVALUATORS", "IMAGE_ENCODERS", "METHODS", "POLICIES", "ActorEnsemble", "ConditionedActor",
+    "DemonstratedActor", "DescriptorConditionedActor", "DescriptorEncoder", "Encoder", "Encoding", "HeldEvaluator",
+    "ImageQueryEvaluator", "Method", "ObservationFeatures", "PlanAttention", "PlanConditionedActor",
+    "PlanConditionedQValue", "PlanConditionedValue", "PlanEncoder", "PlanFocus", "Policy", "QValue", "QueryEvaluator",
+    "ResidualActor", "ScriptedSkillActor", "StateQueryEvaluator", "TransferredActor", "Value", "make_policy",
+    "plan_actor_value",
 ]  # fmt: skip

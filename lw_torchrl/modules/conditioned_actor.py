@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import torch
@@ -14,17 +14,21 @@ from torch import Tensor
 from torch.distributions import Distribution
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_flag, check_int, checked
+from lw_torchrl._checks import check_choice, check_flag, check_int, checked, shown
 from lw_torchrl._keys import as_keys, check_apart, dispatched, key_beside, read, write
+from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import Task
+from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import DISTRIBUTIONS, ActionHead, DistributionName
-from lw_torchrl.modules.policy import Encoder, Encoding, Policy, decided
+from lw_torchrl.modules.policy import Encoder, Encoding, Policy, decided, kind_of
+from lw_torchrl.modules.tables import ENCODERS, class_of
 
+_OF_HEAD = ("width", "depth", "squash", "distribution", "init_std", "decided_gripper", "action_size", "out_keys")
 _ALTERING = ("jitter", "swap_unmentioned", "hide_opening")
 
 
 class ConditionedActor(Policy):
-    """What all our actors share, whatever they are conditioned on; a subclass names its encoder.
+    """A policy on any encoder: what all our actors are, whatever they are conditioned on.
 
     Reads what the encoder reads; writes ``action`` (B, 4) float32 and, of an encoder with plans, ``skill_weights``
     (B, S) and ``skill_latent`` (B, D) float32. With a distribution also ``loc`` and ``scale`` (B, 4) float32, those of
@@ -32,9 +36,10 @@ class ConditionedActor(Policy):
     ``set_exploration_type(ExplorationType.RANDOM)``, as collectors do, and its mode otherwise.
 
     Args:
-        about: what its encoder is conditioned on.
+        about: the encoder; of a subclass, which names the encoder's class, what that is conditioned on.
         feature_noise: standard deviation of the noise on the normalised features while training; None for 0.05, or 0
-            with a distribution, whose likelihoods must not change from call to call.
+            with a distribution, whose likelihoods must not change from call to call. An encoder that is given has its
+            own.
         width, depth: hidden layers of the action decoder; a tuple of widths says both.
         squash: keep each number of the action in (-1, 1) by tanh; without, as in the paper, the environment clips.
         distribution: None for a deterministic actor; for RL "tanh_normal", a Normal through tanh, or "normal", about
@@ -45,7 +50,17 @@ class ConditionedActor(Policy):
         action_size: A, the numbers of an action; None for those of the tasks' layout. A policy that was trained with
             another robot, see :class:`~lw_torchrl.modules.TransferredActor`, has that robot's.
         out_keys: other names for what it writes, in the order above; nested ones too.
-        **options: of the encoder.
+        **options: of the encoder, where it is made here.
+
+    Raises:
+        TypeError: an encoder is given, and options of it too; or nothing says what the encoder is.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> from lw_torchrl.modules import ConditionedActor, DescriptorEncoder
+        >>> actor = ConditionedActor(DescriptorEncoder("MT10"), width=64)
+        >>> actor(lw.LanguageWorldEnv("reach").reset())["action"].shape
+        torch.Size([1, 4])
 
     Attributes:
         dist_params_keys, log_prob_keys, dist_sample_keys: where it writes ``loc`` and ``scale``, the action's
@@ -54,7 +69,7 @@ class ConditionedActor(Policy):
     Source: ``torchrl.modules.ProbabilisticActor``, without its wrapping.
     """
 
-    encoder_class: ClassVar[type[Encoder]]
+    encoder_class: ClassVar[type[Encoder] | None] = None
 
     # What V-trace asks of an actor, as of TorchRL's own.
     default_interaction_type = InteractionType.DETERMINISTIC
@@ -78,9 +93,13 @@ class ConditionedActor(Policy):
         **options: Any,
     ) -> None:
         super().__init__()
-        if feature_noise is None:
-            feature_noise = 0.05 if distribution is None else 0.0
-        self.encoder = self.encoder_class(about, feature_noise=feature_noise, **options)
+        if self.encoder_class is None:
+            _check_encoder(about, options if feature_noise is None else {"feature_noise": feature_noise, **options})
+            self.encoder = about
+        else:
+            if feature_noise is None:
+                feature_noise = 0.05 if distribution is None else 0.0
+            self.encoder = self.encoder_class(about, feature_noise=feature_noise, **options)
         if distribution is not None and any(self.encoder.config.get(name) for name in _ALTERING):
             raise ValueError(
                 f"{', '.join(_ALTERING[:-1])} and {_ALTERING[-1]} must be 0 with a distribution, whose likelihood they "
@@ -97,7 +116,8 @@ class ConditionedActor(Policy):
         self.decided_gripper = check_flag("decided_gripper", decided_gripper)
         if decided_gripper and distribution is not None:
             raise ValueError("decided_gripper must be false with a distribution, which draws any effort")
-        self.config = {**self.encoder.config, **head, "decided_gripper": decided_gripper}
+        own = {} if self.encoder_class is None else self.encoder.config
+        self.config = {**own, **head, "decided_gripper": decided_gripper}
         if action_size is not None:
             self.config["action_size"] = action_size
         self.out_keys = as_keys("out_keys", out_keys, self._written)
@@ -220,27 +240,62 @@ class ConditionedActor(Policy):
         if self.head.distribution is not None:
             raise ValueError(f"distribution: this actor has one already, {self.head.distribution!r}")
         found = self.describe()
-        found["options"] = self.config | {
+        options = found["options"] = self.config | {
             "distribution": distribution,
             "init_std": init_std,
-            **{name: 0.0 for name in ("feature_noise", *_ALTERING) if name in self.config},
             "decided_gripper": False,
             "out_keys": [*self.out_keys_source, "loc", "scale", key_beside(self.out_keys_source[0], "_log_prob")],
         }
+        if self.encoder_class is None:
+            options = found["encoder"]["options"] = dict(self.encoder.config)
+        options.update({name: 0.0 for name in ("feature_noise", *_ALTERING) if name in options})
         with torch.random.fork_rng(devices=[]):
             other = type(self).from_description(found, self.encoder.text_encoder)
         other.encoder.load_state_dict(self.encoder.state_dict())
         other.head.copy_from(self.head)
         return other.train(self.training)
 
+    @classmethod
+    def for_plans(
+        cls, plans: Plans, *, text_encoder: TextEncoder | None = None, encoder: str = "PlanEncoder", **options: Any
+    ) -> Self:
+        """One on an encoder of a class in :data:`~lw_torchrl.modules.ENCODERS`, which gets the options it knows."""
+        head = {name: options.pop(name) for name in _OF_HEAD if name in options}
+        made = ENCODERS[check_choice("encoder", encoder, ENCODERS)]
+        return cls(made.for_plans(plans, text_encoder=text_encoder, **options), **head)
+
     def describe(self) -> dict[str, Any]:
-        return super().describe() | self.encoder.describe()
+        told = self.encoder.describe()
+        if self.encoder_class is None:
+            told = {"encoder": {**kind_of(self.encoder), "options": self.encoder.config, **told}}
+        return super().describe() | told
+
+    @classmethod
+    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> Self:
+        return cls(encoder_from_description(found["encoder"], text_encoder), **found["options"])
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
         self.encoder.features.fit(observation, weights)
 
     def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
         self.encoder.fit_contacts(observation, task_id)
+
+
+def encoder_from_description(found: Any, text_encoder: TextEncoder | None = None) -> Encoder:
+    """The encoder that was described, with fresh weights; :class:`ValueError` if it is no known one."""
+    if not isinstance(found, Mapping) or not isinstance(found.get("options"), Mapping):
+        raise ValueError(f"an encoder's description must have kind and options, got {found!r:.80}")
+    made: Encoder = class_of("kind of encoder", ENCODERS, found).from_description(found, text_encoder)
+    return made
+
+
+def _check_encoder(given: Any, options: Mapping[str, Any]) -> None:
+    if not isinstance(given, Encoder):
+        raise TypeError(f"about must be an Encoder, got {shown(given)}; one for plans is PlanEncoder(plans)")
+    if options:
+        raise TypeError(
+            f"{', '.join(options)}: give it to the encoder, {type(given).__name__}(..., {next(iter(options))}=)"
+        )
 
 
 class _BeforeSampling(TensorDictModuleBase):

@@ -14,12 +14,12 @@ from lw_torchrl._checks import checked, passes_on
 from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.task_index import TaskIndex
-from lw_torchrl.language.tasks import MT50, TASKS, Task, named_tasks, one_layout
+from lw_torchrl.language.tasks import MT50, Task, named_tasks, one_layout
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.networks import text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features, ObservationFeatures
-from lw_torchrl.modules.policy import Encoder, Encoding
+from lw_torchrl.modules.policy import Encoder, Encoding, described_tasks
 
 
 class DescriptorEncoder(Encoder):
@@ -92,10 +92,6 @@ class DescriptorEncoder(Encoder):
         rows, seen = prepared
         return Encoding(self.texts(self.text_vectors)[: len(self.tasks)][rows], seen)
 
-    def describe(self) -> dict[str, Any]:
-        own = {name: task.to_json() for name, task in self.definitions.items() if task != TASKS.get(name)}
-        return {"tasks": list(self.tasks), "own_tasks": own}
-
 
 class DescriptorConditionedActor(ConditionedActor):
     """The description's latent and the observation give the action: the paper's descriptor conditioning (DC).
@@ -131,6 +127,4 @@ class DescriptorConditionedActor(ConditionedActor):
 
     @classmethod
     def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> Self:
-        own = {name: Task.from_json(name, row) for name, row in found["own_tasks"].items()}
-        tasks = [own.get(name, name) for name in found["tasks"]]
-        return cls(tasks, text_encoder=text_encoder, **found["options"])
+        return cls(described_tasks(found), text_encoder=text_encoder, **found["options"])

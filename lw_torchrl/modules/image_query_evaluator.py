@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import sqrt
 from typing import Any
 
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import check_choice, check_int, checked
 from lw_torchrl._rendering import check_cameras
+from lw_torchrl._tables import Functions
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
@@ -112,7 +113,7 @@ class PointingNetwork(ClauseNetwork):
         return places, pointed.unflatten(0, (rows, self.cameras)).unflatten(-1, (height, width))
 
 
-IMAGE_ENCODERS: dict[str, Callable[[], nn.Module]] = {"small": SmallImageEncoder}
+IMAGE_ENCODERS = Functions("image encoder", "lw_torchrl.image_encoders", {"small": SmallImageEncoder})
 """What makes an encoder of pictures, by name: a module from (n, 3, H, W) float32 in [0, 1] to a map of features
 (n, F, h, w). Put yours here, one that is frozen with ``requires_grad_(False)`` too, to have it in files."""
 

@@ -91,6 +91,7 @@ class PlanEncoder(ReadsPlans, Encoder):
     Source: paper section 'Plan Conditioning' and its figure of the architecture.
     """
 
+    plan_options = True
     text_vectors: Tensor
     skill_index: Tensor
     mentioned: Tensor

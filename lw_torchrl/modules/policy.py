@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from inspect import signature
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import torch
 from tensordict import TensorDictBase
@@ -14,10 +13,10 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs import Compose, Transform
 
-from lw_torchrl._checks import check_choice, checked
+from lw_torchrl._checks import check_choice
 from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.layout import METAWORLD, Layout
-from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, Plans
 from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.observation_features import ObservationFeatures
@@ -25,33 +24,6 @@ from lw_torchrl.transforms.qaf import QAFTransform
 
 if TYPE_CHECKING:
     from lw_torchrl.modules.query_evaluator import QueryEvaluator
-
-POLICIES: dict[str, str | type[Policy]] = {
-    "ActorEnsemble": "lw_torchrl.modules.composed_actors",
-    "DemonstratedActor": "lw_torchrl.modules.composed_actors",
-    "DescriptorConditionedActor": "lw_torchrl.modules.descriptor_conditioned_actor",
-    "PlanConditionedActor": "lw_torchrl.modules.plan_conditioned_actor",
-    "ResidualActor": "lw_torchrl.modules.residual_actor",
-    "ScriptedSkillActor": "lw_torchrl.modules.scripted_skill_actor",
-    "TransferredActor": "lw_torchrl.modules.composed_actors",
-}
-"""The name of a class, as in policy files, to the module that has the class, or to the class itself."""
-
-
-@dataclass(frozen=True)
-class Method:
-    """A way to condition a policy on its task: a name in :data:`POLICIES`, and options of that class."""
-
-    policy: str
-    options: Mapping[str, Any] = field(default_factory=dict)
-
-
-METHODS: dict[str, Method] = {
-    "pcbc": Method("PlanConditionedActor"),
-    "dc": Method("DescriptorConditionedActor", {"condition": "description"}),
-    "one-hot": Method("DescriptorConditionedActor", {"condition": "one-hot"}),
-}
-"""The choices of ``train --method`` and ``reproduce --methods``: on plans, the task's description, its number."""
 
 
 class Encoding(NamedTuple):
@@ -75,7 +47,10 @@ class Prepared(TensorDictModuleBase):
         plans: the plans that it is conditioned on; None for none.
         tasks: the names of the tasks that it knows.
         layout: what the observations and actions are: its plans', or Meta-World's.
+        plan_options: whether its class reads plans, and has options about their steps, like ``focus``.
     """
+
+    plan_options: ClassVar[bool] = False
 
     config: dict[str, Any]
     plans: Plans | None = None
@@ -85,6 +60,17 @@ class Prepared(TensorDictModuleBase):
     def definition(self, task: str) -> Task | None:
         """What it knows of a task: its plan's definition, or the shipped one; None if it knows none."""
         return TASKS.get(task) if self.plans is None else self.plans[task].definition
+
+    @classmethod
+    def for_plans(cls, plans: Plans, *, text_encoder: TextEncoder | None = None, **options: Any) -> Self:
+        """One for the tasks of ``plans``, ``cls(plans, **options)``; a class that takes a ``text_encoder`` gets it."""
+        if text_encoder is not None and "text_encoder" in signature(cls).parameters:
+            options["text_encoder"] = text_encoder
+        known = signature(cls).parameters
+        if not any(one.kind is one.VAR_KEYWORD for one in known.values()):
+            for name in options:
+                check_choice(f"option of {cls.__name__}", name, [*known][1:])
+        return cls(plans, **options)
 
     def transform(self) -> Transform | None:
         """A new transform that writes what it reads and the environment does not give; None for none."""
@@ -111,6 +97,9 @@ class Encoder(Prepared):
 
     A subclass splits its work into :meth:`prepare`, which no trained parameter touches and which checks the values,
     and :meth:`encode`, which can be vmapped over parameters. As a module it writes ``encoding`` (B, D + F) float32.
+    :class:`~lw_torchrl.modules.ConditionedActor` makes a policy of it. The policy's file holds it if its class is in
+    :data:`~lw_torchrl.modules.ENCODERS`, is made of plans or of a list of tasks, and has its other arguments in
+    ``config``.
 
     Attributes:
         features: what it sees of the observation.
@@ -136,6 +125,24 @@ class Encoder(Prepared):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return write(tensordict, self, [self.encode(*self.prepare(tensordict)).joined])
 
+    def describe(self) -> dict[str, Any]:
+        """Its plans, or its tasks and which of them are not ours, as JSON."""
+        if self.plans is not None:
+            return {"plans": self.plans.to_json()}
+        known = {name: self.definition(name) for name in self.tasks}
+        own = {name: task.to_json() for name, task in known.items() if task is not None and task != TASKS.get(name)}
+        return {"tasks": list(self.tasks), "own_tasks": own}
+
+    @classmethod
+    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> Self:
+        """Make what :meth:`describe` and ``config``, as ``options``, described, with fresh weights."""
+        options = dict(found["options"])
+        if "text_encoder" in signature(cls).parameters:
+            options["text_encoder"] = text_encoder
+        if "plans" in found:
+            return cls(Plans.from_json(found["plans"]), **options)
+        return cls(described_tasks(found), **options)
+
     def with_plans(self, plans: AnyPlans) -> Encoder:
         """The same weights for other plans: training either trains both."""
         raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} is conditioned on descriptions")
@@ -148,16 +155,15 @@ class Policy(Prepared):
 
     Attributes:
         config: the options that make it again, as JSON; :meth:`describe` adds what :meth:`from_description` needs.
-        plans, tasks: as for :class:`Prepared`.
-        plan_options: whether its class has options about a plan's steps, like ``focus``.
+        plans, tasks, plan_options: as for :class:`Prepared`.
         row_by_row: whether a row's action is the same to the last bit whatever the other rows are: not of networks.
         draws: whether its actions, without exploration, depend on random numbers drawn before, for other episodes too.
         acts_in: the layout of its actions, where it is not that of its tasks, see
             :class:`~lw_torchrl.modules.TransferredActor`.
 
     Example:
-        Your own way of conditioning, here on nothing at all. With an entry in ``METHODS`` the command line trains and
-        evaluates it; ``tests/test_extending.py`` has one that learns a vector for each task.
+        Your own policy, here one that knows nothing of its task. In ``POLICIES`` the command line trains and evaluates
+        it, ``train --method Blind``. For another way of conditioning alone an :class:`Encoder` is less work.
 
         >>> import lw_torchrl as lw, torch
         >>> from lw_torchrl.modules import POLICIES
@@ -176,17 +182,14 @@ class Policy(Prepared):
         ...     @classmethod
         ...     def from_description(cls, found, text_encoder=None):
         ...         return cls(found["tasks"], **found["options"])
-        ...     @classmethod
-        ...     def for_plans(cls, plans, *, text_encoder=None, **options):
-        ...         return cls(plans, **options)
         >>> POLICIES["Blind"] = Blind
         >>> lw.evaluate(Blind(["reach"]), tasks="reach", episodes_per_task=1, seed=1_000, max_steps=5).mean_success
         0.0
+        >>> del POLICIES["Blind"]
 
     Source: the contract that ``torchrl.objectives`` and :func:`lw_torchrl.evaluate` rely on.
     """
 
-    plan_options: ClassVar[bool] = False
     row_by_row: ClassVar[bool] = False
     draws: bool = False
     acts_in: Layout | None = None
@@ -197,11 +200,6 @@ class Policy(Prepared):
         spec = Composite()
         spec[self.out_keys_source[0]] = Bounded(-1.0, 1.0, (self.layout.action_size,))
         return spec
-
-    @classmethod
-    def for_plans(cls, plans: Plans, *, text_encoder: TextEncoder | None = None, **options: Any) -> Policy:
-        """One for the tasks of ``plans``."""
-        raise NotImplementedError(f"{cls.__name__} must say how it is made for plans: override for_plans")
 
     def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
         """From what :meth:`prepare` gives to a tensor for each of ``out_keys``; it can be vmapped over parameters."""
@@ -216,7 +214,7 @@ class Policy(Prepared):
 
     def describe(self) -> dict[str, Any]:
         """All that :meth:`from_description` needs to make it again, but its weights, as JSON."""
-        return {"kind": type(self).__name__, "options": self.config}
+        return {**kind_of(self), "options": self.config}
 
     @classmethod
     def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> Policy:
@@ -233,37 +231,17 @@ class Policy(Prepared):
         raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} has none")
 
 
-def policy_class(kind: Any) -> type[Policy]:
-    """The class of a name in :data:`POLICIES`; :class:`ValueError` names the nearest if there is none."""
-    entry = POLICIES[check_choice("kind of policy", kind, POLICIES)]
-    return getattr(import_module(entry), kind) if isinstance(entry, str) else entry
+def described_tasks(found: Mapping[str, Any]) -> list[str | Task]:
+    """The tasks of a description that :meth:`Encoder.describe` gave."""
+    own = {name: Task.from_json(name, row) for name, row in found["own_tasks"].items()}
+    return [own.get(name, name) for name in found["tasks"]]
 
 
-@checked
-def make_policy(method: str, plans: AnyPlans, *, text_encoder: TextEncoder | None = None, **options: Any) -> Policy:
-    """A policy of a method for the tasks of some plans.
-
-    Args:
-        method: one of :data:`METHODS`; :class:`ValueError` names the nearest.
-        plans: what it carries out, or, where the method knows no plans, the tasks that it is for.
-        text_encoder: texts to vectors (n, E) float32; None for the shipped sentence encoder.
-        **options: of the policy's class.
-
-    Example:
-        >>> import lw_torchrl as lw
-        >>> make_policy("dc", lw.load_plans("MT10"), width=64).tasks == lw.MT10
-        True
-    """
-    chosen = METHODS[check_choice("method", method, METHODS)]
-    kind, given = policy_class(chosen.policy), {**chosen.options, **options}
-    return kind.for_plans(as_plans(plans), text_encoder=text_encoder, **given)
-
-
-def from_description(found: Any, text_encoder: TextEncoder | None = None) -> Policy:
-    """Make the policy that :meth:`Policy.describe` described, with fresh weights; :class:`ValueError` if it is none."""
-    if not isinstance(found, Mapping) or not isinstance(found.get("options"), Mapping):
-        raise ValueError(f"a policy's description must have kind and options, got {found!r:.80}")
-    return policy_class(found.get("kind")).from_description(found, text_encoder)
+def kind_of(module: Prepared) -> dict[str, Any]:
+    """How a description names a module's class; of one that is not ours also the module that has it."""
+    kind = type(module)
+    own = {} if kind.__module__.startswith("lw_torchrl.") else {"module": kind.__module__}
+    return {"kind": kind.__name__, **own}
 
 
 def decided(action: Tensor, layout: Layout, closes_above: float | None = None) -> Tensor:

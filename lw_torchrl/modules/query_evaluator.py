@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 from typing import Any
 
 import torch
@@ -12,19 +11,13 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_choice, checked
+from lw_torchrl._checks import checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, write
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
-from lw_torchrl.modules.policy import Prepared
+from lw_torchrl.modules.policy import Prepared, kind_of
+from lw_torchrl.modules.tables import Kinds, class_of
 from lw_torchrl.transforms.qaf import QAFTransform
-
-EVALUATORS: dict[str, str | type[QueryEvaluator]] = {
-    "HeldEvaluator": "lw_torchrl.modules.held_evaluator",
-    "ImageQueryEvaluator": "lw_torchrl.modules.image_query_evaluator",
-    "StateQueryEvaluator": "lw_torchrl.modules.state_query_evaluator",
-}
-"""The name of a class, as in policy files, to the module that has the class, or to the class itself."""
 
 
 class QueryEvaluator(Prepared):
@@ -104,16 +97,27 @@ class QueryEvaluator(Prepared):
 
     def describe(self) -> dict[str, Any]:
         """All that :func:`evaluator_from_description` needs beside the plans, as JSON."""
-        return {"kind": type(self).__name__, "options": self.config}
+        return {**kind_of(self), "options": self.config}
+
+
+EVALUATORS = Kinds(
+    "evaluator",
+    QueryEvaluator,
+    "lw_torchrl.evaluators",
+    {
+        "HeldEvaluator": "lw_torchrl.modules.held_evaluator:HeldEvaluator",
+        "ImageQueryEvaluator": "lw_torchrl.modules.image_query_evaluator:ImageQueryEvaluator",
+        "StateQueryEvaluator": "lw_torchrl.modules.state_query_evaluator:StateQueryEvaluator",
+    },
+)
+"""The classes of evaluators by name, as in policy files."""
 
 
 def evaluator_from_description(found: Any, plans: Plans, text_encoder: TextEncoder | None = None) -> QueryEvaluator:
     """Make the evaluator that was described, with fresh weights; :class:`ValueError` if it is no known one."""
     if not isinstance(found, Mapping) or not isinstance(found.get("options"), Mapping):
         raise ValueError(f"an evaluator's description must have kind and options, got {found!r:.80}")
-    kind: str = check_choice("kind of evaluator", found.get("kind"), EVALUATORS)
-    entry = EVALUATORS[kind]
-    made = getattr(import_module(entry), kind) if isinstance(entry, str) else entry
+    made: type[QueryEvaluator] = class_of("kind of evaluator", EVALUATORS, found)
     return made.from_options(plans, found["options"], text_encoder)
 
 

@@ -18,7 +18,8 @@ from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.networks import head
 from lw_torchrl.modules.plan_encoder import IN_FORCE, PlanEncoder
-from lw_torchrl.modules.policy import Policy, from_description
+from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.tables import from_description
 
 
 class ResidualActor(Policy):

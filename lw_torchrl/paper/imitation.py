@@ -10,14 +10,15 @@ from typing import Any, Literal
 import torch
 from torchrl.envs import Compose
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import unknown_name
 from lw_torchrl._progress import Progress
 from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.modules import ActorEnsemble, DemonstratedActor, ScriptedSkillActor
-from lw_torchrl.modules.policy import METHODS, Policy, make_policy, policy_class
+from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.tables import METHODS, make_policy
 from lw_torchrl.paper.recipes import DataSetting, Execution, Member, Preset
 from lw_torchrl.paper.runs import Dataset, Run, Work, joined, load_result, own_tasks, plain
 from lw_torchrl.training import BehavioralCloningTrainer, StackedBehavioralCloning
@@ -26,7 +27,7 @@ from lw_torchrl.training.files import describe_data, load_actor, save_actor
 from lw_torchrl.transforms import RandomYaw
 
 SCRIPTED = "scripted"
-"""Plans with scripted skills: a method beside those of :data:`lw_torchrl.modules.policy.METHODS`, without training."""
+"""Plans with scripted skills: a method beside those of :data:`lw_torchrl.modules.METHODS`, without training."""
 
 
 @dataclass(frozen=True)
@@ -57,12 +58,13 @@ class _Trained:
 
     @property
     def reads_plans(self) -> bool:
-        return policy_class(METHODS[self.method].policy).plan_options
+        return METHODS[self.method].reads_plans
 
     @property
     def options(self) -> dict[str, Any]:
-        """Of its actor."""
-        return {**self.member.actor, **(self.member.plan_actor if self.reads_plans else {})}
+        """Of its actor; a method of the user's may not have all."""
+        given = {**self.member.actor, **(self.member.plan_actor if self.reads_plans else {})}
+        return {name: value for name, value in given.items() if METHODS[self.method].takes(name)}
 
     @property
     def yaw(self) -> float:
@@ -88,7 +90,7 @@ class ImitationRun(Run):
     """One policy, or one for each target, or plans with scripts."""
 
     setting: DataSetting  # what data it sees; scripts see none, and are the same in every setting
-    method: str  # one of :data:`~lw_torchrl.modules.policy.METHODS`, or "scripted"
+    method: str  # one of :data:`~lw_torchrl.modules.METHODS`, or "scripted"
     seed: int  # of demonstrations, initial weights and minibatches
     preset: Preset  # how to train
     episodes: int = 20  # evaluated for each task
@@ -97,7 +99,8 @@ class ImitationRun(Run):
     any_device = True
 
     def __post_init__(self) -> None:
-        check_choice("method", self.method, (*METHODS, SCRIPTED))
+        if self.method != SCRIPTED and self.method not in METHODS:
+            raise unknown_name("method", self.method, [*METHODS.names(), SCRIPTED])
 
     @property
     def group(self) -> Path:

@@ -17,7 +17,8 @@ from lw_torchrl.evaluation import EvaluationResult, plot_methods
 from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules import DescriptorEncoder, PlanEncoder, QValue, Value
-from lw_torchrl.modules.policy import METHODS, Encoder, Policy, make_policy
+from lw_torchrl.modules.policy import Encoder, Policy
+from lw_torchrl.modules.tables import METHODS, make_policy
 from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
 from lw_torchrl.paper import recipes
 from lw_torchrl.paper.offline_losses import L1CQLLoss, L1IQLLoss, L1TD3BCLoss
@@ -111,7 +112,7 @@ class Advantages(_Learned):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choice("critic", self.critic, METHODS)
+        check_choice("critic", self.critic, CONDITIONS)
 
     @property
     def folder(self) -> Path:
@@ -165,7 +166,7 @@ class OfflineRun(_Learned, Run):
         super().__post_init__()
         check_choice("method", self.method, recipes.OFFLINE_METHODS)
         for name in ("actor", "critic"):
-            check_choice(name, getattr(self, name), METHODS)
+            check_choice(name, getattr(self, name), CONDITIONS)
 
     @property
     def how(self) -> OfflineMethod:

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from lw_torchrl._checks import Count, check_choice, check_fields, check_int
+from lw_torchrl._checks import Count, check_choice, check_fields, check_int, unknown_name
 from lw_torchrl._files import held
 from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay
 from lw_torchrl.data.co_learning_sampler import GROWN
@@ -18,8 +18,9 @@ from lw_torchrl.data.rewards import RewardName
 from lw_torchrl.envs.episodes import FinishedEpisode, policy_of
 from lw_torchrl.evaluation import EvaluationResult, PlanUse, evaluate, stuck_steps, weakest_step
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.modules.policy import METHODS, Policy, make_policy
+from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.residual_actor import ResidualActor
+from lw_torchrl.modules.tables import METHODS, make_policy
 from lw_torchrl.paper.imitation import ExpertDataset
 from lw_torchrl.paper.recipes import TARGET
 from lw_torchrl.paper.runs import Run, Work, execute_run, kept_policy, own_tasks, plain
@@ -68,7 +69,8 @@ class OnlineRun(Run):
     step: int | str | None = None  # None for all steps
 
     def __post_init__(self) -> None:
-        check_choice("method", self.method, (*LEARNERS, START))
+        if self.method != START and self.method not in LEARNERS:
+            raise unknown_name("method", self.method, [*LEARNERS.names(), START])
         if self.step is not None and self.method != "residual":
             raise ValueError(f"step is of the method 'residual', got it with {self.method!r}")
         if isinstance(self.step, str):
@@ -162,10 +164,11 @@ class OnlineRun(Run):
 
         def train(checkpoint: Path) -> dict[str, Any]:
             torch.manual_seed(self.seed)
-            actor = make_policy(self.condition, self.own_plans(work.plans), feature_noise=self.recipe.feature_noise)
+            noise: dict[str, Any] = {"feature_noise": self.recipe.feature_noise}
+            options = noise if METHODS[self.condition].takes("feature_noise") else {}
+            actor = make_policy(self.condition, self.own_plans(work.plans), **options)
             replay, config = self._replay(work, actor), replace(self.recipe.cloning, seed=self.seed)
-            options: dict[str, Any] = {"checkpoint": checkpoint, "progress": work.progress}
-            BehavioralCloningTrainer(actor, replay, config, **options).train()
+            BehavioralCloningTrainer(actor, replay, config, checkpoint=checkpoint, progress=work.progress).train()
             return {"actor": actor, "replay": replay}
 
         file = work.out / self.begin.folder / "policy.zip"

@@ -58,7 +58,7 @@ class Member:
 class Preset:
     """How demonstrations are made and policies trained in a setting, the same for every method and task."""
 
-    name: str  # "strong", ours; "no-roles" and "evaluator", what they say; "paper", the published recipe
+    name: str  # "strong", ours; "one-network", "no-roles" and "evaluator", what they say; "paper", the published recipe
     base: Execution  # how the base tasks are demonstrated
     label: Label  # which of the expert's actions is imitated, as for :class:`LanguageWorldExperienceReplay`
     members: tuple[Member, ...]  # the actors of a policy, each trained by itself on the same demonstrations

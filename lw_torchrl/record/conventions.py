@@ -42,6 +42,11 @@ def entity_path(*parts: str) -> str:
     return "".join("/" + rr.escape_entity_path_part(part) for part in parts)
 
 
+def changes(values: NDArray[Any]) -> NDArray[np.int64]:
+    """The rows of T×K values that differ from the row before; the first is one."""
+    return np.flatnonzero(np.concatenate([[True], (values[1:] != values[:-1]).any(axis=1)]))
+
+
 def time_columns(steps: NDArray[np.int64], period: float = CONTROL_PERIOD) -> list[Any]:
     """The two timelines of an episode: steps, and seconds at ``period`` each."""
     nanoseconds = (steps * round(period * 1e9)).astype("timedelta64[ns]")

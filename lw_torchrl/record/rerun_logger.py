@@ -26,9 +26,9 @@ from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.record import metrics
 from lw_torchrl.record.conventions import CONTROL_PERIOD, METRIC_TIMELINE, entity_path, rr, time_columns
+from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.metrics import check_name
 from lw_torchrl.record.recorded_episode import PlanLike, RecordedEpisode
-from lw_torchrl.record.scene import Motion
 from lw_torchrl.record.tabs import TABS, Layout, send_page
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.record.writer import RecordingWriter, check_address, check_path
@@ -91,6 +91,7 @@ class RerunLogger(Logger):
         self._counters: dict[str, int] = {}
         self._hparams: dict[str, str] = {}
         self._layout, self._sent = Layout(), 0.0
+        self._meshes: dict[str, bytes] = {}
         super().__init__(exp_name=name, log_dir=str(self.path.parent) if self.path else os.curdir)
 
     def _create_experiment(self) -> rr.RecordingStream:
@@ -327,7 +328,9 @@ class RerunLogger(Logger):
             elif name in taken:
                 raise ValueError(f"name must be another than {', '.join(taken)}, got {name!r}")
             title = heading.title(episode, None if name == own else name)
-            self._layout.add_page(name, send_page(stream, name, title, heading, episode, motion))
+            self._layout.add_page(
+                name, send_page(stream, len(self.episodes) + 1, name, title, heading, episode, motion, self._meshes)
+            )
         return name
 
     def compare(self, names: Sequence[str], title: str = "Side by side") -> None:

@@ -17,9 +17,9 @@ from torchrl.envs import EnvBase, Transform
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import AnyPlans, as_plans
+from lw_torchrl.record.meshes import Motion, model_geometry
 from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.rollouts import read_rollout
-from lw_torchrl.record.scene import Motion, model_geometry
 from lw_torchrl.transforms.environment import base_env, refuse_changed
 
 _BEFORE = ("task_id", "episode", "qaf_plan", "observation", "qaf", "qaf_logits", "skill_weights", "action_corrected")

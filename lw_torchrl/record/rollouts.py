@@ -27,9 +27,9 @@ from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
+from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.recorded_episode import RecordedEpisode
 from lw_torchrl.record.rerun_logger import RerunLogger
-from lw_torchrl.record.scene import Motion
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.suites.suite import Suite, known_suite, load_suite
 
@@ -177,13 +177,17 @@ def simulate_again(
         shape, active = (len(action) + 1, engine.model(0).model.nbody), np.ones(1, bool)
         positions, quaternions = np.empty((*shape, 3), np.float32), np.empty((*shape, 4), np.float32)
         positions[0], quaternions[0] = engine.poses(0)
+        tells = hasattr(engine, "touched")
+        touched = [engine.touched(0) if tells else None]
         for step in range(len(action)):
             if not np.array_equal(seen, observation[step]):
                 off = np.abs(seen.astype(np.float64) - observation[step])
                 raise DiffersError(f"step {step}: number {off.argmax()} is {off.max():.3g} off")
             seen = engine.step(action[step : step + 1], active).observation[0].astype(np.float32)
             positions[step + 1], quaternions[step + 1] = engine.poses(0)
-        return Motion(engine.model(0), positions, quaternions)
+            touched.append(engine.touched(0) if tells else None)
+        told = None if None in touched else tuple(map(str, touched))
+        return Motion(engine.model(0), positions, quaternions, told)
     finally:
         engine.close()
 

@@ -4,14 +4,32 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
 from lw_torchrl._checks import unknown_name
-from lw_torchrl.record.conventions import EPISODE_TIMELINE, METRIC_TIMELINE, SECONDS_TIMELINE, entity_path, rr, rrb
+from lw_torchrl.record.conventions import (
+    EPISODE_TIMELINE,
+    METRIC_TIMELINE,
+    SECONDS_TIMELINE,
+    Color,
+    entity_path,
+    rr,
+    rrb,
+)
+from lw_torchrl.record.lanes import log_lanes
+from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.recorded_episode import RecordedEpisode
-from lw_torchrl.record.scene import Motion, log_scene
-from lw_torchrl.record.verdict import Heading, decisive_step, log_curves, log_plan, log_timeline, telling_steps, verdict
+from lw_torchrl.record.scene import log_scene
+from lw_torchrl.record.verdict import (
+    Heading,
+    decisive_step,
+    drawn_steps,
+    log_curves,
+    log_plan,
+    telling_steps,
+    verdict,
+)
 
 Point = tuple[float, float, float]
 
@@ -41,8 +59,11 @@ class Page:
     decisive: int  # the step to open it at
     curves: Collection[str]
     steps: int  # of the plan
-    rows: int  # of the timeline
+    lanes: str  # what they lie below
+    states: dict[str, tuple[str, Color]]  # of the lanes: words and colour
+    rows: int  # how many lanes
     good: bool
+    frames: dict[str, str] = field(default_factory=dict)  # as log_motion gives them
 
     def tab(self) -> rrb.Horizontal:
         """Scene and curves on the left, words and timeline on the right."""
@@ -68,13 +89,16 @@ class Page:
         first, now = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.cursor_relative()
         timelines = EPISODE_TIMELINE, SECONDS_TIMELINE
         trail = rrb.VisibleTimeRanges([rr.VisibleTimeRange(name, start=first, end=now) for name in timelines])
+        shown: dict[Any, Any] = {path: trail for path in self.trails}
+        # "tf#" and an entity's path is the name of its frame.
+        shown |= {mesh: rr.CoordinateFrame(f"tf#{body}") for mesh, body in self.frames.items() if body}
         return rrb.Spatial3DView(
             origin=f"{self.root}/scene",
+            contents=["$origin/**", *self.frames],
             name="Scene",
-            background=(24, 27, 33),
             line_grid=False,
-            eye_controls=rrb.EyeControls3D(position=self.eye[0], look_target=self.eye[1], eye_up=(0.0, 0.0, 1.0)),
-            overrides={path: trail for path in self.trails},
+            eye_controls=rrb.EyeControls3D(position=self.eye[0], look_target=self.eye[1]),
+            overrides=shown,
         )
 
     def _words(self, part: str, name: str) -> rrb.TextDocumentView:
@@ -83,19 +107,20 @@ class Page:
     def _timeline(self) -> list[tuple[float, Any]]:
         if not self.rows:
             return []
-        origin, name = f"{self.root}/timeline", "The step in force, and what holds"
-        view = rrb.StateTimelineView(origin=origin, name=name, time_view=_window(self.shown))
-        return [(50 + 40 * min(self.rows, 8), view)]
+        labels, colors = zip(*self.states.values(), strict=True)
+        styles = rr.StateConfiguration(values=list(self.states), labels=labels, colors=colors)
+        view = rrb.StateTimelineView(
+            origin=self.lanes, name="What went on", time_view=_window(self.shown), defaults=[styles]
+        )
+        return [(50 + 40 * self.rows, view)]
 
     def _curve(self, name: str) -> rrb.TimeSeriesView:
         title, _, limits = CURVES[name]
-        many = name in ("action", "skill_weights")
         return rrb.TimeSeriesView(
             origin=f"{self.root}/{name}",
             name=title,
             axis_x=_window(self.shown),
             axis_y=None if limits is None else rrb.ScalarAxis(range=limits, zoom_lock=True),
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=many),
         )
 
 
@@ -104,11 +129,23 @@ def _stacked(parts: Sequence[tuple[float, Any]], name: str | None = None) -> rrb
 
 
 def send_page(
-    stream: Any, name: str, title: str, heading: Heading, episode: RecordedEpisode, motion: Motion | None
+    stream: Any,
+    number: int,
+    name: str,
+    title: str,
+    heading: Heading,
+    episode: RecordedEpisode,
+    motion: Motion | None,
+    meshes: dict[str, bytes],
 ) -> Page:
-    """Log an episode under ``name``; what its views, a tab called ``title``, are to show."""
+    """Log the recording's ``number``-th episode, under ``name``; what its views, a tab called ``title``, are to show.
+
+    ``meshes`` are those in the recording, as :func:`log_motion` has them.
+    """
     root = entity_path(name)
-    trails = log_scene(stream, root, episode, motion)
+    touched = None if motion is None else motion.touched
+    lanes = log_lanes(stream, entity_path(f"e{number}"), episode, heading.ended(episode), touched)
+    trails, frames = log_scene(stream, root, episode, motion, meshes, drawn_steps(heading, episode))
     stream.log(f"{root}/verdict", rr.TextDocument(verdict(heading, episode), media_type="text/markdown"), static=True)
     if episode.steps:
         log_plan(stream, root, episode)
@@ -121,8 +158,11 @@ def send_page(
         decisive=decisive_step(heading, episode),
         curves=log_curves(stream, root, episode),
         steps=len(episode.steps),
-        rows=log_timeline(stream, root, episode),
+        lanes=lanes.root,
+        states=lanes.states,
+        rows=lanes.count,
         good=episode.first_success is not None,
+        frames=frames,
     )
 
 

@@ -1,6 +1,6 @@
-"""What a page says of an episode: heading and verdict, the timeline, the plan at the cursor, and the curves."""
+"""What a page says of an episode: heading and verdict, the plan at the cursor, and the curves."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from lw_torchrl.evaluation.failure_records import CAUSES, Failure
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plan_text import one_line
-from lw_torchrl.record.conventions import FALSE, STEEL, TRUE, Color, entity_path, rr, step_color, time_columns
+from lw_torchrl.record.conventions import CONTROL_PERIOD, FALSE, STEEL, Color, changes, rr, step_color, time_columns
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
 
 AFTER_SUCCESS, AROUND_FAILURE = 20, 60
 """How many steps after a first success are worth a look, and how many on both sides of where a failure is seen."""
+SELDOM = 8  # steps between two pictures of the scene where nothing is worth a look: a tenth of a second
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,17 @@ class Heading:
             ended = f"failed: {self.failure.cause}"
         return " · ".join(filter(None, [name or self.task, *self.parts()[1:], ended]))
 
+    def ended(self, episode: RecordedEpisode) -> str:
+        """How it ended, in a few words."""
+        if episode.first_success is not None:
+            return f"SUCCESS at {at(episode.first_success)} of {len(episode)}"
+        return "FAILED" if self.failure is None else f"FAILED: {self.failure.cause}, {CAUSES[self.failure.cause]}"
+
+
+def at(step: int) -> str:
+    """A step of an episode, told apart from a plan's: "t = 80 (1.00 s)"."""
+    return f"t = {step} ({step * CONTROL_PERIOD:.2f} s)"
+
 
 def decisive_step(heading: Heading, episode: RecordedEpisode) -> int:
     """The step to look at first: the failure's, else the first success, else the last."""
@@ -66,19 +78,27 @@ def telling_steps(heading: Heading, episode: RecordedEpisode) -> tuple[int, int]
     return first, min(first + 2 * AROUND_FAILURE, length)
 
 
+def drawn_steps(heading: Heading, episode: RecordedEpisode) -> NDArray[np.int64]:
+    """The steps at which the scene is drawn: each that is worth a look, every few of the others, and the last."""
+    first, last = telling_steps(heading, episode)
+    every = np.arange(len(episode))
+    told = (every >= first) & (every <= last) | (every % SELDOM == 0)
+    told[-1] = True
+    return np.flatnonzero(told)
+
+
 def verdict(heading: Heading, episode: RecordedEpisode) -> str:
     """The verdict, in Markdown; without a :class:`Failure` a failed episode gets the plain facts."""
     length = len(episode)
     if episode.first_success is not None:
         held = int(episode.success.sum()) if episode.success is not None else 0
-        lines = [f"## SUCCESS at step {episode.first_success} of {length}"]
+        lines = [f"## {heading.ended(episode)}"]
         if episode.success is not None and not episode.success[-1]:
             lines.append(f"It did not last: the task stood done in {held} steps, and at the end no more.")
     elif heading.failure is not None:
-        cause = heading.failure.cause
-        lines = [f"## FAILED, {cause}: {CAUSES[cause]}", *_why(heading.failure, episode)]
+        lines = [f"## {heading.ended(episode)}", *_why(heading.failure, episode)]
     elif episode.success is not None:
-        lines = [f"## FAILED in {length} steps", *_facts(episode)]
+        lines = [f"## FAILED in {length} steps ({length * CONTROL_PERIOD:.2f} s)", *_facts(episode)]
     else:
         lines = [f"## {length} steps"]
     return "\n\n".join([*lines, " · ".join(heading.parts())]) + "\n"
@@ -88,7 +108,7 @@ def _why(failure: Failure, episode: RecordedEpisode) -> list[str]:
     lines = [failure.why] if failure.why else []
     if failure.also is not None:
         lines.append(f"Also: {failure.also}, {CAUSES[failure.also]}.")
-    seen = f"Seen at step {failure.at} of {len(episode)}"
+    seen = f"Seen at {at(failure.at)} of {len(episode)}"
     if failure.step is not None and failure.step < len(episode.steps):
         seen += f", in {_step(episode, failure.step)}"
     lines.append(f"{seen}.")
@@ -107,7 +127,7 @@ def _facts(episode: RecordedEpisode) -> list[str]:
     facts = []
     last = int(episode.in_force[-1])
     if last == NOBODY:
-        facts.append("At the end no step of the plan was in force alone.")
+        facts.append("At the end no plan step was in force alone.")
     else:
         steps = int((episode.in_force == last).sum())
         facts.append(f"At the end {_step(episode, last)}, was in force, as in {steps} of {len(episode)} steps.")
@@ -116,7 +136,7 @@ def _facts(episode: RecordedEpisode) -> list[str]:
             distance = np.where(episode.in_force == last, pose.distance, np.inf)
             nearest = int(distance.argmin())
             facts.append(
-                f"What it moves came within **{distance[nearest] * 100:.1f} cm** of where it goes, at step {nearest}; "
+                f"What it moves came within **{distance[nearest] * 100:.1f} cm** of where it goes, at {at(nearest)}; "
                 f"at the end it was {pose.distance[-1] * 100:.1f} cm away."
             )
     answers = episode.answers
@@ -127,58 +147,10 @@ def _facts(episode: RecordedEpisode) -> list[str]:
 
 
 def _step(episode: RecordedEpisode, step: int) -> str:
-    return f"step {step + 1}, **“{episode.steps[step][1]}”**"
+    return f"plan step {step + 1}, **“{episode.steps[step][1]}”**"
 
 
-NONE_HOLDS, EVENLY = "no condition holds", "evenly mixed"
 MARKS = {True: "✓", False: "✗", None: "·"}
-
-
-def log_timeline(stream: Any, root: str, episode: RecordedEpisode) -> int:
-    """Rows for the step in force, each condition and success below ``root``/timeline; returns how many.
-
-    A row has an entry where its state changes, and an empty one at the end. The viewer shows a row's path as its title,
-    with a backslash before whatever is no letter or underscore, and sorts the rows, so the names begin with numbers.
-    """
-    rows = 0
-
-    def send(name: str, first: int, states: Sequence[str], styles: Mapping[str, tuple[str, Color]]) -> None:
-        nonlocal rows
-        rows += 1
-        path = f"{root}/timeline{entity_path(name)}"
-        labels, colors = zip(*styles.values(), strict=True)
-        stream.log(path, rr.StateConfiguration(values=list(styles), labels=labels, colors=colors), static=True)
-        changes = [i for i in range(len(states)) if i == 0 or states[i] != states[i - 1]]
-        entries = [*(states[i] for i in changes), ""]
-        times = time_columns(np.array([*changes, len(states)]) + first)
-        stream.send_columns(path, times, rr.StateChange.columns(state=entries))
-
-    def truth(name: str, first: int, values: NDArray[np.bool_], words: tuple[str, str] = ("true", "false")) -> None:
-        styles = {"true": (words[0], TRUE), "false": (words[1], FALSE)}
-        send(name, first, np.where(values, "true", "false").tolist(), styles)
-
-    found = [a.shape[1] for a in (episode.qaf, episode.believed, episode.skill_weights) if a is not None]
-    columns = max([len(episode.steps), *found])
-    width = len(str(columns))
-    if episode.in_force is not None:
-        names = [f"{i} {skill}" for i, (_, skill) in enumerate(episode.steps, 1)] or map(str, range(1, columns + 1))
-        styles = {str(i): (name, step_color(i)) for i, name in enumerate(names)}
-        styles |= {NONE_HOLDS: (NONE_HOLDS, FALSE), EVENLY: (EVENLY, FALSE)}
-        answered = True if episode.answers is None else episode.answers.any(axis=1)
-        nobody = np.where(np.broadcast_to(answered, len(episode)), EVENLY, NONE_HOLDS)
-        states = np.where(episode.in_force == NOBODY, nobody, episode.in_force.astype(str)).tolist()
-        send(f"{0:0{width}}_in_force", 0, states, styles)
-    for column in range(columns):
-        number = f"{column + 1:0{width}}"
-        if episode.qaf is not None:
-            condition = episode.steps[column][0] if episode.steps else "condition"
-            # This apostrophe counts as a letter.
-            truth(f"{number}_" + condition.replace("'", "\u02bc").replace(" ", "_"), 0, episode.qaf[:, column])
-        if episode.believed is not None:
-            truth(f"{number}b_as_the_evaluator_has_it", 0, episode.believed[:, column])
-    if episode.success is not None:
-        truth("success", 1, episode.success, ("success", "not yet"))
-    return rows
 
 
 def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> None:
@@ -216,9 +188,11 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
         # One line in centimetres, in the colour of the step in force.
         assert episode.in_force is not None
         colors = [FALSE if step == NOBODY else step_color(step) for step in episode.in_force.tolist()]
-        stream.log(f"{root}/distance", rr.SeriesLines(names=["distance [cm]"], widths=[2.0]), static=True)
-        columns = [*rr.Scalars.columns(scalars=distance * 100), *rr.SeriesLines.columns(colors=colors)]
-        stream.send_columns(f"{root}/distance", time_columns(rows), columns)
+        stream.log(f"{root}/distance", rr.SeriesLines(names=["distance [cm]"]), static=True)
+        stream.send_columns(f"{root}/distance", time_columns(rows), rr.Scalars.columns(scalars=distance * 100))
+        new = changes(episode.in_force[:, None])
+        columns = rr.SeriesLines.columns(colors=[colors[row] for row in new])
+        stream.send_columns(f"{root}/distance", time_columns(new), columns)
         sent.append("distance")
     # A sparse reward is the success, which has a row in the timeline.
     reward: Any = episode.reward
@@ -247,6 +221,6 @@ def action_names(layout: Layout) -> list[str]:
 
 def _send(stream: Any, path: str, steps: Any, values: Any, names: Sequence[str], *color: Color) -> None:
     colors = list(color) or [step_color(i) for i in range(len(names))]
-    stream.log(path, rr.SeriesLines(names=names, colors=colors, widths=[1.5] * len(names)), static=True)
+    stream.log(path, rr.SeriesLines(names=names, colors=colors), static=True)
     columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
     stream.send_columns(path, time_columns(steps), columns)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import atexit
 import os
+import re
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 from weakref import WeakSet
 
 import mujoco
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from lw_torchrl._rendering import RENDER_LIBRARIES
 from lw_torchrl.suites.engine import BodyPoses, RowModel
 
+_FINGER = re.compile("finger|claw|pad")
 _ROLLED = ("corner", "corner2", "corner3", "corner4")  # Meta-World hangs them upside down
 _MOST_GEOMS = 2000
 _LOOKS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # a software renderer's time, fourfold
@@ -128,6 +130,7 @@ class SeenRows:
     """What an engine has whose rows can be seen."""
 
     _cameras: Cameras | None = None
+    _fingers: ClassVar[dict[str, NDArray[np.bool_]]] = {}  # by the model's file
 
     def _seen(self, row: int) -> tuple[RowModel, Any]:
         """A row's model, with the row's own places in it, and MuJoCo's data."""
@@ -146,6 +149,22 @@ class SeenRows:
         """Where all bodies of a row are now."""
         data = self._seen(row)[1]
         return BodyPoses(data.xpos.copy(), data.xquat.copy())
+
+    def touched(self, row: int) -> str | None:
+        """What a finger of a row touches now, by the name of its outermost body, "nothing" for nothing; None where no
+        body is called a finger, a claw or a pad."""
+        (path, model), data = self._seen(row)
+        if path not in self._fingers:
+            names = [model.body(body).name for body in range(model.nbody)]
+            self._fingers[path] = np.array([bool(_FINGER.search(name)) for name in names])
+        fingers = self._fingers[path]
+        if not fingers.any():
+            return None
+        bodies = model.geom_bodyid[data.contact.geom]
+        bodies = np.concatenate([bodies, bodies[:, ::-1]])
+        roots = model.body_rootid[bodies]
+        other = roots[fingers[bodies[:, 0]] & (roots[:, 0] != roots[:, 1]), 1]
+        return model.body(int(other[0])).name if len(other) else "nothing"
 
     def close(self) -> None:
         if self._cameras is not None:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from importlib import import_module
 from types import MappingProxyType
 from typing import Any
 
 from lw_torchrl._checks import check_choice, check_fields, shown, unknown_name
+from lw_torchrl._tables import Table
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.skills import Skills
-from lw_torchrl.language.tasks import Task, TaskList, Tasks, named_tasks
+from lw_torchrl.language.tasks import TASKS, Task, TaskList, Tasks, named_tasks
 from lw_torchrl.suites.engine import Engine
 
 _KINDS: dict[str, Any] = dict(tasks=Mapping, layout=Layout, make_engine=Callable, skills=Mapping, plans=Plans)
@@ -93,9 +93,20 @@ class Suite:
         return f"{self.name}/{task}"
 
 
-SUITES: dict[str, str | Suite] = {"metaworld": "lw_torchrl.suites.metaworld", "fetch": "lw_torchrl.suites.fetch"}
-"""The name of a suite to the suite, or to the module that makes it by ``make_suite()``. Add yours here to use it by
-name; nobody has to, since every ``suite=`` takes the object too."""
+class Suites(Table[Suite]):
+    """Suites by name; a function that makes one stands for what it makes."""
+
+    def check(self, name: str, thing: Any) -> Suite:
+        found = thing() if callable(thing) else thing
+        if not isinstance(found, Suite):
+            raise TypeError(f"suite {name!r} must be a Suite, or a function that makes one, got {shown(thing)}")
+        return found
+
+
+SUITES = Suites(
+    "suite", "lw_torchrl.suites", {name: f"lw_torchrl.suites.{name}:make_suite" for name in ("metaworld", "fetch")}
+)
+"""The suites by name. Add yours to use it by name; nobody has to, since every ``suite=`` takes the object too."""
 
 
 def load_suite(suite: str | Suite) -> Suite:
@@ -114,15 +125,13 @@ def load_suite(suite: str | Suite) -> Suite:
             f"{unknown_name('suite', suite, SUITES)} (yours is given as suite=, or has a name by lw.suites.SUITES["
             f"{suite!r}] = ..., on the command line in a module that --import names)"
         )
-    found = SUITES[suite]
-    if isinstance(found, str):
-        found = SUITES[suite] = import_module(found).make_suite()
-    return found
+    return SUITES[suite]
 
 
-def _suite_name(task: str) -> str:
+def suite_name(task: str) -> str:
     """The suite that a task's name begins with, or is; Meta-World's tasks have no suite in front."""
-    return task.partition("/")[0] if "/" in task or task in SUITES else "metaworld"
+    known = task in (*TASKS, "MT10", "MT50")  # else installed packages are asked
+    return task.partition("/")[0] if "/" in task or (not known and task in SUITES) else "metaworld"
 
 
 def listed_tasks(tasks: Any) -> Any:
@@ -140,7 +149,7 @@ def find_suite(tasks: Any, suite: str | Suite | None = None) -> Suite:
         return load_suite(suite)
     listed = [tasks] if isinstance(tasks, (str, Task)) else list(tasks) if isinstance(tasks, Iterable) else []
     names = {one.name if isinstance(one, Task) else one for one in listed if isinstance(one, (str, Task))}
-    prefixes = {_suite_name(name) for name in names}
+    prefixes = {suite_name(name) for name in names}
     if len(prefixes) > 1:
         raise ValueError(f"tasks must be of one suite, got tasks of {', '.join(sorted(prefixes))}")
     return load_suite(next(iter(prefixes), "metaworld"))
@@ -148,7 +157,7 @@ def find_suite(tasks: Any, suite: str | Suite | None = None) -> Suite:
 
 def known_suite(task: str) -> Suite | None:
     """The suite in :data:`SUITES` that has a task of this name and is installed; None for a task of one's own."""
-    name = _suite_name(task)
+    name = suite_name(task)
     try:
         found = load_suite(name) if name in SUITES else None
     except ImportError:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from torch import Tensor, nn
 from torchrl.envs import Compose, Transform
 
 from lw_torchrl._checks import checked, checked_but
-from lw_torchrl._files import AnyPath
+from lw_torchrl._files import AnyPath, shipped_policy
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.text import TextEncoder, encoded
-from lw_torchrl.modules.policy import Policy, from_description
+from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
+from lw_torchrl.modules.tables import from_description
 from lw_torchrl.training.envelope import EVALUATOR, POLICY
 from lw_torchrl.training.file_checks import stand_in, text_vectors
 
@@ -65,7 +67,7 @@ def load_actor(path: AnyPath, *, text_encoder: TextEncoder | None = None) -> Pol
     """Make the policy of a file, with its plans and weights, in eval mode.
 
     Args:
-        path: the file.
+        path: the file; or "few-shot-mt50", a policy that is shipped, if there is no file of that name.
         text_encoder: the one that the policy was made with, if it was not the shipped one.
 
     Raises:
@@ -73,8 +75,18 @@ def load_actor(path: AnyPath, *, text_encoder: TextEncoder | None = None) -> Pol
         ValueError: it is damaged, or its weights, sizes or texts are not those that it says, or are no finite numbers;
             or the text encoder is another than the policy was trained with.
         ImportError: its texts are not shipped, and the extra ``[text]`` is not installed.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> lw.load_actor("few-shot-mt50").tasks == lw.MT50
+        True
     """
-    return POLICY.load(path, from_description, text_encoder, text_vectors)
+    return POLICY.load(policy_file(path), from_description, text_encoder, text_vectors)
+
+
+def policy_file(path: AnyPath) -> Path:
+    """The file of a policy: the path itself, or a shipped policy's of that name where there is no such file."""
+    return shipped_policy(path) or Path(path)
 
 
 @checked_but("evaluator")
@@ -126,7 +138,7 @@ def load_evaluator(path: AnyPath, plans: AnyPlans, *, text_encoder: TextEncoder 
 
 def read_description(path: AnyPath) -> dict[str, Any]:
     """The description that a policy file was saved with; errors as of :func:`load_actor`."""
-    return POLICY.open(path).description
+    return POLICY.open(policy_file(path)).description
 
 
 def demonstration_seeds(path: AnyPath) -> set[int]:

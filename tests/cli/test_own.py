@@ -153,7 +153,7 @@ def test_a_task_that_the_simulator_lacks_is_named(capsys, tmp_path):
     for name, some in (("alone", plans), ("both", both)):
         actor = lw.PlanConditionedActor(some, width=8, text_encoder=read_encoder("my_texts:encode"))
         lw.save_actor(actor, tmp_path / f"{name}.zip")
-    lacks = "the simulator has no stack-cup; tasks of your own run in an engine of yours, in Python"
+    lacks = "the simulator has no stack-cup; tasks of your own run in a suite of yours"
     message = fails(capsys, "evaluate", tmp_path / "alone.zip", "--tasks", "stack-cup", *encoder)
     assert "got 'stack-cup'" in message
     assert "A task of your own is a Task with an engine=, see docs/training.md" in message

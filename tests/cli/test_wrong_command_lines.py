@@ -96,6 +96,8 @@ WRONG = {
     "evaluate my.zip --evaluator nowhere.zip": "--evaluator: no file 'nowhere.zip'",
     "evaluate my.zip --attribute --reference nowhere": "--reference: no plan file or folder 'nowhere'",
     "evaluate my.zip --out file": "--out must be a folder, 'file' is none",
+    "card nowhere.zip": "POLICY: no file 'nowhere.zip'",
+    "card my.zip --result nowhere.json": "--result: no file 'nowhere.json'",
     "record raech": "NAMES must be one of",
     "record reach --policy expret": "--policy must be one of 'expert', ",
     "record reach --compare nowhere.zip": "--compare: no file 'nowhere.zip'",
@@ -248,10 +250,12 @@ def test_the_words_of_the_command_line_are_those_of_the_library():
     from lw_torchrl.modules import METHODS
     from lw_torchrl.paper.online import WEAKEST
     from lw_torchrl.paper.recipes import MIXTURES, OFFLINE_METHODS
+    from lw_torchrl.training import LEARNERS
 
     assert tuple(BEHAVIOURS) == options.ACTORS
     assert get_args(exchange.ExchangeFormat) == FORMATS
-    assert tuple(METHODS) == get_args(options.Condition)
+    assert tuple(METHODS) == options.CONDITIONS
+    assert tuple(LEARNERS) == online.ALGORITHMS
     assert get_args(online.Mixture) == tuple(MIXTURES)
     assert get_args(online.OfflineMethod) == tuple(OFFLINE_METHODS)
     assert online.WEAKEST == WEAKEST

@@ -26,7 +26,7 @@ from tiny_runs import (
 )
 
 import lw_torchrl as lw
-from lw_torchrl.modules.policy import METHODS
+from lw_torchrl.modules import METHODS
 from lw_torchrl.paper import imitation, runs
 from lw_torchrl.paper.imitation import SCRIPTED, ImitationRun
 from lw_torchrl.paper.recipes import PRESETS, SETTINGS, Member
@@ -276,7 +276,7 @@ def test_settings_are_the_papers():
         paper.members[0].actor["width"] = 8
     assert PRESETS["paper"]["one-shot"].base.noise_scale == (0.1, 0.2, 0.3, 0.4)
     for name, preset in PRESETS.items():
-        alone = {"evaluator": {"few-shot"}, "no-roles": {"zero-shot"}}
+        alone = {"evaluator": {"few-shot"}, "one-network": {"few-shot"}, "no-roles": {"zero-shot"}}
         assert preset.keys() == alone.get(name, SETTINGS.keys())
         assert "one-shot" not in preset or preset["one-shot"].training.batch_size % 180 == 0
     with pytest.raises(ValueError, match=r"method must be one of 'pcbc', .*did you mean 'pcbc'"):

@@ -10,10 +10,11 @@ import torch
 from recordings import PLAN, STEPS, Recording, make_objects, make_rollout, record
 
 from lw_torchrl.record import RerunLogger
+from lw_torchrl.record.lanes import EVENLY, NONE_HOLDS, short
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
-from lw_torchrl.record.verdict import EVENLY, NONE_HOLDS
+from lw_torchrl.record.tabs import Layout
 
-ROWS = [f"/push/timeline/{i}_" + c.replace("'", "ʼ").replace(" ", "_") for i, (c, _) in enumerate(STEPS, 1)]
+ROWS = [f"/e1/{i}_" + short(c).replace(" ", "_") for i, (c, _) in enumerate(STEPS, 1)]
 
 
 def test_an_episode_survives_exactly(tmp_path):
@@ -36,8 +37,11 @@ def test_an_episode_survives_exactly(tmp_path):
     for i, row in enumerate(ROWS):
         expected = ["true" if held else "false" for held in rollout["qaf"][:, i]]
         assert found.states(row, 20) == expected
-    assert found.states("/push/timeline/success", 20, first=1) == ["false"] * 10 + ["true"] * 10
-    assert len([entity for entity in found.entities() if "/timeline/" in entity]) == 4
+    assert found.states("/e1/success", 20, first=1) == ["not yet"] * 10 + ["success"] * 10
+    lanes = {"0_verdict", "0b_plan_step", *(row[4:] for row in ROWS), "gripper", "success"}
+    assert {entity[4:] for entity in found.entities() if entity.startswith("/e1/")} == lanes
+    opening = ["open" if told > 0.75 else "closed" for told in rollout["observation"][:, 3].tolist()]
+    assert found.states("/e1/gripper", 20) == opening
 
 
 def test_the_plan_follows_the_cursor(tmp_path):
@@ -64,9 +68,9 @@ def test_the_step_in_force_has_a_timeline(tmp_path):
     found = record(tmp_path / "a.rrd", rollout)
     names = [f"{i} {skill}" for i, (_, skill) in enumerate(STEPS, 1)]
     assert found.values("/push/skill_weights", "SeriesLines:names") == [names]
-    labels = found.values("/push/timeline/0_in_force", "StateConfiguration:labels")[0]
-    assert labels == [*names, NONE_HOLDS, EVENLY]
-    for row, state in enumerate(found.states("/push/timeline/0_in_force", 20)):
+    states = Layout.read(found.reader).pages["push"].states
+    assert [states[state][0] for state in ("0", "1", NONE_HOLDS, EVENLY)] == [*names, NONE_HOLDS, EVENLY]
+    for row, state in enumerate(found.states("/e1/0b_plan_step", 20)):
         weights, truth = rollout["skill_weights"][row, :2], rollout["qaf"][row, :2]
         even = EVENLY if truth.any() else NONE_HOLDS
         assert state == (even if weights[0] == weights[1] else str(int(weights.argmax())))
@@ -77,7 +81,7 @@ def test_attention_that_is_never_soft_has_no_curve(tmp_path):
     rollout["skill_weights"] = torch.nn.functional.one_hot(torch.arange(20) % 2, 3).float()
     found = record(tmp_path / "a.rrd", rollout)
     assert "/push/skill_weights" not in found.entities()
-    assert found.states("/push/timeline/0_in_force", 20) == ["0", "1"] * 10
+    assert found.states("/e1/0b_plan_step", 20) == ["0", "1"] * 10
 
 
 def test_a_learned_evaluators_truth_stands_beside(tmp_path):
@@ -85,7 +89,7 @@ def test_a_learned_evaluators_truth_stands_beside(tmp_path):
     rollout["qaf_logits"] = torch.where(rollout["qaf"], 3.0, -3.0)
     rollout["qaf_logits"][5:, 0] *= -1
     found = record(tmp_path / "a.rrd", rollout)
-    believed = found.states("/push/timeline/1b_as_the_evaluator_has_it", 20)
+    believed = found.states("/e1/1b_but_the_policy_was_told", 20)
     exact = found.states(ROWS[0], 20)
     assert [a == b for a, b in zip(believed, exact, strict=True)] == [True] * 5 + [False] * 15
     texts = [row[0] for row in found.values("/push/plan", "TextDocument:text")]
@@ -134,15 +138,15 @@ def test_what_is_absent_is_left_out(tmp_path):
 def test_without_a_plan_every_column_is_numbered(tmp_path):
     found = record(tmp_path / "a.rrd", make_rollout(5), plan=None)
     assert found.values("/push/skill_weights", "SeriesLines:names") == [["1", "2", "3"]]
-    assert "/push/timeline/3_condition" in found.entities()
+    assert "/e1/3_condition" in found.entities()
 
 
 def test_a_goal_that_is_an_object_has_one_label(tmp_path):
     rollout = make_rollout(5)
     objects = {"target location": rollout["observation"][:, 36:39]}
     found = record(tmp_path / "a.rrd", rollout, objects=objects)
-    assert "/push/scene/goal" in found.entities()
-    assert not any(found.values("/push/scene/goal", "Points3D:show_labels")[0])
+    assert "/push/scene/goal" not in found.entities()
+    assert found.values("/push/scene/objects/target\\ location", "Points3D:labels")[0] == ["target location"]
 
 
 def test_in_force():

@@ -3,28 +3,33 @@
 from __future__ import annotations
 
 import re
-from collections import UserDict
+from typing import Any
 
 from lw_torchrl._checks import check_choice, checked, shown
-from lw_torchrl.language.formats.base import STYLES, PlanFormat
+from lw_torchrl._tables import Table
+from lw_torchrl.language.formats.base import STYLES, Clause, PlanFormat, Reading
 from lw_torchrl.language.formats.prose import md
 from lw_torchrl.language.formats.python import py, py_md
 from lw_torchrl.language.plans import ConditionalPlan
 
 
-class PlanFormats(UserDict[str, PlanFormat]):
+class PlanFormats(Table[PlanFormat]):
     """Plan formats by name, to which others may be added; a name that no folder can have is a ValueError."""
 
-    def __setitem__(self, name: str, format: PlanFormat) -> None:
+    def check(self, name: str, format: Any) -> PlanFormat:
         if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
             raise ValueError(f"a plan format must be named in lower case, like 'basic_py', got {shown(name)}")
         if not isinstance(format, PlanFormat):
             raise TypeError(f"plan format {name!r} must be a PlanFormat, got {shown(format)}")
-        super().__setitem__(name, format)
+        return format
 
 
 _CONTAINERS = {"py": py, "py_md": py_md, "md": md}
-PLAN_FORMATS = PlanFormats({f"{a}_{b}": make(said) for a, said in STYLES.items() for b, make in _CONTAINERS.items()})
+PLAN_FORMATS = PlanFormats(
+    "plan format",
+    "lw_torchrl.formats",
+    {f"{style}_{name}": make(said) for style, said in STYLES.items() for name, make in _CONTAINERS.items()},
+)
 """The formats by name: the nine of the paper, and those that you add, ``PLAN_FORMATS["mine"] = PlanFormat(...)``."""
 
 
@@ -43,3 +48,6 @@ gripper above the window handle.
     Source: paper section 'Conditional Plan Generation'.
     """
     return PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].encode(plan)
+
+
+__all__ = ["PLAN_FORMATS", "Clause", "PlanFormat", "Reading", "encode_plan"]

@@ -4,16 +4,16 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from lw_torchrl._checks import check_choice
+from lw_torchrl._tables import Functions
 from lw_torchrl.suites.engine import Engine
 from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
 from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
 
-ENGINES: dict[str, Callable[..., Engine]] = {"vectorized": VectorizedEngine, "metaworld": MetaWorldEngine}
+ENGINES = Functions("engine", "lw_torchrl.engines", {"vectorized": VectorizedEngine, "metaworld": MetaWorldEngine})
 """Name to ``(row_tasks, *, reward, num_threads) -> Engine``."""
 
 
 def make_engine(engine: str | Callable[..., Engine], row_tasks: Sequence[str], **options: Any) -> Engine:
     """The engine of that name, or what a callable of one's own gives, for rows of these tasks."""
-    if not callable(engine):
-        engine = ENGINES[check_choice("engine", engine, ENGINES)]
-    return engine(list(row_tasks), **options)
+    make: Callable[..., Engine] = engine if callable(engine) else ENGINES[check_choice("engine", engine, ENGINES)]
+    return make(list(row_tasks), **options)

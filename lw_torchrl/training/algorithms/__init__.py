@@ -1,21 +1,27 @@
 """The methods of ``lw-torchrl online``: a file each, with what it reads and does, and a line in :data:`LEARNERS`."""
 
 from lw_torchrl._checks import check_choice
+from lw_torchrl._tables import Classes
 from lw_torchrl.training.algorithms.advantage import AdvantageConfig, AdvantageLearner
 from lw_torchrl.training.algorithms.expert_iteration import ExpertIterationConfig, ExpertIterationLearner
-from lw_torchrl.training.algorithms.learner import Learner, OnlineConfig
+from lw_torchrl.training.algorithms.learner import CriticConfig, Learner, NoiseConfig, OnlineConfig, ReplayConfig, adamw
 from lw_torchrl.training.algorithms.ppo import PPOConfig, PPOLearner
 from lw_torchrl.training.algorithms.sac import SACConfig, SACLearner
 from lw_torchrl.training.algorithms.td3 import ResidualConfig, ResidualLearner, TD3Config, TD3Learner
 
-LEARNERS: dict[str, type[Learner]] = {
-    "advantage": AdvantageLearner,
-    "td3": TD3Learner,
-    "sac": SACLearner,
-    "residual": ResidualLearner,
-    "ppo": PPOLearner,
-    "expert-iteration": ExpertIterationLearner,
-}
+LEARNERS = Classes(
+    "algorithm",
+    Learner,
+    "lw_torchrl.algorithms",
+    {
+        "advantage": AdvantageLearner,
+        "td3": TD3Learner,
+        "sac": SACLearner,
+        "residual": ResidualLearner,
+        "ppo": PPOLearner,
+        "expert-iteration": ExpertIterationLearner,
+    },
+)
 """Name to method; yours can be added."""
 
 
@@ -40,6 +46,6 @@ def method_config(method: str, given: OnlineConfig | None = None) -> OnlineConfi
 
 
 __all__ = [
-    "LEARNERS", "AdvantageConfig", "ExpertIterationConfig", "Learner", "OnlineConfig", "PPOConfig", "ResidualConfig",
-    "SACConfig", "TD3Config", "method_config",
+    "LEARNERS", "AdvantageConfig", "CriticConfig", "ExpertIterationConfig", "Learner", "NoiseConfig", "OnlineConfig",
+    "PPOConfig", "ReplayConfig", "ResidualConfig", "SACConfig", "TD3Config", "adamw", "method_config",
 ]  # fmt: skip

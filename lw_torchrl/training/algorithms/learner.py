@@ -16,12 +16,12 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from lw_torchrl._checks import Count, Natural, Probability, Scale, check_fields
 from lw_torchrl._tensor_archive import check_like, check_optimizer_state
-from lw_torchrl.modules.conditioned_actor import ConditionedActor
+from lw_torchrl.modules.conditioned_actor import ConditionedActor, encoder_from_description
 from lw_torchrl.modules.critics import QValue
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorEncoder
 from lw_torchrl.modules.networks import DistributionName
 from lw_torchrl.modules.plan_encoder import PlanEncoder
-from lw_torchrl.modules.policy import Encoder, Policy
+from lw_torchrl.modules.policy import Encoder, Policy, kind_of
 from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.training.file_checks import copy_weights, tensors_of
 
@@ -243,14 +243,17 @@ def encoder_like(policy: Policy) -> Encoder:
     actor = policy.base if isinstance(policy, ResidualActor) else policy
     if not isinstance(actor, ConditionedActor):
         raise TypeError(f"critic must be given for a {type(policy).__name__}, which has no encoder to make one like")
-    encoder = actor.encoder
+    encoder: Encoder = actor.encoder
     options: dict[str, Any] = {"features": encoder.features.kind, "text_encoder": encoder.text_encoder}
     made: Encoder
     if isinstance(encoder, DescriptorEncoder):
         made = DescriptorEncoder(encoder.definitions.values(), condition=encoder.config["condition"], **options)
-    else:
-        assert encoder.plans is not None
+    elif isinstance(encoder, PlanEncoder):
         made = PlanEncoder(encoder.plans, **options)
+    else:
+        told = {**kind_of(encoder), "options": encoder.config, **encoder.describe()}
+        made = encoder_from_description(told, encoder.text_encoder)
+        made.features.noise = 0.0
     made.features.load_state_dict(encoder.features.state_dict())
     return made
 

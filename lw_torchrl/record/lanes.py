@@ -1,0 +1,108 @@
+"""The lanes of an episode: the step in force, what held, what the gripper did and touched, and success, over time."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lw_torchrl.language.relations import STATES
+from lw_torchrl.record.conventions import (
+    FALSE,
+    GOLD,
+    STEEL,
+    TRUE,
+    Color,
+    changes,
+    entity_path,
+    rr,
+    step_color,
+    time_columns,
+)
+from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
+
+NONE_HOLDS, EVENLY = "no condition holds", "evenly mixed"
+OPEN, CLOSED, NOTHING = "open", "closed", "nothing"
+FAILED: Color = (215, 75, 75)
+TOUCHED: tuple[Color, ...] = ((120, 150, 235), (200, 130, 255), (90, 200, 190))
+
+
+@dataclass
+class Lanes:
+    """Lanes below ``root``: one has an entry where its state changes, and an empty one at the end.
+
+    The viewer shows a lane's path as its title, with a backslash before whatever is no letter, digit or underscore, and
+    sorts the lanes; so paths are short, and names begin with numbers. ``states`` is what all lanes of a view have in
+    common: each state's words and colour.
+    """
+
+    root: str
+    states: dict[str, tuple[str, Color]] = field(default_factory=dict)
+    count: int = 0
+
+    def send(self, stream: Any, name: str, first: int, states: Sequence[str], looks: Mapping[str, Any]) -> None:
+        """Add a lane whose first state is that of step ``first``; ``looks`` are colours, or words and colours."""
+        self.count += 1
+        for state, look in looks.items():
+            self.states[state] = look if isinstance(look[0], str) else (state, look)
+        rows = changes(np.array(states)[:, None])
+        entries = [*(states[row] for row in rows), ""]
+        times = time_columns(np.array([*rows, len(states)]) + first)
+        # This apostrophe counts as a letter.
+        path = self.root + entity_path(name.replace("'", "\u02bc").replace(" ", "_"))
+        stream.send_columns(path, times, rr.StateChange.columns(state=entries))
+
+
+def log_lanes(stream: Any, root: str, episode: RecordedEpisode, ended: str, touched: Sequence[str] | None) -> Lanes:
+    """The lanes of an episode below ``root``; ``ended`` is its verdict, ``touched`` what its fingers touched."""
+    lanes = Lanes(root)
+
+    def truth(name: str, values: NDArray[np.bool_]) -> None:
+        looks = {"true": TRUE, "false": FALSE}
+        lanes.send(stream, name, 0, np.where(values, "true", "false").tolist(), looks)
+
+    found = [a.shape[1] for a in (episode.qaf, episode.believed, episode.skill_weights) if a is not None]
+    columns = max([len(episode.steps), *found])
+    width = len(str(columns))
+    if episode.success is not None:
+        color = TRUE if episode.first_success is not None else FAILED
+        lanes.send(stream, f"{0:0{width}} verdict", 0, [ended] * len(episode), {ended: color})
+    if episode.in_force is not None:
+        send_steps(stream, lanes, f"{0:0{width}}b plan step", episode)
+    for column in range(columns):
+        number, told = f"{column + 1:0{width}}", episode.believed
+        if episode.qaf is not None:
+            condition = short(episode.steps[column][0]) if episode.steps else "condition"
+            truth(f"{number} {condition}", episode.qaf[:, column])
+            if told is not None and (told[:, column] != episode.qaf[:, column]).any():
+                truth(f"{number}b but the policy was told", told[:, column])
+    opening = episode.observation[:, episode.layout.opening]
+    looks = {OPEN: STEEL, CLOSED: GOLD}
+    lanes.send(stream, "gripper", 0, np.where(opening > STATES[OPEN][0].threshold, OPEN, CLOSED).tolist(), looks)
+    if touched is not None:
+        things = dict(zip(dict.fromkeys(one for one in touched if one != NOTHING), cycle(TOUCHED), strict=False))
+        lanes.send(stream, "gripper touches", 0, touched[: len(episode)], things | {NOTHING: FALSE})
+    if episode.success is not None:
+        states = np.where(episode.success, "success", "not yet").tolist()
+        lanes.send(stream, "success", 1, states, {"success": TRUE, "not yet": FALSE})
+    return lanes
+
+
+def send_steps(stream: Any, lanes: Lanes, name: str, episode: RecordedEpisode) -> None:
+    """The step in force, numbered from 1."""
+    assert episode.in_force is not None
+    count = max(len(episode.steps), int(episode.in_force.max()) + 1)
+    named = [f"{i} {skill}" for i, (_, skill) in enumerate(episode.steps, 1)] or map(str, range(1, count + 1))
+    looks: dict[str, Any] = {str(i): (label, step_color(i)) for i, label in enumerate(named)}
+    answered = True if episode.answers is None else episode.answers.any(axis=1)
+    nobody = np.where(np.broadcast_to(answered, len(episode)), EVENLY, NONE_HOLDS)
+    states = np.where(episode.in_force == NOBODY, nobody, episode.in_force.astype(str)).tolist()
+    lanes.send(stream, name, 0, states, looks | {NONE_HOLDS: FALSE, EVENLY: FALSE})
+
+
+def short(condition: str) -> str:
+    """A condition without the words that all of them have."""
+    return re.sub(r"\b(the robot's|the) ", "", condition)

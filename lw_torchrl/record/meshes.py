@@ -1,0 +1,289 @@
+"""What is drawn of a MuJoCo model: a mesh for each body, once a recording; each episode moves them in its own views."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from hashlib import blake2s
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lw_torchrl.record.conventions import changes, entity_path, rr, time_columns
+from lw_torchrl.suites.engine import RowModel
+
+SHOWN_GROUPS = (0, 1, 2)  # Meta-World keeps what only collides in group 4
+DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that was given none: the material's counts
+
+FINEST, COARSEST = 0.0015, 0.010
+CUBES_ALONG = 26.0
+"""How many cubes the longest side of a mesh is cut into; the finest and the coarsest cube bound it, metres."""
+AROUND, ALONG = 24, 7
+"""How many corners a round thing has around its axis, and a quarter of a circle along it."""
+
+Vertices = dict[str, NDArray[Any]]
+_prepared: dict[str, ModelGeometry] = {}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where the B bodies of a model were: ``position`` T×B×3 float32, metres; ``quaternion`` T×B×4 float32, w first.
+
+    ``touched`` is what the fingers touched in each row, a body's name or "nothing"; None where that is not known.
+    """
+
+    model: RowModel
+    position: NDArray[np.float32]
+    quaternion: NDArray[np.float32]
+    touched: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
+class ModelGeometry:
+    """What is drawn of a model: its bodies' names by number; for each mesh its body, its name, and itself.
+
+    What is fixed to a moving body is drawn with that. The same meshes have the same name, whatever the model: most
+    models have the same robot.
+    """
+
+    bodies: dict[int, str]
+    meshes: tuple[tuple[int, str, Any], ...]
+
+
+def model_geometry(model: RowModel) -> ModelGeometry:
+    """What is drawn of a model; prepared once for each XML file, in about half a second."""
+    if model.path not in _prepared:
+        _prepared[model.path] = _prepare(model.model)
+    return _prepared[model.path]
+
+
+def log_motion(
+    stream: Any, root: str, motion: Motion, known: dict[str, bytes], drawn: NDArray[np.int64] | None = None
+) -> dict[str, str]:
+    """The poses of the bodies below ``root``, row t at step t; and their meshes below /meshes, once a recording.
+
+    Args:
+        known: the meshes that are in the recording, and the pose that each has of itself; new ones are added.
+        drawn: the rows to draw, the first one among them; None for all.
+
+    Returns:
+        A mesh's entity to that of the body in whose frame a view is to show it; "" where it stands where it is.
+    """
+    geometry = model_geometry(motion.model)
+    last = len(motion.position) - 1
+    drawn = np.arange(last + 1) if drawn is None else np.append(drawn[drawn < last], last)
+    frames = {}
+    for body, name, mesh in geometry.meshes:
+        path, own = entity_path("meshes", name), f"{root}{entity_path(geometry.bodies[body])}"
+        place, turn = motion.position[drawn, body], motion.quaternion[drawn, body][:, [1, 2, 3, 0]]
+        moved = changes(np.concatenate([place, turn], axis=1))
+        pose = b"" if len(moved) > 1 else place[0].tobytes() + turn[0].tobytes()
+        still = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
+        if path not in known:
+            known[path] = pose
+            stream.log(path, mesh, *([still] if pose else []), static=True)
+        # What stands where it stood in the first episode needs no frame, which costs a page two kilobytes.
+        frames[path] = "" if pose and known[path] == pose else own
+        if pose and frames[path]:
+            stream.log(own, still, static=True)
+        elif frames[path]:
+            columns = rr.Transform3D.columns(translation=place[moved], quaternion=turn[moved])
+            stream.send_columns(own, time_columns(drawn[moved]), columns)
+    return frames
+
+
+def _prepare(model: Any) -> ModelGeometry:
+    bodies: dict[int, str] = {}
+    parts: dict[tuple[int, int], list[tuple[Vertices, NDArray[np.uint8]]]] = {}
+    for geom in range(model.ngeom):
+        color = _color(model, geom)
+        if model.geom_group[geom] not in SHOWN_GROUPS or color[3] == 0:
+            continue
+        shape = _shape(model, geom)
+        if shape is None:
+            continue
+        body = int(model.geom_bodyid[geom])
+        shape = _placed(shape, model.geom_pos[geom], model.geom_quat[geom])
+        while model.body_weldid[body] not in (0, body):
+            shape = _placed(shape, model.body_pos[body], model.body_quat[body])
+            body = int(model.body_parentid[body])
+        bodies.setdefault(body, model.body(body).name or f"body-{body}")
+        parts.setdefault((body, int(color[3])), []).append((shape, color))
+    meshes = []
+    for (body, alpha), shapes in parts.items():
+        mesh = _joined(shapes)
+        color = np.array([255, 255, 255, alpha], np.uint8)
+        if (mesh["vertex_colors"] == mesh["vertex_colors"][0]).all():
+            color[:3] = mesh.pop("vertex_colors")[0, :3]
+        digest = blake2s(b"".join(mesh[key].tobytes() for key in sorted(mesh)) + color.tobytes(), digest_size=4)
+        drawn = rr.Mesh3D(**mesh, albedo_factor=color)
+        meshes.append((body, f"{bodies[body]}-{digest.hexdigest()}", drawn))
+    return ModelGeometry(bodies, tuple(meshes))
+
+
+def _joined(shapes: Iterable[tuple[Vertices, NDArray[np.uint8]]]) -> Vertices:
+    """Shapes of a colour each, as one."""
+    parts: dict[str, list[NDArray[Any]]] = {}
+    start = 0
+    for vertices, color in shapes:
+        corners = len(vertices["vertex_positions"])
+        moved = {**vertices, "triangle_indices": vertices["triangle_indices"] + np.uint32(start)}
+        for key, values in (moved | {"vertex_colors": np.tile([*color[:3], 255], (corners, 1))}).items():
+            parts.setdefault(key, []).append(values)
+        start += corners
+    return {key: np.concatenate(values) for key, values in parts.items()}
+
+
+def _placed(shape: Vertices, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> Vertices:
+    """A shape that stands at a pose, w first, in the frame that the pose is given in."""
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    turn = matrix.reshape(3, 3).T
+    return shape | {
+        "vertex_positions": (shape["vertex_positions"] @ turn + position).astype(np.float32),
+        "vertex_normals": (shape["vertex_normals"] @ turn).astype(np.float32),
+    }
+
+
+def _shape(model: Any, geom: int) -> Vertices | None:
+    """The geom's surface in its own frame, None for a plane."""
+    kind, size = mujoco.mjtGeom(int(model.geom_type[geom])).name, model.geom_size[geom]
+    angle = np.linspace(0, np.pi / 2, ALONG)
+    quarter, up, out = np.stack([np.cos(angle), np.sin(angle)], axis=1), np.array([0, 1]), np.array([1, 0])
+    low = quarter[::-1] * [1, -1]
+    if kind == "mjGEOM_PLANE":
+        return None
+    if kind == "mjGEOM_MESH":
+        return _clustered(*_corners(model, model.geom_dataid[geom]))
+    if kind == "mjGEOM_BOX":
+        return _box(size)
+    if kind in ("mjGEOM_SPHERE", "mjGEOM_ELLIPSOID"):
+        ball, scale = np.concatenate([low, quarter[1:]]), size if kind == "mjGEOM_ELLIPSOID" else size[[0, 0, 0]]
+        found = _turned([(ball, ball)])
+        normals = found["vertex_normals"] / scale
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return found | {"vertex_positions": found["vertex_positions"] * scale, "vertex_normals": normals}
+    radius, half = size[0], size[1]
+    if kind == "mjGEOM_CAPSULE":
+        rims = np.concatenate([low * radius - up * half, quarter * radius + up * half])
+        return _turned([(rims, np.concatenate([low, quarter]))])
+    if kind == "mjGEOM_CYLINDER":
+        bottom, top = np.array([[0, -half], [radius, -half]]), np.array([[radius, half], [0, half]])
+        side = np.stack([bottom[1], top[0]])
+        ones = np.ones((2, 1))
+        return _turned([(bottom, ones * -up), (side, ones * out), (top, ones * up)])
+    raise NotImplementedError(f"geom {geom} is of type {kind}, which no model of Meta-World has")
+
+
+def _box(half: NDArray[np.float64]) -> Vertices:
+    triangles: list[list[int]] = []
+    corners: list[NDArray[np.float64]] = []
+    normals: list[NDArray[np.float64]] = []
+    for axis in range(3):
+        for sign in (-1.0, 1.0):
+            across = (
+                np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+                if sign > 0
+                else np.array([(-1, -1), (-1, 1), (1, 1), (1, -1)])
+            )
+            face = np.empty((4, 3))
+            face[:, axis], face[:, (axis + 1) % 3], face[:, (axis + 2) % 3] = sign, across[:, 0], across[:, 1]
+            triangles += [[4 * len(corners) + i for i in one] for one in ((0, 1, 2), (0, 2, 3))]
+            corners.append(face * half)
+            normals.append(np.eye(3)[[axis] * 4] * sign)
+    return {
+        "vertex_positions": np.concatenate(corners),
+        "vertex_normals": np.concatenate(normals),
+        "triangle_indices": np.array(triangles, np.uint32),
+    }
+
+
+def _turned(profile: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> Vertices:
+    """Lines of corners (K×2: from the axis, along it), from bottom to top, and their normals, turned around z."""
+    angle = np.arange(AROUND) * 2 * np.pi / AROUND
+    corners: list[NDArray[np.float64]] = []
+    normals: list[NDArray[np.float64]] = []
+    triangles: list[NDArray[np.int64]] = []
+    start = 0
+    for line, facing in profile:
+        for values, found in ((line, corners), (facing, normals)):
+            around = np.empty((len(line), AROUND, 3))
+            around[..., 0], around[..., 1] = values[:, :1] * np.cos(angle), values[:, :1] * np.sin(angle)
+            around[..., 2] = values[:, 1:]
+            found.append(around.reshape(-1, 3))
+        here = start + np.arange(len(line) * AROUND).reshape(-1, AROUND)
+        a, b, c, d = here[:-1], np.roll(here[:-1], -1, axis=1), np.roll(here[1:], -1, axis=1), here[1:]
+        triangles += [np.stack(three, axis=-1).reshape(-1, 3) for three in ((a, b, c), (a, c, d))]
+        start += here.size
+    return {
+        "vertex_positions": np.concatenate(corners),
+        "vertex_normals": np.concatenate(normals),
+        "triangle_indices": np.concatenate(triangles).astype(np.uint32),
+    }
+
+
+def _corners(model: Any, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The corners of a mesh's triangles and their normals, each F×3×3: MuJoCo numbers the two apart."""
+
+    def part(values: Any, start: Any, count: Any) -> NDArray[np.float64]:
+        return np.asarray(values[start[mesh] : start[mesh] + count[mesh]])
+
+    faces = part(model.mesh_face, model.mesh_faceadr, model.mesh_facenum)
+    normals = part(model.mesh_facenormal, model.mesh_faceadr, model.mesh_facenum)
+    vertices = part(model.mesh_vert, model.mesh_vertadr, model.mesh_vertnum)
+    directions = part(model.mesh_normal, model.mesh_normaladr, model.mesh_normalnum)
+    return vertices[faces].astype(np.float64), directions[normals].astype(np.float64)
+
+
+def _color(model: Any, geom: int) -> NDArray[np.uint8]:
+    """(4,) uint8: the geom's colour or else its material's, times what the texture is on average."""
+    material = model.geom_matid[geom]
+    rgba = np.array(model.geom_rgba[geom], np.float64)
+    if material >= 0:
+        if np.allclose(rgba, DEFAULT_RGBA):
+            rgba = np.array(model.mat_rgba[material], np.float64)
+        textures = model.mat_texid[material]
+        for texture in textures[textures >= 0][:1]:
+            channels, start = model.tex_nchannel[texture], model.tex_adr[texture]
+            end = start + model.tex_height[texture] * model.tex_width[texture] * channels
+            rgba[:3] *= model.tex_data[start:end].reshape(-1, channels)[:, :3].mean(axis=0) / 255.0
+    return np.rint(np.clip(rgba, 0, 1) * 255).astype(np.uint8)
+
+
+def _clustered(corners: NDArray[np.float64], normals: NDArray[np.float64]) -> dict[str, Any]:
+    """A coarse mesh, as rerun takes it, of triangles' corners (F×3×3, metres) and their unit normals (F×3×3).
+
+    The corners in a cube move to their mean, so no gap opens; those whose normals differ stay apart: edges stay sharp.
+    """
+    points, directions = corners.reshape(-1, 3), normals.reshape(-1, 3)
+    low = points.min(axis=0)
+    size = float(np.clip(np.ptp(points, axis=0).max() / CUBES_ALONG, FINEST, COARSEST))
+    cubes, cube = np.unique(_packed(((points - low) / size).astype(np.int64)), return_inverse=True)
+    places = _means(points, cube, len(cubes))
+    directed = cube * 125 + _packed(np.rint(directions * 2.0).astype(np.int64) + 2, 5)
+    # The first corner of each vertex tells its cube.
+    _, first, vertex = np.unique(directed, return_index=True, return_inverse=True)
+    mean_normals = _means(directions, vertex, len(first))
+    mean_normals /= np.maximum(np.linalg.norm(mean_normals, axis=1, keepdims=True), 1e-9)
+    a, b, c = cube.reshape(-1, 3).T
+    triangles = vertex.reshape(-1, 3)[(a != b) & (b != c) & (a != c)]
+    _, once = np.unique(_packed(triangles), return_index=True)
+    used, renumbered = np.unique(triangles[once], return_inverse=True)
+    return {
+        "vertex_positions": places[cube[first]][used].astype(np.float32),
+        "vertex_normals": mean_normals[used].astype(np.float32),
+        "triangle_indices": renumbered.reshape(-1, 3).astype(np.uint32),
+    }
+
+
+def _packed(indices: NDArray[np.int64], base: int = 1 << 20) -> NDArray[np.int64]:
+    """N×3 indices below ``base`` as one number each."""
+    return (indices[:, 0] * base + indices[:, 1]) * base + indices[:, 2]
+
+
+def _means(values: NDArray[np.float64], group: NDArray[np.int64], groups: int) -> NDArray[np.float64]:
+    """The mean of N×3 values in each group."""
+    count = np.bincount(group, minlength=groups)
+    return np.stack([np.bincount(group, column, minlength=groups) / count for column in values.T], axis=1)

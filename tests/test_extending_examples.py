@@ -1,0 +1,78 @@
+"""The page on adding your own shows the examples as they are, and the commands that each names run."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+import lw_torchrl as lw
+from lw_torchrl.cli.main import main
+from lw_torchrl.language.relations import RELATIONS
+from lw_torchrl.modules import ENCODERS, EVALUATORS
+from lw_torchrl.suites import SUITES
+from lw_torchrl.training import LEARNERS
+
+ROOT = Path(__file__).parent.parent
+FOLDER = ROOT / "examples" / "extending"
+FILES = sorted(FOLDER.glob("my_*.py"))
+TABLES = (ENCODERS, EVALUATORS, LEARNERS, RELATIONS, SUITES, lw.PLAN_FORMATS)
+SAYS = {
+    "my_method.py": ("trained to step 3", "reach"),
+    "my_evaluator.py": ("trained to step 3", "window-open"),
+    "my_relation.py": ("reach.plan: 2 steps, valid", "is far from"),
+    "my_format.py": ("condition -> skill", "no step: Good luck!"),
+    "my_algorithm.py": ("reward-weighted", "start"),
+    "my_suite.py": ("ok   desk/hover", "trained to step 3"),
+}
+FASTER = {"--steps": 3, "--frames": 100, "--episodes": 1}
+
+
+def commands(path):
+    """The command lines in an example's docstring."""
+    said = ast.get_docstring(ast.parse(path.read_text("utf-8")))
+    return [line for line in said.splitlines() if line.startswith("lw-torchrl ")]
+
+
+@pytest.fixture
+def tables(monkeypatch):
+    before = [dict(table.data) for table in TABLES]
+    yield
+    for table, was in zip(TABLES, before, strict=True):
+        table.data = was
+    for path in FILES:
+        sys.modules.pop(path.stem, None)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_the_page_shows_the_example_and_its_commands(path):
+    text = (ROOT / "docs" / "extending.md").read_text("utf-8")
+    shown = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL)]
+    code = path.read_text("utf-8").partition('"""\n\n')[2]
+    assert code in shown, f"docs/extending.md must show {path.name} as it is"
+    assert "\n".join(commands(path)) in text
+    assert len(path.read_text("utf-8").splitlines()) <= 120
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_the_commands_of_an_example_run(path, tables, tmp_path, monkeypatch, capsys):
+    for file in FOLDER.iterdir():
+        if file.is_file():
+            shutil.copy(file, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    for line in commands(path):
+        words = shlex.split(line)[1:]
+        for option, least in FASTER.items():
+            if option in words:
+                words[words.index(option) + 1] = str(least)
+        if words[0] == "train":
+            words += ["--batch-size", "20"]
+        main(words)
+    said = capsys.readouterr()
+    for part in SAYS[path.name]:
+        assert part in said.out + said.err
