@@ -73,6 +73,6 @@ def test_damaged_pictures_are_named(drawn, tmp_path):
     pytest.importorskip("av")
     made, pictures = drawn
     pictures.file(made.root, made.episodes[1]).write_bytes(b"no pictures")
-    with pytest.raises(lw.data.DatasetError, match="drawer-open.1.zip' is damaged"):
+    with pytest.raises(lw.data.DatasetError, match=r"drawer-open.1.zip' is damaged"):
         lw.export_dataset(made.root, "lerobot", tmp_path / "out")
     assert not (tmp_path / "out").exists()
