@@ -83,6 +83,8 @@ WRONG = {
     "train demos --out o.zip --plans push.plan": "--plans push.plan: push.plan, line 2: ",
     "train demos --out o.zip --begin nowhere.zip": "--begin: no file 'nowhere.zip'",
     "train demos --out o.zip --evaluator nowhere.zip": "--evaluator: no file 'nowhere.zip'",
+    "train demos --out o.zip --evaluator Softtruth": "--evaluator must be one of 'new', got 'Softtruth'",
+    "online reach --condition pcb": "--condition must be one of 'pcbc', 'dc', 'one-hot', got 'pcb'",
     "train demos --out o.zip --task-file bad.toml": "--task-file bad.toml: ",
     "train demos --out o.zip --text-encoder mine": "--text-encoder must be like my_texts:encode",
     "train-evaluator raech --out o": "TASKS must be one of",
