@@ -83,6 +83,8 @@ def record(
             if attribute and shown is not None and hasattr(actor, "with_plans"):
                 failures = lw.attribute_failures(found, shown, actor=actor, reference=trusted, **episode_options)
                 why = {(one.task, one.episode): one for one in failures}
+                if failures and not recorded:
+                    logger.show_causes(_result(found, failures, episode_options, len(episodes)))
             pages = []
             for one in found:
                 failure = why.get((one.task, one.episode))
@@ -100,6 +102,16 @@ def record(
             logger.compare(pair, f"{one.task} · episode {one.episode} · side by side")
     output = Output(json).show("episodes", rows)
     return output.show("recording", out, f"written to {out}\nlook at it with: lw-torchrl view {out}")
+
+
+def _result(found: Any, failures: Any, run: Mapping[str, Any], episodes: int) -> Any:
+    """Recorded episodes and their failures as an evaluation's result."""
+    result, episode = lw.evaluation.EvaluationResult, lw.evaluation.EpisodeResult
+    ended = [(one.task, one.episode, one.first_success) for one in found]
+    tasks = list(dict.fromkeys(one.task for one in found))
+    config = {"tasks": tasks, "episodes_per_task": episodes, "seed": run["seed"], "max_steps": len(found[0].steps)}
+    listed = tuple(episode(task, k, first is not None, first, None, None) for task, k, first in ended)
+    return result(config, listed, failures=tuple(failures))
 
 
 def _cast(

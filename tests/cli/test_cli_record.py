@@ -21,7 +21,7 @@ def test_an_expert_is_recorded_with_the_shipped_plan(capsys, tmp_path):
     assert "reach, episode 0, expert: success at step " in printed
     assert "reach, episode 2, expert: " in printed
     assert f"lw-torchrl view {out}" in printed
-    assert tabs(out) == ["reach-0", "reach-2"]
+    assert tabs(out) == ["overview", "reach-0", "reach-2"]
 
 
 @pytest.mark.parametrize("who", ["random", "wrong"])
