@@ -1,108 +1,291 @@
-"""Faults to plant in what acts: in a plan, in a skill, in the answers."""
+"""python -m benchmarks.faults: what attribute_failures says of faults that were planted."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import chain, zip_longest
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+import tyro
+from torchrl.envs import Transform
 
 import lw_torchrl as lw
-from lw_torchrl.evaluation.explanation import attended
-from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.skills import ScriptedSkill
-from lw_torchrl.language.task_index import PlanTables
+from benchmarks import planted
+from benchmarks.planted import Altered, Done, InStep, Liar, Sensor, Shown
+from lw_torchrl._files import write_json, write_text
+from lw_torchrl.data import collect_demonstrations
+from lw_torchrl.envs.episodes import FinishedEpisode
+from lw_torchrl.evaluation import CAUSES, attribute_failures
+from lw_torchrl.evaluation.summary import markdown_table
 
-OFFSET = 0.1  # metres, along x
-
-
-def denied(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
-    """The plan with the first clause of a step's condition denied."""
-    pairs = [(str(one.condition), one.skill) for one in plan.steps]
-    first, joint, rest = pairs[step][0].partition(" and ")
-    first = first.replace(" is not ", " is ") if " is not " in first else first.replace(" is ", " is not ", 1)
-    pairs[step] = (first + joint + rest, pairs[step][1])
-    return lw.ConditionalPlan.from_pairs(plan.definition, pairs)
-
-
-def without(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
-    """The plan without a step."""
-    kept = [(str(one.condition), one.skill) for k, one in enumerate(plan.steps) if k != step]
-    return lw.ConditionalPlan.from_pairs(plan.definition, kept)
+REFERENCE = Path(__file__).parent / "data" / "attribution_plans.json"
+BUILT_ON = ("button-press-topdown", "drawer-open", "push")
+"""The tasks that causes and margins were chosen on."""
+TASKS = ("pick-place", "coffee-pull", "window-open", "faucet-open", "dial-turn")
+RECORDED = ("observation", "task_id", "qaf", "skill_weights")
+HARMLESS = ("not reproducible", "perception", "policy", "undecided")
+"""The causes that blame no part of the policy, its plan or its answers."""
 
 
-def spoilt_skills(plans: lw.Plans, steps: Mapping[str, int]) -> Mapping[str, ScriptedSkill]:
-    """The scripted skills, those of a step of each task's plan with a wrong offset."""
-    table = dict(lw.load_skills())
-    for plan in plans.values():
-        skill = table[plan.steps[steps[plan.task]].skill].for_task(plan.task)
-        x, y, z = skill.offset
-        table[skill.text] = replace(skill, offset=(x + OFFSET, y, z), variants={})
-    return table
+@dataclass
+class Cast:
+    """What acts and where, with faults."""
+
+    sound: lw.Plans
+    scripted: bool
+    plans: lw.Plans
+    skills: Any = None
+    shown: Shown | None = None
+    done: Done | None = None
+    evaluator: Any = None
+    simulator: Transform | None = None  # between the policy and the environment, which attribution is not told of
+    noise: float = 0.1
+    told_steps: int | None = None  # what attribution is given of each episode
+
+    def steps(self, step: int) -> dict[str, int]:
+        """In each task's plan another step."""
+        return {task: (step + place) % len(plan.steps) for place, (task, plan) in enumerate(self.sound.items())}
+
+    def texts(self, step: int) -> dict[str, str]:
+        return {task: self.sound[task].steps[number].skill for task, number in self.steps(step).items()}
+
+    def actor(self, learned: Any) -> Any:
+        actor = (
+            lw.ScriptedSkillActor(self.plans, skills=self.skills) if self.scripted else learned.with_plans(self.plans)
+        )
+        return actor if self.shown is None and self.done is None else Altered(actor, self.shown, self.done)
 
 
-class Liar(TensorDictModuleBase):
-    """An evaluator that takes one condition of each task's plan for its opposite.
-
-    Args:
-        plans: the plans.
-        steps: task to the condition's step; of a plan with fewer steps, counted on from its first.
-    """
-
-    def __init__(self, plans: lw.Plans, steps: Mapping[str, int]) -> None:
-        super().__init__()
-        self.plans, self.steps = plans, dict(steps)
-        self.in_keys, self.out_keys = ["qaf", "task_id"], ["qaf"]
-        self._tables = PlanTables(plans)
-        self._flipped = torch.zeros_like(self._tables.mask)
-        for row, task in enumerate(self._tables.index.tasks):
-            self._flipped[row, self.steps.get(task, 0) % len(plans[task].steps)] = True
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        flipped = self._flipped[self._tables.rows(tensordict.get("task_id"))]
-        return tensordict.set("qaf", tensordict.get("qaf") ^ flipped)
-
-    def with_plans(self, plans: lw.Plans) -> Liar:
-        return Liar(plans, self.steps)
+_ENOUGH, _MOST_TURNS = 12, 3
+Plant = Callable[[Cast, int], None]
 
 
-class Clumsy(TensorDictModuleBase):
-    """A policy that misses by 10 cm while the skill of one step of each plan is in force: it is shown the hand, or the
-    goal where it moves an object, in another place. Other plans have its clumsy skill wherever they name it.
+def in_plan(spoil: Callable[[lw.ConditionalPlan, int], lw.ConditionalPlan]) -> Plant:
+    def plant(cast: Cast, step: int) -> None:
+        cast.plans = lw.Plans({task: spoil(cast.sound[task], number) for task, number in cast.steps(step).items()})
 
-    Args:
-        actor: a policy with plans.
-        skills: task to the text of the skill.
-    """
+    return plant
 
-    def __init__(self, actor: Any, skills: Mapping[str, str]) -> None:
-        super().__init__()
-        self.actor, self.skills, self.plans = actor, dict(skills), actor.plans
-        self.in_keys, self.out_keys, self.draws = actor.in_keys, actor.out_keys, False
-        self._tables = PlanTables(self.plans)
-        table = lw.load_skills()
-        self._chosen = torch.zeros_like(self._tables.mask)
-        self._hand = torch.zeros_like(self._tables.mask)
-        for row, task in enumerate(self._tables.index.tasks):
-            for number, one in enumerate(self.plans[task].steps):
-                self._chosen[row, number] = one.skill == self.skills.get(task)
-                known = table.get(one.skill)
-                self._hand[row, number] = known is None or known.moved == GRIPPER
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = self.actor(tensordict)
-        observation = tensordict.get("observation")
-        rows = self._tables.rows(tensordict.get("task_id"))
-        step = attended(tensordict.get("skill_weights"), self._tables.mask[rows])
-        chosen, hand = self._chosen[rows, step] & (step >= 0), self._hand[rows, step]
-        shown = observation.clone()
-        shown[:, [0, 18]] -= OFFSET * (chosen & hand).unsqueeze(-1)
-        shown[:, 36] += OFFSET * (chosen & ~hand)
-        other = self.actor(tensordict.copy().set("observation", shown)).get("action")
-        return tensordict.set("action", torch.where(chosen.unsqueeze(-1), other, tensordict.get("action")))
+def in_skill(change: Callable[[torch.Tensor], torch.Tensor]) -> Plant:
+    return lambda cast, step: setattr(cast, "done", InStep(cast.plans, cast.texts(step), change))
 
-    def with_plans(self, plans: lw.Plans) -> Clumsy:
-        return Clumsy(self.actor.with_plans(plans), self.skills)
+
+def offset_skill(cast: Cast, step: int) -> None:
+    """In the script's table, or, of a network, as much added to its action."""
+    if cast.scripted:
+        cast.skills = planted.spoilt_skills(cast.sound, cast.steps(step))
+    else:
+        in_skill(lambda action: (action + torch.tensor([1.0, 0.0, 0.0, 0.0])).clamp(-1.0, 1.0))(cast, step)
+
+
+def lie(never: bool = False) -> Plant:
+    return lambda cast, step: setattr(cast, "evaluator", Liar(cast.plans, cast.steps(step), never))
+
+
+def flipped(cast: Cast, step: int) -> None:
+    cast.evaluator = lw.CorruptQAF(cast.plans, flip=0.4, seed=step)
+
+
+def sensor(cast: Cast, step: int) -> None:
+    cast.evaluator = Sensor(cast.plans, 0.1)
+
+
+def setting(**values: Any) -> Plant:
+    def plant(cast: Cast, step: int) -> None:
+        for name, value in values.items():
+            setattr(cast, name, value)
+
+    return plant
+
+
+def both(*plants: Plant) -> Plant:
+    def plant(cast: Cast, step: int) -> None:
+        for place, one in enumerate(plants):
+            one(cast, step + place)
+
+    return plant
+
+
+class Fault(NamedTuple):
+    """What is planted, and the causes that are right: in the list, outside of it, or two at once."""
+
+    kind: str
+    causes: tuple[str, ...]
+    plant: Plant
+
+
+INSIDE: dict[str, Fault] = {
+    "wrong condition": Fault("inside", ("plan",), in_plan(planted.denied)),
+    "missing step": Fault("inside", ("plan",), in_plan(planted.without)),
+    "exchanged skills": Fault("inside", ("plan",), in_plan(planted.swapped)),
+    "a step too many": Fault("inside", ("plan",), in_plan(planted.with_extra)),
+    "a skill 10 cm off": Fault("inside", ("skill",), offset_skill),
+    "a skill without force": Fault("inside", ("skill",), in_skill(planted.scaled(0.05, 0.05, 0.05, 1.0))),
+    "a skill to the wrong side": Fault("inside", ("skill",), in_skill(planted.scaled(-1.0, 1.0, 1.0, 1.0))),
+    "opposite answers": Fault("inside", ("query",), lie()),
+    "answers always no": Fault("inside", ("query",), lie(never=True)),
+    "random answers": Fault("inside", ("query",), flipped),
+    "gripper stays open": Fault("inside", ("gripper",), setting(done=planted.fingers(-1.0))),
+    "gripper reversed": Fault("inside", ("gripper",), setting(done=planted.scaled(1.0, 1.0, 1.0, -1.0))),
+    "hand hardly rises or sinks": Fault("inside", ("actuation",), setting(done=planted.scaled(1.0, 1.0, 0.05, 1.0))),
+    "hand mirrored": Fault("inside", ("actuation",), setting(done=planted.scaled(-1.0, 1.0, 1.0, 1.0))),
+}
+OUTSIDE: dict[str, Fault] = {
+    "view 15 steps late": Fault("outside", ("perception",), setting(shown=planted.late_view(15.0))),
+    "thing seen 10 cm aside": Fault("outside", ("perception",), setting(shown=planted.moved_thing(0.1, 0.0))),
+    "goal seen 15 cm aside": Fault("outside", ("perception",), setting(shown=planted.moved_goal(0.15, 0.0))),
+    "camera 10 cm aside, answers too": Fault("outside", ("perception",), sensor),
+    "simulator scales z by 0.1": Fault(
+        "outside", ("not reproducible",), setting(simulator=planted.Jammed(1.0, 1.0, 0.1, 1.0))
+    ),
+    "simulator mirrors x": Fault(
+        "outside", ("not reproducible",), setting(simulator=planted.Jammed(-1.0, 1.0, 1.0, 1.0))
+    ),
+    "rollouts cut at 40 steps": Fault("outside", ("not reproducible",), setting(told_steps=40)),
+    "other noise than told": Fault("outside", ("not reproducible",), setting(noise=1.0)),
+    "all actions a tenth, fingers too": Fault(
+        "outside", ("policy", "actuation"), setting(done=planted.scaled(0.1, 0.1, 0.1, 0.0))
+    ),
+}
+TWO: dict[str, Fault] = {
+    "opposite answers, wrong condition": Fault("two", ("query", "plan"), both(in_plan(planted.denied), lie())),
+    "opposite answers, skill 10 cm off": Fault("two", ("query", "skill"), both(lie(), offset_skill)),
+    "wrong condition, skill 10 cm off": Fault("two", ("plan", "skill"), both(in_plan(planted.denied), offset_skill)),
+    "missing step, opposite answers": Fault("two", ("plan", "query"), both(in_plan(planted.without), lie())),
+}
+FAULTS: Mapping[str, Fault] = {**INSIDE, **OUTSIDE, **TWO}
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Plant faults and see what is said of them. Stopped and started again it carries on."""
+
+    seed: int = 6000
+    """Of the episodes."""
+    tasks: tuple[str, ...] = TASKS
+    faults: tuple[str, ...] = tuple(FAULTS)
+    policies: tuple[str, ...] = ("scripted", "learned")
+    """Who acts: the scripted skills, and a policy trained on what they did."""
+    episodes: int = 4
+    """Of each task and fault, and of each step that the fault is in."""
+    at_most: int = 16
+    """Failures of a fault that are attributed, of the tasks in turn."""
+    max_steps: int = 150
+    out: Path = Path("runs/faults")
+    """Folder for the results of each unit, the policy and the tables."""
+
+
+def failures_of(fault: Fault, policy: str, args: Arguments, learned: Any, reference: lw.Plans) -> Iterator[Any]:
+    """What is said of the failures of a fault, in one step of the plans and in the next, and how."""
+    found = 0
+    for step in range(_MOST_TURNS):
+        if found >= _ENOUGH:
+            return
+        start = perf_counter()
+        sound = lw.Plans({task: lw.load_plans("MT50")[task] for task in args.tasks})
+        cast = Cast(sound, policy == "scripted", sound)
+        fault.plant(cast, step)
+        actor, failed = cast.actor(learned), []
+        run: dict[str, Any] = {
+            "seed": args.seed + step,
+            "max_steps": args.max_steps,
+            "num_threads": 1,
+            "progress": False,
+        }
+
+        def keep(one: FinishedEpisode, told: int | None = cast.told_steps, failed: list[Any] = failed) -> None:
+            steps = one.steps if told is None else one.steps[:told]
+            if not steps["next", "success"].any():
+                failed.append(one._replace(steps=steps))
+
+        lw.evaluate(
+            actor, tasks=args.tasks, episodes_per_task=args.episodes, stop_at_success=True, also_record=RECORDED,
+            on_episode=keep, evaluator=cast.simulator or cast.evaluator, noise_scale=cast.noise, **run,
+        )  # fmt: skip
+        of_task = [[one for one in failed if one.task == task] for task in args.tasks]
+        turns = [one for one in chain(*zip_longest(*of_task)) if one is not None]
+        chosen = turns[: args.at_most - found]
+        found += len(chosen)
+        told = {"actor": actor, "reference": reference, "evaluator": cast.evaluator, **run}
+        yield from attribute_failures(chosen, cast.plans, **told)
+        print(f"    {policy}, step {step + 1}: {len(failed)} failed, {perf_counter() - start:.0f} s", flush=True)
+
+
+def train(args: Arguments) -> Any:
+    """A policy that imitates the scripted skills under the plans, trained once."""
+    file, data = args.out / "learned.zip", args.out / "demonstrations"
+    if file.is_file():
+        return lw.load_actor(file)
+    tasks = dict.fromkeys((*BUILT_ON, *TASKS, *args.tasks))
+    plans = lw.Plans({task: lw.load_plans("MT50")[task] for task in tasks})
+    how: dict[str, Any] = {"policy": "scripted", "seed": 0, "noise_scale": (0.05, 0.1, 0.2), "max_steps": 150}
+    collect_demonstrations(list(plans), episodes_per_task=10, root=data, progress=False, **how)
+    sampler = lw.TaskBalancedSampler()
+    replay = lw.LanguageWorldExperienceReplay(data, label="executed", sampler=sampler, after_success=20)
+    torch.manual_seed(0)
+    actor = lw.PlanConditionedActor(plans, features="both", width=192)
+    replay.append_transform(lw.QAFTransform(plans))
+    config = lw.BehavioralCloningConfig(steps=1500, batch_size=50 * len(plans))
+    lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=file).train()
+    return lw.load_actor(file)
+
+
+def table(found: Mapping[str, Mapping[str, list[dict[str, Any]]]]) -> str:
+    """What was planted down, what was said across, and below what it comes to."""
+    rows, told = [], []
+    for name, by_policy in found.items():
+        fault = FAULTS[name]
+        for policy, failures in by_policy.items():
+            counts = [sum(one["cause"] == cause for one in failures) for cause in CAUSES]
+            right = sum(is_right(fault, one) for one in failures)
+            cells = [str(count) if count else "" for count in counts]
+            rows.append((name, policy, *cells, f"{right} of {len(failures)}"))
+    for kind, what in (("inside", "named right"), ("outside", "no sound part named"), ("two", "a planted one named")):
+        for policy in ("scripted", "learned"):
+            some = [(FAULTS[name], one) for name, of in found.items() for one in of.get(policy, ())]
+            some = [(fault, one) for fault, one in some if fault.kind == kind]
+            if some:
+                right = sum(is_right(*one) for one in some)
+                told.append(f"{kind}, {policy}: {what} {right} of {len(some)}, {right / len(some):.3f}")
+                if kind == "outside":
+                    exact = sum(one["cause"] in fault.causes for fault, one in some)
+                    told[-1] += f"; the fault itself {exact / len(some):.3f}"
+                if kind == "two":
+                    exact = sum({one["cause"], one["also"]} == set(fault.causes) for fault, one in some)
+                    told[-1] += f"; both {exact / len(some):.3f}"
+    return markdown_table(("planted", "policy", *CAUSES, "right"), rows) + "\n\n" + "\n".join(told) + "\n"
+
+
+def is_right(fault: Fault, failure: Mapping[str, Any]) -> bool:
+    return failure["cause"] in (*fault.causes, *(HARMLESS if fault.kind == "outside" else ()))
+
+
+def main(args: Arguments) -> None:
+    reference = lw.load_plans(REFERENCE)
+    reference.require(args.tasks)
+    learned = train(args) if "learned" in args.policies else None
+    found: dict[str, dict[str, list[dict[str, Any]]]] = {}
+    start = perf_counter()
+    for name in args.faults:
+        for policy in args.policies:
+            file = args.out / f"seed-{args.seed}" / f"{name}, {policy}.json"
+            if not file.is_file():
+                said = [one.to_json() for one in failures_of(FAULTS[name], policy, args, learned, reference)]
+                write_json(file, said)
+            found.setdefault(name, {})[policy] = failures = json.loads(file.read_text("utf-8"))
+            causes = [one["cause"] for one in failures]
+            counts = ", ".join(f"{causes.count(cause)} {cause}" for cause in CAUSES if cause in causes)
+            print(f"{name}, {policy}: {counts}; {(perf_counter() - start) / 60:.1f} minutes", flush=True)
+            write_text(args.out / f"seed-{args.seed}.md", table(found))
+    print(table(found))
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main(tyro.cli(Arguments))

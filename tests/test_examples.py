@@ -74,6 +74,14 @@ def test_somebody_else_s_environment_trains(tmp_path):
 
 
 @pytest.mark.slow
+def test_plain_pytorch_trains_on_what_was_exported(tmp_path):
+    done = run("plain_pytorch.py", tmp_path, "--steps", 500, "--demonstrations", 1, "--episodes", 1)
+    assert "step   500  loss" in done.stdout
+    assert "drawer-open" in done.stdout
+    assert not any("replay" in name.lower() or "Trainer" in name for name in names(EXAMPLES / "plain_pytorch.py"))
+
+
+@pytest.mark.slow
 def test_fetch_learns_from_demonstrations(tmp_path):
     pytest.importorskip("gymnasium_robotics")
     done = run("fetch_few_shot.py", tmp_path, "--demonstrations", 1, "--steps", 3, "--episodes", 1)

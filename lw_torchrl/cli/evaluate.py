@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,7 +11,7 @@ from tyro.conf import Positional, arg
 import lw_torchrl as lw
 from lw_torchrl._checks import counted
 from lw_torchrl._files import held, write_json, write_text
-from lw_torchrl.cli import options
+from lw_torchrl.cli import objects, options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import Task
@@ -40,7 +41,8 @@ def evaluate(
 ) -> Output:
     """Evaluate a trained policy, or the scripted experts, and write the result, a figure and a recording.
 
-    With --suite a policy that was trained with another robot acts there, under that suite's plans.
+    With --suite a policy that was trained with another robot acts there, under that suite's plans. A policy of yours,
+    my_module:policy, is what acts: an lw.Policy, or a module or function from TensorDict to TensorDict.
 
     Example: lw-torchrl evaluate runs/mt10.zip --out runs/mt10
 
@@ -51,12 +53,10 @@ def evaluate(
     if out is not None:
         options.check_folder("--out", out)
     options.check_reference(reference, attribute)  # which may speak of a policy's own tasks
-    if str(checkpoint) != "expert":
+    who = str(checkpoint)
+    if who != "expert" and not objects.is_object(who):
         options.check_saved("checkpoint", checkpoint)
-    elif evaluator is not None:
-        raise ValueError("--evaluator is for a policy with plans, the scripted experts ask no conditions")
-    if evaluator is not None:
-        options.check_saved("evaluator", evaluator, "network", "train-evaluator")
+    objects.check_evaluator(evaluator, who)
     options.check_encoder(text_encoder)
     elsewhere = options.read_suite(suite, tasks)
     known = dict(options.read_tasks(task_file)) | dict({} if elsewhere is None else elsewhere.tasks)
@@ -69,19 +69,19 @@ def evaluate(
 
     options.use_one_thread()
     there = check_device("device", device)
-    if str(checkpoint) == "expert":
+    if who == "expert":
         chosen = chosen or (lw.MT10 if elsewhere is None else tuple(elsewhere.plans or elsewhere.tasks))
         policy = None if elsewhere is None else suite_expert(elsewhere, chosen)
     else:
-        policy = options.load_policy(checkpoint, seed, given, text_encoder, elsewhere, speed)
-        if evaluator is not None:
-            if policy.plans is None:
-                raise ValueError(f"--evaluator is for a policy with plans, {type(policy).__name__} has none")
-            encoder = options.read_encoder(text_encoder)
-            inside = lw.training.load_evaluator(evaluator, policy.plans, text_encoder=encoder)
-            policy = policy.with_evaluator(inside)
-        known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
-        chosen = chosen or _default_tasks(policy, set() if plans else demonstrated_tasks(checkpoint), elsewhere)
+        there_too: dict[str, Any] = {"text_encoder": text_encoder, "suite": elsewhere, "speed": speed}
+        load = partial(options.load_policy, seed=seed, plans=given, **there_too)
+        policy = objects.with_evaluator(objects.read_policy("checkpoint", who, given, load), evaluator, text_encoder)
+        if isinstance(policy, lw.Policy):
+            known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
+            shown = set() if plans or objects.is_object(who) else demonstrated_tasks(checkpoint)
+            chosen = chosen or _default_tasks(policy, shown, elsewhere)
+        elif not chosen:
+            raise ValueError(f"--tasks must name some, {who} is no lw.Policy, which would tell")
     if policy is None and there.type != "cpu":
         raise ValueError("--device is for a policy; the scripted experts work on the CPU")
     own = getattr(policy, "plans", None)
@@ -99,15 +99,15 @@ def evaluate(
     if out is not None:
         with held(out, "out", folder=True, wait=True):
             told: dict[str, Any] = {"plans": None if own is None else own.fingerprint, "evaluator": evaluator}
-            told["checkpoint"] = None if str(checkpoint) == "expert" else policy_file(checkpoint)
+            told["checkpoint"] = None if who == "expert" or objects.is_object(who) else policy_file(checkpoint)
             result.save(out / "results.json", **told)
             lw.plot_success(result, out / "success.png", title=f"{checkpoint}, {episodes} episodes a task")
             if attribute:
                 lw.evaluation.plot_failures(result, out / "failures.png", title=str(checkpoint))
             if policy is not None:
-                shown: list[str | Task] = list(result.config["tasks"][:3])
-                recorded = run_recorded(policy, shown, seed=seed, noise_scale=noise, **where)
-                said: dict[str, Any] = {"seed": seed, "policy": checkpoint.stem, "suite": elsewhere}
+                first: list[str | Task] = list(result.config["tasks"][:3])
+                recorded = run_recorded(policy, first, seed=seed, noise_scale=noise, **where)
+                said: dict[str, Any] = {"seed": seed, "policy": objects.name_of(who), "suite": elsewhere}
                 write_recording(out / "rollout.rrd", recorded, own, **said)
         print(f"written to {out}")
     return output
@@ -145,9 +145,9 @@ def card(
     Example: lw-torchrl card few-shot-mt50
     Example: lw-torchrl card runs/mt10.zip --result runs/mt10/results.json --out README.md
     """
-    options.check_saved("policy", policy)
     if out is not None:
         options.check_file("--out", out)
+    options.check_saved("policy", policy)
     if result is not None and not result.is_file():
         raise FileNotFoundError(f"--result: no file {str(result)!r}; `lw-torchrl evaluate --out` writes results.json")
     measured = None if result is None else lw.EvaluationResult.load(result)

@@ -18,7 +18,7 @@ from tyro.conf import arg
 
 import lw_torchrl as lw
 from lw_torchrl._checks import check_choice, unknown_name
-from lw_torchrl._files import shipped_policy
+from lw_torchrl._files import absent_policy, shipped_policy
 from lw_torchrl._tables import plugins_of
 from lw_torchrl.cli.parsing import own_module
 from lw_torchrl.language.plan_files import load_plans
@@ -224,7 +224,7 @@ def check_saved(argument: str, path: Path, what: str = "policy", writer: str = "
     if path.is_dir():
         raise ValueError(f"{argument}: {str(path)!r} is a folder; a {what} is one file")
     if not path.exists() and (what != "policy" or shipped_policy(path) is None):
-        raise FileNotFoundError(f"{argument}: no file {str(path)!r}; `lw-torchrl {writer}` writes one")
+        raise FileNotFoundError(f"{argument}: {absent_policy(path, writer)}")
 
 
 def check_actor(argument: str, who: str) -> None:
@@ -235,7 +235,7 @@ def check_actor(argument: str, who: str) -> None:
         check_saved(argument, Path(who))
 
 
-def _imported(option: str, name: str, kind: str) -> Any:
+def imported(option: str, name: str, kind: str) -> Any:
     """What "package.module:name" names."""
     module, _, attribute = name.partition(":")
     try:
@@ -249,7 +249,7 @@ def read_encoder(name: str | None) -> TextEncoder | None:
     if name is None:
         return None
     check_encoder(name)
-    found = _imported("--text-encoder", name, "function")
+    found = imported("--text-encoder", name, "function")
     if not callable(found):
         raise ValueError(f"--text-encoder {name!r} must name a function, it names {type(found).__name__}")
     return found
@@ -273,7 +273,7 @@ def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite |
         return find_suite(tasks) if other else None
     if ":" not in name:
         return load_suite(name)
-    found = _imported("suite", name, "object")
+    found = imported("suite", name, "object")
     if not isinstance(found, Suite):
         raise ValueError(f"suite {name!r} must name a Suite, it names {type(found).__name__}")
     return found

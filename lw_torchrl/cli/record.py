@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
 from lw_torchrl._files import replacing
-from lw_torchrl.cli import options
+from lw_torchrl.cli import objects, options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.language.plans import Plans
 
@@ -25,6 +25,8 @@ def record(
     plans: tuple[str, ...] = (),
     attribute: bool = False,  # say why failed episodes failed, as evaluate does; for scripted and policies with plans
     reference: tuple[str, ...] = (),  # with --attribute, trusted plans for running failed episodes again
+    evaluator: Path | None = None,  # a network that answers the conditions, of `lw-torchrl train-evaluator`
+    suite: options.SuiteName = None,
     speed: options.Speed = 1.0,
     task_file: options.TaskFile = None,
     text_encoder: options.OwnEncoder = None,
@@ -40,29 +42,38 @@ def record(
 
     Args:
         policy: expert, Meta-World's script; scripted, the plan by scripted skills; random; spoilt-60, spoilt-30 or
-            wrong, the plan by skills that are right in 60, 30 or 0 of 100 pieces; or a policy's file.
+            wrong, the plan by skills that are right in 60, 30 or 0 of 100 pieces; a policy's file; or one of yours, as
+            my_module:policy, as for evaluate.
         plans: whose steps and conditions are shown and, by policies that read plans, carried out: MT10, MT50, .plan or
             .json files, or folders. If none is given, a policy's own, or else the shipped ones.
     """
     options.check_reference(reference, attribute)
     for option, who in (("policy", policy), ("compare", compare or policy)):
-        options.check_actor(option, who)
+        objects.check_policy(option, who)
+    objects.check_evaluator(evaluator, policy)
     options.check_encoder(text_encoder)
-    known = dict(options.read_tasks(task_file, names))
-    tasks = options.simulated("names", options.one_or_many(names), known)
+    elsewhere = options.read_suite(suite, names)
+    known = dict(options.read_tasks(task_file, names)) | dict({} if elsewhere is None else elsewhere.tasks)
+    tasks = options.simulated("names", options.one_or_many(names), known, elsewhere)
     given = options.read_plans(plans, known) if plans else None
     label = names[0].replace("/", "-") if len(names) == 1 else f"{len(names)}-tasks"
-    out = out or Path("runs/recordings") / f"{label}-{Path(policy).stem}.rrd"
+    out = out or Path("runs/recordings") / f"{label}-{objects.name_of(policy)}.rrd"
     options.check_file("--out", out, ".rrd")
     from lw_torchrl.record.rollouts import run_recorded
 
     options.use_one_thread()
     trusted = options.read_plans(reference, known) if reference else None
     episode_options: dict[str, Any] = {"seed": seed, "noise_scale": noise, "max_steps": max_steps}
+    episode_options["suite"] = elsewhere
     # What can be refused is refused before the first episode runs.
-    suite = options.read_suite(None, tasks)
-    load = partial(options.load_policy, seed=seed, plans=given, text_encoder=text_encoder, suite=suite, speed=speed)
-    cast = [_cast(who, tasks, given, known, load, seed, max_steps) for who in filter(None, (policy, compare))]
+    there: dict[str, Any] = {"text_encoder": text_encoder, "suite": elsewhere, "speed": speed}
+    load = partial(options.load_policy, seed=seed, plans=given, **there)
+    cast = []
+    for who in filter(None, (policy, compare)):
+        actor, shown, called = _cast(who, tasks, given, known, load, seed, max_steps, elsewhere)
+        if who == policy or hasattr(actor, "with_evaluator"):
+            actor = objects.with_evaluator(actor, evaluator, text_encoder)
+        cast.append((actor, shown, called))
     rows: list[dict[str, Any]] = []
     recorded: list[list[str]] = []
     with replacing(out) as file, lw.RerunLogger(file, exp_name=out.stem) as logger:
@@ -72,6 +83,8 @@ def record(
             if attribute and shown is not None and hasattr(actor, "with_plans"):
                 failures = lw.attribute_failures(found, shown, actor=actor, reference=trusted, **episode_options)
                 why = {(one.task, one.episode): one for one in failures}
+                if failures and not recorded:
+                    logger.show_causes(_result(found, failures, episode_options, len(episodes)))
             pages = []
             for one in found:
                 failure = why.get((one.task, one.episode))
@@ -83,7 +96,7 @@ def record(
                 rows.append(row | {"failure": None if failure is None else failure.to_json()})
                 name = None if compare is None else f"{one.task}-{one.episode}-{len(recorded) + 1}"
                 told: dict[str, Any] = {"seed": seed, "policy": who, "failure": failure, "name": name}
-                pages.append(lw.log_rollout(logger, one.steps, shown, **told))
+                pages.append(lw.log_rollout(logger, one.steps, shown, suite=elsewhere, **told))
             recorded.append(pages)
         for pair, one in zip(zip(*recorded, strict=True), found, strict=True) if compare is not None else ():
             logger.compare(pair, f"{one.task} · episode {one.episode} · side by side")
@@ -91,8 +104,25 @@ def record(
     return output.show("recording", out, f"written to {out}\nlook at it with: lw-torchrl view {out}")
 
 
+def _result(found: Any, failures: Any, run: Mapping[str, Any], episodes: int) -> Any:
+    """Recorded episodes and their failures as an evaluation's result."""
+    result, episode = lw.evaluation.EvaluationResult, lw.evaluation.EpisodeResult
+    ended = [(one.task, one.episode, one.first_success) for one in found]
+    tasks = list(dict.fromkeys(one.task for one in found))
+    config = {"tasks": tasks, "episodes_per_task": episodes, "seed": run["seed"], "max_steps": len(found[0].steps)}
+    listed = tuple(episode(task, k, first is not None, first, None, None) for task, k, first in ended)
+    return result(config, listed, failures=tuple(failures))
+
+
 def _cast(
-    who: str, tasks: Sequence[str], plans: Plans | None, known: Any, load: Any, seed: int, max_steps: int | None
+    who: str,
+    tasks: Sequence[str],
+    plans: Plans | None,
+    known: Any,
+    load: Any,
+    seed: int,
+    max_steps: int | None,
+    own: Any,
 ) -> tuple[Any, Plans | None, str]:
     """Who acts, the plans whose conditions are answered, and what the policy is called."""
     from lw_torchrl.data.behaviours import SegmentActor, behaviour_of
@@ -100,15 +130,17 @@ def _cast(
     from lw_torchrl.suites.suite import find_suite
 
     if who not in options.ACTORS:
-        actor = load(Path(who))
+        actor = objects.read_policy("--policy", who, plans, load)
+        if not isinstance(actor, lw.Policy):
+            return actor, getattr(actor, "plans", None), objects.name_of(who)
         if missing := [task for task in tasks if task not in actor.tasks]:
             knows = f"it knows {', '.join(actor.tasks)}"
             raise ValueError(f"the policy of {who!r} does not know {', '.join(missing)}; {knows}")
-        return actor, actor.plans, Path(who).stem
-    shown = options.read_plans(("MT50",), known) if plans is None else plans
+        return actor, actor.plans, objects.name_of(who)
+    suite = find_suite(tasks) if own is None else own
+    shown = plans or (options.read_plans(("MT50",), known) if own is None else Plans(own.plans or {}))
     shown.require(tasks)
     shown = Plans({task: shown[task] for task in tasks})
-    suite = find_suite(tasks)
     if who == "expert":
         return suite_expert(suite, tasks), shown, who
     if who == "scripted":

@@ -14,25 +14,17 @@ from torchrl.envs import EnvBase
 from lw_torchrl._checks import Count, Scale, checked, missing_keys
 from lw_torchrl._devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.counterfactuals import Counterfactuals, EpisodeId, EpisodeRepeater, own_evaluators
+from lw_torchrl.evaluation.counterfactuals import Counterfactuals, own_evaluators
+from lw_torchrl.evaluation.deciding import MARGIN, PAIR_WORDS, REPLACEMENTS, Decision, decide
 from lw_torchrl.evaluation.explanation import EpisodeStates, Explanation, Scripts, explain, stall_step, states_of
-from lw_torchrl.evaluation.failure_records import Cause, Failure
+from lw_torchrl.evaluation.failure_records import Failure
+from lw_torchrl.evaluation.repeating import EpisodeId, EpisodeRepeater, NullControl, null_control
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import plans_of
 from lw_torchrl.suites.suite import Suite, find_suite
-
-_MARGIN = 0.3  # minimum lead for a larger replacement to win, as a share of the task's failed episodes
-_COUNTERFACTUALS: dict[str, tuple[Cause, str]] = {  # the smaller ones first; time counts where nothing else mends
-    "query": ("query", "true answers"),
-    "skill": ("skill", "a script in one step"),
-    "plan": ("plan", "the reference plan"),
-    "skills": ("skill", "scripts in all steps"),
-    "time": ("out of time", "twice the time"),
-}
-_PARTS: dict[str, str] = {"query": "true answers", "plan": "the reference plan", "skill": "scripts"}
 
 
 @checked
@@ -54,8 +46,8 @@ def attribute_failures(
     device: str | torch.device | None = None,
     progress: bool = True,
 ) -> list[Failure]:
-    """Say of each failed episode whether a query was answered wrongly, the plan led astray, a skill was clumsy, or it
-    only lacked time.
+    """Say of each failed episode what is to blame: what the policy was shown, the answers, the plan, a skill, another
+    part of what it does, or the time; or that it does not fail again.
 
     **A rule explains.** *Query*, if the policy acted on other answers than the query answering function gives in the
     same states; else *plan*, if late in the episode the plan's true step asks for something else than the reference
@@ -63,13 +55,16 @@ def attribute_failures(
     tells wrong answers, a plan of which no condition holds, and a skill that stays far from where it goes; the rest is
     undecided. Without ``actor`` that is all.
 
-    **A counterfactual decides**, with ``actor``: the very same episode, its noise too, is run again with true answers,
-    where they were wrong; with scripted skills in one step of the plan, or, if that mends nothing, in all (where a text
-    is no scripted skill, with the expert's actions); with the reference plan; with twice the time. What alone mends the
-    episode is its cause. Where several do, the smallest replacement counts: answers, a skill in one step, the plan,
-    skills in all steps, unless a larger one mends clearly more of the task's failed episodes; time counts last. Where
-    none mends, pairs are tried, which give ``cause`` and ``also``. One mended episode may be luck: ``evidence`` holds
-    how much of the task's failed episodes each mended.
+    **A counterfactual decides**, with ``actor``. First the null control: the very same episode, its noise too, is run
+    again with nothing replaced. If it succeeds it is *not reproducible*, and ``why`` says what differs. Else it is run
+    with one part replaced by a sound one: the observations, if the policy was shown others than the environment told
+    (*perception*); the answers, where they were wrong (*query*); the *plan*, by the reference; what scripted skills do
+    (where a text is no scripted skill, the expert's actions) in one step of the plan (*skill*), for the *gripper* or
+    the hand's motion (*actuation*) alone, or in all steps (*policy*, not told which part); twice the time (*out of
+    time*). Where none mends, pairs are tried, which give ``cause`` and ``also``. Where several do, that counts which
+    mends most of the task's failed episodes, and of those as good the smallest. One mended episode may be luck:
+    ``evidence`` and ``why`` hold how much of the task's failed episodes each mended, nothing replaced among them. A
+    policy without plans is told of no step.
 
     Args:
         rollouts: episodes as :func:`evaluate` gives them to ``on_episode``, or TensorDicts of batch (T,), each one
@@ -86,7 +81,8 @@ def attribute_failures(
             evaluator inside the policy is found there.
         skills: the scripted skills by text that are trusted; None for the suite's, :func:`load_skills` of
             Meta-World.
-        seed, noise_scale, max_steps, suite, engine: with which the episodes were run.
+        seed, noise_scale, max_steps, suite, engine: with which the episodes were run. One that was cut before
+            ``max_steps`` is run on: if it then succeeds, it is not reproducible.
         num_envs, num_threads, device, progress: as for :func:`evaluate`.
 
     Returns:
@@ -105,7 +101,8 @@ def attribute_failures(
         >>> import lw_torchrl as lw
         >>> from dataclasses import replace
         >>> plans = lw.Plans({"reach": lw.load_plans("MT10")["reach"]})
-        >>> spoilt = {text: replace(skill, offset=(0.1, 0.0, 0.0)) for text, skill in lw.load_skills().items()}
+        >>> skills, text = lw.load_skills(), plans["reach"].steps[1].skill
+        >>> spoilt = {**skills, text: replace(skills[text], offset=(0.1, 0.0, 0.0))}
         >>> actor, episodes = lw.ScriptedSkillActor(plans, skills=spoilt), []
         >>> run, keys = {"seed": 1_000, "max_steps": 100}, ["observation", "task_id", "qaf", "skill_weights"]
         >>> told = {"also_record": keys, "on_episode": episodes.append}
@@ -142,10 +139,10 @@ def attribute_failures(
         return failures
     tasks = {name: found.tasks.get(name, answered[name].definition) for name in names}
     max_steps = found.max_steps if max_steps is None else max_steps
-    firsts = {one.which: one.steps.get("observation")[0] for one in seen}
     env = {"seed": seed, "suite": found, "engine": engine, "num_threads": num_threads}
-    repeat = EpisodeRepeater(tasks, firsts, env, noise_scale, max_steps, num_envs, device, progress)
-    tried = Counterfactuals(actor, evaluator, None if theirs is None else theirs.plans, scripts, repeat)
+    repeat = EpisodeRepeater(tasks, env, noise_scale, max_steps, num_envs, device, progress)
+    null = null_control(repeat, {one.which: one.steps for one in seen}, actor, answered, evaluator)
+    tried = Counterfactuals(actor, evaluator, None if theirs is None else theirs.plans, scripts, repeat, null)
     tried.run(seen, [which for which, one in told.items() if one.evidence.get("plan_departs") == 0.0])
     shares = tried.shares()
     return [_by_counterfactuals(one, told[one.which], tried, shares.get(one.task, {}), seed) for one in seen]
@@ -205,57 +202,27 @@ def keys_to_attribute(actor: Any, env: EnvBase) -> list[NestedKey]:
     return list(dict.fromkeys(keys))
 
 
-def choose_cause(mended: Iterable[str], shares: Mapping[str, float]) -> str | None:
-    """Of the single replacements that mend an episode, the one that counts; None of none.
-
-    It is the smallest, unless a larger one mends more of the task's failed episodes by 0.3 of them.
-    More time comes last.
-    """
-    given = set(mended)
-    best = None
-    for name in _COUNTERFACTUALS:
-        lead = best is None or (name != "time" and shares.get(name, 0.0) >= shares.get(best, 0.0) + _MARGIN)
-        best = name if name in given and lead else best
-    return best
-
-
-def choose_cause_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tuple[Cause, Cause] | None:
-    """The pair that counts, the first the cause: wrong answers, which are a fact; else what alone mends more of the
-    task's failed episodes."""
-    alone = {**shares, "skill": max(shares.get("skill", 0.0), shares.get("skills", 0.0))}
-    found: list[Any] = [name.split(" + ") for name in mended if " + " in name]
-    if not found:
-        return None
-    cause, also = max(found, key=lambda pair: sum(alone.get(name, 0.0) for name in pair))
-    return (also, cause) if cause != "query" and alone.get(also, 0.0) > alone.get(cause, 0.0) else (cause, also)
-
-
 def _by_counterfactuals(
     one: EpisodeStates, told: Explanation, tried: Counterfactuals, shares: Mapping[str, float], seed: int
 ) -> Failure:
     """What the counterfactuals tell, explained by the states."""
-    first = {name: results[one.which] for name, results in tried.found.items() if one.which in results}
-    mended = {name: hit for name, hit in first.items() if hit is not None}
-    replaced: dict[str, bool] = {}
-    for name in first:
-        part = "skill" if name == "skills" else name
-        replaced[part] = replaced.get(part, False) or name in mended
-    cause: Cause = "undecided"
-    also: Cause | None = None
-    decided: tuple[str, str] | None = None  # the counterfactual, and what it replaces, in words
+    which, null = one.which, tried.null
+    share = null.share(one.task)
+    by = {f"mended_by_{name.replace(' + ', '_and_')}": of for name, of in {"nothing": share, **shares}.items()}
+    evidence = {**told.evidence, "failed": float(sum(task == one.task for task, _ in null.episodes)), **by}
+    if null.succeeds(which) or (which in null.differs and share >= MARGIN):
+        return _not_reproducible(one, null, evidence, seed)
+    first = {name: results[which] for name, results in tried.found.items() if which in results}
+    mended = [name for name, hit in first.items() if hit is not None]
     same = told.evidence.get("plan_departs") == 0.0
-    best = choose_cause([name for name in mended if not (same and name == "plan")], shares)
-    if best is not None:
-        cause, part = _COUNTERFACTUALS[best]
-        decided = best, part
-        words = f"With {part} the same episode succeeds, at step {len(mended[best].steps) - 1}"
-        if others := [name for name in mended if name in _COUNTERFACTUALS and name not in ("time", best)]:
-            words += f"; with {_listed(others, 'and')} too, which replaces more or mends less of the task"
-    elif (pair := choose_cause_pair(mended, shares)) is not None:
-        cause, also = pair
-        both = next(name for name in mended if set(name.split(" + ")) == {cause, also})
-        decided = both, f"{_PARTS[cause]} and {_PARTS[also]}"
-        words = f"Neither {_PARTS[cause]} nor {_PARTS[also]} alone mend it, both together do"
+    counting = [name for name in tried.mending(one) if not (same and name == "plan")]
+    decision = decide(counting, shares, share)
+    cause, also, how = decision.cause, decision.also, tried.mended(decision, which)
+    if also is not None:
+        words = f"Neither {PAIR_WORDS[cause]} nor {PAIR_WORDS[also]} alone mend it, both together do"
+    elif how is not None:
+        words = f"With {how.by} the same episode succeeds, at step {len(how.steps) - 1}"
+        words += _certainty(decision, shares, share)
     elif same and "plan" in mended:
         words = "With the reference plan it succeeds, though in no state that asks for anything else"
     elif told.cause == "query" and "query" not in first:
@@ -266,19 +233,40 @@ def _by_counterfactuals(
         words = "There is nothing to replace"
     if cause == "undecided" and told.cause != "undecided":
         words += f". By the states alone it would be the {told.cause}: {told.blames[told.cause].why}"
-    step, at, why = told.blames[cause]
-    if best == "skill":
-        step, plan = tried.step[one.which], tried.plans[one.task]
+    step, at, why = told.blames.get(cause, told.blames["undecided"])
+    if cause == "skill" and also is None:
+        step, plan = tried.step[which], tried.plans[one.task]
         at, why = stall_step(one, step, plan.definition.layout), one.active_time(plan, step)
-    by = {f"mended_by_{name.replace(' + ', '_and_')}": share for name, share in shares.items()}
-    evidence = {**told.evidence, **by}
-    how = None if decided is None else tried.mended(decided[0], one.which, decided[1])
-    return Failure(one.task, seed, one.episode, cause, also, step, at, _text(why, words), evidence, replaced, how)
+    elif cause == "perception":
+        why = null.misled[which].words
+    if plans_of(tried.actor) is None and cause != "query":
+        step = None
+    told_why = [] if step is None and cause != "perception" else [why]
+    replaced = {name: name in mended for name in first}
+    return Failure(one.task, seed, one.episode, cause, also, step, at, _text(*told_why, words), evidence, replaced, how)
+
+
+def _not_reproducible(one: EpisodeStates, null: NullControl, evidence: Mapping[str, float], seed: int) -> Failure:
+    """Of an episode that nothing has to be replaced in, or that cannot be run again in a task of such."""
+    succeeds = null.succeeds(one.which)
+    again = "it succeeds" if succeeds else "it fails in another way, and others of the task succeed"
+    at, what = null.differs.get(one.which, (len(one.steps) - 1, "nothing that was recorded"))
+    why = _text(f"Run again with nothing replaced {again}", f"What differs is {what}")
+    return Failure(one.task, seed, one.episode, "not reproducible", None, None, at, why, evidence)
+
+
+def _certainty(decision: Decision, shares: Mapping[str, float], null: float) -> str:
+    """How sure a cause is: what it mends of the task's failed episodes, beside the next best and nothing replaced."""
+    assert decision.by is not None
+    parts = [f"; it mends {shares.get(decision.by, 1.0):.0%} of the task's failed episodes"]
+    if decision.rival is not None:
+        parts.append(f"{REPLACEMENTS[decision.rival].words} {shares.get(decision.rival, 1.0):.0%}")
+    return ", ".join([*parts, f"nothing replaced {null:.0%}"])
 
 
 def _listed(names: Iterable[str], joint: str) -> str:
-    pairs = {f"{a} + {b}": f"{_PARTS[a]} and {_PARTS[b]}" for a in _PARTS for b in _PARTS}
-    words = [pairs.get(name) or _COUNTERFACTUALS[name][1] for name in names]
+    pairs = {f"{a} + {b}": f"{PAIR_WORDS[a]} and {PAIR_WORDS[b]}" for a in PAIR_WORDS for b in PAIR_WORDS}
+    words = [pairs.get(name) or REPLACEMENTS[name].words for name in names]
     return f" {joint} ".join(words) if len(words) < 3 else f"{', '.join(words[:-1])} {joint} {words[-1]}"
 
 

@@ -1,34 +1,33 @@
 """Counterfactuals: failed episodes run again with one part of what acted replaced by a sound one."""
 
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
-from itertools import groupby
-from operator import itemgetter
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.envs import Transform
 
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.evaluation.explanation import EpisodeStates, Scripts, attended, candidates, unlike_scripts
+from lw_torchrl.evaluation.deciding import PAIR_WORDS, REPLACEMENTS, Decision
+from lw_torchrl.evaluation.explanation import (
+    EpisodeStates,
+    Scripts,
+    candidates,
+    often_far,
+    script_gaps,
+    unlike_scripts,
+)
 from lw_torchrl.evaluation.failure_records import MendedEpisode
-from lw_torchrl.evaluation.running import ROWS, Acts, answered_by, make_env, running
+from lw_torchrl.evaluation.repeating import EpisodeId, EpisodeRepeater, NullControl, Perception
+from lw_torchrl.evaluation.scripts_in_charge import WithScripts
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.language.tasks import TASKS, Task, task_id
-from lw_torchrl.modules.plan_encoder import IN_FORCE
+from lw_torchrl.modules.policy import plans_of
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
-from lw_torchrl.suites.metaworld.experts import ExpertActor
 from lw_torchrl.transforms.qaf import plan_program
 
-EpisodeId = tuple[str, int]  # task, episode
-_KEPT: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next", "success"), ("next", "reward")]
-_TRIED_STEPS = 3  # in which a skill is replaced, one at a time, before it is in all steps
+_TRIED_STEPS = 3  # in which a skill is replaced, one at a time
 
 
 class TrueAnswers(QueryEvaluator):
@@ -70,101 +69,23 @@ def with_true_answers(actor: Any) -> Any:
     return other
 
 
-class WithScripts(nn.Module):
-    """A policy whose attention mixes scripted skills' actions, where it singles any steps out; where the step in force
-    has no scripted skill, the action is the expert's."""
-
-    def __init__(self, actor: Acts, plans: Plans, scripts: Scripts, steps: Mapping[EpisodeId, int] | None) -> None:
-        super().__init__()
-        self.actor, self.scripts = actor, scripts
-        self._tables = PlanTables(plans)
-        self._known = torch.zeros_like(self._tables.mask)
-        for row, task in enumerate(self._tables.index.tasks):
-            self._known[row, : len(plans[task].steps)] = torch.tensor(scripts.known[task])
-        self._steps = None if steps is None else {(task_id(task), k): step for (task, k), step in steps.items()}
-        unscripted = [task for task, known in scripts.known.items() if not all(known) and task in TASKS]
-        self._expert = ExpertActor(unscripted) if unscripted else None
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        seen = tensordict.select("observation", "task_id", "episode", "_step", strict=False).clone()
-        tensordict = self.actor(tensordict)
-        action, task = tensordict.get("action"), seen.get("task_id")
-        rows = self._tables.rows(task)
-        mask, known = self._tables.mask.to(action.device)[rows], self._known.to(action.device)[rows]
-        weights = tensordict.get("skill_weights", None)
-        if weights is None:
-            truth = tensordict.get("qaf") & mask
-            first = torch.where(truth.any(-1), truth.int().argmax(-1), mask.sum(-1) - 1)
-            weights = torch.nn.functional.one_hot(first, mask.shape[-1]).float()
-        step = attended(weights, mask)
-        replaced = step >= 0
-        if self._steps is not None:
-            which = zip(task.tolist(), seen.get("episode").tolist(), strict=True)
-            asked = torch.tensor([self._steps.get(one, -1) for one in which], device=action.device)
-            there = weights.gather(-1, asked.clamp(min=0).unsqueeze(-1)).squeeze(-1) > IN_FORCE
-            replaced = replaced & there & (asked >= 0)
-        scripted = (weights * known).unsqueeze(-1) * self.scripts.program(seen.get("observation"), task)
-        proper = scripted.sum(-2).to(action.dtype)
-        unknown = ~known.gather(-1, step.clamp(min=0).unsqueeze(-1)).squeeze(-1)
-        if self._expert is None:
-            replaced = replaced & ~unknown
-        elif (needed := replaced & unknown).any():
-            expert = self._expert(seen.set("_step", needed).cpu()).get("action").to(action.device)
-            proper = torch.where(unknown.unsqueeze(-1), expert, proper)
-        return tensordict.set("action", torch.where(replaced.unsqueeze(-1), proper, action))
-
-
-@dataclass(frozen=True)
-class EpisodeRepeater:
-    """Runs episodes again as they were run, whatever acts in them."""
-
-    tasks: Mapping[str, Task]
-    firsts: Mapping[EpisodeId, Tensor]
-    env: Mapping[str, Any]
-    noise_scale: float
-    max_steps: int
-    num_envs: int | None
-    device: str | torch.device | None
-    progress: bool
-
-    def __call__(
-        self, what: str, which: Sequence[EpisodeId], actor: Any, plans: Plans, evaluator: Any = None, longer: int = 1
-    ) -> dict[EpisodeId, FinishedEpisode | None]:
-        """Each episode up to its first success, None of one that fails again; they may be ``longer`` by this factor."""
-        wanted = {task: [k for _, k in listed] for task, listed in groupby(sorted(which), itemgetter(0))}
-        rows = len(wanted) * max(1, min(max(map(len, wanted.values())), ROWS // len(wanted)))
-        rows = max(len(wanted), min(rows, self.num_envs or rows))
-        tasks = [self.tasks[task] for task in wanted]
-        base = LanguageWorldEnv(tasks, num_envs=rows, max_steps=self.max_steps * longer, strict=True, **self.env)
-        acts = actor.actor if isinstance(actor, WithScripts) else actor
-        env = make_env(acts, plans, base, evaluator)
-        found: dict[EpisodeId, FinishedEpisode | None] = {}
-        told = [key for key in ("qaf",) if key in env.full_observation_spec.keys()]
-        told += [key for key in ("skill_weights",) if key in getattr(acts, "out_keys", ())]
-        how: dict[str, Any] = {"noise_scale": self.noise_scale, "device": self.device, "progress": self.progress}
-        how |= {"keys": [*_KEPT, *told], "after_success": 0}
-        with running(f"again with {what}", env, answered_by(actor, evaluator), wanted, **how) as episodes:
-            for one in episodes:
-                if not torch.equal(one.steps.get("observation")[0], self.firsts[one.task, one.episode]):
-                    raise ValueError(
-                        f"rollouts: episode {one.episode} of {one.task!r} does not begin as episode {one.episode} of "
-                        f"seed={self.env['seed']} does; give the seed and the engine that it was run with, and the "
-                        "episode from its first state on"
-                    )
-                found[one.task, one.episode] = None if one.first_success is None else one
-        return found
-
-
 class Counterfactuals:
     """Runs the counterfactuals that are worth it, and keeps what each gave."""
 
     def __init__(
-        self, actor: Any, evaluator: Any, reference: Plans | None, scripts: Scripts, repeat: EpisodeRepeater
+        self,
+        actor: Any,
+        evaluator: Any,
+        reference: Plans | None,
+        scripts: Scripts,
+        repeat: EpisodeRepeater,
+        null: NullControl,
     ) -> None:
-        self.actor, self.evaluator, self.scripts, self.repeat = actor, evaluator, scripts, repeat
+        self.actor, self.evaluator, self.scripts, self.repeat, self.null = actor, evaluator, scripts, repeat, null
         self.plans = plans = scripts.plans
         self.found: dict[str, dict[EpisodeId, FinishedEpisode | None]] = {}  # counterfactual to episodes that it mends
         self.step: dict[EpisodeId, int] = {}  # in which a script mends the episode
+        self.gaps: dict[EpisodeId, Tensor] = {}  # from the actions of scripts
         self.reference: Plans | None = None
         self.other = self.other_evaluator = None  # that carry out the reference
         different = [] if reference is None else [reference[task] for task in reference.differences(plans)]
@@ -180,29 +101,36 @@ class Counterfactuals:
             warnings.warn(f"reference: the policy cannot carry it out, so no plan is replaced ({why})", stacklevel=4)
 
     def run(self, seen: Sequence[EpisodeStates], same: Collection[EpisodeId] = ()) -> None:
-        """Run all that are worth it."""
+        """Run all that are worth it; ``same`` are those in which the reference asks for nothing else."""
+        seen = [one for one in seen if not self.null.succeeds(one.which)]
         every = [one.which for one in seen]
-        wrong = [w for w, one in zip(every, seen, strict=True) if bool((one.given != one.truth).any())]
-        with_reference = [w for w in every if self.reference is not None and w[0] in self.reference]
+        misled = [which for which in every if which in self.null.misled]
+        with Perception(self.actor, put_right=True):
+            self._run("perception", misled, self.actor, self.plans, None if self._is_sensor() else self.evaluator)
         true = with_true_answers(self.actor)
-        can_answer = self.evaluator is not None or true is not self.actor
-        if can_answer:
-            self._run("query", "true answers", wrong, true, self.plans)
-        self._run_skills(seen)
-        self._run("plan", "the reference plan", with_reference, self.other, self.reference, self.other_evaluator)
-        left = self._unmended(every, "query", "skill", "skills")
+        can_answer = (self.evaluator is not None and not self._is_sensor()) or true is not self.actor
+        wrong = [one.which for one in seen if can_answer and bool((one.given != one.truth).any())]
+        self._run("query", wrong, true, self.plans)
+        left = self._unmended(every, "perception", "query")
+        with_reference = [w for w in left if self.reference is not None and w[0] in self.reference]
+        self._run("plan", with_reference, self.other, self.reference, self.other_evaluator)
+        self._run_scripts([one for one in seen if one.which in left])
+        left = self._unmended(left, "skill", "gripper", "actuation", "policy")
         left = [one for one in left if one in same or not self._mends("plan", one)]
-        self._run("time", "twice the time", left, self.actor, self.plans, self.evaluator, 2)
+        self._run("time", left, self.actor, self.plans, self.evaluator, 2)
         left = self._unmended(left, "time")
-        if can_answer:
-            pair = [one for one in left if one in wrong]
-            self._run("query + skill", "true answers and scripts", pair, self._scripted(true, self.plans), self.plans)
-            both, other = [one for one in pair if one in with_reference], with_true_answers(self.other)
-            self._run("query + plan", "true answers and the reference plan", both, other, self.reference)
-        left = [one for one in self._unmended(left, "query + skill", "query + plan") if one in with_reference]
+        pair = [one for one in left if one in wrong]
+        with_reference = [one for one in left if one in with_reference]
+        self._run("query + skill", pair, self._scripted(true, self.plans), self.plans)
+        both, other = [one for one in pair if one in with_reference], with_true_answers(self.other)
+        self._run("query + plan", both, other, self.reference)
+        left = self._unmended(with_reference, "query + skill", "query + plan")
         other = self._scripted(self.other, self.reference)
-        what = "the reference plan and scripts"
-        self._run("plan + skill", what, left, other, self.reference, self.other_evaluator)
+        self._run("plan + skill", left, other, self.reference, self.other_evaluator)
+
+    def _is_sensor(self) -> bool:
+        """Whether what stands between environment and policy changes the state that it is shown."""
+        return isinstance(self.evaluator, Transform) and "observation" in self.evaluator.out_keys
 
     def _mends(self, name: str, which: EpisodeId) -> bool:
         return self.found.get(name, {}).get(which) is not None
@@ -210,39 +138,71 @@ class Counterfactuals:
     def _unmended(self, which: Iterable[EpisodeId], *names: str) -> list[EpisodeId]:
         return [one for one in which if not any(self._mends(name, one) for name in names)]
 
-    def _run(self, name: str, what: str, which: Sequence[EpisodeId], actor: Any, plans: Any, *options: Any) -> None:
+    def _run(self, name: str, which: Sequence[EpisodeId], actor: Any, plans: Any, *options: Any) -> None:
         if which and actor is not None and plans is not None:
-            self.found.setdefault(name, {}).update(self.repeat(what, which, actor, plans, *options))
+            single = REPLACEMENTS.get(name)
+            what = " and ".join(PAIR_WORDS[one] for one in name.split(" + ")) if single is None else single.words
+            again = self.repeat(what, which, actor, plans, *options)
+            kept = {one: None if episode.first_success is None else episode for one, episode in again.items()}
+            self.found.setdefault(name, {}).update(kept)
 
-    def _scripted(self, actor: Any, plans: Plans | None, steps: Mapping[EpisodeId, int] | None = None) -> Any:
+    def _scripted(self, actor: Any, plans: Plans | None, **where: Any) -> Any:
         if actor is None or plans is None:
             return None
         scripts = self.scripts if plans is self.plans else Scripts(plans, self.scripts.table)
-        return WithScripts(actor, plans, scripts, steps)
+        return WithScripts(actor, plans, scripts, **where)
 
-    def _run_skills(self, seen: Sequence[EpisodeStates]) -> None:
-        """Scripts in one step, for the likeliest steps in turn, then in all of them."""
-        ranked = {}
+    def _run_scripts(self, seen: Sequence[EpisodeStates]) -> None:
+        """Scripts in one step, for the likeliest steps in turn; for the gripper or the motion alone; for all."""
+        ranked, one_step = {}, set[EpisodeId]()
         for one in seen:
-            unlike = unlike_scripts(self.actor, one, self.scripts)
+            gaps = script_gaps(self.actor, one, self.scripts)
+            unlike = None if gaps is None else unlike_scripts(gaps)
+            if gaps is not None:
+                self.gaps[one.which] = gaps
             if unlike is None or unlike.any():
                 ranked[one.which] = candidates(one, unlike)
-        for turn in range(_TRIED_STEPS):
+            if gaps is not None and unlike is not None and len(one.in_force[unlike].unique()) == 1:
+                motion = gaps[:, torch.arange(gaps.shape[-1]) != self.plans.layout.gripper]
+                one_step |= {one.which} if unlike_scripts(motion).any() else set()  # elsewhere it does what scripts do
+        told_of_steps = plans_of(self.actor) is not None
+        for turn in range(_TRIED_STEPS if told_of_steps else 0):
             which = self._unmended([w for w, steps in ranked.items() if len(steps) > turn], "skill")
             steps = {one: ranked[one][turn] for one in which}
-            what = f"scripts in a step ({turn + 1} of up to {_TRIED_STEPS})"
-            scripted = self._scripted(self.actor, self.plans, steps)
-            self._run("skill", what, which, scripted, self.plans, self.evaluator)
+            self._run("skill", which, self._scripted(self.actor, self.plans, steps=steps), self.plans, self.evaluator)
             self.step.update({one: steps[one] for one in which if self._mends("skill", one)})
-        which = self._unmended([w for w in ranked if len(self.plans[w[0]].steps) > 1], "skill")
-        scripted = self._scripted(self.actor, self.plans)
-        self._run("skills", "scripts in all steps", which, scripted, self.plans, self.evaluator)
+        left = [one for one in ranked if not (one in one_step and self._mends("skill", one))]
+        for name, part in (("gripper", "gripper"), ("actuation", "displacement")):
+            if self.plans.layout.gripper is not None:
+                scripted = self._scripted(self.actor, self.plans, part=part)
+                self._run(name, left, scripted, self.plans, self.evaluator)
+        parts = self._unmended(left, "skill", "gripper", "actuation")
+        left = [one for one in ranked if one in parts or self._mends("plan", one)]  # can scripts follow this plan?
+        self._run("policy", left, self._scripted(self.actor, self.plans), self.plans, self.evaluator)
 
-    def mended(self, name: str, which: EpisodeId, what: str) -> MendedEpisode | None:
-        """The episode as it goes with this counterfactual, under the plan that it carries out."""
-        episode = self.found[name].get(which)
-        plans = self.reference if "plan" in name.split(" + ") and self.reference is not None else self.plans
-        return None if episode is None else MendedEpisode(what, plans[which[0]], episode.steps)
+    def mending(self, one: EpisodeStates) -> list[str]:
+        """What mends an episode. A script in one step does not count where scripts for a part of the action in all
+        steps mend too, and the policy is as wrong in another step, or only its gripper is."""
+        found = [name for name, results in self.found.items() if results.get(one.which) is not None]
+        gaps, step, layout = self.gaps.get(one.which), self.step.get(one.which), self.plans.layout
+        if gaps is None or step is None or layout.gripper is None:
+            return found
+        fingers = torch.arange(gaps.shape[-1]) == layout.gripper
+        parts = {"gripper": gaps[:, fingers], "actuation": gaps[:, ~fingers]}
+        fingers_alone = "gripper" in found and often_far(parts["gripper"], one, [step])
+        fingers_alone = fingers_alone and not often_far(parts["actuation"], one, [step])
+        others = [other for other in range(one.truth.shape[1]) if other != step]
+        if fingers_alone or any(often_far(of, one, others) for name, of in parts.items() if name in found):
+            found.remove("skill")
+        return found
+
+    def mended(self, decision: Decision, which: EpisodeId) -> MendedEpisode | None:
+        """The episode as it goes with what counts replaced, under the plan that is then carried out."""
+        episode = None if decision.by is None else self.found[decision.by].get(which)
+        if episode is None or decision.by is None:
+            return None
+        plans = self.reference if "plan" in decision.by.split(" + ") and self.reference is not None else self.plans
+        return MendedEpisode(decision.words, plans[which[0]], episode.steps)
 
     def shares(self) -> dict[str, dict[str, float]]:
         """Task to the share of its failed episodes that each mends, of those it was tried in."""

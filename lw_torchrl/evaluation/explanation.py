@@ -1,7 +1,7 @@
 """What the states of a failed episode tell: which answers were wrong, where the plan departs from a reference, which
 step it ended in."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -26,6 +26,7 @@ _AHEAD, _STILL = 10, 0.01  # a hand that within so many states comes less than a
 _AWAY = 25  # states that a stay in a step may be left for: two steps that alternate are one stay
 _WRONG = 0.01  # the share of states with wrong answers from which they count
 _OTHER = 0.3  # how far two actions differ, on some axis, that are not meant to do the same
+_OFTEN, _BRIEF = 0.4, 5  # the share of a step's states from which something is usual; states that are too few to say
 _SAME = 0.02  # how far an action may be from the script's and still be the script's
 _REST = ScriptedSkill("", GRIPPER, gain=(0.0, 0.0, 0.0))  # in the place of a text that is no scripted skill
 _RULER = 1e-3  # action per metre, so small that no distance is cut off
@@ -239,9 +240,10 @@ def _departs(
     return torch.where(scripted, differ, ~same_text), ours, theirs
 
 
-def unlike_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> Tensor | None:
-    """(T,) bool, the states in which the policy does something else than the scripted skills of the steps it is in;
-    None where it cannot be asked, since it draws its actions or reads what was not recorded."""
+def script_gaps(actor: Any, seen: EpisodeStates, scripts: Scripts) -> Tensor | None:
+    """(T, A) float32, how far the policy's actions are from those of the scripted skills of the steps that it is in, 0
+    where it is in none, infinite where its step has no script; None where it cannot be asked, since it draws its
+    actions or reads what was not recorded."""
     keys = [key for key in getattr(actor, "in_keys", ()) if key != "qaf"]
     if getattr(actor, "draws", True) or any(seen.steps.get(key, None) is None for key in keys):
         return None
@@ -253,4 +255,17 @@ def unlike_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> Tensor 
     program = scripts.program(seen.steps.get("observation"), seen.steps.get("task_id"))[:, : seen.weights.shape[1]]
     wanted = (seen.weights.unsqueeze(-1) * program).sum(-2)
     unscripted = ~torch.tensor(scripts.known[seen.task])[seen.in_force]
-    return (seen.in_force >= 0) & (((action - wanted).abs().amax(-1) > _SAME) | unscripted)
+    gaps = (action - wanted).abs().masked_fill(unscripted.unsqueeze(-1), torch.inf)
+    return gaps.masked_fill((seen.in_force < 0).unsqueeze(-1), 0.0)
+
+
+def unlike_scripts(gaps: Tensor) -> Tensor:
+    """(T,) bool, where actions are not those of scripts."""
+    return gaps.amax(-1) > _SAME
+
+
+def often_far(gaps: Tensor, seen: EpisodeStates, steps: Sequence[int]) -> bool:
+    """Whether the actions are far from the scripts' in one of these steps of the plan, in a good part of its states."""
+    far = gaps.amax(-1) > _OTHER
+    stays = [seen.in_force == step for step in steps]
+    return any(bool(far[inside].float().mean() > _OFTEN) for inside in stays if inside.sum() >= _BRIEF)

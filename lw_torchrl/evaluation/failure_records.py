@@ -37,12 +37,18 @@ def read_records(argument: str, stated: Any, record: Any, faults: Callable[[Any]
     return tuple(found)
 
 
-Cause = Literal["query", "plan", "skill", "out of time", "undecided"]
+Told = Literal["not reproducible", "perception", "query", "plan", "skill", "gripper", "actuation", "policy"]
+Cause = Literal[Told, "out of time", "undecided"]
 
 CAUSES: dict[str, str] = {
+    "not reproducible": "run again with nothing replaced, it succeeds",
+    "perception": "the policy was shown another state than the true one",
     "query": "a condition was answered wrongly",
     "plan": "the plan led astray",
     "skill": "a skill was clumsy",
+    "gripper": "the gripper opened or closed wrongly",
+    "actuation": "the hand moved wrongly, not in one step alone",
+    "policy": "the policy, not told which part of it",
     "out of time": "it was on its way",
     "undecided": "nothing that was tried tells",
 }
@@ -78,8 +84,10 @@ class Failure:
         at: the step of the episode to look at first, counted from 0.
         why: a sentence or two for people, with the numbers.
         evidence: name to number, what ``why`` rests on.
-        counterfactuals: what was replaced, "query", "plan", "skill", "time", or two as "query + plan", and whether
-            the same episode then succeeded; empty where none was tried.
+        counterfactuals: what was replaced, and whether the same episode then succeeded; empty where none was tried.
+            "perception", the observations; "query", the answers; "plan"; "skill", what one
+            step of the plan does; "gripper" and "actuation", one part of the action in all steps; "policy", the whole
+            action in all steps; "time"; or two as "query + plan", where "skill" is in all steps.
         mended: the same episode with the cause replaced, where it then succeeds; it is not saved.
     """
 
@@ -101,7 +109,7 @@ class Failure:
         return {name: dict(value) if isinstance(value, Mapping) else value for name, value in found.items()}
 
 
-PARTS = ("query", "plan", "skill", "time")
+PARTS = ("perception", "query", "plan", "skill", "gripper", "actuation", "policy", "time")
 
 
 def count_causes(tasks: Sequence[str], failures: Sequence[Failure]) -> dict[str, dict[str, int]]:
@@ -113,15 +121,16 @@ def count_causes(tasks: Sequence[str], failures: Sequence[Failure]) -> dict[str,
 
 
 def failure_table(tasks: Sequence[str], episodes_per_task: int, failures: Sequence[Failure]) -> str:
-    """Why episodes failed: a row for each task, a column for each cause."""
+    """Why episodes failed: a row for each task, a column for each cause that there is."""
+    there = [cause for cause in CAUSES if any(failure.cause == cause for failure in failures)]
     width = max(len("task"), len("all"), *map(len, tasks))
-    lines = [f"{'task':{width}}  {'failed':>10}  " + "  ".join(f"{cause:>5}" for cause in CAUSES)]
+    lines = [f"{'task':{width}}  {'failed':>10}  " + "  ".join(f"{cause:>5}" for cause in there)]
     counts = count_causes(tasks, failures)
     if len(tasks) > 1:
-        counts["all"] = {cause: sum(row[cause] for row in counts.values()) for cause in CAUSES}
+        counts["all"] = {cause: sum(row[cause] for row in counts.values()) for cause in there}
     for task, row in counts.items():
         trials = episodes_per_task * (len(tasks) if task == "all" and len(tasks) > 1 else 1)
-        cells = "  ".join(f"{number:>{max(5, len(cause))}}" for cause, number in row.items())
+        cells = "  ".join(f"{number:>{max(5, len(cause))}}" for cause, number in row.items() if cause in there)
         lines.append(f"{task:{width}}  {f'{sum(row.values())} of {trials}':>10}  {cells}")
     return "\n".join(lines)
 

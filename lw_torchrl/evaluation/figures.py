@@ -23,7 +23,11 @@ _FORMATS = (".png", ".svg", ".pdf", ".jpg", ".jpeg")
 Rates = Mapping[str, float | Sequence[float]]
 COLORS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d755d", "#e45756")
 _DASHES = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)), (0, (3, 3)))
-_CAUSE_COLORS = dict(zip(CAUSES, ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#bab0ac"), strict=True))
+_CAUSE_COLORS: dict[str, str] = {
+    **{"query": "#4c78a8", "plan": "#f58518", "skill": "#54a24b", "out of time": "#b279a2", "undecided": "#bab0ac"},
+    **{"not reproducible": "#d5cec9", "perception": "#72b7b2", "gripper": "#eeca3b", "actuation": "#9d755d"},
+    **{"policy": "#e45756"},
+}
 Curve = Sequence[tuple[float, float]]  # points: steps of the environment, success rate in [0, 1]
 
 
@@ -117,6 +121,8 @@ def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, titl
     left = np.zeros(len(tasks))
     for cause, meaning in CAUSES.items():
         numbers = [counts[task][cause] for task in tasks]
+        if not any(numbers):
+            continue
         label = f"{cause}: {meaning} ({sum(numbers)})"
         bars = axes.barh(tasks, numbers, left=left, color=_CAUSE_COLORS[cause], label=label, height=0.7)
         axes.bar_label(bars, [str(n) if n else "" for n in numbers], label_type="center", color="white", fontsize=8)
@@ -128,7 +134,8 @@ def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, titl
     episodes = counted(trials * len(counts), "episode")
     axes.set_title(f"{title}\n{len(failures)} of {episodes} failed".strip())
     trim(axes)
-    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    if failures:
+        figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=9)
     return saved(figure, path)
 
 

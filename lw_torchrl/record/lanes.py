@@ -3,7 +3,6 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -22,12 +21,12 @@ from lw_torchrl.record.conventions import (
     step_color,
     time_columns,
 )
-from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
+from lw_torchrl.record.recorded_episode import NOBODY, MendedRecording, RecordedEpisode
 
 NONE_HOLDS, EVENLY = "no condition holds", "evenly mixed"
 OPEN, CLOSED, NOTHING = "open", "closed", "nothing"
 FAILED: Color = (215, 75, 75)
-TOUCHED: tuple[Color, ...] = ((120, 150, 235), (200, 130, 255), (90, 200, 190))
+TOUCHES_CLOSED, TOUCHES_OPEN = (225, 130, 60), (150, 165, 220)
 
 
 @dataclass
@@ -56,7 +55,14 @@ class Lanes:
         stream.send_columns(path, times, rr.StateChange.columns(state=entries))
 
 
-def log_lanes(stream: Any, root: str, episode: RecordedEpisode, ended: str, touched: Sequence[str] | None) -> Lanes:
+def log_lanes(
+    stream: Any,
+    root: str,
+    episode: RecordedEpisode,
+    ended: str,
+    touched: Sequence[str] | None,
+    ghost: MendedRecording | None,
+) -> Lanes:
     """The lanes of an episode below ``root``; ``ended`` is its verdict, ``touched`` what its fingers touched."""
     lanes = Lanes(root)
 
@@ -67,11 +73,15 @@ def log_lanes(stream: Any, root: str, episode: RecordedEpisode, ended: str, touc
     found = [a.shape[1] for a in (episode.qaf, episode.believed, episode.skill_weights) if a is not None]
     columns = max([len(episode.steps), *found])
     width = len(str(columns))
-    if episode.success is not None:
-        color = TRUE if episode.first_success is not None else FAILED
-        lanes.send(stream, f"{0:0{width}} verdict", 0, [ended] * len(episode), {ended: color})
+    if episode.success is not None and episode.first_success is None:
+        lanes.send(stream, f"{0:0{width}} verdict", 1, [ended] * len(episode), {ended: FAILED})
+    elif episode.success is not None:
+        states = np.where(episode.success, "success", "not yet").tolist()
+        lanes.send(stream, f"{0:0{width}} verdict", 1, states, {"success": TRUE, "not yet": FALSE})
     if episode.in_force is not None:
-        send_steps(stream, lanes, f"{0:0{width}}b plan step", episode)
+        _send_steps(stream, lanes, f"{0:0{width}}b plan step", episode)
+    if ghost is not None and ghost.episode.in_force is not None:
+        _send_steps(stream, lanes, f"{0:0{width}}c ghost with {ghost.by}", ghost.episode, "ghost")
     for column in range(columns):
         number, told = f"{column + 1:0{width}}", episode.believed
         if episode.qaf is not None:
@@ -80,26 +90,26 @@ def log_lanes(stream: Any, root: str, episode: RecordedEpisode, ended: str, touc
             if told is not None and (told[:, column] != episode.qaf[:, column]).any():
                 truth(f"{number}b but the policy was told", told[:, column])
     opening = episode.observation[:, episode.layout.opening]
+    states = np.where(opening > STATES[OPEN][0].threshold, OPEN, CLOSED).tolist()
     looks = {OPEN: STEEL, CLOSED: GOLD}
-    lanes.send(stream, "gripper", 0, np.where(opening > STATES[OPEN][0].threshold, OPEN, CLOSED).tolist(), looks)
-    if touched is not None:
-        things = dict(zip(dict.fromkeys(one for one in touched if one != NOTHING), cycle(TOUCHED), strict=False))
-        lanes.send(stream, "gripper touches", 0, touched[: len(episode)], things | {NOTHING: FALSE})
-    if episode.success is not None:
-        states = np.where(episode.success, "success", "not yet").tolist()
-        lanes.send(stream, "success", 1, states, {"success": TRUE, "not yet": FALSE})
+    for row, thing in enumerate(touched[: len(episode)] if touched is not None else ()):
+        if thing != NOTHING:
+            states[row] += f", touches {thing}"
+            looks.setdefault(states[row], TOUCHES_CLOSED if states[row].startswith(CLOSED) else TOUCHES_OPEN)
+    lanes.send(stream, "gripper", 0, states, looks)
     return lanes
 
 
-def send_steps(stream: Any, lanes: Lanes, name: str, episode: RecordedEpisode) -> None:
-    """The step in force, numbered from 1."""
+def _send_steps(stream: Any, lanes: Lanes, name: str, episode: RecordedEpisode, kind: str = "") -> None:
+    """The step in force, numbered from 1; steps of another ``kind`` of plan have names of their own."""
     assert episode.in_force is not None
     count = max(len(episode.steps), int(episode.in_force.max()) + 1)
     named = [f"{i} {skill}" for i, (_, skill) in enumerate(episode.steps, 1)] or map(str, range(1, count + 1))
-    looks: dict[str, Any] = {str(i): (label, step_color(i)) for i, label in enumerate(named)}
+    looks: dict[str, Any] = {f"{kind}{i}": (label, step_color(i)) for i, label in enumerate(named)}
     answered = True if episode.answers is None else episode.answers.any(axis=1)
     nobody = np.where(np.broadcast_to(answered, len(episode)), EVENLY, NONE_HOLDS)
-    states = np.where(episode.in_force == NOBODY, nobody, episode.in_force.astype(str)).tolist()
+    steps = np.array([f"{kind}{step}" for step in episode.in_force])
+    states = np.where(episode.in_force == NOBODY, nobody, steps).tolist()
     lanes.send(stream, name, 0, states, looks | {NONE_HOLDS: FALSE, EVENLY: FALSE})
 
 

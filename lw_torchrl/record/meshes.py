@@ -18,10 +18,12 @@ SHOWN_GROUPS = (0, 1, 2)  # Meta-World keeps what only collides in group 4
 DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that was given none: the material's counts
 
 FINEST, COARSEST = 0.0015, 0.010
-CUBES_ALONG = 26.0
+CUBES_ALONG = 22.0
 """How many cubes the longest side of a mesh is cut into; the finest and the coarsest cube bound it, metres."""
 AROUND, ALONG = 24, 7
 """How many corners a round thing has around its axis, and a quarter of a circle along it."""
+
+GHOST = (150, 190, 255, 90)
 
 Vertices = dict[str, NDArray[Any]]
 _prepared: dict[str, ModelGeometry] = {}
@@ -49,7 +51,7 @@ class ModelGeometry:
     """
 
     bodies: dict[int, str]
-    meshes: tuple[tuple[int, str, Any], ...]
+    meshes: tuple[tuple[int, str, Vertices], ...]
 
 
 def model_geometry(model: RowModel) -> ModelGeometry:
@@ -60,13 +62,20 @@ def model_geometry(model: RowModel) -> ModelGeometry:
 
 
 def log_motion(
-    stream: Any, root: str, motion: Motion, known: dict[str, bytes], drawn: NDArray[np.int64] | None = None
+    stream: Any,
+    root: str,
+    motion: Motion,
+    known: dict[str, bytes],
+    drawn: NDArray[np.int64] | None = None,
+    *,
+    ghost: bool = False,
 ) -> dict[str, str]:
     """The poses of the bodies below ``root``, row t at step t; and their meshes below /meshes, once a recording.
 
     Args:
         known: the meshes that are in the recording, and the pose that each has of itself; new ones are added.
         drawn: the rows to draw, the first one among them; None for all.
+        ghost: draw translucent meshes, below /ghosts, and only of what moves.
 
     Returns:
         A mesh's entity to that of the body in whose frame a view is to show it; "" where it stands where it is.
@@ -76,14 +85,18 @@ def log_motion(
     drawn = np.arange(last + 1) if drawn is None else np.append(drawn[drawn < last], last)
     frames = {}
     for body, name, mesh in geometry.meshes:
-        path, own = entity_path("meshes", name), f"{root}{entity_path(geometry.bodies[body])}"
+        path = entity_path("ghosts" if ghost else "meshes", name)
+        own = f"{root}{entity_path(geometry.bodies[body])}"
         place, turn = motion.position[drawn, body], motion.quaternion[drawn, body][:, [1, 2, 3, 0]]
         moved = changes(np.concatenate([place, turn], axis=1))
         pose = b"" if len(moved) > 1 else place[0].tobytes() + turn[0].tobytes()
+        if ghost and pose:
+            continue
         still = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
         if path not in known:
             known[path] = pose
-            stream.log(path, mesh, *([still] if pose else []), static=True)
+            look: dict[str, Any] = {"albedo_factor": GHOST, "vertex_colors": None} if ghost else {}
+            stream.log(path, rr.Mesh3D(**(mesh | look)), *([still] if pose else []), static=True)
         # What stands where it stood in the first episode needs no frame, which costs a page two kilobytes.
         frames[path] = "" if pose and known[path] == pose else own
         if pose and frames[path]:
@@ -118,8 +131,7 @@ def _prepare(model: Any) -> ModelGeometry:
         if (mesh["vertex_colors"] == mesh["vertex_colors"][0]).all():
             color[:3] = mesh.pop("vertex_colors")[0, :3]
         digest = blake2s(b"".join(mesh[key].tobytes() for key in sorted(mesh)) + color.tobytes(), digest_size=4)
-        drawn = rr.Mesh3D(**mesh, albedo_factor=color)
-        meshes.append((body, f"{bodies[body]}-{digest.hexdigest()}", drawn))
+        meshes.append((body, f"{bodies[body]}-{digest.hexdigest()}", mesh | {"albedo_factor": color}))
     return ModelGeometry(bodies, tuple(meshes))
 
 

@@ -16,8 +16,10 @@ from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import Task
+from lw_torchrl.record.meshes import Motion
 from lw_torchrl.suites.suite import known_suite
 
+APART = 0.01  # metres between two episodes that have parted
 NOBODY = -1  # in the place of a step's number: no step is in force alone
 
 
@@ -175,6 +177,24 @@ class RecordedEpisode:
             layout=layout,
             reasons=tuple(getattr(step, "reason", "") for step in plan.steps) if plan is not None else (),
         )
+
+
+@dataclass(frozen=True)
+class MendedRecording:
+    """The same episode as it goes with a part replaced, ``by`` something: the ghost beside it."""
+
+    by: str
+    episode: RecordedEpisode
+    motion: Motion | None = None
+
+    def parts_at(self, other: RecordedEpisode) -> int:
+        """The first row in which the hand or a thing is elsewhere, by more than a centimetre; else the last of both."""
+        length = min(len(self.episode), len(other))
+        gap = np.zeros(length)
+        for place in other.layout.positions:
+            apart = self.episode.observation[:length, place] - other.observation[:length, place]
+            gap = np.maximum(gap, np.linalg.norm(apart, axis=1))
+        return int((gap > APART).argmax()) if (gap > APART).any() else length - 1
 
 
 def _array(value: Any, label: str, shape: tuple[int | None, ...]) -> NDArray[Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import io
 import math
 import os
 import threading
@@ -22,13 +23,16 @@ from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import check_choice, checked
 from lw_torchrl._files import AnyPath
+from lw_torchrl.evaluation.figures import plot_failures
+from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.record import metrics
 from lw_torchrl.record.conventions import CONTROL_PERIOD, METRIC_TIMELINE, entity_path, rr, time_columns
 from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.metrics import check_name
-from lw_torchrl.record.recorded_episode import PlanLike, RecordedEpisode
+from lw_torchrl.record.overview import OVERVIEW
+from lw_torchrl.record.recorded_episode import MendedRecording, PlanLike, RecordedEpisode
 from lw_torchrl.record.tabs import TABS, Layout, send_page
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.record.writer import RecordingWriter, check_address, check_path
@@ -315,12 +319,18 @@ class RerunLogger(Logger):
         return self.add_page(Heading(task), episode, name=name)
 
     def add_page(
-        self, heading: Heading, episode: RecordedEpisode, *, motion: Motion | None = None, name: str | None = None
+        self,
+        heading: Heading,
+        episode: RecordedEpisode,
+        *,
+        motion: Motion | None = None,
+        ghost: MendedRecording | None = None,
+        name: str | None = None,
     ) -> str:
         """Add the page of an episode that was checked; returns its name. With a motion the robot is shown as it is."""
         stream = self._open()
         with self._adding:  # else two threads find the same name free
-            taken, own = (*TABS, *self._layout.pages), heading.name
+            taken, own = (*TABS, OVERVIEW, *self._layout.pages), heading.name
             if name is None:
                 name = next(free for i in count(1) if (free := own if i == 1 else f"{own}-{i}") not in taken)
             elif not isinstance(name, str) or not name.strip():
@@ -329,9 +339,19 @@ class RerunLogger(Logger):
                 raise ValueError(f"name must be another than {', '.join(taken)}, got {name!r}")
             title = heading.title(episode, None if name == own else name)
             self._layout.add_page(
-                name, send_page(stream, len(self.episodes) + 1, name, title, heading, episode, motion, self._meshes)
+                name,
+                send_page(stream, len(self.episodes) + 1, name, title, heading, episode, motion, ghost, self._meshes),
             )
         return name
+
+    def show_causes(self, result: EvaluationResult) -> None:
+        """Put :func:`lw_torchrl.evaluation.plot_failures` of a result into the overview of several episodes."""
+        picture = io.BytesIO()
+        plot_failures(result).savefig(picture, format="png", dpi=100)
+        stream = self._open()
+        encoded = rr.EncodedImage(contents=picture.getvalue(), media_type="image/png")
+        stream.log(entity_path(OVERVIEW, "causes"), encoded, static=True)
+        self._layout.add_figure()
 
     def compare(self, names: Sequence[str], title: str = "Side by side") -> None:
         """Show episodes beside one another, in a tab before their own: one cursor moves in all of them.

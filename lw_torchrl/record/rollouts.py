@@ -20,7 +20,7 @@ from lw_torchrl._files import AnyPath, replacing
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import episode_seed
-from lw_torchrl.evaluation.failure_records import Failure
+from lw_torchrl.evaluation.failure_records import Failure, MendedEpisode
 from lw_torchrl.evaluation.protocol import actor_plans, tasks_of
 from lw_torchrl.evaluation.running import make_env, running
 from lw_torchrl.language.layout import METAWORLD
@@ -28,7 +28,7 @@ from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
 from lw_torchrl.record.meshes import Motion
-from lw_torchrl.record.recorded_episode import RecordedEpisode
+from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
 from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.suites.suite import Suite, known_suite, load_suite
@@ -103,8 +103,16 @@ def log_rollout(
         suite = load_suite(suite)
         tasks = [*tasks, *suite.tasks.values()]
     heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
-    motion = _motion(heading, episode, suite or known_suite(heading.task))
-    return logger.add_page(heading, episode, motion=motion, name=name)
+    suite = suite or known_suite(heading.task)
+    motion, ghost = _motion(heading, episode, suite), None
+    if failure is not None and failure.mended is not None:
+        by, plan, steps = failure.mended
+        for key in ("task_id", "episode"):
+            if (got := _single(steps, key, required=False)) != (own := _single(rollout, key, required=False)):
+                raise ValueError(f"failure.mended must be of the rollout's episode, {key} {own}, got {got}")
+        other, mended = read_rollout(steps, Plans([plan]), seed=seed, tasks=tasks)
+        ghost = MendedRecording(by, mended, None if motion is None else _motion(other, mended, suite))
+    return logger.add_page(heading, episode, motion=motion, ghost=ghost, name=name)
 
 
 def read_rollout(
@@ -135,6 +143,8 @@ def read_rollout(
             raise ValueError(f"rollout['qaf'] answers another plan of {label!r} than was given, as 'qaf_plan' tells")
     if not isinstance(failure, Failure | None):
         raise TypeError(f"failure must be a Failure, got {shown(failure)} ({type(failure).__name__})")
+    if failure is not None and not isinstance(failure.mended, MendedEpisode | None):
+        raise TypeError(f"failure.mended must be a MendedEpisode, got {shown(failure.mended)}")
     if failure is not None and (failure.task, failure.episode) != (label, failure.episode if index is None else index):
         got = f"{failure.task} {failure.episode}"
         raise ValueError(f"failure must be of the rollout's episode, {label} {index}, got that of {got}")

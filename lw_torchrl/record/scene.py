@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.record.conventions import GOLD, GREEN, STEEL, Color, changes, entity_path, rr, step_color, time_columns
-from lw_torchrl.record.meshes import Motion, log_motion
-from lw_torchrl.record.recorded_episode import RecordedEpisode
+from lw_torchrl.record.meshes import GHOST, Motion, log_motion
+from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
 
 OBJECT_COLORS: tuple[Color, ...] = ((80, 170, 255), (255, 120, 90), (200, 130, 255), (90, 220, 210))
 
@@ -34,6 +34,7 @@ def log_scene(
     motion: Motion | None,
     known: dict[str, bytes],
     drawn: NDArray[np.int64],
+    ghost: MendedRecording | None = None,
 ) -> tuple[list[str], dict[str, str]]:
     """Draw robot, objects, goal, the hand's path and the target pose under ``root``/scene.
 
@@ -56,8 +57,8 @@ def log_scene(
         stream.send_columns(f"{scene}/{path}", time_columns(rows), rr.Points3D.columns(positions=position[rows]))
 
     def lines(path: str, strips: NDArray[np.float32], radius: float, color: Color) -> None:
-        stream.log(f"{scene}/{path}", rr.LineStrips3D.from_fields(colors=[color], radii=[radius]), static=True)
-        stream.send_columns(f"{scene}/{path}", time_columns(drawn), rr.LineStrips3D.columns(strips=strips))
+        look = {"colors": [color] * len(drawn), "radii": [radius] * len(drawn)}
+        stream.send_columns(f"{scene}/{path}", time_columns(drawn), rr.LineStrips3D.columns(strips=strips, **look))
 
     goal = np.ascontiguousarray(episode.observation[:, episode.layout.positions[-1]])
     # Objects that stand for the goal, like "target location", have its colour, and their own label.
@@ -82,6 +83,11 @@ def log_scene(
     if goal.any() and not goals:
         point("goal", goal, "goal", 0.018, GREEN)
     _log_target(stream, scene, episode, drawn)
+    if ghost is not None:
+        way = ghost.episode.objects[GRIPPER]
+        stream.log(f"{scene}/ghost", rr.LineStrips3D([way], colors=[GHOST], radii=[0.002]), static=True)
+        if motion is not None and ghost.motion is not None:
+            frames |= log_motion(stream, f"{scene}/ghost", ghost.motion, known, drawn, ghost=True)
     return trails, frames
 
 
@@ -126,6 +132,6 @@ def _log_target(stream: Any, scene: str, episode: RecordedEpisode, drawn: NDArra
             colors[rows], shown[rows] = (*step_color(step), 255), True
     rows = drawn[changes(np.concatenate([start, end, colors, shown[:, None]], axis=1)[drawn])]
     start, end, colors, shown, times = start[rows], end[rows], colors[rows], shown[rows], time_columns(rows)
-    arrows = rr.Arrows3D.columns(origins=start[shown], vectors=(end - start)[shown], colors=colors[shown])
-    stream.log(f"{scene}/target", rr.Arrows3D.from_fields(radii=[0.004], labels=["target"]), static=True)
+    look = {"colors": colors[shown], "radii": [0.004] * int(shown.sum())}
+    arrows = rr.Arrows3D.columns(origins=start[shown], vectors=(end - start)[shown], **look)
     stream.send_columns(f"{scene}/target", times, arrows.partition(shown.astype(int)))

@@ -19,7 +19,8 @@ from lw_torchrl.record.conventions import (
 )
 from lw_torchrl.record.lanes import log_lanes
 from lw_torchrl.record.meshes import Motion
-from lw_torchrl.record.recorded_episode import RecordedEpisode
+from lw_torchrl.record.overview import OVERVIEW, table
+from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
 from lw_torchrl.record.scene import log_scene
 from lw_torchrl.record.verdict import (
     Heading,
@@ -37,14 +38,14 @@ Point = tuple[float, float, float]
 SIMPLE_EYE: tuple[Point, Point] = ((0.54, 0.23, 0.46), (0.03, 0.63, 0.10))
 ROBOT_EYE: tuple[Point, Point] = ((0.54, 0.18, 0.47), (-0.02, 0.62, 0.13))
 
-CURVES: dict[str, tuple[str, int, tuple[float, float] | None]] = {
-    "distance": ("Distance of what the skill moves from where it goes, cm", 3, None),
-    "action": ("Action", 4, (-1.2, 1.2)),
-    "reward": ("Reward", 2, None),
-    "skill_weights": ("Skill weights", 4, (-0.1, 1.1)),
-    "corrected": ("How much of the correction counts", 2, (-0.1, 1.1)),
+CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
+    "distance": ("Distance of what the skill moves from where it goes, cm", None),
+    "action": ("Action", (-1.2, 1.2)),
+    "reward": ("Reward", None),
+    "skill_weights": ("Skill weights", (-0.1, 1.1)),
+    "corrected": ("How much of the correction counts", (-0.1, 1.1)),
 }
-"""Each curve's title, its share of the height, and the range of its numbers where they have one."""
+"""Each curve's title, and the range of its numbers where they have one."""
 
 
 @dataclass(frozen=True)
@@ -63,17 +64,19 @@ class Page:
     states: dict[str, tuple[str, Color]]  # of the lanes: words and colour
     rows: int  # how many lanes
     good: bool
+    row: dict[str, Any] = field(default_factory=dict)  # in the overview
     frames: dict[str, str] = field(default_factory=dict)  # as log_motion gives them
 
     def tab(self) -> rrb.Horizontal:
         """Scene and curves on the left, words and timeline on the right."""
-        left: list[tuple[float, Any]] = [(13, self._scene())]
-        left += [(share, self._curve(name)) for name, (_, share, _) in CURVES.items() if name in self.curves]
-        # Shares are about as many pixels as a view needs; what is longer scrolls.
-        right: list[tuple[float, Any]] = [(115 if self.good else 215, self._words("verdict", "Verdict"))]
-        if self.steps:
-            right.append((70 + 58 * min(self.steps, 6), self._words("plan", "Plan")))
+        # Shares are the pixels that a view needs in a window of 1100×700; what is longer scrolls.
+        plan = 45 + 42 * self.steps if self.steps else 0
+        left: list[tuple[float, Any]] = [(max(200, 480 - plan), self._scene())]
+        left += [(plan, self._words("plan", "Plan"))] if plan else []
+        left.append((120, rrb.Tabs(*(self._curve(name) for name in CURVES if name in self.curves))))
+        right: list[tuple[float, Any]] = [(85 if self.good else 160, self._words("verdict", "Verdict"))]
         right += self._timeline()
+        right[0] = max(right[0][0], 600 - sum(share for share, _ in right[1:])), right[0][1]
         return rrb.Horizontal(_stacked(left), _stacked(right), column_shares=[6, 5], name=self.title)
 
     def column(self, shown: tuple[int, int]) -> rrb.Vertical:
@@ -112,10 +115,10 @@ class Page:
         view = rrb.StateTimelineView(
             origin=self.lanes, name="What went on", time_view=_window(self.shown), defaults=[styles]
         )
-        return [(50 + 40 * self.rows, view)]
+        return [(60 + 40 * self.rows, view)]
 
     def _curve(self, name: str) -> rrb.TimeSeriesView:
-        title, _, limits = CURVES[name]
+        title, limits = CURVES[name]
         return rrb.TimeSeriesView(
             origin=f"{self.root}/{name}",
             name=title,
@@ -136,6 +139,7 @@ def send_page(
     heading: Heading,
     episode: RecordedEpisode,
     motion: Motion | None,
+    ghost: MendedRecording | None,
     meshes: dict[str, bytes],
 ) -> Page:
     """Log the recording's ``number``-th episode, under ``name``; what its views, a tab called ``title``, are to show.
@@ -144,9 +148,11 @@ def send_page(
     """
     root = entity_path(name)
     touched = None if motion is None else motion.touched
-    lanes = log_lanes(stream, entity_path(f"e{number}"), episode, heading.ended(episode), touched)
-    trails, frames = log_scene(stream, root, episode, motion, meshes, drawn_steps(heading, episode))
-    stream.log(f"{root}/verdict", rr.TextDocument(verdict(heading, episode), media_type="text/markdown"), static=True)
+    lanes = log_lanes(stream, entity_path(f"e{number}"), episode, heading.ended(episode), touched, ghost)
+    trails, frames = log_scene(stream, root, episode, motion, meshes, drawn_steps(heading, episode, ghost), ghost)
+    stream.log(
+        f"{root}/verdict", rr.TextDocument(verdict(heading, episode, ghost), media_type="text/markdown"), static=True
+    )
     if episode.steps:
         log_plan(stream, root, episode)
     return Page(
@@ -154,14 +160,15 @@ def send_page(
         title,
         trails=trails,
         eye=SIMPLE_EYE if motion is None else ROBOT_EYE,
-        shown=telling_steps(heading, episode),
-        decisive=decisive_step(heading, episode),
+        shown=telling_steps(heading, episode, ghost),
+        decisive=decisive_step(heading, episode, ghost),
         curves=log_curves(stream, root, episode),
         steps=len(episode.steps),
         lanes=lanes.root,
         states=lanes.states,
         rows=lanes.count,
         good=episode.first_success is not None,
+        row=heading.row(episode, name),
         frames=frames,
     )
 
@@ -196,6 +203,7 @@ class Layout:
     def __init__(self) -> None:
         self.pages: dict[str, Page] = {}  # iterate over a copy: the writer's thread reads while pages come
         self._compared: list[tuple[str, list[str]]] = []
+        self.figure = False  # whether there is one of the causes
         self._views: dict[str, list[list[str]]] = {kind: [] for kind in TABS}
         self._entries: list[str] = []
         self._saved = self._shown = 0
@@ -209,6 +217,15 @@ class Layout:
         """Show episodes beside one another in a tab."""
         self._compared.append((title, list(names)))
         self._entries.append(json.dumps(["compare", title, list(names)]))
+
+    def _has_overview(self) -> bool:
+        """Whether there are several episodes, other than the two of one comparison."""
+        return len(self.pages) > 1 and len(self._compared) != 1
+
+    def add_figure(self) -> None:
+        """Show the figure of the causes in the overview."""
+        self.figure = True
+        self._entries.append(json.dumps(["figure", "", None]))
 
     def add_view(self, kind: str, *names: str) -> None:
         """Show what is logged under ``kind``/``names``, if it is not shown yet."""
@@ -229,6 +246,8 @@ class Layout:
                 layout.add_page(name, Page(**content))
             elif kind == "compare":
                 layout.compare(name, content)
+            elif kind == "figure":
+                layout.add_figure()
             else:
                 layout.add_view(name, *content)
         return layout if found else None
@@ -248,11 +267,20 @@ class Layout:
     def send(self, stream: Any, tab: str | None = None) -> None:
         """Have the viewer show the tabs, ``tab`` in front; an unknown one is a ValueError."""
         self._shown = len(self._entries)
+        if self._has_overview():
+            text = table(page.row for page in list(self.pages.values()))
+            document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+            stream.log(entity_path(OVERVIEW, "table"), document, static=True)
         stream.send_blueprint(self.blueprint(tab))
 
     def blueprint(self, tab: str | None = None) -> rrb.Blueprint:
         """The layout as rerun's; its time panel plays episodes at Meta-World's 80 steps a second."""
         tabs: list[Any] = []
+        if self._has_overview():
+            views: list[Any] = [rrb.TextDocumentView(origin=entity_path(OVERVIEW, "table"), name="Episodes")]
+            if self.figure:
+                views.append(rrb.Spatial2DView(origin=entity_path(OVERVIEW, "causes"), name="Causes"))
+            tabs.append(rrb.Horizontal(*views, name=OVERVIEW.title()))
         for title, names in self._compared:  # a column each
             pages = [self.pages[name] for name in names]
             shown = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
@@ -270,7 +298,10 @@ class Layout:
 
     def tabs(self) -> list[Tab]:
         """The tabs from left to right."""
-        tabs = [Tab(title, title, names) for title, names in self._compared]
+        failed = [name for name, page in list(self.pages.items()) if page.row.get("ended") == "failed"]
+        first = [*failed, *self.pages][:1]
+        tabs = [Tab(OVERVIEW, OVERVIEW.title(), first)] if self._has_overview() else []
+        tabs += [Tab(title, title, names) for title, names in self._compared]
         tabs += [Tab(name, page.title, [name]) for name, page in list(self.pages.items())]
         for kind in (kind for kind, views in self._views.items() if views):
             timeline = METRIC_TIMELINE if kind in OF_TRAINING else EPISODE_TIMELINE

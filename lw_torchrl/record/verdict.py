@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from lw_torchrl.evaluation.failure_records import CAUSES, Failure
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plan_text import one_line
-from lw_torchrl.record.conventions import CONTROL_PERIOD, FALSE, STEEL, Color, changes, rr, step_color, time_columns
-from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
+from lw_torchrl.record.conventions import CONTROL_PERIOD, FALSE, STEEL, Color, rr, step_color, time_columns
+from lw_torchrl.record.recorded_episode import NOBODY, MendedRecording, RecordedEpisode
 
 AFTER_SUCCESS, AROUND_FAILURE = 20, 60
 """How many steps after a first success are worth a look, and how many on both sides of where a failure is seen."""
+LONGEST = 200  # steps from where a ghost parts to where the failure is seen that are shown at once
 SELDOM = 8  # steps between two pictures of the scene where nothing is worth a look: a tenth of a second
 
 
@@ -48,6 +49,15 @@ class Heading:
             ended = f"failed: {self.failure.cause}"
         return " · ".join(filter(None, [name or self.task, *self.parts()[1:], ended]))
 
+    def row(self, episode: RecordedEpisode, name: str) -> dict[str, Any]:
+        """What an overview says of the episode that is called ``name``, with its own parts for filters."""
+        at = episode.first_success or len(episode)
+        ended = "" if episode.success is None else "failed" if episode.first_success is None else "success"
+        cause = self.failure.cause if self.failure is not None and ended == "failed" else None
+        title = " · ".join([name if name != self.name else self.task, *self.parts()[1:2]])
+        known = {"title": title, "task": self.task, "episode": self.episode, "policy": self.policy}
+        return known | {"ended": ended, "cause": cause, "at": at, "seconds": at * CONTROL_PERIOD}
+
     def ended(self, episode: RecordedEpisode) -> str:
         """How it ended, in a few words."""
         if episode.first_success is not None:
@@ -60,16 +70,34 @@ def at(step: int) -> str:
     return f"t = {step} ({step * CONTROL_PERIOD:.2f} s)"
 
 
-def decisive_step(heading: Heading, episode: RecordedEpisode) -> int:
-    """The step to look at first: the failure's, else the first success, else the last."""
+def decisive_step(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None) -> int:
+    """The step to look at first: the failure's, else the first success, else the last; one of :func:`telling_steps`."""
+    first, last = telling_steps(heading, episode, ghost)
+    if (
+        ghost is not None
+        and ghost.episode.first_success is not None
+        and not first <= _decisive(heading, episode) <= last
+    ):
+        return min(ghost.episode.first_success, last)
+    return _decisive(heading, episode)
+
+
+def _decisive(heading: Heading, episode: RecordedEpisode) -> int:
     if heading.failure is not None and episode.first_success is None:
         return min(heading.failure.at, len(episode))
     return len(episode) if episode.first_success is None else episode.first_success
 
 
-def telling_steps(heading: Heading, episode: RecordedEpisode) -> tuple[int, int]:
-    """The first and last step worth a look: up to a success, around where a failure is seen, or all."""
-    at, length = decisive_step(heading, episode), len(episode)
+def telling_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None) -> tuple[int, int]:
+    """The first and last step worth a look: up to a success, around where a failure is seen, or all.
+
+    With a ghost, from where the two part; if that is long before the failure is seen, until the ghost has succeeded.
+    """
+    at, length = _decisive(heading, episode), len(episode)
+    if ghost is not None:
+        first, seen = max(0, ghost.parts_at(episode) - AFTER_SUCCESS), min(at + AFTER_SUCCESS, length)
+        end = min((ghost.episode.first_success or len(ghost.episode)) + AFTER_SUCCESS, length)
+        return first, max(end, seen if seen - first <= LONGEST else 0, min(first + 2 * AROUND_FAILURE, length))
     if episode.first_success is not None:
         return 0, min(at + AFTER_SUCCESS, length)
     if heading.failure is None:
@@ -78,16 +106,16 @@ def telling_steps(heading: Heading, episode: RecordedEpisode) -> tuple[int, int]
     return first, min(first + 2 * AROUND_FAILURE, length)
 
 
-def drawn_steps(heading: Heading, episode: RecordedEpisode) -> NDArray[np.int64]:
+def drawn_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None) -> NDArray[np.int64]:
     """The steps at which the scene is drawn: each that is worth a look, every few of the others, and the last."""
-    first, last = telling_steps(heading, episode)
+    first, last = telling_steps(heading, episode, ghost)
     every = np.arange(len(episode))
     told = (every >= first) & (every <= last) | (every % SELDOM == 0)
     told[-1] = True
     return np.flatnonzero(told)
 
 
-def verdict(heading: Heading, episode: RecordedEpisode) -> str:
+def verdict(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None) -> str:
     """The verdict, in Markdown; without a :class:`Failure` a failed episode gets the plain facts."""
     length = len(episode)
     if episode.first_success is not None:
@@ -101,6 +129,10 @@ def verdict(heading: Heading, episode: RecordedEpisode) -> str:
         lines = [f"## FAILED in {length} steps ({length * CONTROL_PERIOD:.2f} s)", *_facts(episode)]
     else:
         lines = [f"## {length} steps"]
+    if ghost is not None:
+        end, parting = ghost.episode.first_success, ghost.parts_at(episode)
+        ended = "does not succeed" if end is None else f"succeeds at {at(end)}"
+        lines.insert(1, f"The blue ghost, with {ghost.by}, {ended}. They part at **{at(parting)}**.")
     return "\n\n".join([*lines, " · ".join(heading.parts())]) + "\n"
 
 
@@ -117,7 +149,7 @@ def _why(failure: Failure, episode: RecordedEpisode) -> list[str]:
     told = [f"replacing {' or '.join(mended)} made it a success"] if mended else []
     told += [f"replacing {' or '.join(useless)} did not help"] if useless else []
     if told:
-        lines.append("; ".join(told).capitalize() + ".")
+        lines[-1] += " " + "; ".join(told).capitalize() + "."
     return lines
 
 
@@ -165,16 +197,24 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> None:
     texts = []
     trust = [told for told in episode.reasons[:1] if told.startswith("plan trusted")]
     for row in changes.tolist():
-        parts = [f"*{told.split(';')[0]}*\n" for told in trust]
+        parts = [f"*{told.split(';')[0]}*" for told in trust]
+        if episode.in_force is not None and episode.in_force[row] == NOBODY:
+            answers = episode.answers
+            none = answers is None or not answers[row].any()
+            parts.append(f"**{'No condition holds' if none else 'No step stands out'}: all steps mixed**")
         for step, (condition, skill) in enumerate(episode.steps):
             truth = None if episode.qaf is None else bool(episode.qaf[row, step])
             line = f"{MARKS[truth]}  {step + 1}.  if {condition}"
             if episode.believed is not None and (believed := bool(episode.believed[row, step])) != truth:
                 line += f"  (evaluator: {MARKS[believed]})"
             leads = episode.in_force is not None and episode.in_force[row] == step
-            reason = f"\n*{one_line(episode.reasons[step])}*\n" if episode.reasons and episode.reasons[step] else ""
-            parts.append(f"**{line}**\n### → {skill}\n{reason}" if leads else f"{line}  \n\u2003\u2003{skill}\n")
-        texts.append("\n".join(parts))
+            reason = (
+                f"  \n\u2003*{one_line(episode.reasons[step])}*" if episode.reasons and episode.reasons[step] else ""
+            )
+            parts.append(
+                f"**{line}**  \n\u2003\u2003**→ {skill}**{reason}" if leads else f"{line}  \n\u2003\u2003{skill}"
+            )
+        texts.append("  \n".join(parts))
     documents = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
     stream.send_columns(f"{root}/plan", time_columns(changes), documents)
 
@@ -189,10 +229,8 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
         assert episode.in_force is not None
         colors = [FALSE if step == NOBODY else step_color(step) for step in episode.in_force.tolist()]
         stream.log(f"{root}/distance", rr.SeriesLines(names=["distance [cm]"]), static=True)
-        stream.send_columns(f"{root}/distance", time_columns(rows), rr.Scalars.columns(scalars=distance * 100))
-        new = changes(episode.in_force[:, None])
-        columns = rr.SeriesLines.columns(colors=[colors[row] for row in new])
-        stream.send_columns(f"{root}/distance", time_columns(new), columns)
+        columns = [*rr.Scalars.columns(scalars=distance * 100), *rr.SeriesLines.columns(colors=colors)]
+        stream.send_columns(f"{root}/distance", time_columns(rows), columns)
         sent.append("distance")
     # A sparse reward is the success, which has a row in the timeline.
     reward: Any = episode.reward

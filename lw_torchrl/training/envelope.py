@@ -19,9 +19,10 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import differences, shown
-from lw_torchrl._files import AnyPath
+from lw_torchrl._files import AnyPath, absent_policy
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, join, split, write_archive
 from lw_torchrl._versions import LIBRARIES, warn_of_other_versions
+from lw_torchrl.language.plans import PlanError
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.training.file_checks import check_integers, check_size, check_texts, copy_weights, first_line
 
@@ -72,7 +73,7 @@ class Envelope:
         """The archive of a file whose format, version and part have been checked."""
         begin = f"{self.argument}: {str(path)!r}"
         if not Path(path).exists():
-            raise FileNotFoundError(f"{self.argument}: no file {str(path)!r}; `lw-torchrl {self.command}` writes one")
+            raise FileNotFoundError(f"{self.argument}: {absent_policy(path, self.command)}")
         if Path(path).is_dir():
             raise ValueError(f"{begin} is a folder; {self.called} is one file")
         try:
@@ -130,7 +131,8 @@ class Envelope:
             raise
         except Exception as error:  # a file from a stranger may say anything
             what = f"{self.argument}: the {self.part} of {str(path)!r} cannot be made"
-            raise ValueError(f"{what} ({first_line(error)})") from error
+            own = "; a relation of yours must be imported first" if isinstance(error, PlanError) else ""
+            raise ValueError(f"{what} ({first_line(error)}){own}") from error
         return module.eval()
 
     def resume(

@@ -1,6 +1,7 @@
 """``lw-torchrl record``: any task under any policy, two of them side by side, and why it failed."""
 
 import pytest
+import torch
 from commands import fails, run
 from rerun.chunk import RrdReader
 
@@ -20,7 +21,7 @@ def test_an_expert_is_recorded_with_the_shipped_plan(capsys, tmp_path):
     assert "reach, episode 0, expert: success at step " in printed
     assert "reach, episode 2, expert: " in printed
     assert f"lw-torchrl view {out}" in printed
-    assert tabs(out) == ["reach-0", "reach-2"]
+    assert tabs(out) == ["overview", "reach-0", "reach-2"]
 
 
 @pytest.mark.parametrize("who", ["random", "wrong"])
@@ -47,9 +48,43 @@ def test_a_failure_is_explained(capsys, tmp_path):
     assert "push, episode 0, scripted: failed, out of time: " in printed
 
 
+MINE = """
+import lw_torchrl as lw
+policy = lw.ScriptedSkillActor(lw.load_plans("MT10"))
+number = 3
+class Unmade: ...
+"""
+
+
+def test_a_policy_of_your_own_in_python(capsys, tmp_path, monkeypatch):
+    (tmp_path / "my_policies.py").write_text(MINE)
+    monkeypatch.chdir(tmp_path)
+    printed = run(capsys, "record", "reach", "--policy", "my_policies:policy", *SHORT)
+    assert "reach, episode 0, policy: success at step " in printed
+    assert tabs(tmp_path / "runs" / "recordings" / "reach-policy.rrd") == ["reach-0"]
+    told = run(capsys, "evaluate", "my_policies:policy", "--tasks", "reach", "--episodes", 1, *SHORT, "--json")
+    assert '"success_once": 1.0' in told
+    for wrong, message in (("my_policies:number", "must name a policy"), ("my_policies:Unmade", "the class Unmade")):
+        assert message in fails(capsys, "record", "reach", "--policy", wrong)
+        assert message in fails(capsys, "evaluate", wrong)
+
+
+def test_conditions_answered_by_a_network(capsys, tmp_path):
+    file, out = tmp_path / "evaluator.zip", tmp_path / "x.rrd"
+    torch.manual_seed(0)
+    lw.training.save_evaluator(lw.StateQueryEvaluator(lw.load_plans("MT10"), width=8), file)
+    few = ("record", "reach", "--policy", "scripted", "--max-steps", 20, "--out", out)
+    assert "reach, episode 0, scripted: failed" in run(capsys, *few, "--evaluator", file)
+    assert "expert" in fails(capsys, "record", "reach", "--evaluator", file)
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
+        (("--policy", "my policies:x"), "must be like my_module:policy"),
+        (("--policy", "scripted", "--evaluator", "nowhere.zip"), "evaluator: no file 'nowhere.zip'"),
+        (("--policy", "random", "--evaluator", "x.zip"), "random asks no conditions"),
+        (("--suite", "metawold"), "did you mean 'metaworld'"),
         (("--policy", "experts"), "did you mean 'expert'"),
         (("--compare", "nowhere.zip"), "'nowhere.zip'"),
         (("--reference", "MT10"), "--reference is for --attribute"),

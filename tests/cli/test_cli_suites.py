@@ -77,6 +77,7 @@ def test_data_policies_and_recordings_of_another_suite(capsys, tmp_path):
     assert lw.load_actor(policy).tasks == tuple(load_suite("fetch").tasks)
     main(["record", "fetch/reach", "--policy", str(policy), "--max-steps", "3", "--out", str(recording)])
     main(["record", "fetch/reach", "--policy", "wrong", "--max-steps", "3", "--out", str(recording)])
+    main(["record", "reach", "--suite", "fetch", "--policy", str(policy), "--max-steps", "3", "--out", str(recording)])
     assert recording.stat().st_size > 10_000
 
 

@@ -13,8 +13,8 @@ from torch import nn
 import lw_torchrl as lw
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation import attribute_failures
-from lw_torchrl.evaluation.attribution import choose_cause, choose_cause_pair
 from lw_torchrl.evaluation.counterfactuals import own_evaluators, with_true_answers
+from lw_torchrl.evaluation.deciding import choose_pair, decide
 from lw_torchrl.evaluation.explanation import attended, chosen, last_stay_start, stall_step
 from lw_torchrl.record.rollouts import simulate_again
 from lw_torchrl.transforms.qaf import plan_program
@@ -171,8 +171,8 @@ def test_a_network_s_skills_are_replaced_and_its_mode_stays(wrapped):
     actor.get_submodule(next(name for name, _ in actor.named_modules() if name)).eval()
     modes = [module.training for module in actor.modules()]
     [failure] = evaluated(actor).failures
-    assert (failure.cause, failure.counterfactuals) == ("skill", {"skill": True})
-    assert failure.step is not None
+    found = {"skill": False, "gripper": False, "actuation": True}
+    assert (failure.cause, failure.counterfactuals) == ("actuation", found), "its hand rests in every step"
     assert [module.training for module in actor.modules()] == modes
 
 
@@ -218,21 +218,34 @@ def test_failures_hang_on_neither_environments_nor_order():
 # ---- what decides
 
 
-def test_the_smallest_replacement_decides_unless_another_mends_clearly_more():
-    same = dict.fromkeys(("query", "skill", "plan", "skills", "time"), 0.5)
-    assert choose_cause(["skills", "plan", "skill", "query"], same) == "query"
-    assert choose_cause(["skills", "plan", "time"], same) == "plan"
-    assert choose_cause(["skills", "plan"], {**same, "skills": 0.9}) == "skills"
-    assert choose_cause(["time"], same) == "time"
-    assert choose_cause([], same) is None
+def caused(mended, shares, null=0.0):
+    return decide(mended, shares, null).cause
+
+
+def test_what_mends_most_decides_and_of_those_as_good_the_smallest():
+    same = dict.fromkeys(("query", "skill", "plan", "policy", "time"), 0.5)
+    assert caused(["policy", "plan", "skill", "query"], same) == "query"
+    assert caused(["policy", "skill", "time"], same) == "skill"
+    assert caused(["policy", "plan", "skill"], {**same, "skill": 0.9}) == "skill"
+    assert caused(["policy"], same) == "policy"
+    assert caused(["time"], same) == "out of time"
+    assert caused([], same) == "undecided"
+
+
+def test_a_part_is_named_only_if_it_leads():
+    assert caused(["gripper"], {"gripper": 0.9}) == "gripper"
+    assert caused(["gripper", "actuation", "policy"], {"gripper": 0.9, "actuation": 0.8, "policy": 1.0}) == "policy"
+    assert caused(["gripper", "actuation"], {"gripper": 0.9, "actuation": 0.2}) == "gripper"
+    assert caused(["skill", "actuation", "policy"], dict.fromkeys(("skill", "actuation", "policy"), 1.0)) == "skill"
+    assert caused(["gripper"], {"gripper": 0.9}, null=0.7) == "policy", "as good as nothing replaced"
 
 
 def test_of_two_causes_the_certain_one_comes_first_or_the_one_that_mends_more():
-    assert choose_cause_pair(["query + skill"], {"skill": 0.9}) == ("query", "skill")
-    assert choose_cause_pair(["plan + skill"], {}) == ("plan", "skill")
-    assert choose_cause_pair(["plan + skill"], {"skills": 0.2}) == ("skill", "plan")
-    assert choose_cause_pair(["query + plan", "query + skill"], {"skill": 0.2}) == ("query", "skill")
-    assert choose_cause_pair(["query"], {}) is None
+    assert choose_pair(["query + skill"], {"skill": 0.9}) == ("query", "skill", "query + skill")
+    assert choose_pair(["plan + skill"], {}) == ("plan", "skill", "plan + skill")
+    assert choose_pair(["plan + skill"], {"policy": 0.2}) == ("skill", "plan", "plan + skill")
+    assert choose_pair(["query + plan", "query + skill"], {"skill": 0.2}) == ("query", "skill", "query + skill")
+    assert choose_pair(["query"], {}) is None
 
 
 def test_the_step_in_force():

@@ -14,7 +14,8 @@ from recordings import Recording, run
 
 import lw_torchrl as lw
 from lw_torchrl.envs.seeding import episode_seed
-from lw_torchrl.evaluation.failure_records import Failure
+from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
+from lw_torchrl.evaluation.failure_records import Failure, MendedEpisode
 from lw_torchrl.record.recording_file import opening_step
 from lw_torchrl.record.tabs import Layout
 from lw_torchrl.record.viewer import open_viewer
@@ -181,6 +182,70 @@ def test_a_failure_is_the_verdict(tmp_path, pushed):
     (store,) = found.reader.blueprints()
     layout = " ".join(str(chunk.to_record_batch()) for chunk in found.reader.stream(store=store))
     assert "push · episode 0 · seed 5 · mine · failed: skill" in layout
+
+
+def test_what_mends_a_failure_is_a_ghost_beside_it(tmp_path, pushed):
+    failed, mended = pushed.clone(), run("push", 60, plans=PLANS)[0]
+    failed["next", "success"][:] = False
+    mended["observation"][30:, 0] += 0.02  # what parts them
+    mended["next", "success"][40] = True
+    ghost = MendedEpisode("the reference plan", PLANS["push"], mended[:41].exclude("qaf_plan"))
+    why = failure_of(failed, mended=ghost)
+    _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS, failure=why)
+    verdict = found.text("/push-0/verdict")
+    assert "The blue ghost, with the reference plan, succeeds at t = 41 (0.51 s). They part at **t = 30" in verdict
+    steps = [f"ghost{step}" for step in mended[:41]["skill_weights"].argmax(-1).tolist()]
+    assert found.states("/e1/0c_ghost_with_the_reference_plan", 41) == steps
+    page = Layout.read(found.reader).pages["push-0"]
+    assert page.shown[0] == 10
+    assert page.states["ghost0"][0] == f"1 {PLANS['push'].steps[0].skill}"
+    with lw.RerunLogger(tmp_path / "b.rrd") as logger:
+        for wrong, error in (("the plan", TypeError), (ghost._replace(steps=run("reach", 5)[0]), ValueError)):
+            with pytest.raises(error, match=r"failure\.mended must be"):
+                lw.log_rollout(logger, failed, PLANS, failure=failure_of(failed, mended=wrong))
+
+
+def test_an_overview_lists_failures_first_and_counts_causes(tmp_path, pushed):
+    failed = pushed.clone()
+    failed["next", "success"][:] = False
+    won = failed.clone()
+    won["next", "success"][39] = True
+    result = EvaluationResult(
+        {"tasks": ["push"], "episodes_per_task": 1, "max_steps": 60, "seed": SEED},
+        (EpisodeResult("push", 0, False, None, None, None),),
+        failures=(failure_of(failed),),
+    )
+    with lw.RerunLogger(tmp_path / "a.rrd") as logger:
+        lw.log_rollout(logger, won, PLANS, policy="mine")
+        lw.log_rollout(logger, failed, PLANS, policy="mine", failure=failure_of(failed))
+        logger.show_causes(result)
+    found = Recording(tmp_path / "a.rrd")
+    title, _, _, _, *rows = found.text("/overview/table").splitlines()
+    assert title == "## 1 of 2 episodes failed · skill 1"
+    assert rows == [
+        "| ✗ | push-0-2 · episode 0 | mine | skill | 60 | 0.75 |",
+        "| ✓ | push · episode 0 | mine |  | 40 | 0.50 |",
+    ]
+    assert next(iter(found.shown_tabs())) == "Overview"
+    assert found.shown_tabs()["Overview"] == ["Episodes", "Causes"]
+    assert found.values("/overview/causes", "EncodedImage:media_type") == [["image/png"]]
+    assert opening_step(tmp_path / "a.rrd") == 33
+
+
+def test_a_ghost_of_the_robot_moves_what_moves(tmp_path, pushed):
+    failed = pushed.clone()
+    failed["next", "success"][:] = False
+    why = failure_of(failed, mended=MendedEpisode("scripts", PLANS["push"], pushed))
+    _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS, seed=SEED, failure=why)
+    frames = Layout.read(found.reader).pages["push-0"].frames
+    ghosts = {mesh: body for mesh, body in frames.items() if mesh.startswith("/ghosts/")}
+    assert {mesh.replace("ghosts", "meshes") for mesh in ghosts} == {mesh for mesh in frames if frames[mesh]} - set(
+        ghosts
+    )
+    for body in ghosts.values():
+        other = body.replace("/ghost/", "/bodies/")
+        for part in ("Transform3D:translation", "Transform3D:quaternion"):
+            np.testing.assert_array_equal(found.array(body, part), found.array(other, part))
 
 
 def test_without_a_failure_the_verdict_tells_facts(tmp_path, pushed):

@@ -37,8 +37,8 @@ def test_an_episode_survives_exactly(tmp_path):
     for i, row in enumerate(ROWS):
         expected = ["true" if held else "false" for held in rollout["qaf"][:, i]]
         assert found.states(row, 20) == expected
-    assert found.states("/e1/success", 20, first=1) == ["not yet"] * 10 + ["success"] * 10
-    lanes = {"0_verdict", "0b_plan_step", *(row[4:] for row in ROWS), "gripper", "success"}
+    assert found.states("/e1/0_verdict", 20, first=1) == ["not yet"] * 10 + ["success"] * 10
+    lanes = {"0_verdict", "0b_plan_step", *(row[4:] for row in ROWS), "gripper"}
     assert {entity[4:] for entity in found.entities() if entity.startswith("/e1/")} == lanes
     opening = ["open" if told > 0.75 else "closed" for told in rollout["observation"][:, 3].tolist()]
     assert found.states("/e1/gripper", 20) == opening
@@ -57,10 +57,10 @@ def test_the_plan_follows_the_cursor(tmp_path):
     assert steps == [t for t in range(20) if t == 0 or qaf[t] != qaf[t - 1]]
     (first, one), (second, two) = STEPS
     assert f"**✓  1.  if {first}**" in texts[0]
-    assert f"### → {one}" in texts[0]
-    assert f"\n✗  2.  if {second}  \n\u2003\u2003{two}\n" in texts[0]
+    assert f"**→ {one}**" in texts[0]
+    assert f"\n✗  2.  if {second}  \n\u2003\u2003{two}" in texts[0]
     assert f"✗  1.  if {first}" in texts[1]
-    assert f"### → {two}" in texts[1]
+    assert f"**→ {two}**" in texts[1]
 
 
 def test_the_step_in_force_has_a_timeline(tmp_path):

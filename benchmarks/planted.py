@@ -1,0 +1,226 @@
+"""Faults to plant in what acts: in a plan, in a skill, in the answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import Transform
+
+import lw_torchrl as lw
+from lw_torchrl.evaluation.explanation import attended
+from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.language.task_index import PlanTables
+from lw_torchrl.transforms.qaf import plan_program
+
+OFFSET = 0.1  # metres, along x
+Shown = Callable[[Tensor, Tensor], Tensor]
+Done = Callable[[TensorDictBase], Tensor]
+
+
+def denied(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
+    """The plan with the first clause of a step's condition denied."""
+    pairs = [(str(one.condition), one.skill) for one in plan.steps]
+    first, joint, rest = pairs[step][0].partition(" and ")
+    first = first.replace(" is not ", " is ") if " is not " in first else first.replace(" is ", " is not ", 1)
+    pairs[step] = (first + joint + rest, pairs[step][1])
+    return lw.ConditionalPlan.from_pairs(plan.definition, pairs)
+
+
+def without(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
+    """The plan without a step."""
+    kept = [(str(one.condition), one.skill) for k, one in enumerate(plan.steps) if k != step]
+    return lw.ConditionalPlan.from_pairs(plan.definition, kept)
+
+
+def swapped(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
+    """The plan with the skills of a step and the next one exchanged."""
+    pairs = [(str(one.condition), one.skill) for one in plan.steps]
+    other = (step + 1) % len(pairs)
+    pairs[step], pairs[other] = (pairs[step][0], pairs[other][1]), (pairs[other][0], pairs[step][1])
+    return lw.ConditionalPlan.from_pairs(plan.definition, pairs)
+
+
+def with_extra(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
+    """The plan with a step too many in front: where a step's condition holds, the skill of the one before it."""
+    pairs = [(str(one.condition), one.skill) for one in plan.steps]
+    extra = (pairs[step][0], pairs[step - 1][1])
+    return lw.ConditionalPlan.from_pairs(plan.definition, [extra, *pairs])
+
+
+def spoilt_skills(plans: lw.Plans, steps: Mapping[str, int]) -> Mapping[str, ScriptedSkill]:
+    """The scripted skills, those of a step of each task's plan with a wrong offset."""
+    table = dict(lw.load_skills())
+    for plan in plans.values():
+        skill = table[plan.steps[steps[plan.task]].skill].for_task(plan.task)
+        x, y, z = skill.offset
+        table[skill.text] = replace(skill, offset=(x + OFFSET, y, z), variants={})
+    return table
+
+
+class Liar(TensorDictModuleBase):
+    """An evaluator that takes one condition of each task's plan for its opposite, or for something that never holds.
+
+    Args:
+        plans: the plans.
+        steps: task to the condition's step; of a plan with fewer steps, counted on from its first.
+        never: answer no, instead of the opposite.
+    """
+
+    def __init__(self, plans: lw.Plans, steps: Mapping[str, int], never: bool = False) -> None:
+        super().__init__()
+        self.plans, self.steps, self.never = plans, dict(steps), never
+        self.in_keys, self.out_keys = ["qaf", "task_id"], ["qaf"]
+        self._tables = PlanTables(plans)
+        self._flipped = torch.zeros_like(self._tables.mask)
+        for row, task in enumerate(self._tables.index.tasks):
+            self._flipped[row, self.steps.get(task, 0) % len(plans[task].steps)] = True
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        flipped = self._flipped[self._tables.rows(tensordict.get("task_id"))]
+        answers = tensordict.get("qaf")
+        return tensordict.set("qaf", answers & ~flipped if self.never else answers ^ flipped)
+
+    def with_plans(self, plans: lw.Plans) -> Liar:
+        return Liar(plans, self.steps, self.never)
+
+
+class Altered(TensorDictModuleBase):
+    """A policy that is shown another observation, or whose action comes out as another.
+
+    Args:
+        actor: the policy.
+        shown: of the observation (B, 39) and the task_id (B,), what the policy sees in its place.
+        done: of what the policy wrote, the action (B, 4) in its action's place.
+    """
+
+    def __init__(self, actor: Any, shown: Shown | None = None, done: Done | None = None) -> None:
+        super().__init__()
+        self.actor, self.shown, self.done, self.plans = actor, shown, done, actor.plans
+        self.in_keys, self.out_keys, self.draws = actor.in_keys, actor.out_keys, False
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        asked, told = tensordict.copy(), tensordict.get("observation")
+        if self.shown is not None:
+            asked.set("observation", self.shown(told, tensordict.get("task_id")))
+        written = self.actor(asked).set("observation", told)
+        if self.done is not None:
+            written.set("action", self.done(written))
+        return tensordict.update(written.select(*self.out_keys))
+
+    def with_plans(self, plans: lw.Plans) -> Altered:
+        done = self.done.with_plans(plans) if isinstance(self.done, InStep) else self.done
+        return Altered(self.actor.with_plans(plans), self.shown, done)
+
+
+class InStep:
+    """Changes the action while the skill of one step of each plan is in force; of other plans wherever they name it.
+
+    Args:
+        plans: the plans.
+        skills: task to the text of the skill.
+        change: of the action (B, 4), another.
+    """
+
+    def __init__(self, plans: lw.Plans, skills: Mapping[str, str], change: Callable[[Tensor], Tensor]) -> None:
+        self.skills, self.change = dict(skills), change
+        self._tables = PlanTables(plans)
+        self._chosen = torch.zeros_like(self._tables.mask)
+        for row, task in enumerate(self._tables.index.tasks):
+            for number, one in enumerate(plans[task].steps):
+                self._chosen[row, number] = one.skill == self.skills.get(task)
+
+    def __call__(self, written: TensorDictBase) -> Tensor:
+        rows = self._tables.rows(written.get("task_id"))
+        step = attended(written.get("skill_weights"), self._tables.mask[rows])
+        chosen = (self._chosen[rows, step] & (step >= 0)).unsqueeze(-1)
+        return torch.where(chosen, self.change(written.get("action")), written.get("action"))
+
+    def with_plans(self, plans: lw.Plans) -> InStep:
+        return InStep(plans, self.skills, self.change)
+
+
+def scaled(*factors: float) -> Callable[[Any], Tensor]:
+    """The action times these, of an action or of what a policy wrote."""
+    return lambda given: (given if isinstance(given, Tensor) else given.get("action")) * torch.tensor(factors)
+
+
+def fingers(effort: float) -> Done:
+    """The gripper's effort in all steps."""
+
+    def done(written: TensorDictBase) -> Tensor:
+        action = written.get("action").clone()
+        action[:, 3] = effort
+        return action
+
+    return done
+
+
+def moved_thing(dx: float, dy: float) -> Shown:
+    """The first thing seen in another place."""
+
+    def shown(observation: Tensor, task_id: Tensor) -> Tensor:
+        return observation + _at({4: dx, 22: dx, 5: dy, 23: dy}, observation)
+
+    return shown
+
+
+def moved_goal(dx: float, dy: float) -> Shown:
+    """The target seen in another place."""
+    return lambda observation, task_id: observation + _at({36: dx, 37: dy}, observation)
+
+
+def late_view(steps: float) -> Shown:
+    """The hand and the things where they were so many steps ago, had they moved as in the last one."""
+
+    def shown(observation: Tensor, task_id: Tensor) -> Tensor:
+        seen = observation.clone()
+        for number in (slice(0, 3), slice(4, 7)):
+            past = observation[:, number.start + 18 : number.stop + 18]
+            seen[:, number] = observation[:, number] + steps * (past - observation[:, number])
+        return seen
+
+    return shown
+
+
+def _at(numbers: Mapping[int, float], like: Tensor) -> Tensor:
+    found = torch.zeros(like.shape[-1])
+    for number, value in numbers.items():
+        found[number] = value
+    return found
+
+
+class Sensor(Transform):
+    """A camera that stands wrong: policy and query answering function see everything but the hand moved aside."""
+
+    def __init__(self, plans: lw.Plans, aside: float) -> None:
+        super().__init__(in_keys=["observation", "task_id"], out_keys=["observation", "qaf"])
+        self.plans, self.aside, self.program = plans, aside, plan_program(plans)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        told = next_tensordict.get("observation")
+        seen = told + _at({4: self.aside, 22: self.aside, 36: self.aside}, told)
+        answers = self.program(seen, next_tensordict.get("task_id"))
+        return next_tensordict.set("observation", seen).set("qaf", answers)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def with_plans(self, plans: lw.Plans) -> Sensor:
+        return Sensor(plans, self.aside)
+
+
+class Jammed(Transform):
+    """A simulator that executes the action times these factors, which nobody tells."""
+
+    def __init__(self, *factors: float) -> None:
+        super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
+        self.factors = torch.tensor(factors)
+
+    def _inv_apply_transform(self, action: Tensor) -> Tensor:
+        return action * self.factors

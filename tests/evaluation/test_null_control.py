@@ -1,0 +1,112 @@
+"""attribute_failures blames nobody for what does not come again, and tells what was seen from what was done."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+import lw_torchrl as lw
+from benchmarks.planted import Altered, Jammed, Sensor, fingers, moved_thing, scaled
+from lw_torchrl.evaluation import attribute_failures
+from lw_torchrl.evaluation.repeating import difference
+
+TASK, SEED = "drawer-open", 7
+PLANS = lw.Plans({TASK: lw.load_plans("MT10")[TASK]})
+RUN = {"seed": SEED, "max_steps": 80, "num_threads": 1, "progress": False}
+RECORDED = ["observation", "task_id", "qaf", "skill_weights"]
+
+
+def scripted():
+    return lw.ScriptedSkillActor(PLANS)
+
+
+def ran(actor, **options):
+    """Its one episode, whatever became of it."""
+    seen = []
+    how = {"tasks": TASK, "episodes_per_task": 1, "also_record": RECORDED, "on_episode": seen.append}
+    lw.evaluate(actor, **how, stop_at_success=True, **{**RUN, **options})
+    return seen
+
+
+def test_an_episode_that_was_cut_lacks_nothing_but_its_end():
+    [one] = ran(scripted())
+    assert one.first_success is not None
+    assert one.first_success > 30
+    [failure] = attribute_failures([one._replace(steps=one.steps[:30])], PLANS, actor=scripted(), **RUN)
+    assert (failure.cause, failure.step, failure.counterfactuals) == ("not reproducible", None, {})
+    assert f"the length: it was given 30 steps and has {one.first_success}" in failure.why
+    assert failure.evidence["mended_by_nothing"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"evaluator": Jammed(1.0, 1.0, 0.1, 1.0)}, "the executed actions, from step 0 on"),
+        ({"noise_scale": 1.0}, "the executed actions, from step 0 on"),
+    ],
+)
+def test_another_environment_or_noise_is_nobody_s_fault(options, what):
+    [failure] = attribute_failures(ran(scripted(), **options), PLANS, actor=scripted(), **RUN)
+    assert failure.cause == "not reproducible"
+    assert what in failure.why
+    assert failure.mended is None
+
+
+def rollout(states, actions):
+    steps = torch.tensor(states)[:, None].expand(-1, 39)
+    return TensorDict(observation=steps, action=torch.tensor(actions)[:, None].expand(-1, 4), batch_size=[len(states)])
+
+
+def test_what_differs_between_two_runs():
+    one = rollout([0.0, 1.0, 2.0], [0.5, 0.5, 0.5])
+    assert difference(one, one) is None
+    assert difference(one[:2], one) == (1, "the length: it was given 2 steps and has 3")
+    at, what = difference(rollout([0.0, 1.0, 3.0], [0.5, 0.5, 0.5]), one)
+    assert (at, what) == (2, "the environment: from state 1 the same action leads to another state")
+    at, what = difference(rollout([0.0, 1.0, 3.0], [0.5, 0.2, 0.5]), one)
+    assert (at, what.startswith("the executed actions, from step 1 on, there by 0.3")) == (1, True)
+    at, what = difference(rollout([0.0, 3.0], [0.5, 0.5]).exclude("action"), one)
+    assert (at, "holds no actions" in what) == (1, True)
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_a_policy_that_is_shown_another_state_is_told(inside):
+    actor = Altered(scripted(), shown=moved_thing(0.1, 0.0)) if inside else scripted()
+    evaluator = None if inside else Sensor(PLANS, 0.1)
+    run = {**RUN, "evaluator": evaluator}
+    [failure] = attribute_failures(ran(actor, evaluator=evaluator), PLANS, actor=actor, **run)
+    assert (failure.cause, failure.counterfactuals) == ("perception", {"perception": True})
+    assert "policy was shown another observation than the true one: number " in failure.why
+    assert "was off by up to 0.1" in failure.why
+    assert failure.mended.by == "true observations"
+    assert not any(module._forward_pre_hooks for module in actor.modules()), "nothing stays on the policy"
+
+
+@pytest.mark.parametrize(
+    ("task", "done", "cause"),
+    [
+        ("push", fingers(-1.0), "gripper"),
+        pytest.param("drawer-open", scaled(-1.0, 1.0, 1.0, 1.0), "actuation", marks=pytest.mark.slow),
+        pytest.param("push", scaled(0.05, 0.05, 0.05, 0.0), "policy", marks=pytest.mark.slow),
+    ],
+)
+def test_the_part_of_the_action_that_is_wrong(task, done, cause):
+    plans = lw.Plans({task: lw.load_plans("MT10")[task]})
+    actor = Altered(lw.ScriptedSkillActor(plans), done=done)
+    result = lw.evaluate(actor, tasks=task, episodes_per_task=1, stop_at_success=True, attribute=True, **RUN)
+    [failure] = result.failures
+    assert failure.cause == cause
+    assert "it mends 100% of the task's failed episodes" in failure.why
+    assert "nothing replaced 0%" in failure.why
+
+
+def test_a_policy_without_plans_is_told_of_no_step():
+    torch.manual_seed(0)
+    actor = lw.DescriptorConditionedActor(TASK, condition="one-hot", width=8, depth=1)
+    result = lw.evaluate(
+        actor, tasks=TASK, plans=PLANS, episodes_per_task=1, stop_at_success=True, attribute=True, **RUN
+    )
+    [failure] = result.failures
+    assert failure.cause in ("actuation", "policy")
+    assert failure.step is None
+    assert "skill" not in failure.counterfactuals
+    assert "in force" not in failure.why
