@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, NamedTuple
 
 from lw_torchrl._checks import unknown_name
@@ -64,8 +64,8 @@ class Page:
     states: dict[str, tuple[str, Color]]  # of the lanes: words and colour
     rows: int  # how many lanes
     good: bool
-    row: dict[str, Any] = field(default_factory=dict)  # in the overview
-    frames: dict[str, str] = field(default_factory=dict)  # as log_motion gives them
+    row: dict[str, Any]  # in the overview
+    frames: dict[str, str]  # as log_motion gives them
 
     def tab(self) -> rrb.Horizontal:
         """Scene and curves on the left, words and timeline on the right."""
@@ -243,6 +243,8 @@ class Layout:
         layout = cls()
         for _, (kind, name, content) in sorted(found.items()):
             if kind == "page":
+                if {part.name for part in fields(Page)} != set(content):
+                    return None
                 layout.add_page(name, Page(**content))
             elif kind == "compare":
                 layout.compare(name, content)
@@ -264,16 +266,16 @@ class Layout:
         new = len(self._entries) - self._shown
         return bool(new) and (4 * new >= self._shown or seconds >= 5 * self._shown)
 
-    def send(self, stream: Any, tab: str | None = None) -> None:
-        """Have the viewer show the tabs, ``tab`` in front; an unknown one is a ValueError."""
+    def send(self, stream: Any, tab: str | None = None, *, alone: bool = False) -> None:
+        """Have the viewer show the tabs, ``tab`` in front or ``alone``; an unknown one is a ValueError."""
         self._shown = len(self._entries)
         if self._has_overview():
             text = table(page.row for page in list(self.pages.values()))
             document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
             stream.log(entity_path(OVERVIEW, "table"), document, static=True)
-        stream.send_blueprint(self.blueprint(tab))
+        stream.send_blueprint(self.blueprint(tab, alone=alone))
 
-    def blueprint(self, tab: str | None = None) -> rrb.Blueprint:
+    def blueprint(self, tab: str | None = None, *, alone: bool = False) -> rrb.Blueprint:
         """The layout as rerun's; its time panel plays episodes at Meta-World's 80 steps a second."""
         tabs: list[Any] = []
         if self._has_overview():
@@ -294,6 +296,8 @@ class Layout:
         closed = {"state": "collapsed"}
         time = {"timeline": self.tab(tab).timeline, "fps": 80.0, "play_state": "paused", "loop_mode": "all"}
         panels = rrb.BlueprintPanel(**closed), rrb.SelectionPanel(**closed), rrb.TimePanel(**closed, **time)
+        if alone and tabs:
+            return rrb.Blueprint(tabs[self._find(tab or self.front())], *panels, auto_views=False)
         return rrb.Blueprint(rrb.Tabs(*tabs, active_tab=front), *panels, auto_views=False)
 
     def tabs(self) -> list[Tab]:
@@ -321,6 +325,11 @@ class Layout:
         """The tab of a name, or the first one."""
         tabs = self.tabs()
         return tabs[self._find(name)] if tabs or name is not None else Tab("", "", [], METRIC_TIMELINE)
+
+    def front(self) -> str | None:
+        """The name of the tab that shows most: the first one, or that of the episode that an overview begins with."""
+        first = self.tab()
+        return first.episodes[0] if first.name == OVERVIEW else first.name or None
 
     def opening_step(self, tab: str | None = None) -> int | None:
         """The step to open a tab at, the earliest decisive one of its episodes; None for a tab of no episode."""
