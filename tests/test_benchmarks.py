@@ -14,7 +14,7 @@ import torch
 
 import lw_torchrl as lw
 from benchmarks import __main__ as cli
-from benchmarks import ablations, latents, truth
+from benchmarks import ablations, faults, latents, truth
 from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
 from lw_torchrl.language.task_index import PlanTables
@@ -210,3 +210,26 @@ def test_truth_refuses_a_policy_that_reads_no_answers(tmp_path):
     lw.save_actor(lw.DescriptorConditionedActor(["reach"], width=8), tmp_path / "dc.zip")
     with pytest.raises(SystemExit, match=r"dc\.zip does not read qaf"):
         truth.main(truth.Arguments(policy=(tmp_path / "dc.zip",), out=tmp_path))
+
+
+@pytest.mark.slow
+def test_planted_faults_are_counted_and_a_second_run_reads_the_first(tmp_path, monkeypatch, capsys):
+    args = faults.Arguments(
+        tasks=("drawer-open",), faults=("missing step",), policies=("scripted",), episodes=1, out=tmp_path
+    )
+    faults.main(args)
+    assert "inside, scripted: named right 3 of 3, 1.000" in capsys.readouterr().out
+    monkeypatch.setattr(faults, "failures_of", None)
+    faults.main(args)
+    assert "inside, scripted: named right 3 of 3, 1.000" in capsys.readouterr().out
+
+
+def test_outside_the_list_no_sound_part_is_right():
+    late = faults.FAULTS["view 15 steps late"]
+    assert [faults.is_right(late, {"cause": cause}) for cause in ("perception", "undecided", "skill")] == [
+        True,
+        True,
+        False,
+    ]
+    missing = faults.FAULTS["missing step"]
+    assert [faults.is_right(missing, {"cause": cause}) for cause in ("plan", "undecided")] == [True, False]

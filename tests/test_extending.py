@@ -193,6 +193,13 @@ def test_a_kind_that_is_not_there_is_named(plans, replay, tmp_path, monkeypatch)
         lw.load_actor(tmp_path / "policy.zip")
 
 
+def test_a_relation_that_is_not_there_is_told_of(plans, tmp_path, monkeypatch):
+    lw.save_actor(lw.PlanConditionedActor(plans, text_encoder=letters, width=8), tmp_path / "policy.zip")
+    monkeypatch.delitem(RELATIONS, "beside")
+    with pytest.raises(ValueError, match=r"'beside'.*; a relation of yours must be imported first"):
+        lw.load_actor(tmp_path / "policy.zip", text_encoder=letters)
+
+
 def test_an_own_task_travels_with_its_policy(plans, tmp_path):
     lw.save_actor(lw.PlanConditionedActor(plans, text_encoder=letters, width=8), tmp_path / "policy.zip")
     loaded = lw.load_actor(tmp_path / "policy.zip", text_encoder=letters)

@@ -31,6 +31,7 @@ SAYS = {
     "my_suite.py": ("ok   desk/hover", "trained to step 3"),
 }
 FASTER = {"--steps": 3, "--frames": 100, "--episodes": 1}
+MORE = {"train": ("--batch-size", "20"), "online": ("--episodes", "1")}
 
 
 def commands(path):
@@ -70,9 +71,7 @@ def test_the_commands_of_an_example_run(path, tables, tmp_path, monkeypatch, cap
         for option, least in FASTER.items():
             if option in words:
                 words[words.index(option) + 1] = str(least)
-        if words[0] == "train":
-            words += ["--batch-size", "20"]
-        main(words)
+        main([*words, *MORE.get(words[0], ())])
     said = capsys.readouterr()
     for part in SAYS[path.name]:
         assert part in said.out + said.err

@@ -422,3 +422,28 @@ def test_what_was_written_reads_back(tmp_path):
     value = {"a": [1, 2.5, -0.0, None, True, "ü\u2028"], "b": {"c": 10**400}}
     write_json(tmp_path / "a.json", value)
     assert read_json(tmp_path / "a.json", "it") == value == json.loads((tmp_path / "a.json").read_text("utf-8"))
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path):
+    out = tmp_path / "out"
+
+    def fail():
+        with _files.replacing_folder(out) as folder:
+            (folder / "half").write_text("half")
+            raise RuntimeError("on the way")
+
+    with pytest.raises(RuntimeError, match="on the way"):
+        fail()
+    assert [*tmp_path.iterdir()] == []
+    left = tmp_path / ".out.0123456789abcdef.tmp"  # of a process that was killed
+    (left / "inside").mkdir(parents=True)
+    with _files.replacing_folder(out) as folder, _files.replacing_folder(tmp_path / "other") as other:
+        assert not left.exists()
+        (folder / "inside").mkdir()
+        (folder / "inside" / "file").write_text("whole")
+        with _files.replacing_folder(out):  # of another thread, which leaves the first one alone
+            assert (folder / "inside" / "file").exists()
+        out.rmdir()
+        (other / "file").write_text("whole")
+    assert (out / "inside" / "file").read_text() == (tmp_path / "other" / "file").read_text() == "whole"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["other", "out"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -37,8 +38,8 @@ def kept() -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def built(kept, tmp_path_factory) -> tuple[set[str], set[str]]:
-    """The files in the source distribution and in the wheel of a clean clone."""
+def built(kept, tmp_path_factory) -> tuple[set[str], set[str], Path]:
+    """The files in the source distribution and in the wheel of a clean clone, and the wheel."""
     pytest.importorskip("setuptools", minversion="77")
     clone, dist = tmp_path_factory.mktemp("clone"), tmp_path_factory.mktemp("dist")
     for name in kept:
@@ -59,7 +60,7 @@ def built(kept, tmp_path_factory) -> tuple[set[str], set[str]]:
     with tarfile.open(sdist) as archive:
         sources = {member.name.split("/", 1)[1] for member in archive if member.isfile()}
     with zipfile.ZipFile(wheel) as archive:
-        return sources, set(archive.namelist())
+        return sources, set(archive.namelist()), wheel
 
 
 def test_the_source_distribution_is_the_repository(kept, built):
@@ -71,6 +72,27 @@ def test_the_wheel_is_the_package_with_its_data(kept, built):
     assert [name for name in package if name not in built[1]] == []
     assert "lw_torchrl/py.typed" in built[1]
     assert not [name for name in built[1] if name.split("/")[0] in ("tests", "benchmarks", "docs")]
+
+
+@pytest.mark.slow
+def test_the_wheel_works_outside_the_checkout(built, tmp_path):
+    place, elsewhere = tmp_path / "installed", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    with zipfile.ZipFile(built[2]) as archive:
+        archive.extractall(place)
+    environment = {**os.environ, "PYTHONPATH": str(place)}
+
+    def ran(*words: str) -> str:
+        done = subprocess.run(
+            [sys.executable, *words], cwd=elsewhere, env=environment, capture_output=True, text=True, timeout=400
+        )
+        assert done.returncode == 0, done.stderr[-2000:]
+        return done.stdout
+
+    assert ran("-c", "import lw_torchrl; print(lw_torchrl.__file__)").startswith(str(place))
+    told = json.loads(ran("-m", "lw_torchrl", "demo", "--quick", "--json"))
+    assert [row["task"] for row in told["tasks"]] == ["drawer-open", "window-open"]
+    assert (elsewhere / "runs" / "demo-quick" / "rollout.rrd").is_file()
 
 
 def test_every_dependency_has_a_tested_version():

@@ -1,4 +1,5 @@
-"""Docstrings speak of names as Sphinx does, ``:class:`Task```; here a name becomes a link where the site has it."""
+"""Docstrings speak of names as Sphinx does, ``:class:`Task```; here a name becomes a link where the site has it, an
+example a block of code, and "a, b: words" two entries."""
 
 from __future__ import annotations
 
@@ -9,13 +10,23 @@ from griffe import Extension, Object
 
 ROLE = re.compile(r":(?:class|func|meth|attr|data|mod):`(~?)([^`]+)`")
 
+SEVERAL = re.compile(r"^( +)(\w+(?:, \w+)*), (\w+):(?= )", re.MULTILINE)
+
 
 def linked(match: re.Match[str]) -> str:
     name = match[2].rpartition(".")[2] if match[1] else match[2]
     return f'<autoref identifier="{match[2]}" optional><code>{name}</code></autoref>'
 
 
+def one_by_one(match: re.Match[str]) -> str:
+    """ "a, b: words" is told of each name."""
+    indent, names, last = match.groups()
+    return "".join(f"{indent}{name}: see `{last}`.\n" for name in names.split(", ")) + f"{indent}{last}:"
+
+
 class Roles(Extension):
     def on_object(self, *, obj: Object, **kwargs: Any) -> None:
         if obj.docstring is not None:
-            obj.docstring.value = ROLE.sub(linked, obj.docstring.value).replace("``", "`")
+            text = ROLE.sub(linked, obj.docstring.value).replace("``", "`")
+            text = re.sub(r"^( *)Example:$", r"\1Examples:", text, flags=re.MULTILINE)
+            obj.docstring.value = SEVERAL.sub(one_by_one, text)

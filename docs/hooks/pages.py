@@ -28,7 +28,7 @@ def on_files(files: Files, config: Any) -> Files:
     """Adds the pages."""
     made = {page: (ROOT / name).read_text("utf-8") for name, page in PAGES.items()}
     made["tour.md"] = notebook(made["tour.md"])
-    examples = sorted((ROOT / "examples").glob("*.py"))
+    examples = sorted((ROOT / "examples").rglob("*.py"))
     made["examples.md"] = example_list(examples)
     texts = {f"docs/{file.src_uri}": file.content_string for file in files.documentation_pages()}
     texts |= {name: made[page] for name, page in PAGES.items()}
@@ -90,10 +90,9 @@ def example_list(paths: list[Path]) -> str:
     rows = ["# Examples", "", "Each is one page, and a test runs it.", "", "| file | shows |", "|---|---|"]
     for path in paths:
         about = (ast.get_docstring(ast.parse(path.read_text("utf-8"))) or "").split("\n\n")[0].replace("\n", " ")
-        rows.append(f"| [{path.name}](../examples/{path.name}) | {about} |")
-    return "\n".join(
-        ["# Examples", "", "Each is one page, and a test runs it.", "", "| file | shows |", "|---|---|", *rows]
-    )
+        name = path.relative_to(ROOT / "examples").as_posix()
+        rows.append(f"| [{name}](../examples/{name}) | {about} |")
+    return "\n".join(rows)
 
 
 def notebook(text: str) -> str:
@@ -108,5 +107,5 @@ def notebook(text: str) -> str:
                 picture = "".join(data["image/png"]).replace("\n", "")
                 parts.append(f'<img alt="what the cell draws" src="data:image/png;base64,{picture}">')
             elif printed := "".join(output.get("text", data.get("text/plain", ""))).rstrip():
-                parts.append(f"```text\n{printed}\n```")
+                parts.append(f"``` {{.text .wrap}}\n{printed}\n```")
     return "\n\n".join(parts) + "\n"

@@ -44,7 +44,7 @@ def commands() -> str:
     for name in names:
         line = [sys.executable, "-m", "lw_torchrl", *name, "--help"]
         told = subprocess.run(line, env=environment, capture_output=True, text=True, check=True).stdout
-        parts += [f"## {' '.join(name)}", "", "```text", told.strip(), "```", ""]
+        parts += [f"## {' '.join(name)}", "", "``` {.text .wrap}", told.strip(), "```", ""]
     return "\n".join(parts)
 
 

@@ -1,6 +1,6 @@
 """An online algorithm of your own: imitate all that was done, and what earned more, more.
 
-lw-torchrl online reach --methods reward-weighted --frames 2000 --seeds 0 --episodes 4 --import my_algorithm
+lw-torchrl online reach --start few-shot-mt50 --methods reward-weighted --frames 2000 --seeds 0 --import my_algorithm
 """
 
 from dataclasses import dataclass

@@ -145,9 +145,9 @@ def card(
     Example: lw-torchrl card few-shot-mt50
     Example: lw-torchrl card runs/mt10.zip --result runs/mt10/results.json --out README.md
     """
-    options.check_saved("policy", policy)
     if out is not None:
         options.check_file("--out", out)
+    options.check_saved("policy", policy)
     if result is not None and not result.is_file():
         raise FileNotFoundError(f"--result: no file {str(result)!r}; `lw-torchrl evaluate --out` writes results.json")
     measured = None if result is None else lw.EvaluationResult.load(result)

@@ -61,6 +61,7 @@ class CoLearningSampler(GroupSampler):
 
     Where a target by name is itself a base task, its base demonstrations are left out. A batch holds the target's rows,
     then those of the base tasks in the order of their ids, and one more column, ``is_target`` (B,) bool.
+
     Args:
         target: "grown"; a task's name, for all demonstrations of the task, or in a storage that joins datasets, those
             of the last one that has any; or one bool for each of ``replay.demonstrations.episodes``, in their order.

@@ -15,9 +15,9 @@ from lw_torchrl.evaluation.explanation import (
     EpisodeStates,
     Scripts,
     candidates,
+    often_far,
     script_gaps,
     unlike_scripts,
-    wrong_elsewhere,
 )
 from lw_torchrl.evaluation.failure_records import MendedEpisode
 from lw_torchrl.evaluation.repeating import EpisodeId, EpisodeRepeater, NullControl, Perception
@@ -154,7 +154,7 @@ class Counterfactuals:
 
     def _run_scripts(self, seen: Sequence[EpisodeStates]) -> None:
         """Scripts in one step, for the likeliest steps in turn; for the gripper or the motion alone; for all."""
-        ranked, one_step = {}, set()
+        ranked, one_step = {}, set[EpisodeId]()
         for one in seen:
             gaps = script_gaps(self.actor, one, self.scripts)
             unlike = None if gaps is None else unlike_scripts(gaps)
@@ -162,8 +162,9 @@ class Counterfactuals:
                 self.gaps[one.which] = gaps
             if unlike is None or unlike.any():
                 ranked[one.which] = candidates(one, unlike)
-            if unlike is not None and len(one.in_force[unlike].unique()) == 1:
-                one_step.add(one.which)  # in all others it does what scripts do
+            if gaps is not None and unlike is not None and len(one.in_force[unlike].unique()) == 1:
+                motion = gaps[:, torch.arange(gaps.shape[-1]) != self.plans.layout.gripper]
+                one_step |= {one.which} if unlike_scripts(motion).any() else set()  # elsewhere it does what scripts do
         told_of_steps = plans_of(self.actor) is not None
         for turn in range(_TRIED_STEPS if told_of_steps else 0):
             which = self._unmended([w for w, steps in ranked.items() if len(steps) > turn], "skill")
@@ -180,15 +181,18 @@ class Counterfactuals:
         self._run("policy", left, self._scripted(self.actor, self.plans), self.plans, self.evaluator)
 
     def mending(self, one: EpisodeStates) -> list[str]:
-        """What mends an episode. A script in one step does not count where the policy is as wrong in another one, and
-        scripts for a part of the action in all steps mend too."""
+        """What mends an episode. A script in one step does not count where scripts for a part of the action in all
+        steps mend too, and the policy is as wrong in another step, or only its gripper is."""
         found = [name for name, results in self.found.items() if results.get(one.which) is not None]
         gaps, step, layout = self.gaps.get(one.which), self.step.get(one.which), self.plans.layout
         if gaps is None or step is None or layout.gripper is None:
             return found
         fingers = torch.arange(gaps.shape[-1]) == layout.gripper
         parts = {"gripper": gaps[:, fingers], "actuation": gaps[:, ~fingers]}
-        if any(wrong_elsewhere(of, one, step) for name, of in parts.items() if name in found):
+        fingers_alone = "gripper" in found and often_far(parts["gripper"], one, [step])
+        fingers_alone = fingers_alone and not often_far(parts["actuation"], one, [step])
+        others = [other for other in range(one.truth.shape[1]) if other != step]
+        if fingers_alone or any(often_far(of, one, others) for name, of in parts.items() if name in found):
             found.remove("skill")
         return found
 

@@ -1,7 +1,7 @@
 """What the states of a failed episode tell: which answers were wrong, where the plan departs from a reference, which
 step it ended in."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -264,8 +264,8 @@ def unlike_scripts(gaps: Tensor) -> Tensor:
     return gaps.amax(-1) > _SAME
 
 
-def wrong_elsewhere(gaps: Tensor, seen: EpisodeStates, step: int) -> bool:
-    """Whether the actions are far from the scripts' in another step of the plan too, in a good part of its states."""
+def often_far(gaps: Tensor, seen: EpisodeStates, steps: Sequence[int]) -> bool:
+    """Whether the actions are far from the scripts' in one of these steps of the plan, in a good part of its states."""
     far = gaps.amax(-1) > _OTHER
-    others = [seen.in_force == other for other in range(seen.truth.shape[1]) if other != step]
-    return any(bool(far[inside].float().mean() > _OFTEN) for inside in others if inside.sum() >= _BRIEF)
+    stays = [seen.in_force == step for step in steps]
+    return any(bool(far[inside].float().mean() > _OFTEN) for inside in stays if inside.sum() >= _BRIEF)

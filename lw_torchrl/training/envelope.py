@@ -22,6 +22,7 @@ from lw_torchrl._checks import differences, shown
 from lw_torchrl._files import AnyPath
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, join, split, write_archive
 from lw_torchrl._versions import LIBRARIES, warn_of_other_versions
+from lw_torchrl.language.plans import PlanError
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.training.file_checks import check_integers, check_size, check_texts, copy_weights, first_line
 
@@ -130,7 +131,8 @@ class Envelope:
             raise
         except Exception as error:  # a file from a stranger may say anything
             what = f"{self.argument}: the {self.part} of {str(path)!r} cannot be made"
-            raise ValueError(f"{what} ({first_line(error)})") from error
+            own = "; a relation of yours must be imported first" if isinstance(error, PlanError) else ""
+            raise ValueError(f"{what} ({first_line(error)}){own}") from error
         return module.eval()
 
     def resume(

@@ -28,6 +28,7 @@ COMMANDS = (
     "train",
     "train-evaluator",
     "evaluate",
+    "card",
     "record",
     "view",
     "query",

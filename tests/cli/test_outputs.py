@@ -25,7 +25,12 @@ FOLDERS = {
     "plan compare": ["plans", "--out"],
     "plan repair": ["reach", "--model", "m", "--out"],
 }
-FILES = {"train": ["demos", "--out"], "record": ["reach", "--out"], "view": ["x.rrd", "--screenshot"]}
+FILES = {
+    "train": ["demos", "--out"],
+    "card": ["x.zip", "--out"],
+    "record": ["reach", "--out"],
+    "view": ["x.rrd", "--screenshot"],
+}
 
 
 @pytest.fixture(autouse=True)

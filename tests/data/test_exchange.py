@@ -57,7 +57,7 @@ def test_there_and_back_no_bit_changes(format):
         lambda each: st.lists(st.lists(st.integers(1, 12), min_size=each, max_size=each), min_size=1, max_size=3)
     )
 
-    @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    @settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.too_slow])
     @given(lengths=lengths, seed=st.integers(0, 99))
     def check(lengths, seed):
         with TemporaryDirectory() as folder:
@@ -300,3 +300,14 @@ def test_torchrl_shows_zeros_for_minari(made, monkeypatch, tmp_path):
     replay = MinariExperienceReplay("demos-v0", batch_size=4, **how)
     assert replay[:]["observation"].shape == (21, 39)
     assert not replay[:]["observation"].any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("format", FORMATS)
+def test_another_suites_dataset_comes_back_too(format, tmp_path):
+    skip_without(format)
+    pytest.importorskip("gymnasium_robotics")
+    how = {"episodes_per_task": 2, "max_steps": 12, "progress": False}
+    made = lw.collect_demonstrations(["fetch/push", "fetch/reach"], root=tmp_path / "demos", **how)
+    out = lw.export_dataset(made.root, format, tmp_path / "out")
+    assert tree(lw.import_dataset(out, tmp_path / "back").root) == tree(made.root)

@@ -35,8 +35,10 @@ def test_rows_are_those_of_the_buffer(replay):
     assert told == 8 * [lw.TASKS["drawer-open"].description] + 13 * [lw.TASKS["push"].description]
 
 
-def test_a_loader_shuffles_and_has_workers(replay):
-    loader = DataLoader(RowDataset(replay), batch_size=6, shuffle=True, num_workers=1, generator=torch.Generator())
+@pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_loader_shuffles_and_has_workers(replay, workers):
+    how = {"shuffle": True, "num_workers": workers, "generator": torch.Generator()}
+    loader = DataLoader(RowDataset(replay), batch_size=6, **how)
     found = torch.cat([batch["observation"] for batch in loader])
     assert sorted(found[:, 0].tolist()) == sorted(replay[:]["observation"][:, 0].tolist())
 

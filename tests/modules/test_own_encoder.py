@@ -1,0 +1,104 @@
+"""An encoder of the user's makes deterministic actors, stochastic ones and critics, and files hold them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import lw_torchrl as lw
+from lw_torchrl.language.text import TEXT_DIMENSION
+from lw_torchrl.modules import ENCODERS, ConditionedActor, DescriptorEncoder, PlanEncoder, QValue, make_policy
+from lw_torchrl.training.algorithms.learner import encoder_like
+
+FOLDER = Path(__file__).parent.parent.parent / "examples" / "extending"
+PLANS = lw.load_plans("MT10")
+
+
+@pytest.fixture
+def own(monkeypatch):
+    monkeypatch.syspath_prepend(str(FOLDER))
+    before = dict(ENCODERS.data)
+    import my_method
+
+    yield my_method.TaskVectors
+    ENCODERS.data = before
+    sys.modules.pop("my_method")
+
+
+def states():
+    torch.manual_seed(1)
+    return {"observation": torch.rand(4, 39), "task_id": torch.tensor([lw.task_id(task) for task in lw.MT10[:4]])}
+
+
+def saved(actor, path, **options):
+    lw.save_actor(actor, path)
+    return lw.load_actor(path, **options)
+
+
+@pytest.mark.parametrize("distribution", [None, "normal"])
+def test_it_is_kept_in_a_file(own, tmp_path, distribution):
+    actor = ConditionedActor(own(["push", "reach"], size=3, feature_noise=0.0), width=8, distribution=distribution)
+    again = saved(actor, tmp_path / "policy.zip")
+    assert (again.tasks, again.config, again.encoder.config) == (actor.tasks, actor.config, actor.encoder.config)
+    state = states() | {"task_id": torch.full((4,), lw.task_id("push"))}
+    assert torch.equal(actor(**state), again(**state)) if distribution is None else actor(**state)[0].shape == (4, 4)
+
+
+def test_a_trained_one_gets_a_distribution_without_noise(own):
+    actor = ConditionedActor(own(PLANS, feature_noise=0.3), width=8).eval()
+    drawn = actor.stochastic(init_std=0.2)
+    assert drawn.encoder.features.noise == 0.0
+    assert actor.encoder.features.noise == 0.3
+    state = states()
+    assert torch.allclose(actor(**state), drawn(**state)[0], atol=1e-6)
+
+
+def test_a_critic_sees_what_it_sees(own):
+    actor = ConditionedActor(own(PLANS, feature_noise=0.3), width=8)
+    actor.fit_normalization(torch.rand(50, 39))
+    encoder = encoder_like(actor)
+    assert type(encoder) is own
+    assert encoder.features.noise == 0.0
+    assert torch.equal(encoder.features.mean, actor.encoder.features.mean)
+    assert QValue(encoder)(**states(), action=torch.zeros(4, 4)).shape == (4, 1)
+
+
+def test_the_name_of_its_class_is_a_method_with_its_options(own):
+    actor = make_policy("TaskVectors", PLANS, size=3, width=8)
+    assert isinstance(actor, ConditionedActor)
+    assert (actor.encoder.latent_size, actor.config["width"], actor.tasks) == (3, 8, lw.MT10)
+    with pytest.raises(ValueError, match="option of TaskVectors must be one of 'size', 'feature_noise', got 'sise'"):
+        make_policy("TaskVectors", PLANS, sise=3)
+
+
+@pytest.mark.parametrize("make", [PlanEncoder, DescriptorEncoder])
+def test_ours_make_actors_too(tmp_path, make):
+    actor = ConditionedActor(make(PLANS, feature_noise=0.1), width=8).eval()
+    again = saved(actor, tmp_path / "policy.zip")
+    state = states() | ({"qaf": torch.zeros(4, 6, dtype=torch.bool)} if make is PlanEncoder else {})
+    ours, found = actor(**state), again(**state)
+    assert torch.equal(ours[0] if make is PlanEncoder else ours, found[0] if make is PlanEncoder else found)
+    assert type(again.encoder) is make
+
+
+def test_its_own_tasks_and_texts_travel(tmp_path):
+    task = lw.Task("touch", "Touch the puck.", lw.TASKS["push"].objects)
+
+    def encode(texts):
+        return torch.ones(len(texts), TEXT_DIMENSION)
+
+    actor = ConditionedActor(DescriptorEncoder([task], text_encoder=encode), width=8)
+    again = saved(actor, tmp_path / "policy.zip", text_encoder=encode)
+    assert again.definition("touch").description == "Touch the puck."
+    with pytest.raises(ValueError, match="text_encoder"):
+        lw.load_actor(tmp_path / "policy.zip", text_encoder=lambda texts: torch.zeros(len(texts), TEXT_DIMENSION))
+
+
+def test_what_is_no_encoder_and_options_of_one_are_refused():
+    with pytest.raises(TypeError, match=r"about must be an Encoder, got Plans.*PlanEncoder\(plans\)"):
+        ConditionedActor(PLANS)
+    with pytest.raises(TypeError, match=r"feature_noise: give it to the encoder, PlanEncoder\(..., feature_noise=\)"):
+        ConditionedActor(PlanEncoder(PLANS), feature_noise=0.1)
