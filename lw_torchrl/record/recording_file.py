@@ -191,7 +191,8 @@ def layouts(path: AnyPath) -> tuple[list[dict[str, Any]], str | None, bytes]:
     from rerun.chunk import RrdReader
 
     reader = RrdReader(os.fspath(path))
-    layout, known, found, pieces = Layout.read(reader), reader.recordings()[0], [], b""
+    layout, known, pieces = Layout.read(reader), reader.recordings()[0], b""
+    found: list[dict[str, Any]] = []
     if layout is None:
         return [], None, b""
     for tab in layout.tabs():
