@@ -90,7 +90,7 @@ def train(
     if evaluator not in (None, "new") and not Path(evaluator).exists():
         if evaluator.endswith(".zip"):
             options.check_saved("evaluator", Path(evaluator), "network", "train-evaluator")
-        options.check_listed("evaluator", evaluator, (), "lw_torchrl.modules:EVALUATORS", ("evaluators",))
+        options.check_listed("evaluator", evaluator, ("new",), "lw_torchrl.modules:EVALUATORS", ("evaluators",))
     loaded = options.read_plans(plans, known)
     import torch
 
