@@ -26,6 +26,7 @@ from lw_torchrl.record.verdict import (
     Heading,
     decisive_step,
     drawn_steps,
+    farthest,
     log_curves,
     log_plan,
     telling_steps,
@@ -64,6 +65,7 @@ class Page:
     states: dict[str, tuple[str, Color]]  # of the lanes: words and colour
     rows: int  # how many lanes
     good: bool
+    farthest: float  # of the distances, cm
     row: dict[str, Any]  # in the overview
     frames: dict[str, str]  # as log_motion gives them
 
@@ -79,12 +81,12 @@ class Page:
         right[0] = max(right[0][0], 600 - sum(share for share, _ in right[1:])), right[0][1]
         return rrb.Horizontal(_stacked(left), _stacked(right), column_shares=[6, 5], name=self.title)
 
-    def column(self, shown: tuple[int, int]) -> rrb.Vertical:
-        """Verdict, scene, timeline and distance in a column, beside others that show the same steps."""
-        page = replace(self, shown=shown)
-        parts: list[tuple[float, Any]] = [(130, page._words("verdict", self.title)), (420, page._scene())]
+    def column(self, shown: tuple[int, int], farthest: float) -> rrb.Vertical:
+        """Verdict, scene, lanes and distance in a column, beside others that show the same steps and centimetres."""
+        page = replace(self, shown=shown, farthest=farthest)
+        parts: list[tuple[float, Any]] = [(100, page._words("verdict", self.title)), (190, page._scene())]
         if "distance" in page.curves:
-            parts.append((120, page._curve("distance")))
+            parts.append((90, page._curve("distance")))
         parts += page._timeline()
         return _stacked(parts, self.title)
 
@@ -119,6 +121,8 @@ class Page:
 
     def _curve(self, name: str) -> rrb.TimeSeriesView:
         title, limits = CURVES[name]
+        if name == "distance":
+            limits = -0.05 * self.farthest, 1.05 * self.farthest
         return rrb.TimeSeriesView(
             origin=f"{self.root}/{name}",
             name=title,
@@ -168,6 +172,7 @@ def send_page(
         states=lanes.states,
         rows=lanes.count,
         good=episode.first_success is not None,
+        farthest=farthest(episode),
         row=heading.row(episode, name),
         frames=frames,
     )
@@ -286,7 +291,8 @@ class Layout:
         for title, names in self._compared:  # a column each
             pages = [self.pages[name] for name in names]
             shown = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
-            tabs.append(rrb.Horizontal(*(page.column(shown) for page in pages), name=title))
+            farthest = max(page.farthest for page in pages)
+            tabs.append(rrb.Horizontal(*(page.column(shown, farthest) for page in pages), name=title))
         tabs += [page.tab() for page in list(self.pages.values())]
         for kind, views in self._views.items():
             if views:

@@ -219,6 +219,12 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> None:
     stream.send_columns(f"{root}/plan", time_columns(changes), documents)
 
 
+def farthest(episode: RecordedEpisode) -> float:
+    """The largest distance of what a skill moves from where it goes, cm; 1 where there is none."""
+    distance = episode.distance()
+    return 1.0 if distance is None else max(1.0, 100 * float(np.nanmax(distance)))
+
+
 def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
     """``root``/action, and, where there is any, /distance (cm), /reward, /skill_weights, /corrected; returns which."""
     rows = np.arange(len(episode))
