@@ -13,7 +13,7 @@ from lw_torchrl.language.plan_text import one_line
 from lw_torchrl.record.conventions import CONTROL_PERIOD, FALSE, STEEL, Color, rr, step_color, time_columns
 from lw_torchrl.record.recorded_episode import NOBODY, MendedRecording, RecordedEpisode
 
-AFTER_SUCCESS, AROUND_FAILURE = 20, 60
+AFTER_SUCCESS, AROUND_FAILURE = 12, 60
 """How many steps after a first success are worth a look, and how many on both sides of where a failure is seen."""
 LONGEST = 200  # steps from where a ghost parts to where the failure is seen that are shown at once
 SELDOM = 8  # steps between two pictures of the scene where nothing is worth a look: a tenth of a second
@@ -217,6 +217,12 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> None:
         texts.append("  \n".join(parts))
     documents = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
     stream.send_columns(f"{root}/plan", time_columns(changes), documents)
+
+
+def farthest(episode: RecordedEpisode) -> float:
+    """The largest distance of what a skill moves from where it goes, cm; 1 where there is none."""
+    distance = episode.distance()
+    return 1.0 if distance is None else max(1.0, 100 * float(np.nanmax(distance)))
 
 
 def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
