@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -182,7 +183,10 @@ def reworded(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
 def by_small_model(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
     """Each step in the words of `benchmarks.paraphrases`, whatever the model made of it."""
     others = read_json(Path(__file__).parent / "data" / "paraphrases.json", "paraphrases")
-    steps = [(step.condition, drawn.choice(others[step.skill])) for step in plan.steps]
+    said = [
+        re.sub(r"[^a-z0-9' -]", "", drawn.choice(others[step.skill])) for step in plan.steps
+    ]  # a skill has no commas
+    steps = [(step.condition, skill) for step, skill in zip(plan.steps, said, strict=True)]
     return ConditionalPlan.from_pairs(plan.definition, steps)
 
 
