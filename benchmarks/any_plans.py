@@ -181,7 +181,7 @@ def reworded(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
 
 
 def by_small_model(plan: ConditionalPlan, drawn: random.Random) -> ConditionalPlan:
-    """Each step in the words of `benchmarks.paraphrases`, whatever the model made of it."""
+    """Each step in the words of `benchmarks.paraphrases`, whatever the model made of it; skills have no commas."""
     others = read_json(Path(__file__).parent / "data" / "paraphrases.json", "paraphrases")
     said = [
         re.sub(r"[^a-z0-9' -]", "", drawn.choice(others[step.skill])) for step in plan.steps
