@@ -14,7 +14,7 @@ from torchrl.envs import Compose, TransformedEnv
 import lw_torchrl as lw
 from benchmarks.report import Row, Settings, timed, under
 from lw_torchrl.record.meshes import Motion
-from lw_torchrl.record.rollouts import read_rollout, simulate_again
+from lw_torchrl.record.rollouts import read_rollout, run_recorded, simulate_again
 
 TASK, SEED = "pick-place", 0
 EPISODES = 10
@@ -43,16 +43,32 @@ def recording(settings: Settings) -> list[Row]:
             pages = [timed(lambda: logger.add_page(heading, episode, motion=motion)) for _ in range(EPISODES)]
         sizes = [os.path.getsize(path) / 1e6 for path in (one, ten)]
         live = _live(settings, plans, f"{folder}/live.rrd")
+        many = _many(settings, plans, folder)
     name = f"recorded episode of {steps} steps:"
     return [
         under(
             f"{name} page, after the first of its model", median(pages) * 1e3, "ms", 40, f"first {first * 1e3:.0f} ms"
         ),
         Row(f"{name} simulating it again", simulating * 1e3, "ms"),
-        under(f"{name} file", sizes[0], "MB", 3, "with meshes"),
-        under(f"{EPISODES} recorded episodes of {steps} steps: file", sizes[1], "MB", 25, "with meshes"),
+        under(f"{name} file", sizes[0], "MB", 2, "with meshes"),
+        under(f"{EPISODES} recorded episodes of {steps} steps: file", sizes[1], "MB", 8, "with meshes"),
+        *many,
         live,
     ]
+
+
+def _many(settings: Settings, plans: lw.Plans, folder: str) -> list[Row]:
+    """Three episodes of eight tasks: the recording, and the page."""
+    tasks, length = lw.MT10[: settings.pick(8, 2)], settings.pick(150, 20)
+    actor = lw.ScriptedSkillActor(plans)
+    found = run_recorded(actor, tasks, plans=plans, seed=1_000, episodes=range(3), max_steps=length)
+    with lw.RerunLogger(f"{folder}/many.rrd") as logger:
+        for one in found:
+            lw.log_rollout(logger, one.steps, plans, seed=1_000, policy="scripted")
+    lw.record.write_html(f"{folder}/many.rrd", f"{folder}/many.html")
+    sizes = [os.path.getsize(f"{folder}/many.{ending}") / 1e6 for ending in ("rrd", "html")]
+    name = f"{len(found)} recorded episodes of {length} steps, {len(tasks)} tasks:"
+    return [under(f"{name} file", sizes[0], "MB", 6), under(f"{name} page", sizes[1], "MB", 12, "with rerun's viewer")]
 
 
 def _rollout(plans: lw.Plans, steps: int) -> Any:

@@ -27,9 +27,19 @@ _KEY = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DOTTED = re.compile(rf"{_KEY}(?:[ \t]*+\.[ \t]*+{_KEY})*+")
 
 
+_SHIPPED = Path(__file__).with_name("training") / "data"
+
+
+def absent_policy(path: AnyPath, writer: str = "train") -> str:
+    """What to say of a policy's file that is not there."""
+    close = [file.stem for file in _SHIPPED.glob("*.zip") if file.stem.startswith(Path(path).name[:8])]
+    hint = f"; did you mean {close[0]!r}, which is shipped?" if close and Path(path).name == str(path) else ""
+    return f"no file {str(path)!r}; `lw-torchrl {writer}` writes one{hint}"
+
+
 def shipped_policy(name: AnyPath) -> Path | None:
     """The file of a policy that is shipped under a name, "few-shot-mt50", unless there is a file of that name."""
-    found = Path(__file__).with_name("training") / "data" / f"{name}.zip"
+    found = _SHIPPED / f"{name}.zip"
     return found if Path(name).name == str(name) and not Path(name).exists() and found.is_file() else None
 
 

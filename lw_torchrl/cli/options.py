@@ -18,7 +18,7 @@ from tyro.conf import arg
 
 import lw_torchrl as lw
 from lw_torchrl._checks import check_choice, unknown_name
-from lw_torchrl._files import shipped_policy
+from lw_torchrl._files import absent_policy, shipped_policy
 from lw_torchrl._tables import plugins_of
 from lw_torchrl.cli.parsing import own_module
 from lw_torchrl.language.plan_files import load_plans
@@ -224,7 +224,7 @@ def check_saved(argument: str, path: Path, what: str = "policy", writer: str = "
     if path.is_dir():
         raise ValueError(f"{argument}: {str(path)!r} is a folder; a {what} is one file")
     if not path.exists() and (what != "policy" or shipped_policy(path) is None):
-        raise FileNotFoundError(f"{argument}: no file {str(path)!r}; `lw-torchrl {writer}` writes one")
+        raise FileNotFoundError(f"{argument}: {absent_policy(path, writer)}")
 
 
 def check_actor(argument: str, who: str) -> None:

@@ -115,4 +115,6 @@ def _send_steps(stream: Any, lanes: Lanes, name: str, episode: RecordedEpisode, 
 
 def short(condition: str) -> str:
     """A condition without the words that all of them have."""
-    return re.sub(r"\b(the robot's|the) ", "", condition)
+    said = re.sub(r"\b(the robot's|the) | is\b", "", condition).split(" and ")
+    about = said[0].split()[0]
+    return " and ".join([said[0], *(one.removeprefix(f"{about} ") for one in said[1:])])

@@ -18,7 +18,7 @@ SHOWN_GROUPS = (0, 1, 2)  # Meta-World keeps what only collides in group 4
 DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that was given none: the material's counts
 
 FINEST, COARSEST = 0.0015, 0.010
-CUBES_ALONG = 22.0
+CUBES_ALONG = 18.0
 """How many cubes the longest side of a mesh is cut into; the finest and the coarsest cube bound it, metres."""
 AROUND, ALONG = 24, 7
 """How many corners a round thing has around its axis, and a quarter of a circle along it."""

@@ -11,11 +11,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from lw_torchrl._checks import check_int
 from lw_torchrl._files import AnyPath
 from lw_torchrl.record.conventions import EPISODE_TIMELINE, METRIC_TIMELINE, rr
+from lw_torchrl.record.overview import OVERVIEW
 from lw_torchrl.record.tabs import Layout
 
 LOCAL = "127.0.0.1"
@@ -113,8 +114,8 @@ def find_recording(path: AnyPath) -> Path:
 
 
 @contextmanager
-def opened(recording: Path, tab: str | None = None) -> Iterator[Path]:
-    """The recording as a viewer can open it: itself, or a copy that ends properly and opens at ``tab``.
+def opened(recording: Path, tab: str | None = None, *, alone: bool = False) -> Iterator[Path]:
+    """The recording as a viewer can open it: itself, or a copy that ends properly, with ``tab`` in front or ``alone``.
 
     Rerun's viewer waits for the rest of one that was cut or still grows. One that cannot be read is a ValueError.
     """
@@ -123,7 +124,7 @@ def opened(recording: Path, tab: str | None = None) -> Iterator[Path]:
     whole, source = is_whole(recording), recording
     if whole:
         _run_rerun(recording, "verify", recording)
-        if tab is None:
+        if tab is None and not alone:
             yield recording
             return
     else:
@@ -136,11 +137,11 @@ def opened(recording: Path, tab: str | None = None) -> Iterator[Path]:
             reader = RrdReader(source)
             if not reader.recordings():
                 raise _damaged(recording, "it holds nothing yet")
-            if Layout.read(reader) is None and tab is None:  # it has a layout of another's
+            if Layout.read(reader) is None and tab is None and not alone:  # it has a layout of another's
                 yield source
                 return
         copy = Path(folder) / recording.name
-        copy_recording(source, copy, tab)
+        copy_recording(source, copy, tab, alone=alone)
         yield copy
 
 
@@ -151,7 +152,7 @@ def is_whole(path: Path) -> bool:
         return b"RRF2FOOT" in file.read()
 
 
-def copy_recording(source: Path, target: Path, tab: str | None = None) -> None:
+def copy_recording(source: Path, target: Path, tab: str | None = None, *, alone: bool = False) -> None:
     """Write a recording again: compact, with an index, and with ``tab`` in front. ValueError: it cannot be read."""
     from rerun.chunk import OptimizationProfile, RrdReader
 
@@ -170,7 +171,8 @@ def copy_recording(source: Path, target: Path, tab: str | None = None) -> None:
     try:
         stream.save(target)
         # The layout comes first, else a slow browser shows views of its own choice meanwhile.
-        (layout or Layout()).send(stream, tab)
+        if layout is not None or not alone:
+            (layout or Layout()).send(stream, tab, alone=alone)
         stream.send_chunks(data)
         stream.flush(timeout_sec=FLUSH_SECONDS)
     except RuntimeError as error:
@@ -179,6 +181,36 @@ def copy_recording(source: Path, target: Path, tab: str | None = None) -> None:
         stream.disconnect()
     if not is_whole(target):  # rerun does not say so
         raise OSError(f"{str(target)!r} could not be written to its end")
+
+
+def layouts(path: AnyPath) -> tuple[list[dict[str, Any]], str | None, bytes]:
+    """A recording's tabs, the first one's name, and layouts of each alone, pieces of a rerun stream in a row.
+
+    A tab has its name, title, the step to open it at, its ``row`` of the overview, and where its layout is.
+    """
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(os.fspath(path))
+    layout, known, pieces = Layout.read(reader), reader.recordings()[0], b""
+    found: list[dict[str, Any]] = []
+    if layout is None:
+        return [], None, b""
+    for tab in layout.tabs():
+        if tab.name == OVERVIEW:
+            continue
+        stream = rr.RecordingStream(known.application_id, recording_id=known.recording_id, send_properties=False)
+        memory = rr.binary_stream(stream)
+        layout.send(stream, tab.name, alone=True)
+        piece = memory.read() or b""
+        stream.disconnect()
+        page = layout.pages.get(tab.name)
+        place = [len(pieces), len(pieces) + len(piece)]
+        row = page.row if page is not None and page.row else None
+        step = layout.opening_step(tab.name)
+        found.append({"name": tab.name, "title": tab.title, "step": step, "row": row, "layout": place})
+        pieces += piece
+    by_failure = sorted(found, key=lambda one: (one["row"] or {}).get("ended") != "failed")
+    return by_failure, layout.front(), pieces
 
 
 def opening_step(path: AnyPath, tab: str | None = None, step: int | None = None) -> int | None:

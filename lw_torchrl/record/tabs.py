@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, NamedTuple
 
 from lw_torchrl._checks import unknown_name
@@ -26,6 +26,7 @@ from lw_torchrl.record.verdict import (
     Heading,
     decisive_step,
     drawn_steps,
+    farthest,
     log_curves,
     log_plan,
     telling_steps,
@@ -64,8 +65,9 @@ class Page:
     states: dict[str, tuple[str, Color]]  # of the lanes: words and colour
     rows: int  # how many lanes
     good: bool
-    row: dict[str, Any] = field(default_factory=dict)  # in the overview
-    frames: dict[str, str] = field(default_factory=dict)  # as log_motion gives them
+    farthest: float  # of the distances, cm
+    row: dict[str, Any]  # in the overview
+    frames: dict[str, str]  # as log_motion gives them
 
     def tab(self) -> rrb.Horizontal:
         """Scene and curves on the left, words and timeline on the right."""
@@ -79,12 +81,12 @@ class Page:
         right[0] = max(right[0][0], 600 - sum(share for share, _ in right[1:])), right[0][1]
         return rrb.Horizontal(_stacked(left), _stacked(right), column_shares=[6, 5], name=self.title)
 
-    def column(self, shown: tuple[int, int]) -> rrb.Vertical:
-        """Verdict, scene, timeline and distance in a column, beside others that show the same steps."""
-        page = replace(self, shown=shown)
-        parts: list[tuple[float, Any]] = [(130, page._words("verdict", self.title)), (420, page._scene())]
+    def column(self, shown: tuple[int, int], farthest: float) -> rrb.Vertical:
+        """Verdict, scene, lanes and distance in a column, beside others that show the same steps and centimetres."""
+        page = replace(self, shown=shown, farthest=farthest)
+        parts: list[tuple[float, Any]] = [(100, page._words("verdict", self.title)), (190, page._scene())]
         if "distance" in page.curves:
-            parts.append((120, page._curve("distance")))
+            parts.append((90, page._curve("distance")))
         parts += page._timeline()
         return _stacked(parts, self.title)
 
@@ -119,6 +121,8 @@ class Page:
 
     def _curve(self, name: str) -> rrb.TimeSeriesView:
         title, limits = CURVES[name]
+        if name == "distance":
+            limits = -0.05 * self.farthest, 1.05 * self.farthest
         return rrb.TimeSeriesView(
             origin=f"{self.root}/{name}",
             name=title,
@@ -168,6 +172,7 @@ def send_page(
         states=lanes.states,
         rows=lanes.count,
         good=episode.first_success is not None,
+        farthest=farthest(episode),
         row=heading.row(episode, name),
         frames=frames,
     )
@@ -243,6 +248,8 @@ class Layout:
         layout = cls()
         for _, (kind, name, content) in sorted(found.items()):
             if kind == "page":
+                if {part.name for part in fields(Page)} != set(content):
+                    return None
                 layout.add_page(name, Page(**content))
             elif kind == "compare":
                 layout.compare(name, content)
@@ -264,16 +271,16 @@ class Layout:
         new = len(self._entries) - self._shown
         return bool(new) and (4 * new >= self._shown or seconds >= 5 * self._shown)
 
-    def send(self, stream: Any, tab: str | None = None) -> None:
-        """Have the viewer show the tabs, ``tab`` in front; an unknown one is a ValueError."""
+    def send(self, stream: Any, tab: str | None = None, *, alone: bool = False) -> None:
+        """Have the viewer show the tabs, ``tab`` in front or ``alone``; an unknown one is a ValueError."""
         self._shown = len(self._entries)
         if self._has_overview():
             text = table(page.row for page in list(self.pages.values()))
             document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
             stream.log(entity_path(OVERVIEW, "table"), document, static=True)
-        stream.send_blueprint(self.blueprint(tab))
+        stream.send_blueprint(self.blueprint(tab, alone=alone))
 
-    def blueprint(self, tab: str | None = None) -> rrb.Blueprint:
+    def blueprint(self, tab: str | None = None, *, alone: bool = False) -> rrb.Blueprint:
         """The layout as rerun's; its time panel plays episodes at Meta-World's 80 steps a second."""
         tabs: list[Any] = []
         if self._has_overview():
@@ -284,7 +291,8 @@ class Layout:
         for title, names in self._compared:  # a column each
             pages = [self.pages[name] for name in names]
             shown = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
-            tabs.append(rrb.Horizontal(*(page.column(shown) for page in pages), name=title))
+            farthest = max(page.farthest for page in pages)
+            tabs.append(rrb.Horizontal(*(page.column(shown, farthest) for page in pages), name=title))
         tabs += [page.tab() for page in list(self.pages.values())]
         for kind, views in self._views.items():
             if views:
@@ -294,6 +302,8 @@ class Layout:
         closed = {"state": "collapsed"}
         time = {"timeline": self.tab(tab).timeline, "fps": 80.0, "play_state": "paused", "loop_mode": "all"}
         panels = rrb.BlueprintPanel(**closed), rrb.SelectionPanel(**closed), rrb.TimePanel(**closed, **time)
+        if alone and tabs:
+            return rrb.Blueprint(tabs[self._find(tab or self.front())], *panels, auto_views=False)
         return rrb.Blueprint(rrb.Tabs(*tabs, active_tab=front), *panels, auto_views=False)
 
     def tabs(self) -> list[Tab]:
@@ -321,6 +331,11 @@ class Layout:
         """The tab of a name, or the first one."""
         tabs = self.tabs()
         return tabs[self._find(name)] if tabs or name is not None else Tab("", "", [], METRIC_TIMELINE)
+
+    def front(self) -> str | None:
+        """The name of the tab that shows most: the first one, or that of the episode that an overview begins with."""
+        first = self.tab()
+        return first.episodes[0] if first.name == OVERVIEW else first.name or None
 
     def opening_step(self, tab: str | None = None) -> int | None:
         """The step to open a tab at, the earliest decisive one of its episodes; None for a tab of no episode."""

@@ -13,7 +13,7 @@ from lw_torchrl.language.plan_text import one_line
 from lw_torchrl.record.conventions import CONTROL_PERIOD, FALSE, STEEL, Color, rr, step_color, time_columns
 from lw_torchrl.record.recorded_episode import NOBODY, MendedRecording, RecordedEpisode
 
-AFTER_SUCCESS, AROUND_FAILURE = 20, 60
+AFTER_SUCCESS, AROUND_FAILURE = 8, 60
 """How many steps after a first success are worth a look, and how many on both sides of where a failure is seen."""
 LONGEST = 200  # steps from where a ghost parts to where the failure is seen that are shown at once
 SELDOM = 8  # steps between two pictures of the scene where nothing is worth a look: a tenth of a second
@@ -219,6 +219,12 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> None:
     stream.send_columns(f"{root}/plan", time_columns(changes), documents)
 
 
+def farthest(episode: RecordedEpisode) -> float:
+    """The largest distance of what a skill moves from where it goes, cm; 1 where there is none."""
+    distance = episode.distance()
+    return 1.0 if distance is None else max(1.0, 100 * float(np.nanmax(distance)))
+
+
 def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
     """``root``/action, and, where there is any, /distance (cm), /reward, /skill_weights, /corrected; returns which."""
     rows = np.arange(len(episode))
@@ -228,7 +234,6 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
         # One line in centimetres, in the colour of the step in force.
         assert episode.in_force is not None
         colors = [FALSE if step == NOBODY else step_color(step) for step in episode.in_force.tolist()]
-        stream.log(f"{root}/distance", rr.SeriesLines(names=["distance [cm]"]), static=True)
         columns = [*rr.Scalars.columns(scalars=distance * 100), *rr.SeriesLines.columns(colors=colors)]
         stream.send_columns(f"{root}/distance", time_columns(rows), columns)
         sent.append("distance")

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 import gzip
 import html
 import json
+import lzma
 import socket
 import threading
 import time
@@ -16,12 +16,23 @@ from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from string import Template
+from typing import Any
 from urllib.error import URLError
 
 from lw_torchrl._checks import checked
 from lw_torchrl._files import AnyPath, replacing
+from lw_torchrl._progress import Progress
 from lw_torchrl.record.conventions import EPISODE_TIMELINE
-from lw_torchrl.record.recording_file import LOCAL, failure, find_recording, free_port, opened, opening_step, running
+from lw_torchrl.record.recording_file import (
+    LOCAL,
+    failure,
+    find_recording,
+    free_port,
+    layouts,
+    opened,
+    opening_step,
+    running,
+)
 
 LARGE = 30 * 10**6
 START_SECONDS = 60.0
@@ -35,7 +46,9 @@ _PIECE = 65_536
 def write_html(path: AnyPath, page: AnyPath, *, episode: str | None = None, step: int | None = None) -> Path:
     """Write a recording as one page to send to somebody: it opens from disk, without a network.
 
-    Some 20 MB of viewer, and the recording, compressed. It wants WebGL 2 or WebGPU. The rest is as :func:`open_viewer`.
+    Some 10 MB of viewer, and the recording, compressed, which takes a computer ten seconds and a browser a few. It
+    wants WebGL 2 or WebGPU. Above the viewer is a table of the episodes, to filter and to click at; the address then
+    ends in the episode and its step, ``#episode=push-7&t=33``, for a link. The rest is as :func:`open_viewer`.
 
     Args:
         page: the .html file; it is replaced whole or not at all.
@@ -49,18 +62,19 @@ def write_html(path: AnyPath, page: AnyPath, *, episode: str | None = None, step
     recording, target = find_recording(path), Path(page)
     if target.suffix not in (".html", ".htm"):
         raise ValueError(f"page must end in '.html', got {str(target)!r}")
-    with opened(recording, episode) as file:
-        at = opening_step(file, episode, step)
-        data = {"recording": gzip.compress(file.read_bytes(), 6)}
-    script, data["wasm"] = _viewer_files()
-    script = script.replace("</script", "<\\/script")
-    texts = {name: base64.b64encode(content).decode() for name, content in data.items()}
-    parts = [f'<script type="text/plain" id="{name}">{content}</script>' for name, content in texts.items()]
-    text = _page(recording.stem, "\n".join([f"<script>{script}</script>", *parts]), at)
+    script, wasm = _viewer_files()
+    data = {"script": (len(script), _packed(script)), "wasm": (len(wasm), _packed_viewer())}
+    page_text, parts = _page(recording, episode, step)
+    data |= {name: (len(content), _packed(content)) for name, content in parts.items()}
+    texts = []
+    for name, (size, content) in data.items():
+        start = f'<script type="text/plain" id="{name}" data-size="{size}">'
+        texts.append(start.encode() + _escaped(content) + b"</script>")
+    whole = page_text.replace(_DATA, b"\n".join(texts))
     with replacing(target) as file:
-        file.write_text(text, encoding="utf-8")
-    if len(text) > LARGE:
-        warnings.warn(f"{str(target)!r} has {len(text) / 1e6:.0f} MB; fewer episodes make it lighter", stacklevel=2)
+        file.write_bytes(whole)
+    if len(whole) > LARGE:
+        warnings.warn(f"{str(target)!r} has {len(whole) / 1e6:.0f} MB; fewer episodes make it lighter", stacklevel=2)
     return target
 
 
@@ -86,17 +100,11 @@ class WebPage(AbstractContextManager["WebPage"]):
     @checked
     def __init__(self, path: AnyPath, *, episode: str | None = None, step: int | None = None, port: int = 0) -> None:
         recording = find_recording(path)
-        with opened(recording, episode) as file:
-            at = opening_step(file, episode, step)
-            data = gzip.compress(file.read_bytes(), 1)
+        page, parts = _page(recording, episode, step)
         script, wasm = _viewer_files()
-        page = _page(recording.stem, '<script src="viewer.js"></script>', at)
-        files = {
-            "/": ("text/html; charset=utf-8", page.encode()),
-            "/viewer.js": ("text/javascript; charset=utf-8", script.encode()),
-            "/wasm.gz": ("application/gzip", wasm),
-            "/recording.gz": ("application/gzip", data),
-        }
+        files = {"/": ("text/html; charset=windows-1252", page.replace(_DATA, b""))}
+        for name, content in {"script": script, "wasm": wasm, **parts}.items():
+            files[f"/{name}.gz"] = ("application/gzip", gzip.compress(content, 1))
         self._server = ThreadingHTTPServer((LOCAL, port), _handler(files))
         self._server.daemon_threads = True
         self.address = f"http://{LOCAL}:{self._server.server_address[1]}/"
@@ -161,16 +169,62 @@ def _handler(files: dict[str, tuple[str, bytes]]) -> type[BaseHTTPRequestHandler
     return Handler
 
 
-def _page(title: str, data: str, step: int | None) -> str:
-    template = Template(Path(__file__).with_name("viewer_page.html").read_text(encoding="utf-8"))
-    quoted = json.dumps(title).replace("<", "\\u003c")
-    cursor = json.dumps(None if step is None else {"request": list(request(step)), "sign": list(sign(step))})
-    return template.substitute(title=html.escape(title), title_json=quoted, data=data, cursor=cursor)
+_DATA = b"<!-- data -->"
+
+
+def _page(recording: Path, episode: str | None, step: int | None) -> tuple[bytes, dict[str, bytes]]:
+    """The page without its parts, in windows-1252, and of these the recording and the layouts of its tabs."""
+    with opened(recording, episode, alone=True) as file:
+        tabs, front, pieces = layouts(file)
+        first = episode if episode is not None else front
+        at = opening_step(file, episode, step)
+        data = {"recording": file.read_bytes(), "layouts": pieces}
+    here = Path(__file__)
+    said = {"title_json": recording.stem, "timeline": EPISODE_TIMELINE, "tabs": tabs, "front": first, "step": at}
+    texts = {name: json.dumps(value).replace("<", "\\u003c") for name, value in said.items()}
+    texts |= {"title": html.escape(recording.stem), "unlzma": here.with_name("unlzma.js").read_text("ascii")}
+    template = Template(here.with_name("viewer_page.html").read_text("ascii"))
+    return template.substitute(texts, data=_DATA.decode()).encode("ascii", "xmlcharrefreplace"), data
+
+
+# What compresses an executable of 43 MB by a factor of 4.5, in a time that one can wait for.
+_LZMA: dict[str, Any] = {
+    "id": lzma.FILTER_LZMA1,
+    "mode": lzma.MODE_NORMAL,
+    "mf": lzma.MF_HC4,
+    "nice_len": 32,
+    "depth": 4,
+}
+_LZMA |= {"dict_size": 1 << 23, "lc": 4, "lp": 0, "pb": 0}
+
+
+def _packed(content: bytes, bar: Progress | None = None) -> bytes:
+    packer = lzma.LZMACompressor(lzma.FORMAT_ALONE, filters=[_LZMA])
+    found = []
+    for start in range(0, len(content), 2**20):
+        found.append(packer.compress(content[start : start + 2**20]))
+        if bar is not None:
+            bar.update()
+    return b"".join([*found, packer.flush()])
 
 
 @cache
-def _viewer_files() -> tuple[str, bytes]:
-    """The installed rerun's web viewer, as rerun serves it: JavaScript, and WebAssembly, gzipped."""
+def _packed_viewer() -> bytes:
+    _, wasm = _viewer_files()
+    with Progress("packing the viewer", -(-len(wasm) // 2**20), "MiB") as bar:
+        return _packed(wasm, bar)
+
+
+def _escaped(content: bytes) -> bytes:
+    """Bytes of windows-1252 that come out of an HTML script as they went in; the page's ``unescaped`` reads them."""
+    for byte in b"=<\0\r":
+        content = content.replace(bytes([byte]), bytes([ord("="), byte + 64]))
+    return content
+
+
+@cache
+def _viewer_files() -> tuple[bytes, bytes]:
+    """The installed rerun's web viewer, as rerun serves it: JavaScript, and WebAssembly."""
     port = free_port()
     # No proxy stands between this machine and itself.
     get = urllib.request.build_opener(urllib.request.ProxyHandler({})).open
@@ -187,30 +241,4 @@ def _viewer_files() -> tuple[str, bytes]:
                 if time.monotonic() > deadline:
                     raise RuntimeError(f"rerun's web viewer did not answer within {START_SECONDS:.0f} s") from error
                 time.sleep(0.1)
-        return script.decode(), gzip.compress(get(f"http://{LOCAL}:{port}/re_viewer_bg.wasm", timeout=60).read(), 6)
-
-
-# Only ``viewer_control`` sets the cursor of a viewer in a page. It takes a protobuf message, which nothing that a page
-# can load writes; so two of rerun 0.41 are spelled out. A viewer that does not know them shows the recording's start.
-
-
-def request(step: int) -> bytes:
-    """The message that asks a viewer for ``step`` of the timeline in force, paused (a ``ViewerControlRequest``)."""
-    paused = b"\x28\x01"
-    return b"\x32" + _sized(b"\x1a" + _sized(b"\x08" + _varint(step)) + paused)
-
-
-def sign(step: int) -> bytes:
-    """What a viewer's state (a ``GetStateResponse``) holds when its cursor stands at ``step``."""
-    timeline = b"\n" + _sized(EPISODE_TIMELINE.encode())
-    time = b"\x08" + _varint(step) if step else b""
-    return b"\n" + _sized(timeline) + b"\x10\x01\x1a" + _sized(time)
-
-
-def _sized(message: bytes) -> bytes:
-    return _varint(len(message)) + message
-
-
-def _varint(number: int) -> bytes:
-    high, low = divmod(number, 128)
-    return bytes([low | 128]) + _varint(high) if high else bytes([low])
+        return script, get(f"http://{LOCAL}:{port}/re_viewer_bg.wasm", timeout=60).read()

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import differences, shown
-from lw_torchrl._files import AnyPath
+from lw_torchrl._files import AnyPath, absent_policy
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, join, split, write_archive
 from lw_torchrl._versions import LIBRARIES, warn_of_other_versions
 from lw_torchrl.language.plans import PlanError
@@ -73,7 +73,7 @@ class Envelope:
         """The archive of a file whose format, version and part have been checked."""
         begin = f"{self.argument}: {str(path)!r}"
         if not Path(path).exists():
-            raise FileNotFoundError(f"{self.argument}: no file {str(path)!r}; `lw-torchrl {self.command}` writes one")
+            raise FileNotFoundError(f"{self.argument}: {absent_policy(path, self.command)}")
         if Path(path).is_dir():
             raise ValueError(f"{begin} is a folder; {self.called} is one file")
         try:

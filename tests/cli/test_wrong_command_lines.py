@@ -98,6 +98,7 @@ WRONG = {
     "evaluate my.zip --evaluator nowhere.zip": "--evaluator: no file 'nowhere.zip'",
     "evaluate my.zip --attribute --reference nowhere": "--reference: no plan file or folder 'nowhere'",
     "evaluate my.zip --out file": "--out must be a folder, 'file' is none",
+    "card few-shot-mt5": "POLICY: no file 'few-shot-mt5'; `lw-torchrl train` writes one; did you mean 'few-shot-mt50'",
     "card nowhere.zip": "POLICY: no file 'nowhere.zip'",
     "card my.zip --result nowhere.json": "--result: no file 'nowhere.json'",
     "record raech": "NAMES must be one of",

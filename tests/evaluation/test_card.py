@@ -52,7 +52,7 @@ def test_a_file_of_that_name_comes_first(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     lw.save_actor(lw.DescriptorConditionedActor("reach", width=8), tmp_path / SHIPPED)
     assert lw.load_actor(SHIPPED).tasks == ("reach",)
-    with pytest.raises(FileNotFoundError, match="no file 'few-shot-mt5'"):
+    with pytest.raises(FileNotFoundError, match="did you mean 'few-shot-mt50', which is shipped"):
         lw.load_actor("few-shot-mt5")
     with pytest.raises(FileNotFoundError):
         lw.load_actor("../data/few-shot-mt50")
