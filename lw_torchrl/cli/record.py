@@ -156,7 +156,7 @@ def view(
     screenshot: Path | None = None,  # write a .png here, no window; wants Debian's mesa-vulkan-drivers and libvulkan1
     step: int | None = None,  # the step to open at; by default the most telling one, of a training the last
     window_size: str = "1400x900",  # of the picture or the window, WIDTHxHEIGHT
-    html: Path | None = None,  # write one self-contained page here, some 20 MB, that opens from disk in a browser
+    html: Path | None = None,  # write one self-contained page here, some 11 MB, that opens from disk in a browser
     web: bool = False,  # serve a page on this machine and print its address, until Ctrl-C
     port: int = 0,  # of the page; 0 takes a free one
 ) -> None:

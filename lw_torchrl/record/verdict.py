@@ -13,7 +13,7 @@ from lw_torchrl.language.plan_text import one_line
 from lw_torchrl.record.conventions import CONTROL_PERIOD, FALSE, STEEL, Color, rr, step_color, time_columns
 from lw_torchrl.record.recorded_episode import NOBODY, MendedRecording, RecordedEpisode
 
-AFTER_SUCCESS, AROUND_FAILURE = 12, 60
+AFTER_SUCCESS, AROUND_FAILURE = 8, 60
 """How many steps after a first success are worth a look, and how many on both sides of where a failure is seen."""
 LONGEST = 200  # steps from where a ghost parts to where the failure is seen that are shown at once
 SELDOM = 8  # steps between two pictures of the scene where nothing is worth a look: a tenth of a second
@@ -234,7 +234,6 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
         # One line in centimetres, in the colour of the step in force.
         assert episode.in_force is not None
         colors = [FALSE if step == NOBODY else step_color(step) for step in episode.in_force.tolist()]
-        stream.log(f"{root}/distance", rr.SeriesLines(names=["distance [cm]"]), static=True)
         columns = [*rr.Scalars.columns(scalars=distance * 100), *rr.SeriesLines.columns(colors=colors)]
         stream.send_columns(f"{root}/distance", time_columns(rows), columns)
         sent.append("distance")

@@ -197,7 +197,7 @@ def test_what_mends_a_failure_is_a_ghost_beside_it(tmp_path, pushed):
     steps = [f"ghost{step}" for step in mended[:41]["skill_weights"].argmax(-1).tolist()]
     assert found.states("/e1/0c_ghost_with_the_reference_plan", 41) == steps
     page = Layout.read(found.reader).pages["push-0"]
-    assert page.shown[0] == 18
+    assert page.shown[0] == 22
     assert page.states["ghost0"][0] == f"1 {PLANS['push'].steps[0].skill}"
     with lw.RerunLogger(tmp_path / "b.rrd") as logger:
         for wrong, error in (("the plan", TypeError), (ghost._replace(steps=run("reach", 5)[0]), ValueError)):
