@@ -232,7 +232,7 @@ def _template(task: Task, steps: Sequence[CanonicalStep], last: CanonicalStep) -
 
 def _touched(task: Task, steps: Sequence[CanonicalStep]) -> str:
     """Where the hand acts: on the thing that it first goes to."""
-    hands = (one.target for one in steps if one.moved == GRIPPER and not is_goal(task, one.target))
+    hands = (one.target for one in steps if one.moved == GRIPPER != one.target and not is_goal(task, one.target))
     found = next(hands, None) or first_thing(task)
     assert found is not None
     return point_on(task, found)

@@ -201,3 +201,12 @@ def test_marks_are_of_the_longest_name():
     task = OWN["drawer-open"].definition
     assert mark("Pull the drawer handle, then the drawer", task) == "pull <drawer handle>, then <drawer handle>"
     assert first_thing(OWN["reach"].definition) is None
+
+
+def test_a_hand_that_is_told_to_go_to_itself_goes_to_the_thing():
+    """As a small model put it."""
+    far, over = "the gripper is not above the plate edge", "the gripper is above the plate edge"
+    written = (far, "set the plate with the gripper above it"), (over, "lower the gripper onto the plate")
+    found = canonical_plan(plan_of("plate-slide-back", *written, (over, "pull the plate to the target location")))
+    assert found.source == "completed"
+    assert {step.target for step in found.steps if step.moved == canonical.GRIPPER} == {"plate edge"}
