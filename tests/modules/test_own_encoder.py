@@ -102,3 +102,13 @@ def test_what_is_no_encoder_and_options_of_one_are_refused():
         ConditionedActor(PLANS)
     with pytest.raises(TypeError, match=r"feature_noise: give it to the encoder, PlanEncoder\(..., feature_noise=\)"):
         ConditionedActor(PlanEncoder(PLANS), feature_noise=0.1)
+
+
+def test_what_is_no_encoding_is_named(own):
+    class Bare(own):
+        def encode(self, rows, seen):
+            return seen
+
+    actor = ConditionedActor(Bare(PLANS), width=8)
+    with pytest.raises(TypeError, match=r"encode of Bare must return an Encoding\(latent, features\), got Tensor"):
+        actor(**states())
