@@ -206,10 +206,10 @@ def test_a_recording_shows_the_kitchen_as_it_moved(tmp_path):
     chunks = list(RrdReader(tmp_path / "kitchen.rrd").stream())
     scene = r"/kitchen\/microwave-0/scene"
     there = {chunk.entity_path for chunk in chunks}
-    assert {f"{scene}/bodies/{body}" for body in ("microdoorroot", "panda0_link7", "kettleroot")} <= there
+    assert {f"{scene}/bodies/{body}" for body in ("microdoorroot", "panda0_link7", "kettle")} <= there
     assert {f"{scene}/objects/microwave", r"/kitchen\/microwave-0/plan"} <= there
     assert f"{scene}/gripper" not in there  # a hand over a table, which stands for a robot that is not known
-    (kettle,) = (chunk.to_record_batch() for chunk in chunks if chunk.entity_path == f"{scene}/bodies/kettleroot")
+    (kettle,) = (chunk.to_record_batch() for chunk in chunks if chunk.entity_path == f"{scene}/bodies/kettle")
     x, y, z = kettle.column("Transform3D:translation").to_pylist()[0][0]
     assert (round(x, 2), round(y, 2)) == (-0.27, 0.35)
     assert abs(z) < 0.02  # on the counter, which is our z = 0

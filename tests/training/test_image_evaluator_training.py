@@ -91,7 +91,7 @@ def test_a_policy_that_sees_is_tuned_and_goes_on_bit_for_bit(replay, tmp_path):
 
 @pytest.mark.slow
 def test_it_learns_where_things_are_and_what_holds(replay):
-    config = replace(CONFIG, steps=400, batch_size=16, learning_rate=3e-3, held_out_states=0.0)
+    config = replace(CONFIG, steps=900, batch_size=16, learning_rate=3e-3, held_out_states=0.0)
     data = lw.training.LabelledQueries(replay, config)
 
     def right(evaluator):
