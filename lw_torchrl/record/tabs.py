@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, NamedTuple
 
@@ -75,6 +75,18 @@ class Page:
             ended = f"failed: {self.row['cause']}"
         return " · ".join(filter(None, [self.row["name"], self.row["policy"] if policy else None, ended]))
 
+    def below(self, run: str) -> Page:
+        """The page where all entities of its recording lie below that of a ``run``, whose name it takes too."""
+        root, row = entity_path(run), self.row
+        return replace(
+            self,
+            root=root + self.root,
+            trails=[root + path for path in self.trails],
+            lanes=[root + path for path in self.lanes],
+            frames={root + mesh: frame for mesh, frame in self.frames.items()},
+            row=row | {"name": f"{run}/{row['name']}", "title": f"{run}: {row['title']}"},
+        )
+
     def tab(self, title: str) -> rrb.Horizontal:
         """Scene and curves on the left, words and lanes on the right."""
         # Shares are the pixels that a view needs in a window of 1100×700; what is longer scrolls.
@@ -94,12 +106,11 @@ class Page:
         page = replace(self, shown=shown, farthest=farthest)
         conditions = [lane for lane in self.lanes if _CONDITION.search(lane)]
         behind = [view for _, view in page._lanes(conditions, "What held")]
-        parts: list[tuple[float, Any]] = [(118, page._words("verdict", title))]
-        parts.append((212, rrb.Tabs(page._scene(), *behind) if behind else page._scene()))
-        if "distance" in page.curves:
-            parts.append((100, page._curve("distance")))
-        parts += page._lanes([lane for lane in self.lanes if lane not in conditions])
-        return _stacked(parts, title)
+        below: list[tuple[float, Any]] = [(100, page._curve("distance"))] if "distance" in page.curves else []
+        below += page._lanes([lane for lane in self.lanes if lane not in conditions])
+        scene = rrb.Tabs(page._scene(), *behind) if behind else page._scene()
+        room = max(120, 487 - sum(share for share, _ in below))
+        return _stacked([(118, page._words("verdict", title)), (room, scene), *below], title)
 
     def _scene(self) -> rrb.Spatial3DView:
         first, now = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.cursor_relative()
@@ -214,8 +225,8 @@ class Layout:
     def __init__(self) -> None:
         self.pages: dict[str, Page] = {}  # iterate over a copy: the writer's thread reads while pages come
         self._compared: list[tuple[str, list[str]]] = []
-        self.figure = False  # whether there is one of the causes
-        self._views: dict[str, list[list[str]]] = {kind: [] for kind in TABS}
+        self.figures: list[str] = []  # entities of pictures of the causes
+        self._views: dict[str, dict[str, list[str]]] = {kind: {} for kind in TABS}  # titles to what they show
         self._entries: list[str] = []
         self._saved = self._shown = 0
 
@@ -243,16 +254,45 @@ class Layout:
         """Whether there are several episodes, other than the two of one comparison."""
         return len(self.pages) > 1 and len(self._compared) != 1
 
-    def add_figure(self) -> None:
-        """Show the figure of the causes in the overview."""
-        self.figure = True
-        self._entries.append(json.dumps(["figure", "", None]))
+    def add_figure(self, entity: str) -> None:
+        """Show a figure of the causes in the overview."""
+        self.figures.append(entity)
+        self._entries.append(json.dumps(["figure", entity, None]))
 
-    def add_view(self, kind: str, *names: str) -> None:
-        """Show what is logged under ``kind``/``names``, if it is not shown yet."""
-        if list(names) not in self._views[kind]:
-            self._views[kind].append(list(names))
-            self._entries.append(json.dumps(["view", kind, names]))
+    def add_view(self, kind: str, *names: str, title: str | None = None, origin: str | None = None) -> None:
+        """Show what is logged under ``kind``/``names``, or under ``origin``, if it is not shown yet."""
+        title, origin = title or "/".join(names) or TABS[kind], origin or entity_path(kind, *names)
+        shown = self._views[kind].setdefault(title, [])
+        if origin not in shown:
+            shown.append(origin)
+            self._entries.append(json.dumps(["view", kind, [title, origin]]))
+
+    @classmethod
+    def joined(cls, runs: Mapping[str, Layout]) -> Layout:
+        """The layout of recordings each of which lies below its run's name: curves in one view, and the same episode of
+        several runs side by side."""
+        layout = cls()
+        same: dict[tuple[Any, ...], list[str]] = {}
+        for run, one in runs.items():
+            root = entity_path(run)
+            for page in one.pages.values():
+                moved = page.below(run)
+                layout.add_page(moved.row["name"], moved)
+                known = page.row["task"], page.row["episode"]
+                same.setdefault(known if known[1] is not None else (page.row["name"],), []).append(moved.row["name"])
+            for title, names in one._compared:
+                layout.compare(f"{run}: {title}", [f"{run}/{name}" for name in names])
+            for figure in one.figures:
+                layout.add_figure(root + figure)
+            for kind, views in one._views.items():
+                for title, origins in views.items():
+                    for origin in origins:
+                        own = title if kind == "metrics" else f"{title} · {run}"
+                        layout.add_view(kind, title=own, origin=root + origin)
+        for known, names in same.items():
+            if len({name.partition("/")[0] for name in names}) > 1:
+                layout.compare(f"{' · episode '.join(map(str, known))} · side by side", names)
+        return layout
 
     @classmethod
     def read(cls, reader: Any) -> Layout | None:
@@ -270,9 +310,10 @@ class Layout:
             elif kind == "compare":
                 layout.compare(name, content)
             elif kind == "figure":
-                layout.add_figure()
+                layout.add_figure(name)
             else:
-                layout.add_view(name, *content)
+                layout.add_view(name, title=content[0], origin=content[1])
+        layout._saved = len(layout._entries)
         return layout if found else None
 
     def save(self, stream: Any) -> None:
@@ -301,20 +342,21 @@ class Layout:
         tabs: list[Any] = []
         if self._has_overview():
             views: list[Any] = [rrb.TextDocumentView(origin=entity_path(OVERVIEW, "table"), name="Episodes")]
-            if self.figure:
-                views.append(rrb.Spatial2DView(origin=entity_path(OVERVIEW, "causes"), name="Causes"))
+            views += [rrb.Spatial2DView(origin=figure, name="Causes") for figure in self.figures]
             tabs.append(rrb.Horizontal(*views, column_shares=[1] * len(views), name=OVERVIEW.title()))
         for title, names in self._compared:  # a column each
             pages = [self.pages[name] for name in names]
-            shown = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
+            window = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
             farthest = max(page.farthest for page in pages)
-            columns = [page.column(self._title(page), shown, farthest) for page in pages]
+            columns = [page.column(self._title(page), window, farthest) for page in pages]
             tabs.append(rrb.Horizontal(*columns, name=title))
-        tabs += [page.tab(self._title(page)) for page in self._ordered()]
-        for kind, views in self._views.items():
-            if views:
-                grid = [_view(kind, names) for names in views]
-                tabs.append(grid[0] if kind == "hparams" else rrb.Grid(*grid, name=TABS[kind]))
+        of_episodes = [page.tab(self._title(page)) for page in self._ordered()]
+        of_kinds: list[Any] = []
+        for kind, shown in self._views.items():
+            if shown:
+                grid = [_view(kind, title, origins) for title, origins in shown.items()]
+                of_kinds.append(grid[0] if kind == "hparams" and len(grid) == 1 else rrb.Grid(*grid, name=TABS[kind]))
+        tabs += of_kinds + of_episodes if self._has_overview() else of_episodes + of_kinds
         front = None if tab is None else self._find(tab)
         closed = {"state": "collapsed"}
         time = {"timeline": self.tab(tab).timeline, "fps": 80.0, "play_state": "paused", "loop_mode": "all"}
@@ -329,11 +371,14 @@ class Layout:
         first = [page.row["name"] for page in pages[:1]]
         tabs = [Tab(OVERVIEW, OVERVIEW.title(), first)] if self._has_overview() else []
         tabs += [Tab(title, title, names) for title, names in self._compared]
-        tabs += [Tab(page.row["name"], self._title(page), [page.row["name"]]) for page in pages]
-        for kind in (kind for kind, views in self._views.items() if views):
-            timeline = METRIC_TIMELINE if kind in OF_TRAINING else EPISODE_TIMELINE
-            tabs.append(Tab(TABS[kind], TABS[kind], [], timeline))
-        return tabs
+        of_episodes = [Tab(page.row["name"], self._title(page), [page.row["name"]]) for page in pages]
+        of_kinds = [
+            Tab(TABS[kind], TABS[kind], [], METRIC_TIMELINE if kind in OF_TRAINING else EPISODE_TIMELINE)
+            for kind, shown in self._views.items()
+            if shown
+        ]
+        # Behind many episodes nobody would find the rest.
+        return tabs + (of_kinds + of_episodes if self._has_overview() else of_episodes + of_kinds)
 
     def _find(self, name: str | None) -> int:
         """The place of the tab of that name or title, or of the only one whose title holds it; of None the first."""
@@ -359,13 +404,14 @@ class Layout:
         return min((self.pages[name].decisive for name in self.tab(tab).episodes), default=None)
 
 
-def _view(kind: str, names: Sequence[str]) -> Any:
-    origin, name = entity_path(kind, *names), "/".join(names)
+def _view(kind: str, name: str, origins: Sequence[str]) -> Any:
+    origin = origins[0]
     if kind == "metrics":
         legend = rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=True)
-        return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=legend)
+        several: dict[str, Any] = {"contents": [f"{one}/**" for one in origins]} if len(origins) > 1 else {}
+        return rrb.TimeSeriesView(origin="/" if several else origin, name=name, plot_legend=legend, **several)
     if kind == "histograms":
         return rrb.BarChartView(origin=origin, name=name, plot_legend=rrb.PlotLegend(visible=False))
     if kind == "hparams":
-        return rrb.TextDocumentView(origin="/hparams", name=TABS[kind])
+        return rrb.TextDocumentView(origin=origin, name=name)
     return rrb.Spatial2DView(origin=origin, name=name)
