@@ -223,6 +223,9 @@ def _by_counterfactuals(
     elif how is not None:
         words = f"With {how.by} the same episode succeeds, at step {len(how.steps) - 1}"
         words += _certainty(decision, shares, share)
+        if cause == "actuation" and "skill" in set(mended) - set(counting):
+            alone = f"A scripted skill in step {tried.step[which] + 1} alone suffices"
+            words += f". {alone} too, but what is wrong there is as wrong in other steps"
     elif same and "plan" in mended:
         words = "With the reference plan it succeeds, though in no state that asks for anything else"
     elif told.cause == "query" and "query" not in first:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.evaluation.failure_records import CAUSES, Failure
+from lw_torchrl.evaluation.failure_records import CAUSES, Failure, part_words
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plan_text import one_line
 from lw_torchrl.record.conventions import CONTROL_PERIOD, FALSE, STEEL, Color, rr, step_color, time_columns
@@ -144,8 +144,8 @@ def _why(failure: Failure, episode: RecordedEpisode) -> list[str]:
     if failure.step is not None and failure.step < len(episode.steps):
         seen += f", in {_step(episode, failure.step)}"
     lines.append(f"{seen}.")
-    mended = [part for part, worked in failure.counterfactuals.items() if worked]
-    useless = [part for part, worked in failure.counterfactuals.items() if not worked]
+    mended = [part_words(part) for part, worked in failure.counterfactuals.items() if worked]
+    useless = [part_words(part) for part, worked in failure.counterfactuals.items() if not worked]
     told = [f"replacing {' or '.join(mended)} made it a success"] if mended else []
     told += [f"replacing {' or '.join(useless)} did not help"] if useless else []
     if told:
