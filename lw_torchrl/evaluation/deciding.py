@@ -51,7 +51,7 @@ def decide(mended: Collection[str], shares: Mapping[str, float], null: float = 0
 
     What was shown or answered wrongly comes first, if that put right mends. Of the other replacements the one that
     mends most of the task's failed episodes counts; of those about as good the first: the plan, unless scripts that
-    follow it succeed; a script in one step; the gripper or the motion alone. Where two that do not contain each other
+    follow it succeed; a skill in one step; the gripper or the motion alone. Where two that do not contain each other
     are about as good, or none leads clearly over running the episode again as it was, it is the policy, not told which
     part. Time comes last, then pairs.
 

@@ -337,11 +337,8 @@ class RerunLogger(Logger):
                 raise ValueError(f"name must be a non-empty string, got {name!r}")
             elif name in taken:
                 raise ValueError(f"name must be another than {', '.join(taken)}, got {name!r}")
-            title = heading.title(episode, None if name == own else name)
-            self._layout.add_page(
-                name,
-                send_page(stream, len(self.episodes) + 1, name, title, heading, episode, motion, ghost, self._meshes),
-            )
+            page = send_page(stream, len(self.episodes) + 1, name, heading, episode, motion, ghost, self._meshes)
+            self._layout.add_page(name, page)
         return name
 
     def show_causes(self, result: EvaluationResult) -> None:
