@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.evaluation.failure_records import CAUSES, Failure
+from lw_torchrl.evaluation.failure_records import CAUSES, Failure, part_words
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plan_text import one_line
 from lw_torchrl.record.conventions import CONTROL_PERIOD, FALSE, STEEL, Color, changes, rr, step_color, time_columns
@@ -143,7 +143,7 @@ def _why(failure: Failure, episode: RecordedEpisode) -> list[str]:
     seen = f"Seen at {at(failure.at)} of {len(episode)}"
     if failure.step is not None and failure.step < len(episode.steps):
         seen += f", in {_step(episode, failure.step)}"
-    useless = [part for part, worked in failure.counterfactuals.items() if not worked]
+    useless = [part_words(part) for part, worked in failure.counterfactuals.items() if not worked]
     helped = f" Replacing {' or '.join(useless)} did not help." if useless else ""
     return [*lines, f"{seen}.{helped}"]
 

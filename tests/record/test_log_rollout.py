@@ -183,7 +183,7 @@ def test_a_failure_is_the_verdict(tmp_path, pushed):
     assert verdict.startswith("#### FAILED: skill, a skill was clumsy\n\nIt came to rest 10 cm away.  \n")
     skill = PLANS["push"].steps[1].skill
     assert f"Seen at t = 33 (0.41 s) of 60, in plan step 2, **“{skill}”**." in verdict
-    assert "Replacing plan or query did not help." in verdict
+    assert "Replacing the plan or the answers did not help." in verdict
     assert "push · episode 0 · seed 5 · mine" in verdict
     assert opening_step(tmp_path / "a.rrd") == 33
     (store,) = found.reader.blueprints()
