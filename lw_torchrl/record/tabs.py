@@ -22,7 +22,7 @@ from lw_torchrl.record.lanes import log_lanes
 from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.overview import OVERVIEW, place, table
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
-from lw_torchrl.record.scene import Point, log_pictures, log_scene
+from lw_torchrl.record.scene import Point, log_pictures, log_scene, touched_things
 from lw_torchrl.record.verdict import (
     Heading,
     decisive_step,
@@ -181,7 +181,7 @@ def send_page(
     ``meshes`` are those in the recording, as :func:`log_motion` has them.
     """
     root = entity_path(name)
-    touched = None if motion is None else motion.touched
+    touched = None if motion is None else touched_things(motion, episode)
     lanes = log_lanes(stream, entity_path(f"e{number}"), episode, heading.ended(episode), touched, ghost)
     eye = SIMPLE_EYE if motion is None else ROBOT_EYE
     drawn = drawn_steps(heading, episode, ghost)

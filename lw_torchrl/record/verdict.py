@@ -223,7 +223,8 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
 
 def _lines(conditions: Sequence[str], episode: RecordedEpisode) -> int:
     """The lines that a plan takes with these conditions, and the longest reason, in a small window."""
-    texts = [f"x  1.  if {condition}" for condition in conditions] + [skill for _, skill in episode.steps]
+    told = "  (evaluator: x)" if episode.believed is not None else ""
+    texts = [f"x  1.  if {condition}{told}" for condition in conditions] + [skill for _, skill in episode.steps]
     texts += [max(episode.reasons, key=len, default="")]
     return sum(-(-len(text) // LINE) for text in texts)
 
