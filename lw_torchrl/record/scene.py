@@ -58,10 +58,12 @@ def log_scene(
 
     def point(path: str, position: NDArray[np.float32], label: str | None, radius: float, color: Color) -> None:
         labels = None if label is None else [label]
-        style = rr.Points3D.from_fields(radii=[radius], colors=[color], labels=labels)
-        stream.log(f"{scene}/{path}", style, static=True)
         rows = drawn[changes(position[drawn])]
-        stream.send_columns(f"{scene}/{path}", time_columns(rows), rr.Points3D.columns(positions=position[rows]))
+        still = position[rows] if len(rows) == 1 else None
+        style = rr.Points3D.from_fields(positions=still, radii=[radius], colors=[color], labels=labels)
+        stream.log(f"{scene}/{path}", style, static=True)
+        if still is None:
+            stream.send_columns(f"{scene}/{path}", time_columns(rows), rr.Points3D.columns(positions=position[rows]))
 
     def named(path: str, label: str, radius: float, color: Color) -> None:
         """A point with its name, which stands beside it if it would cover another there."""

@@ -279,17 +279,16 @@ class Layout:
 
     @classmethod
     def joined(cls, runs: Mapping[str, Layout]) -> Layout:
-        """The layout of recordings each of which lies below its run's name: curves in one view, and the same episode of
-        several runs side by side."""
+        """The layout of recordings each of which lies below its run's name: curves in one view, and episodes of
+        the same name side by side."""
         layout = cls()
-        same: dict[tuple[Any, ...], list[str]] = {}
+        same: dict[str, list[str]] = {}
         for run, one in runs.items():
             root = entity_path(run)
             for page in one.pages.values():
                 moved = page.below(run)
                 layout.add_page(moved.row["name"], moved)
-                known = page.row["task"], page.row["episode"]
-                same.setdefault(known if known[1] is not None else (page.row["name"],), []).append(moved.row["name"])
+                same.setdefault(page.row["name"], []).append(moved.row["name"])
             for title, names in one._compared:
                 layout.compare(f"{run}: {title}", [f"{run}/{name}" for name in names])
             for figure in one.figures:
@@ -299,9 +298,9 @@ class Layout:
                     for origin in origins:
                         own = title if kind == "metrics" else f"{title} · {run}"
                         layout.add_view(kind, title=own, origin=root + origin)
-        for known, names in same.items():
-            if len({name.partition("/")[0] for name in names}) > 1:
-                layout.compare(f"{' · episode '.join(map(str, known))} · side by side", names)
+        for name, names in same.items():
+            if len(names) > 1:
+                layout.compare(f"{name} · side by side", names)
         return layout
 
     @classmethod

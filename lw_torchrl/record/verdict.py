@@ -67,15 +67,14 @@ def at(step: int) -> str:
 
 
 def decisive_step(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None) -> int:
-    """The step to look at first: the failure's, else the first success, else the last; one of :func:`telling_steps`."""
-    first, last = telling_steps(heading, episode, ghost)
-    if (
-        ghost is not None
-        and ghost.episode.first_success is not None
-        and not first <= _decisive(heading, episode) <= last
-    ):
-        return min(ghost.episode.first_success, last)
-    return _decisive(heading, episode)
+    """The step to look at first: the failure's, else the first success, else the last; one of :func:`telling_steps`.
+
+    Where a ghost that succeeds has not parted yet, or is gone, it is that of its success.
+    """
+    (_, last), seen = telling_steps(heading, episode, ghost), _decisive(heading, episode)
+    if ghost is None or ghost.episode.first_success is None or ghost.parts_at(episode) < seen <= last:
+        return seen
+    return min(ghost.episode.first_success, last)
 
 
 def _decisive(heading: Heading, episode: RecordedEpisode) -> int:
