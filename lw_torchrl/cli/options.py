@@ -238,10 +238,12 @@ def check_actor(argument: str, who: str) -> None:
 def imported(option: str, name: str, kind: str) -> Any:
     """What "package.module:name" names."""
     module, _, attribute = name.partition(":")
+    absent = f"{option} {name!r} names no {kind}"
+    found = own_module(absent, module)
     try:
-        return getattr(own_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"{option} {name!r} names no {kind}: {error}") from error
+        return getattr(found, attribute)
+    except AttributeError as error:
+        raise ValueError(f"{absent}: {error}") from None
 
 
 def read_encoder(name: str | None) -> TextEncoder | None:
