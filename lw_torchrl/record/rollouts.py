@@ -16,6 +16,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import checked, missing_keys, shown
+from lw_torchrl._devices import device_of
 from lw_torchrl._files import AnyPath, replacing
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
@@ -62,7 +63,8 @@ def log_rollout(
             int64, "action" T×4 float32 in [-1, 1], as executed, and ("next", "success") T×1 bool. Optional are
             ("next", "executed_action") T×4, which is taken in the place of the action, "episode" T int64, "qaf" T×S
             bool, "qaf_plan" T int64, "qaf_logits" T×S float32 (positive: true), "skill_weights" T×S float32,
-            "action_corrected" T×1 and ("next", "reward") T×1 float32. Or batch size (N, T), an episode in each row.
+            "action_corrected" T×1, ("next", "reward") T×1 float32 and "pixels" T×H×W×3 uint8, what the policy saw. Or
+            batch size (N, T), an episode in each row.
         plans: what ``qaf`` answers; None for no plan.
         seed: of the environment; with ``episode`` it says how the episode began.
         name: of the episode in the recording; None takes "push-7", of task and episode, or else "push".
@@ -244,6 +246,8 @@ def run_recorded(
     max_steps: int | None = None,
     suite: str | Suite | None = None,
     engine: Any = None,
+    stop_at_success: bool = False,
+    device: str | torch.device | None = None,
     progress: bool = False,
 ) -> list[FinishedEpisode]:
     """Episodes with all that :func:`lw_torchrl.log_rollout` shows of them, run as :func:`lw_torchrl.evaluate` does.
@@ -264,12 +268,16 @@ def run_recorded(
     env = make_env(actor, answered, LanguageWorldEnv(list(chosen.values()), strict=True, **options))
     written = set() if answered is None else {"qaf", *actor.out_keys}
     evaluator = getattr(actor, "evaluator", None)
-    keys = list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *getattr(evaluator, "in_keys", ())]))
-    how: dict[str, Any] = {"noise_scale": noise_scale, "progress": progress, "keys": keys}
+    seen = {"pixels"} & set(getattr(actor, "in_keys", ()))
+    keys = list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *getattr(evaluator, "in_keys", ()), *seen]))
+    how: dict[str, Any] = {"noise_scale": noise_scale, "progress": progress, "keys": keys, "device": device}
+    how["after_success"] = 0 if stop_at_success else None
     found = {}
     with running("recording", env, actor, dict.fromkeys(chosen, episodes), **how) as finished:
         for one in finished:
-            found[one.task, one.episode] = one if evaluator is None else one._replace(steps=evaluator(one.steps))
+            if evaluator is not None:
+                one = one._replace(steps=evaluator(one.steps.to(device_of(evaluator))).cpu())
+            found[one.task, one.episode] = one
     return [found[task, episode] for task in chosen for episode in episodes]
 
 
