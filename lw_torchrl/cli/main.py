@@ -72,7 +72,8 @@ ABOUT = """Language-World with TorchRL: policies carried by plans in English. --
 or evaluators of your own to their tables (docs/extending.md).
 
 Exit status: 0, done; 1, a bug of ours, with a traceback; 2, an error that you can fix, in one line on the standard
-error, which names the line of a module of yours if it is there (LW_TORCHRL_TRACEBACK=1 shows the traceback); 130, stopped by Ctrl-C; 141, nobody reads the output. What prints a table prints JSON with --json."""
+error, which names the line of a module of yours if it is there (LW_TORCHRL_TRACEBACK=1 shows the traceback); 130,
+stopped by Ctrl-C; 141, nobody reads the output. What prints a table prints JSON with --json."""
 
 _RESUMABLE = {"demo", "collect", "train", "train-evaluator", "reproduce", "offline", "online"}
 _RESUMABLE |= {"plan generate", "plan compare", "plan repair"}
