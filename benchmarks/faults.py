@@ -24,7 +24,10 @@ from lw_torchrl.evaluation import CAUSES, attribute_failures
 from lw_torchrl.evaluation.summary import markdown_table
 
 REFERENCE = Path(__file__).parent / "data" / "attribution_plans.json"
-BUILT_ON = ("button-press-topdown", "drawer-open", "push")
+BUILT_ON = (
+    *("button-press-topdown", "drawer-open", "push", "plate-slide-back", "plate-slide-side", "handle-press-side"),
+    *("door-close", "button-press-wall", "peg-unplug-side", "sweep", "hand-insert"),
+)
 """The tasks that causes and margins were chosen on."""
 TASKS = ("pick-place", "coffee-pull", "window-open", "faucet-open", "dial-turn")
 RECORDED = ("observation", "task_id", "qaf", "skill_weights")

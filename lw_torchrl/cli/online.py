@@ -40,7 +40,7 @@ def online(
     task_file: options.TaskFile = None,
     episodes: int = 40,  # evaluated, on seeds that no training used, action noise 0.1
     step: str | None = None,
-    logger: Literal["none", "csv", "tensorboard", "wandb"] = "none",
+    logger: Literal["none", "csv", "tensorboard", "wandb", "rerun"] = "none",
     out: Path = Path("runs/online"),  # where everything goes; on a cluster, a folder that all its machines share
     json: options.Json = False,
 ) -> Output:

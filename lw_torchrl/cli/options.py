@@ -287,8 +287,14 @@ def _suite_of(tasks: Mapping[str, Task]) -> lw.suites.Suite | None:
     return known_suite(first) if "/" in first else None
 
 
-def make_logger(kind: Literal["csv", "tensorboard", "wandb"], out: Path) -> Any:
-    """The TorchRL logger of --logger, in a folder beside ``out``."""
+Logs = Literal["csv", "tensorboard", "wandb", "rerun"]
+
+
+def make_logger(kind: Logs, out: Path) -> Any:
+    """The TorchRL logger of --logger, in a folder beside ``out``; rerun's goes on in its recording if training does."""
+    if kind == "rerun":
+        resume = out.exists() or out.with_name("checkpoint.zip").exists()
+        return lw.RerunLogger(out.parent / "logs" / f"{out.stem}.rrd", resume=resume)
     from torchrl.record.loggers import get_logger
 
     try:

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
@@ -150,7 +151,7 @@ def _cast(
 
 
 def view(
-    recording: Positional[Annotated[Path, arg(metavar="RUN|FILE")]],  # an .rrd file, or a folder that holds one
+    recordings: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN|FILE ...")]],  # .rrd files, or folders of one
     /,
     episode: str | None = None,  # open at this tab, by its title or its episode's name
     screenshot: Path | None = None,  # write a .png here, no window; wants Debian's mesa-vulkan-drivers and libvulkan1
@@ -162,7 +163,10 @@ def view(
 ) -> None:
     """Open a recording in the rerun viewer; or take a picture of it, write it as one page, or serve it as one.
 
+    Of several runs, up to four, curves lie over one another, and an episode that they share stands side by side.
+
     Example: lw-torchrl view runs/demo --episode drawer-open --screenshot picture.png --step 80
+    Example: lw-torchrl view runs/small/logs/policy.rrd runs/large/logs/policy.rrd
     """
     given = [f"--{name}" for name, value in (("screenshot", screenshot), ("html", html), ("web", web)) if value]
     if len(given) > 1:
@@ -172,21 +176,27 @@ def view(
             options.check_file(option, file, ending)
     if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", window_size):
         raise ValueError(f"window_size must be like '1400x900', got {window_size!r}")
-    if not recording.exists():
-        raise FileNotFoundError(f"recording: there is no file or folder {str(recording)!r}")
-    if recording.is_dir() and not any(recording.glob("*.rrd")):
-        raise FileNotFoundError(f"recording: the folder {str(recording)!r} holds no recording (*.rrd)")
-    from lw_torchrl.record import WebPage, open_viewer, write_html
+    if not 1 <= len(recordings) <= 4:
+        raise ValueError(f"recordings must be 1 to 4 files or folders, got {len(recordings)}")
+    for recording in recordings:
+        if not recording.exists():
+            raise FileNotFoundError(f"recordings: there is no file or folder {str(recording)!r}")
+        if recording.is_dir() and not any(recording.glob("*.rrd")):
+            raise FileNotFoundError(f"recordings: the folder {str(recording)!r} holds no recording (*.rrd)")
+    from lw_torchrl.record import WebPage, join_recordings, open_viewer, write_html
 
-    if web:
-        with WebPage(recording, episode=episode, step=step, port=port) as page:
-            print(f"{page.address}  (Ctrl-C ends it)", flush=True)
-            with suppress(KeyboardInterrupt):
-                page.serve()
-        return
-    if html is not None:
-        write_html(recording, html, episode=episode, step=step)
-    else:
-        open_viewer(recording, screenshot, window_size, step=step, episode=episode)
+    with TemporaryDirectory() as folder:
+        shown = recordings[0]
+        if len(recordings) > 1:
+            shown = join_recordings(recordings, Path(folder) / "runs.rrd")
+        if web:
+            with WebPage(shown, episode=episode, step=step, port=port) as page:
+                print(f"{page.address}  (Ctrl-C ends it)", flush=True)
+                with suppress(KeyboardInterrupt):
+                    page.serve()
+        elif html is not None:
+            write_html(shown, html, episode=episode, step=step)
+        else:
+            open_viewer(shown, screenshot, window_size, step=step, episode=episode)
     if written := html or screenshot:
         print(f"written to {written}")

@@ -43,7 +43,7 @@ def train(
     answers: Literal["logit", "tanh", "hard"] | None = None,
     qaf_anchor: float = 0.0,
     seed: int = 0,  # of the initial weights and the minibatches
-    logger: Literal["csv", "tensorboard", "wandb"] | None = None,  # write loss and learning rate to logs/ beside OUT
+    logger: options.Logs | None = None,  # write loss and learning rate to logs/ beside OUT
     device: options.Device = "cpu",
     json: options.Json = False,
 ) -> Output:

@@ -62,9 +62,9 @@ def attribute_failures(
     (where a text is no scripted skill, the expert's actions) in one step of the plan (*skill*), for the *gripper* or
     the hand's motion (*actuation*) alone, or in all steps (*policy*, not told which part); twice the time (*out of
     time*). Where none mends, pairs are tried, which give ``cause`` and ``also``. Where several do, that counts which
-    mends most of the task's failed episodes, and of those as good the smallest. One mended episode may be luck:
-    ``evidence`` and ``why`` hold how much of the task's failed episodes each mended, nothing replaced among them. A
-    policy without plans is told of no step.
+    mends most of the task's failed episodes, and of those as good the smallest; a skill, unless what is wrong in its
+    step is as wrong in the others. One mended episode may be luck: ``evidence`` and ``why`` hold how much of the task's
+    failed episodes each mended, nothing replaced among them. A policy without plans is told of no step.
 
     Args:
         rollouts: episodes as :func:`evaluate` gives them to ``on_episode``, or TensorDicts of batch (T,), each one
@@ -223,6 +223,9 @@ def _by_counterfactuals(
     elif how is not None:
         words = f"With {how.by} the same episode succeeds, at step {len(how.steps) - 1}"
         words += _certainty(decision, shares, share)
+        if cause == "actuation" and "skill" in set(mended) - set(counting):
+            alone = f"A scripted skill in step {tried.step[which] + 1} alone suffices"
+            words += f". {alone} too, but what is wrong there is as wrong in other steps"
     elif same and "plan" in mended:
         words = "With the reference plan it succeeds, though in no state that asks for anything else"
     elif told.cause == "query" and "query" not in first:

@@ -10,15 +10,9 @@ from torch import Tensor, nn
 from torchrl.envs import Transform
 
 from lw_torchrl.envs.episodes import FinishedEpisode
+from lw_torchrl.evaluation.beside_scripts import BesideScripts, beside_scripts
 from lw_torchrl.evaluation.deciding import PAIR_WORDS, REPLACEMENTS, Decision
-from lw_torchrl.evaluation.explanation import (
-    EpisodeStates,
-    Scripts,
-    candidates,
-    often_far,
-    script_gaps,
-    unlike_scripts,
-)
+from lw_torchrl.evaluation.explanation import EpisodeStates, Scripts, candidates, states_of
 from lw_torchrl.evaluation.failure_records import MendedEpisode
 from lw_torchrl.evaluation.repeating import EpisodeId, EpisodeRepeater, NullControl, Perception
 from lw_torchrl.evaluation.scripts_in_charge import WithScripts
@@ -85,7 +79,7 @@ class Counterfactuals:
         self.plans = plans = scripts.plans
         self.found: dict[str, dict[EpisodeId, FinishedEpisode | None]] = {}  # counterfactual to episodes that it mends
         self.step: dict[EpisodeId, int] = {}  # in which a script mends the episode
-        self.gaps: dict[EpisodeId, Tensor] = {}  # from the actions of scripts
+        self.beside: dict[EpisodeId, BesideScripts] = {}  # where it failed, and where a script mends one step
         self.reference: Plans | None = None
         self.other = self.other_evaluator = None  # that carry out the reference
         different = [] if reference is None else [reference[task] for task in reference.differences(plans)]
@@ -154,24 +148,21 @@ class Counterfactuals:
 
     def _run_scripts(self, seen: Sequence[EpisodeStates]) -> None:
         """Scripts in one step, for the likeliest steps in turn; for the gripper or the motion alone; for all."""
-        ranked, one_step = {}, set[EpisodeId]()
+        ranked = {}
         for one in seen:
-            gaps = script_gaps(self.actor, one, self.scripts)
-            unlike = None if gaps is None else unlike_scripts(gaps)
-            if gaps is not None:
-                self.gaps[one.which] = gaps
+            beside = beside_scripts(self.actor, one, self.scripts)
+            unlike = None if beside is None else beside.unlike()
+            if beside is not None:
+                self.beside[one.which] = beside
             if unlike is None or unlike.any():
                 ranked[one.which] = candidates(one, unlike)
-            if gaps is not None and unlike is not None and len(one.in_force[unlike].unique()) == 1:
-                motion = gaps[:, torch.arange(gaps.shape[-1]) != self.plans.layout.gripper]
-                one_step |= {one.which} if unlike_scripts(motion).any() else set()  # elsewhere it does what scripts do
         told_of_steps = plans_of(self.actor) is not None
         for turn in range(_TRIED_STEPS if told_of_steps else 0):
             which = self._unmended([w for w, steps in ranked.items() if len(steps) > turn], "skill")
             steps = {one: ranked[one][turn] for one in which}
             self._run("skill", which, self._scripted(self.actor, self.plans, steps=steps), self.plans, self.evaluator)
             self.step.update({one: steps[one] for one in which if self._mends("skill", one)})
-        left = [one for one in ranked if not (one in one_step and self._mends("skill", one))]
+        left = [one for one in ranked if not (self._mends("skill", one) and self._in_one_step(one))]
         for name, part in (("gripper", "gripper"), ("actuation", "displacement")):
             if self.plans.layout.gripper is not None:
                 scripted = self._scripted(self.actor, self.plans, part=part)
@@ -180,19 +171,42 @@ class Counterfactuals:
         left = [one for one in ranked if one in parts or self._mends("plan", one)]  # can scripts follow this plan?
         self._run("policy", left, self._scripted(self.actor, self.plans), self.plans, self.evaluator)
 
+    def _motion(self, beside: BesideScripts) -> BesideScripts:
+        return beside.part(~self._fingers(beside))
+
+    def _fingers(self, beside: BesideScripts) -> Tensor:
+        gripper = self.plans.layout.gripper
+        return torch.arange(beside.done.shape[-1]) == torch.tensor(-1 if gripper is None else gripper)
+
+    def _in_one_step(self, which: EpisodeId) -> bool:
+        """Whether the motion differs from the scripts' in one step of the plan and the policy is their equal elsewhere,
+        also in the steps that it gets to once a script has mended that one."""
+        episode, beside = self.found["skill"][which], self.beside.get(which)
+        assert episode is not None
+        if beside is None:
+            return False
+        mended = beside_scripts(self.actor, states_of(*which, episode.steps, self.plans, None), self.scripts)
+        if mended is not None:
+            both = zip(beside, mended, strict=True)
+            beside = self.beside[which] = BesideScripts(*(torch.cat(tensors) for tensors in both))
+        return len(beside.in_force[beside.unlike()].unique()) == 1 and bool(self._motion(beside).unlike().any())
+
     def mending(self, one: EpisodeStates) -> list[str]:
-        """What mends an episode. A script in one step does not count where scripts for a part of the action in all
-        steps mend too, and the policy is as wrong in another step, or only its gripper is."""
+        """What mends an episode. A script in one step does not count where scripts for the gripper or the motion in all
+        steps mend too, and only the gripper is wrong in it, or what is wrong there is as wrong in other steps; where
+        it is not, scripts for the motion do not count."""
         found = [name for name, results in self.found.items() if results.get(one.which) is not None]
-        gaps, step, layout = self.gaps.get(one.which), self.step.get(one.which), self.plans.layout
-        if gaps is None or step is None or layout.gripper is None:
+        beside, step = self.beside.get(one.which), self.step.get(one.which)
+        if beside is None or step is None or self.plans.layout.gripper is None:
             return found
-        fingers = torch.arange(gaps.shape[-1]) == layout.gripper
-        parts = {"gripper": gaps[:, fingers], "actuation": gaps[:, ~fingers]}
-        fingers_alone = "gripper" in found and often_far(parts["gripper"], one, [step])
-        fingers_alone = fingers_alone and not often_far(parts["actuation"], one, [step])
+        motion, fingers = self._motion(beside), beside.part(self._fingers(beside))
         others = [other for other in range(one.truth.shape[1]) if other != step]
-        if fingers_alone or any(often_far(of, one, others) for name, of in parts.items() if name in found):
+        in_others = motion.in_other_steps(step)
+        if in_others is False and "actuation" in found:
+            found.remove("actuation")
+        in_all = motion.often_far(others) if in_others is None else in_others
+        by_gripper = fingers.often_far(others) or (fingers.often_far([step]) and not motion.often_far([step]))
+        if ("gripper" in found and by_gripper) or ("actuation" in found and in_all):
             found.remove("skill")
         return found
 

@@ -16,16 +16,16 @@ class Replacement(NamedTuple):
 
 
 REPLACEMENTS: dict[str, Replacement] = {
-    "perception": Replacement("perception", "true observations"),
-    "query": Replacement("query", "true answers"),
+    "perception": Replacement("perception", "the true observations"),
+    "query": Replacement("query", "the true answers"),
     "plan": Replacement("plan", "the reference plan"),
-    "skill": Replacement("skill", "a script in one step"),
-    "gripper": Replacement("gripper", "scripts for the gripper"),
-    "actuation": Replacement("actuation", "scripts for the hand's motion"),
-    "policy": Replacement("policy", "scripts in all steps"),
+    "skill": Replacement("skill", "a scripted skill in one step"),
+    "gripper": Replacement("gripper", "the gripper under scripted control"),
+    "actuation": Replacement("actuation", "the hand's motion under scripted control"),
+    "policy": Replacement("policy", "scripted skills in every step"),
     "time": Replacement("out of time", "twice the time"),
 }
-PAIR_WORDS: dict[str, str] = {"query": "true answers", "plan": "the reference plan", "skill": "scripts"}
+PAIR_WORDS: dict[str, str] = {"query": "the true answers", "plan": "the reference plan", "skill": "scripted skills"}
 _FACTS = ("perception", "query")  # tried only where something was shown or answered wrongly, which is a fact
 
 
@@ -51,7 +51,7 @@ def decide(mended: Collection[str], shares: Mapping[str, float], null: float = 0
 
     What was shown or answered wrongly comes first, if that put right mends. Of the other replacements the one that
     mends most of the task's failed episodes counts; of those about as good the first: the plan, unless scripts that
-    follow it succeed; a script in one step; the gripper or the motion alone. Where two that do not contain each other
+    follow it succeed; a skill in one step; the gripper or the motion alone. Where two that do not contain each other
     are about as good, or none leads clearly over running the episode again as it was, it is the policy, not told which
     part. Time comes last, then pairs.
 

@@ -1,7 +1,7 @@
 """What the states of a failed episode tell: which answers were wrong, where the plan departs from a reference, which
 step it ended in."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -10,7 +10,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from lw_torchrl._devices import device_of
 from lw_torchrl.evaluation.failure_records import Cause
 from lw_torchrl.evaluation.plan_use import where_stuck
 from lw_torchrl.language.layout import METAWORLD, Layout
@@ -18,16 +17,13 @@ from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
-from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.transforms.qaf import plan_program
 
 _LATE = 100  # the last states, in which a failed episode got nowhere
 _AHEAD, _STILL = 10, 0.01  # a hand that within so many states comes less than a centimetre further
 _AWAY = 25  # states that a stay in a step may be left for: two steps that alternate are one stay
 _WRONG = 0.01  # the share of states with wrong answers from which they count
-_OTHER = 0.3  # how far two actions differ, on some axis, that are not meant to do the same
-_OFTEN, _BRIEF = 0.4, 5  # the share of a step's states from which something is usual; states that are too few to say
-_SAME = 0.02  # how far an action may be from the script's and still be the script's
+OTHER = 0.3  # how far two actions differ, on some axis, that are not meant to do the same
 _REST = ScriptedSkill("", GRIPPER, gain=(0.0, 0.0, 0.0))  # in the place of a text that is no scripted skill
 _RULER = 1e-3  # action per metre, so small that no distance is cut off
 
@@ -234,38 +230,7 @@ def _departs(
     rows = torch.arange(len(ours))
     done = scripts.program(observation, task_id)[rows, ours]
     wanted = other_scripts.program(observation, task_id)[rows, theirs]
-    differ = (done - wanted).abs().amax(-1) > _OTHER
+    differ = (done - wanted).abs().amax(-1) > OTHER
     same_text = torch.tensor([[a.skill == b.skill for b in other.steps] for a in plan.steps])[ours, theirs]
     scripted = torch.tensor(scripts.known[plan.task])[ours] & torch.tensor(other_scripts.known[other.task])[theirs]
     return torch.where(scripted, differ, ~same_text), ours, theirs
-
-
-def script_gaps(actor: Any, seen: EpisodeStates, scripts: Scripts) -> Tensor | None:
-    """(T, A) float32, how far the policy's actions are from those of the scripted skills of the steps that it is in, 0
-    where it is in none, infinite where its step has no script; None where it cannot be asked, since it draws its
-    actions or reads what was not recorded."""
-    keys = [key for key in getattr(actor, "in_keys", ()) if key != "qaf"]
-    if getattr(actor, "draws", True) or any(seen.steps.get(key, None) is None for key in keys):
-        return None
-    states = seen.steps.select(*keys).clone()
-    if "qaf" in actor.in_keys:
-        states.set("qaf", torch.nn.functional.pad(seen.given, (0, actor.plans.num_steps - seen.given.shape[1])))
-    with torch.no_grad(), evaluating(actor):
-        action = actor(states.to(device_of(actor))).get("action").cpu()
-    program = scripts.program(seen.steps.get("observation"), seen.steps.get("task_id"))[:, : seen.weights.shape[1]]
-    wanted = (seen.weights.unsqueeze(-1) * program).sum(-2)
-    unscripted = ~torch.tensor(scripts.known[seen.task])[seen.in_force]
-    gaps = (action - wanted).abs().masked_fill(unscripted.unsqueeze(-1), torch.inf)
-    return gaps.masked_fill((seen.in_force < 0).unsqueeze(-1), 0.0)
-
-
-def unlike_scripts(gaps: Tensor) -> Tensor:
-    """(T,) bool, where actions are not those of scripts."""
-    return gaps.amax(-1) > _SAME
-
-
-def often_far(gaps: Tensor, seen: EpisodeStates, steps: Sequence[int]) -> bool:
-    """Whether the actions are far from the scripts' in one of these steps of the plan, in a good part of its states."""
-    far = gaps.amax(-1) > _OTHER
-    stays = [seen.in_force == step for step in steps]
-    return any(bool(far[inside].float().mean() > _OFTEN) for inside in stays if inside.sum() >= _BRIEF)

@@ -109,7 +109,23 @@ class Failure:
         return {name: dict(value) if isinstance(value, Mapping) else value for name, value in found.items()}
 
 
-PARTS = ("perception", "query", "plan", "skill", "gripper", "actuation", "policy", "time")
+PARTS: dict[str, str] = {
+    "perception": "the observations",
+    "query": "the answers",
+    "plan": "the plan",
+    "skill": "the skill of one step",
+    "gripper": "the gripper's commands",
+    "actuation": "the hand's motion",
+    "policy": "all actions",
+    "time": "the time limit",
+}
+"""What a counterfactual replaces, in words."""
+
+
+def part_words(name: str) -> str:
+    """What a counterfactual of :attr:`Failure.counterfactuals` replaces: "the answers and the plan"."""
+    names = name.split(" + ")
+    return " and ".join(PARTS["policy" if one == "skill" and len(names) > 1 else one] for one in names)
 
 
 def count_causes(tasks: Sequence[str], failures: Sequence[Failure]) -> dict[str, dict[str, int]]:

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lw_torchrl.language.relations import STATES
+from lw_torchrl.language.relations import PREDICATES, STATES
 from lw_torchrl.record.conventions import (
     FALSE,
     GOLD,
@@ -26,6 +25,7 @@ from lw_torchrl.record.recorded_episode import NOBODY, MendedRecording, Recorded
 NONE_HOLDS, EVENLY = "no condition holds", "evenly mixed"
 OPEN, CLOSED, NOTHING = "open", "closed", "nothing"
 FAILED: Color = (215, 75, 75)
+WRONG: Color = (200, 60, 140)
 TOUCHES_CLOSED, TOUCHES_OPEN = (225, 130, 60), (150, 165, 220)
 
 
@@ -40,11 +40,10 @@ class Lanes:
 
     root: str
     states: dict[str, tuple[str, Color]] = field(default_factory=dict)
-    count: int = 0
+    paths: list[str] = field(default_factory=list)
 
     def send(self, stream: Any, name: str, first: int, states: Sequence[str], looks: Mapping[str, Any]) -> None:
         """Add a lane whose first state is that of step ``first``; ``looks`` are colours, or words and colours."""
-        self.count += 1
         for state, look in looks.items():
             self.states[state] = look if isinstance(look[0], str) else (state, look)
         rows = changes(np.array(states)[:, None])
@@ -53,6 +52,7 @@ class Lanes:
         # This apostrophe counts as a letter.
         path = self.root + entity_path(name.replace("'", "\u02bc").replace(" ", "_"))
         stream.send_columns(path, times, rr.StateChange.columns(state=entries))
+        self.paths.append(path)
 
 
 def log_lanes(
@@ -65,11 +65,6 @@ def log_lanes(
 ) -> Lanes:
     """The lanes of an episode below ``root``; ``ended`` is its verdict, ``touched`` what its fingers touched."""
     lanes = Lanes(root)
-
-    def truth(name: str, values: NDArray[np.bool_]) -> None:
-        looks = {"true": TRUE, "false": FALSE}
-        lanes.send(stream, name, 0, np.where(values, "true", "false").tolist(), looks)
-
     found = [a.shape[1] for a in (episode.qaf, episode.believed, episode.skill_weights) if a is not None]
     columns = max([len(episode.steps), *found])
     width = len(str(columns))
@@ -86,9 +81,12 @@ def log_lanes(
         number, told = f"{column + 1:0{width}}", episode.believed
         if episode.qaf is not None:
             condition = short(episode.steps[column][0]) if episode.steps else "condition"
-            truth(f"{number} {condition}", episode.qaf[:, column])
-            if told is not None and (told[:, column] != episode.qaf[:, column]).any():
-                truth(f"{number}b but the policy was told", told[:, column])
+            truth = np.where(episode.qaf[:, column], "true", "false")
+            if told is not None:
+                wrong = told[:, column] != episode.qaf[:, column]
+                truth = np.where(wrong, np.where(told[:, column], "false, told true", "true, told false"), truth)
+            looks = {"true": TRUE, "false": FALSE, "false, told true": WRONG, "true, told false": WRONG}
+            lanes.send(stream, f"{number} {condition}", 0, truth.tolist(), looks)
     opening = episode.observation[:, episode.layout.opening]
     states = np.where(opening > STATES[OPEN][0].threshold, OPEN, CLOSED).tolist()
     looks = {OPEN: STEEL, CLOSED: GOLD}
@@ -114,7 +112,29 @@ def _send_steps(stream: Any, lanes: Lanes, name: str, episode: RecordedEpisode, 
 
 
 def short(condition: str) -> str:
-    """A condition without the words that all of them have."""
-    said = re.sub(r"\b(the robot's|the) | is\b", "", condition).split(" and ")
-    about = said[0].split()[0]
-    return " and ".join([said[0], *(one.removeprefix(f"{about} ") for one in said[1:])])
+    """A condition without the words that all have; what is said of the same things names them once: "gripper above and
+    not left or right of puck"."""
+    said: list[tuple[str, str, list[tuple[bool, str]]]] = []
+    for clause in condition.split(" and "):
+        subject, _, rest = re.sub(r"\b(the robot's|the) ", "", clause).partition(" is ")
+        negated, rest = rest.startswith("not "), rest.removeprefix("not ")
+        predicate = max((known for known in PREDICATES if f"{rest} ".startswith(f"{known} ")), key=len, default=rest)
+        thing = rest.removeprefix(predicate)
+        if not said or said[-1][:2] != (subject, thing) or not thing:
+            said.append((subject, thing, []))
+        said[-1][2].append((negated, predicate))
+    parts, before = [], ""
+    for subject, thing, predicates in said:
+        words = ""
+        for i, (negated, predicate) in enumerate(predicates):
+            follows = bool(i) and predicates[i - 1][0]
+            joint = ("or " if follows else "and not ") if negated else "but " if follows else "and "
+            last = i == len(predicates) - 1
+            words += f" {joint if i else 'not ' if negated else ''}" + (
+                predicate if last else re.sub(r" (of|with|to)$", "", predicate)
+            )
+        parts.append(f"{'' if subject == before else subject}{words}{thing}".strip())
+        before = subject
+    return re.sub(
+        r"\b(not )?touching table\b", lambda found: "off table" if found[1] else "on table", " and ".join(parts)
+    )

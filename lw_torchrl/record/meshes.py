@@ -78,32 +78,42 @@ def log_motion(
         ghost: draw translucent meshes, below /ghosts, and only of what moves.
 
     Returns:
-        A mesh's entity to that of the body in whose frame a view is to show it; "" where it stands where it is.
+        A mesh's entity to the frame in which a view is to show it; "" where it stands where it is.
     """
     geometry = model_geometry(motion.model)
     last = len(motion.position) - 1
     drawn = np.arange(last + 1) if drawn is None else np.append(drawn[drawn < last], last)
-    frames = {}
+    frames: dict[str, str] = {}
+    placed: list[tuple[str, NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]] = []
     for body, name, mesh in geometry.meshes:
         path = entity_path("ghosts" if ghost else "meshes", name)
-        own = f"{root}{entity_path(geometry.bodies[body])}"
         place, turn = motion.position[drawn, body], motion.quaternion[drawn, body][:, [1, 2, 3, 0]]
         moved = changes(np.concatenate([place, turn], axis=1))
         pose = b"" if len(moved) > 1 else place[0].tobytes() + turn[0].tobytes()
         if ghost and pose:
             continue
-        still = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
         if path not in known:
             known[path] = pose
             look: dict[str, Any] = {"albedo_factor": GHOST, "vertex_colors": None} if ghost else {}
+            still = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
             stream.log(path, rr.Mesh3D(**(mesh | look)), *([still] if pose else []), static=True)
         # What stands where it stood in the first episode needs no frame, which costs a page two kilobytes.
-        frames[path] = "" if pose and known[path] == pose else own
-        if pose and frames[path]:
-            stream.log(own, still, static=True)
-        elif frames[path]:
-            columns = rr.Transform3D.columns(translation=place[moved], quaternion=turn[moved])
-            stream.send_columns(own, time_columns(drawn[moved]), columns)
+        if pose and known[path] == pose:
+            frames[path] = ""
+            continue
+        frames[path] = f"{stream.get_recording_id()[-8:]}{root}/{geometry.bodies[body]}"
+        if frames[path] not in [frame for frame, *_ in placed]:
+            placed.append((frames[path], drawn[moved], place[moved], turn[moved]))
+    if placed:  # all in one: an entity for each body would weigh as much again
+        rows = np.concatenate([rows for _, rows, _, _ in placed])
+        order = np.argsort(rows, kind="stable")
+        names = np.repeat([frame for frame, *_ in placed], [len(rows) for _, rows, _, _ in placed])
+        columns = rr.Transform3D.columns(
+            translation=np.concatenate([place for *_, place, _ in placed])[order],
+            quaternion=np.concatenate([turn for *_, turn in placed])[order],
+            child_frame=names[order].tolist(),
+        )
+        stream.send_columns(root, time_columns(rows[order]), columns)
     return frames
 
 

@@ -33,6 +33,7 @@ from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.metrics import check_name
 from lw_torchrl.record.overview import OVERVIEW
 from lw_torchrl.record.recorded_episode import MendedRecording, PlanLike, RecordedEpisode
+from lw_torchrl.record.resuming import Begun
 from lw_torchrl.record.tabs import TABS, Layout, send_page
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.record.writer import RecordingWriter, check_address, check_path
@@ -53,6 +54,9 @@ class RerunLogger(Logger):
             "rerun+http://127.0.0.1:9876/proxy"; start it with ``rerun``.
         exp_name: the name of the run; None takes the file's, without ".rrd".
         application_id: recordings of one application share the last one's layout in rerun's viewer; None for a new one.
+        resume: go on in the recording that the file holds, if it is there: a viewer shows one, with all curves and
+            episodes, and steps that nobody gives count on. What a training logs a second time, since it had gone
+            further than its last checkpoint, stands there twice.
 
     Attributes:
         previous: where an older file of that name is kept, or None.
@@ -60,6 +64,7 @@ class RerunLogger(Logger):
 
     Raises:
         OSError: the file cannot be made.
+        ValueError: what is to be gone on with is no recording, or one of an earlier version.
 
     Example:
         >>> import tempfile, os
@@ -82,24 +87,33 @@ class RerunLogger(Logger):
         connect: str | None = None,
         exp_name: str | None = None,
         application_id: str | None = None,
+        resume: bool = False,
     ) -> None:
         if path is None and connect is None:
             raise ValueError("give path, a file to write, or connect, a viewer to show it in, or both; got neither")
         self.path = None if path is None else check_path(path)
         self.connect = None if connect is None else check_address(connect)[0]
         name = exp_name or (self.path.stem if self.path else "lw_torchrl")
+        if resume and self.path is None:
+            raise ValueError("resume=True needs path, the file to go on with")
+        begun = None
+        if resume and self.path is not None and self.path.is_file() and self.path.stat().st_size:
+            begun = Begun.read(self.path)
+            application_id = application_id or begun.application_id
         self.application_id = application_id or f"{name}-{uuid.uuid4().hex[:8]}"
         self._lock, self._adding = threading.RLock(), threading.Lock()
         self._scalars: dict[str, tuple[list[int], list[list[float]]]] = {}
         self._curves: dict[str, int] = {}
-        self._counters: dict[str, int] = {}
-        self._hparams: dict[str, str] = {}
-        self._layout, self._sent = Layout(), 0.0
-        self._meshes: dict[str, bytes] = {}
+        self._counters = {} if begun is None else begun.counters
+        self._hparams = {} if begun is None else begun.hparams
+        self._layout, self._sent = Layout() if begun is None else begun.layout, 0.0
+        self._meshes = {} if begun is None else begun.meshes
+        self._recording_id = None if begun is None else begun.recording_id
         super().__init__(exp_name=name, log_dir=str(self.path.parent) if self.path else os.curdir)
 
     def _create_experiment(self) -> rr.RecordingStream:
-        self._writer = RecordingWriter(self.path, self.connect, self.application_id, self.exp_name, self._send_waiting)
+        name, prepare, begun = self.exp_name, self._send_waiting, self._recording_id
+        self._writer = RecordingWriter(self.path, self.connect, self.application_id, name, prepare, begun)
         stream = self._writer.stream
         # In another process (service_backend="process") torchrl ends the experiment, not the logger.
         stream.finish = self.shutdown
@@ -148,7 +162,7 @@ class RerunLogger(Logger):
             stream.log(entity_path("metrics", *parts), lines, static=True)
         with self._lock:
             steps, values = self._scalars.setdefault(name, ([], []))
-            steps.append(self._count(f"metrics/{name}", step))
+            steps.append(self._count(entity_path("metrics", *parts), step))
             values.append(row)
             full = len(values) >= BUFFERED_SCALARS
         if full:
@@ -337,11 +351,8 @@ class RerunLogger(Logger):
                 raise ValueError(f"name must be a non-empty string, got {name!r}")
             elif name in taken:
                 raise ValueError(f"name must be another than {', '.join(taken)}, got {name!r}")
-            title = heading.title(episode, None if name == own else name)
-            self._layout.add_page(
-                name,
-                send_page(stream, len(self.episodes) + 1, name, title, heading, episode, motion, ghost, self._meshes),
-            )
+            page = send_page(stream, len(self.episodes) + 1, name, heading, episode, motion, ghost, self._meshes)
+            self._layout.add_page(name, page)
         return name
 
     def show_causes(self, result: EvaluationResult) -> None:
@@ -350,8 +361,9 @@ class RerunLogger(Logger):
         plot_failures(result).savefig(picture, format="png", dpi=100)
         stream = self._open()
         encoded = rr.EncodedImage(contents=picture.getvalue(), media_type="image/png")
-        stream.log(entity_path(OVERVIEW, "causes"), encoded, static=True)
-        self._layout.add_figure()
+        path = entity_path(OVERVIEW, "causes")
+        stream.log(path, encoded, static=True)
+        self._layout.add_figure(path)
 
     def compare(self, names: Sequence[str], title: str = "Side by side") -> None:
         """Show episodes beside one another, in a tab before their own: one cursor moves in all of them.

@@ -25,6 +25,10 @@ PALM_HALF, PALM_RISE = (0.018, 0.062, 0.014), 0.012
 WRIST_HALF, WRIST_RISE = (0.012, 0.012, 0.055), 0.081
 TABLE_CENTER, TABLE_HALF = (0.0, 0.6, -0.010), (0.7, 0.4, 0.010)
 TABLE, GRID = (58, 64, 74), (92, 99, 112)
+FOCAL, LABEL, LETTER = 160.0, 26.0, 6.5
+"""In pixels, of the scene in a window of 1100×700: of its camera, the height of a name, the width of a letter."""
+
+Point = tuple[float, float, float]
 
 
 def log_scene(
@@ -34,9 +38,10 @@ def log_scene(
     motion: Motion | None,
     known: dict[str, bytes],
     drawn: NDArray[np.int64],
+    eye: tuple[Point, Point],
     ghost: MendedRecording | None = None,
 ) -> tuple[list[str], dict[str, str]]:
-    """Draw robot, objects, goal, the hand's path and the target pose under ``root``/scene.
+    """Draw robot, objects, goal, the hand's path and the target pose under ``root``/scene, seen from ``eye``.
 
     Returns the trails' paths and what :func:`log_motion` does. A trail is one short line per row that is ``drawn``,
     shown up to the cursor. Without a motion, the robot is a hand over a table.
@@ -56,6 +61,13 @@ def log_scene(
         rows = drawn[changes(position[drawn])]
         stream.send_columns(f"{scene}/{path}", time_columns(rows), rr.Points3D.columns(positions=position[rows]))
 
+    def named(path: str, label: str, radius: float, color: Color) -> None:
+        """A point with its name, which stands beside it if it would cover another there."""
+        away = offsets[label]
+        point(path, things[label], None if away.any() else label, radius, color)
+        if away.any():
+            point(f"names{entity_path(label)}", things[label] + away, label, 0.0005, color)
+
     def lines(path: str, strips: NDArray[np.float32], radius: float, color: Color) -> None:
         look = {"colors": [color] * len(drawn), "radii": [radius] * len(drawn)}
         stream.send_columns(f"{scene}/{path}", time_columns(drawn), rr.LineStrips3D.columns(strips=strips, **look))
@@ -65,12 +77,16 @@ def log_scene(
     goals = [name for name, position in episode.objects.items() if np.allclose(goal, position, atol=1e-3)]
     others = [name for name in episode.objects if name != GRIPPER]
     colors = {GRIPPER: GOLD} | dict(zip(others, cycle(OBJECT_COLORS), strict=False))
+    things = {name: position for name, position in episode.objects.items() if name != GRIPPER}
+    things |= {"goal": goal} if goal.any() and not goals and "goal" not in things else {}
+    offsets = beside({name: position[drawn] for name, position in things.items()}, eye)
     trails = []
     for name, color in (colors | {name: GREEN for name in goals if name != GRIPPER}).items():
         part, position = entity_path(name), episode.objects[name]
-        label, size = (None, 0.005) if name == GRIPPER else (name, 0.016 if motion is None else 0.008)
-        if motion is None or name != GRIPPER:
-            point(f"objects{part}", position, label, size, color)
+        if name != GRIPPER:
+            named(f"objects{part}", name, 0.016 if motion is None else 0.008, color)
+        elif motion is None:
+            point(f"objects{part}", position, None, 0.005, color)
         if motion is None:  # from each row straight down, or up, to the table's top
             onto = position * np.array([1, 1, 0], np.float32)
             lines(f"heights{part}", np.stack([position, onto], axis=1)[drawn], 0.0012, (*color, 150))
@@ -80,8 +96,8 @@ def log_scene(
             before = np.concatenate([way[:1], way[:-1]])
             lines(f"trails{part}", np.stack([before, way], axis=1), 0.003 if motion is None else 0.002, color)
 
-    if goal.any() and not goals:
-        point("goal", goal, "goal", 0.018, GREEN)
+    if "goal" in things and "goal" not in episode.objects:
+        named("goal", "goal", 0.018, GREEN)
     _log_target(stream, scene, episode, drawn)
     if ghost is not None:
         way = ghost.episode.objects[GRIPPER]
@@ -89,6 +105,34 @@ def log_scene(
         if motion is not None and ghost.motion is not None:
             frames |= log_motion(stream, f"{scene}/ghost", ghost.motion, known, drawn, ghost=True)
     return trails, frames
+
+
+def beside(things: dict[str, NDArray[np.float32]], eye: tuple[Point, Point]) -> dict[str, NDArray[np.float32]]:
+    """How far from its thing, T×3 metres, each name stands (3, float32), so that names cover one another least.
+
+    They are seen from ``eye``, its place and where it looks, in the smallest window; there is one place an episode.
+    """
+    place, ahead = np.array(eye[0], np.float32), np.subtract(eye[1], eye[0]).astype(np.float32)
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0, 0, 1]).astype(np.float32)
+    right /= np.linalg.norm(right)
+    up = np.cross(right, ahead)
+    found: dict[str, NDArray[np.float32]] = {}
+    taken: list[tuple[NDArray[Any], float]] = []
+    for name, position in things.items():
+        depth = np.maximum((position - place) @ ahead, 0.05)
+        at = np.stack([(position - place) @ right, (position - place) @ up], axis=1) * (FOCAL / depth)[:, None]
+        wide = LETTER * len(name) + 2 * LETTER
+
+        def covered(lines: int, at: Any = at, wide: float = wide) -> float:
+            shifted = at + np.array([0, lines * LABEL])
+            gaps = [(np.abs(shifted - other), (wide + width) / 2) for other, width in taken]
+            return sum(float(((gap[:, 0] < both) & (gap[:, 1] < LABEL)).mean()) for gap, both in gaps)
+
+        lines = min((0, 1, -1, 2, -2, 3), key=lambda lines: covered(lines) + 0.05 * abs(lines))
+        taken.append((at + np.array([0, lines * LABEL]), wide))
+        found[name] = (up * lines * LABEL * float(depth.mean()) / FOCAL).astype(np.float32)
+    return found
 
 
 def _log_simple_robot(stream: Any, scene: str, episode: RecordedEpisode, drawn: NDArray[np.int64]) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Sequence
+import re
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, NamedTuple
 
@@ -19,9 +20,9 @@ from lw_torchrl.record.conventions import (
 )
 from lw_torchrl.record.lanes import log_lanes
 from lw_torchrl.record.meshes import Motion
-from lw_torchrl.record.overview import OVERVIEW, table
+from lw_torchrl.record.overview import OVERVIEW, place, table
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
-from lw_torchrl.record.scene import log_scene
+from lw_torchrl.record.scene import Point, log_scene
 from lw_torchrl.record.verdict import (
     Heading,
     decisive_step,
@@ -33,14 +34,15 @@ from lw_torchrl.record.verdict import (
     verdict,
 )
 
-Point = tuple[float, float, float]
+MANY_LANES = 9  # beside more, a small window has little room for the verdict
+_CONDITION = re.compile(r"/0*[1-9]\d*_[^/]*$")  # how lanes of conditions are called, as log_lanes has it
 
 # From behind the robot's right shoulder, over a table whose middle is at (0, 0.6, 0); with the arm, from the front.
 SIMPLE_EYE: tuple[Point, Point] = ((0.54, 0.23, 0.46), (0.03, 0.63, 0.10))
 ROBOT_EYE: tuple[Point, Point] = ((0.54, 0.18, 0.47), (-0.02, 0.62, 0.13))
 
 CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
-    "distance": ("Distance of what the skill moves from where it goes, cm", None),
+    "distance": ("Distance to the target, cm", None),
     "action": ("Action", (-1.2, 1.2)),
     "reward": ("Reward", None),
     "skill_weights": ("Skill weights", (-0.1, 1.1)),
@@ -54,49 +56,68 @@ class Page:
     """What was logged of an episode, as far as its views depend on it."""
 
     root: str
-    title: str
     trails: Collection[str]  # entities that are shown up to the cursor
     eye: tuple[Point, Point]  # where the scene is seen from, and what is looked at
     shown: tuple[int, int]  # the first and last step worth a look
     decisive: int  # the step to open it at
     curves: Collection[str]
-    steps: int  # of the plan
-    lanes: str  # what they lie below
+    lines: int  # of the plan's text, in a small window; 0 where there is no plan
+    lanes: Sequence[str]  # their entities
     states: dict[str, tuple[str, Color]]  # of the lanes: words and colour
-    rows: int  # how many lanes
-    good: bool
     farthest: float  # of the distances, cm
     row: dict[str, Any]  # in the overview
     frames: dict[str, str]  # as log_motion gives them
 
-    def tab(self) -> rrb.Horizontal:
-        """Scene and curves on the left, words and timeline on the right."""
-        # Shares are the pixels that a view needs in a window of 1100×700; what is longer scrolls.
-        plan = 45 + 42 * self.steps if self.steps else 0
-        left: list[tuple[float, Any]] = [(max(200, 480 - plan), self._scene())]
-        left += [(plan, self._words("plan", "Plan"))] if plan else []
-        left.append((120, rrb.Tabs(*(self._curve(name) for name in CURVES if name in self.curves))))
-        right: list[tuple[float, Any]] = [(85 if self.good else 160, self._words("verdict", "Verdict"))]
-        right += self._timeline()
-        right[0] = max(right[0][0], 600 - sum(share for share, _ in right[1:])), right[0][1]
-        return rrb.Horizontal(_stacked(left), _stacked(right), column_shares=[6, 5], name=self.title)
+    def title(self, policy: bool = True) -> str:
+        """The tab's: the episode's name, who acted if that is to be said, and how it ended, if that is known."""
+        ended = {"failed": "failed", "success": f"success at {self.row['at']}"}.get(self.row["ended"])
+        if self.row["cause"]:
+            ended = f"failed: {self.row['cause']}"
+        return " · ".join(filter(None, [self.row["name"], self.row["policy"] if policy else None, ended]))
 
-    def column(self, shown: tuple[int, int], farthest: float) -> rrb.Vertical:
-        """Verdict, scene, lanes and distance in a column, beside others that show the same steps and centimetres."""
+    def below(self, run: str) -> Page:
+        """The page where all entities of its recording lie below that of a ``run``, whose name it takes too."""
+        root, row = entity_path(run), self.row
+        return replace(
+            self,
+            root=root + self.root,
+            trails=[root + path for path in self.trails],
+            lanes=[root + path for path in self.lanes],
+            frames={root + mesh: frame for mesh, frame in self.frames.items()},
+            row=row | {"name": f"{run}/{row['name']}", "title": f"{run}: {row['title']}"},
+        )
+
+    def tab(self, title: str) -> rrb.Horizontal:
+        """Scene and curves on the left, words and lanes on the right."""
+        # Shares are the pixels that a view needs in a window of 1100×700; what is longer scrolls.
+        plan = 60 + 15 * self.lines if self.lines else 0
+        left: list[tuple[float, Any]] = [(max(150, 500 - plan), self._scene())]
+        left += [(plan, self._words("plan", "Plan"))] if plan else []
+        left.append((105, rrb.Tabs(*(self._curve(name) for name in CURVES if name in self.curves))))
+        right = self._lanes(self.lanes)
+        right.insert(0, (max(100, 605 - sum(share for share, _ in right)), self._words("verdict", "Verdict")))
+        return rrb.Horizontal(_stacked(left), _stacked(right), column_shares=[9, 10], name=title)
+
+    def column(self, title: str, shown: tuple[int, int], farthest: float) -> rrb.Vertical:
+        """Verdict, scene, distance and main lanes in a column, beside others that show the same steps and centimetres.
+
+        What held is behind the scene.
+        """
         page = replace(self, shown=shown, farthest=farthest)
-        parts: list[tuple[float, Any]] = [(100, page._words("verdict", self.title)), (190, page._scene())]
-        if "distance" in page.curves:
-            parts.append((90, page._curve("distance")))
-        parts += page._timeline()
-        return _stacked(parts, self.title)
+        conditions = [lane for lane in self.lanes if _CONDITION.search(lane)]
+        behind = [view for _, view in page._lanes(conditions, "What held")]
+        below: list[tuple[float, Any]] = [(100, page._curve("distance"))] if "distance" in page.curves else []
+        below += page._lanes([lane for lane in self.lanes if lane not in conditions])
+        scene = rrb.Tabs(page._scene(), *behind) if behind else page._scene()
+        room = max(120, 487 - sum(share for share, _ in below))
+        return _stacked([(118, page._words("verdict", title)), (room, scene), *below], title)
 
     def _scene(self) -> rrb.Spatial3DView:
         first, now = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.cursor_relative()
         timelines = EPISODE_TIMELINE, SECONDS_TIMELINE
         trail = rrb.VisibleTimeRanges([rr.VisibleTimeRange(name, start=first, end=now) for name in timelines])
         shown: dict[Any, Any] = {path: trail for path in self.trails}
-        # "tf#" and an entity's path is the name of its frame.
-        shown |= {mesh: rr.CoordinateFrame(f"tf#{body}") for mesh, body in self.frames.items() if body}
+        shown |= {mesh: rr.CoordinateFrame(frame) for mesh, frame in self.frames.items() if frame}
         return rrb.Spatial3DView(
             origin=f"{self.root}/scene",
             contents=["$origin/**", *self.frames],
@@ -109,20 +130,21 @@ class Page:
     def _words(self, part: str, name: str) -> rrb.TextDocumentView:
         return rrb.TextDocumentView(origin=f"{self.root}/{part}", name=name)
 
-    def _timeline(self) -> list[tuple[float, Any]]:
-        if not self.rows:
+    def _lanes(self, lanes: Sequence[str], name: str = "What went on") -> list[tuple[float, Any]]:
+        if not lanes:
             return []
         labels, colors = zip(*self.states.values(), strict=True)
         styles = rr.StateConfiguration(values=list(self.states), labels=labels, colors=colors)
+        origin = lanes[0].rpartition("/")[0]
         view = rrb.StateTimelineView(
-            origin=self.lanes, name="What went on", time_view=_window(self.shown), defaults=[styles]
+            origin=origin, contents=lanes, name=name, time_view=_window(self.shown), defaults=[styles]
         )
-        return [(60 + 40 * self.rows, view)]
+        return [(50 + 40 * len(lanes), view)]
 
     def _curve(self, name: str) -> rrb.TimeSeriesView:
         title, limits = CURVES[name]
-        if name == "distance":
-            limits = -0.05 * self.farthest, 1.05 * self.farthest
+        if name == "distance":  # a small view has no room for the axis' numbers
+            limits, title = (-0.05 * self.farthest, 1.05 * self.farthest), f"{title} (up to {self.farthest:.0f})"
         return rrb.TimeSeriesView(
             origin=f"{self.root}/{name}",
             name=title,
@@ -139,39 +161,34 @@ def send_page(
     stream: Any,
     number: int,
     name: str,
-    title: str,
     heading: Heading,
     episode: RecordedEpisode,
     motion: Motion | None,
     ghost: MendedRecording | None,
     meshes: dict[str, bytes],
 ) -> Page:
-    """Log the recording's ``number``-th episode, under ``name``; what its views, a tab called ``title``, are to show.
+    """Log the recording's ``number``-th episode, under ``name``; returns what its views are to show.
 
     ``meshes`` are those in the recording, as :func:`log_motion` has them.
     """
     root = entity_path(name)
     touched = None if motion is None else motion.touched
     lanes = log_lanes(stream, entity_path(f"e{number}"), episode, heading.ended(episode), touched, ghost)
-    trails, frames = log_scene(stream, root, episode, motion, meshes, drawn_steps(heading, episode, ghost), ghost)
-    stream.log(
-        f"{root}/verdict", rr.TextDocument(verdict(heading, episode, ghost), media_type="text/markdown"), static=True
-    )
-    if episode.steps:
-        log_plan(stream, root, episode)
+    eye = SIMPLE_EYE if motion is None else ROBOT_EYE
+    drawn = drawn_steps(heading, episode, ghost)
+    trails, frames = log_scene(stream, root, episode, motion, meshes, drawn, eye, ghost)
+    text = verdict(heading, episode, ghost, small=len(lanes.paths) > MANY_LANES)
+    stream.log(f"{root}/verdict", rr.TextDocument(text, media_type="text/markdown"), static=True)
     return Page(
         root,
-        title,
         trails=trails,
-        eye=SIMPLE_EYE if motion is None else ROBOT_EYE,
+        eye=eye,
         shown=telling_steps(heading, episode, ghost),
         decisive=decisive_step(heading, episode, ghost),
         curves=log_curves(stream, root, episode),
-        steps=len(episode.steps),
-        lanes=lanes.root,
+        lines=log_plan(stream, root, episode) if episode.steps else 0,
+        lanes=lanes.paths,
         states=lanes.states,
-        rows=lanes.count,
-        good=episode.first_success is not None,
         farthest=farthest(episode),
         row=heading.row(episode, name),
         frames=frames,
@@ -208,8 +225,8 @@ class Layout:
     def __init__(self) -> None:
         self.pages: dict[str, Page] = {}  # iterate over a copy: the writer's thread reads while pages come
         self._compared: list[tuple[str, list[str]]] = []
-        self.figure = False  # whether there is one of the causes
-        self._views: dict[str, list[list[str]]] = {kind: [] for kind in TABS}
+        self.figures: list[str] = []  # entities of pictures of the causes
+        self._views: dict[str, dict[str, list[str]]] = {kind: {} for kind in TABS}  # titles to what they show
         self._entries: list[str] = []
         self._saved = self._shown = 0
 
@@ -223,20 +240,59 @@ class Layout:
         self._compared.append((title, list(names)))
         self._entries.append(json.dumps(["compare", title, list(names)]))
 
+    def _ordered(self) -> list[Page]:
+        """The pages of episodes from left to right: failures first where there is an overview, as in that."""
+        pages = list(self.pages.values())
+        return sorted(pages, key=lambda page: place(page.row)) if self._has_overview() else pages
+
+    def _title(self, page: Page) -> str:
+        """A page's; who acted is said unless that is the same for several."""
+        who = {one.row["policy"] for one in list(self.pages.values())}
+        return page.title(policy=len(who) > 1 or len(self.pages) == 1)
+
     def _has_overview(self) -> bool:
         """Whether there are several episodes, other than the two of one comparison."""
         return len(self.pages) > 1 and len(self._compared) != 1
 
-    def add_figure(self) -> None:
-        """Show the figure of the causes in the overview."""
-        self.figure = True
-        self._entries.append(json.dumps(["figure", "", None]))
+    def add_figure(self, entity: str) -> None:
+        """Show a figure of the causes in the overview."""
+        self.figures.append(entity)
+        self._entries.append(json.dumps(["figure", entity, None]))
 
-    def add_view(self, kind: str, *names: str) -> None:
-        """Show what is logged under ``kind``/``names``, if it is not shown yet."""
-        if list(names) not in self._views[kind]:
-            self._views[kind].append(list(names))
-            self._entries.append(json.dumps(["view", kind, names]))
+    def add_view(self, kind: str, *names: str, title: str | None = None, origin: str | None = None) -> None:
+        """Show what is logged under ``kind``/``names``, or under ``origin``, if it is not shown yet."""
+        title, origin = title or "/".join(names) or TABS[kind], origin or entity_path(kind, *names)
+        shown = self._views[kind].setdefault(title, [])
+        if origin not in shown:
+            shown.append(origin)
+            self._entries.append(json.dumps(["view", kind, [title, origin]]))
+
+    @classmethod
+    def joined(cls, runs: Mapping[str, Layout]) -> Layout:
+        """The layout of recordings each of which lies below its run's name: curves in one view, and the same episode of
+        several runs side by side."""
+        layout = cls()
+        same: dict[tuple[Any, ...], list[str]] = {}
+        for run, one in runs.items():
+            root = entity_path(run)
+            for page in one.pages.values():
+                moved = page.below(run)
+                layout.add_page(moved.row["name"], moved)
+                known = page.row["task"], page.row["episode"]
+                same.setdefault(known if known[1] is not None else (page.row["name"],), []).append(moved.row["name"])
+            for title, names in one._compared:
+                layout.compare(f"{run}: {title}", [f"{run}/{name}" for name in names])
+            for figure in one.figures:
+                layout.add_figure(root + figure)
+            for kind, views in one._views.items():
+                for title, origins in views.items():
+                    for origin in origins:
+                        own = title if kind == "metrics" else f"{title} · {run}"
+                        layout.add_view(kind, title=own, origin=root + origin)
+        for known, names in same.items():
+            if len({name.partition("/")[0] for name in names}) > 1:
+                layout.compare(f"{' · episode '.join(map(str, known))} · side by side", names)
+        return layout
 
     @classmethod
     def read(cls, reader: Any) -> Layout | None:
@@ -254,9 +310,10 @@ class Layout:
             elif kind == "compare":
                 layout.compare(name, content)
             elif kind == "figure":
-                layout.add_figure()
+                layout.add_figure(name)
             else:
-                layout.add_view(name, *content)
+                layout.add_view(name, title=content[0], origin=content[1])
+        layout._saved = len(layout._entries)
         return layout if found else None
 
     def save(self, stream: Any) -> None:
@@ -285,19 +342,21 @@ class Layout:
         tabs: list[Any] = []
         if self._has_overview():
             views: list[Any] = [rrb.TextDocumentView(origin=entity_path(OVERVIEW, "table"), name="Episodes")]
-            if self.figure:
-                views.append(rrb.Spatial2DView(origin=entity_path(OVERVIEW, "causes"), name="Causes"))
-            tabs.append(rrb.Horizontal(*views, name=OVERVIEW.title()))
+            views += [rrb.Spatial2DView(origin=figure, name="Causes") for figure in self.figures]
+            tabs.append(rrb.Horizontal(*views, column_shares=[1] * len(views), name=OVERVIEW.title()))
         for title, names in self._compared:  # a column each
             pages = [self.pages[name] for name in names]
-            shown = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
+            window = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
             farthest = max(page.farthest for page in pages)
-            tabs.append(rrb.Horizontal(*(page.column(shown, farthest) for page in pages), name=title))
-        tabs += [page.tab() for page in list(self.pages.values())]
-        for kind, views in self._views.items():
-            if views:
-                grid = [_view(kind, names) for names in views]
-                tabs.append(grid[0] if kind == "hparams" else rrb.Grid(*grid, name=TABS[kind]))
+            columns = [page.column(self._title(page), window, farthest) for page in pages]
+            tabs.append(rrb.Horizontal(*columns, name=title))
+        of_episodes = [page.tab(self._title(page)) for page in self._ordered()]
+        of_kinds: list[Any] = []
+        for kind, shown in self._views.items():
+            if shown:
+                grid = [_view(kind, title, origins) for title, origins in shown.items()]
+                of_kinds.append(grid[0] if kind == "hparams" and len(grid) == 1 else rrb.Grid(*grid, name=TABS[kind]))
+        tabs += of_kinds + of_episodes if self._has_overview() else of_episodes + of_kinds
         front = None if tab is None else self._find(tab)
         closed = {"state": "collapsed"}
         time = {"timeline": self.tab(tab).timeline, "fps": 80.0, "play_state": "paused", "loop_mode": "all"}
@@ -308,15 +367,18 @@ class Layout:
 
     def tabs(self) -> list[Tab]:
         """The tabs from left to right."""
-        failed = [name for name, page in list(self.pages.items()) if page.row.get("ended") == "failed"]
-        first = [*failed, *self.pages][:1]
+        pages = self._ordered()
+        first = [page.row["name"] for page in pages[:1]]
         tabs = [Tab(OVERVIEW, OVERVIEW.title(), first)] if self._has_overview() else []
         tabs += [Tab(title, title, names) for title, names in self._compared]
-        tabs += [Tab(name, page.title, [name]) for name, page in list(self.pages.items())]
-        for kind in (kind for kind, views in self._views.items() if views):
-            timeline = METRIC_TIMELINE if kind in OF_TRAINING else EPISODE_TIMELINE
-            tabs.append(Tab(TABS[kind], TABS[kind], [], timeline))
-        return tabs
+        of_episodes = [Tab(page.row["name"], self._title(page), [page.row["name"]]) for page in pages]
+        of_kinds = [
+            Tab(TABS[kind], TABS[kind], [], METRIC_TIMELINE if kind in OF_TRAINING else EPISODE_TIMELINE)
+            for kind, shown in self._views.items()
+            if shown
+        ]
+        # Behind many episodes nobody would find the rest.
+        return tabs + (of_kinds + of_episodes if self._has_overview() else of_episodes + of_kinds)
 
     def _find(self, name: str | None) -> int:
         """The place of the tab of that name or title, or of the only one whose title holds it; of None the first."""
@@ -342,13 +404,14 @@ class Layout:
         return min((self.pages[name].decisive for name in self.tab(tab).episodes), default=None)
 
 
-def _view(kind: str, names: Sequence[str]) -> Any:
-    origin, name = entity_path(kind, *names), "/".join(names)
+def _view(kind: str, name: str, origins: Sequence[str]) -> Any:
+    origin = origins[0]
     if kind == "metrics":
         legend = rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=True)
-        return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=legend)
+        several: dict[str, Any] = {"contents": [f"{one}/**" for one in origins]} if len(origins) > 1 else {}
+        return rrb.TimeSeriesView(origin="/" if several else origin, name=name, plot_legend=legend, **several)
     if kind == "histograms":
         return rrb.BarChartView(origin=origin, name=name, plot_legend=rrb.PlotLegend(visible=False))
     if kind == "hparams":
-        return rrb.TextDocumentView(origin="/hparams", name=TABS[kind])
+        return rrb.TextDocumentView(origin=origin, name=name)
     return rrb.Spatial2DView(origin=origin, name=name)

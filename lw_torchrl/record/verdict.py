@@ -7,15 +7,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.evaluation.failure_records import CAUSES, Failure
+from lw_torchrl.evaluation.failure_records import CAUSES, Failure, part_words
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plan_text import one_line
-from lw_torchrl.record.conventions import CONTROL_PERIOD, FALSE, STEEL, Color, rr, step_color, time_columns
+from lw_torchrl.record.conventions import CONTROL_PERIOD, FALSE, STEEL, Color, changes, rr, step_color, time_columns
+from lw_torchrl.record.lanes import short
 from lw_torchrl.record.recorded_episode import NOBODY, MendedRecording, RecordedEpisode
 
 AFTER_SUCCESS, AROUND_FAILURE = 8, 60
 """How many steps after a first success are worth a look, and how many on both sides of where a failure is seen."""
 LONGEST = 200  # steps from where a ghost parts to where the failure is seen that are shown at once
+PLAN_LINES, LINE = 13, 78
+"""How many lines of a plan leave room for the scene in a window of 1100×700, and the letters of one."""
 SELDOM = 8  # steps between two pictures of the scene where nothing is worth a look: a tenth of a second
 
 
@@ -40,29 +43,22 @@ class Heading:
         known = [f"{name} {number}" for name, number in numbers.items() if number is not None]
         return [self.task, *known, *([] if self.policy is None else [self.policy])]
 
-    def title(self, episode: RecordedEpisode, name: str | None) -> str:
-        """The tab's: the name that a user gave or the task's, what else is known, and how it ended, if that is."""
-        ended = "" if episode.success is None else "failed"
-        if episode.first_success is not None:
-            ended = f"success at {episode.first_success}"
-        elif self.failure is not None:
-            ended = f"failed: {self.failure.cause}"
-        return " · ".join(filter(None, [name or self.task, *self.parts()[1:], ended]))
-
     def row(self, episode: RecordedEpisode, name: str) -> dict[str, Any]:
         """What an overview says of the episode that is called ``name``, with its own parts for filters."""
         at = episode.first_success or len(episode)
         ended = "" if episode.success is None else "failed" if episode.first_success is None else "success"
         cause = self.failure.cause if self.failure is not None and ended == "failed" else None
         title = " · ".join([name if name != self.name else self.task, *self.parts()[1:2]])
-        known = {"title": title, "task": self.task, "episode": self.episode, "policy": self.policy}
+        known = {"name": name, "title": title, "task": self.task, "episode": self.episode, "policy": self.policy}
         return known | {"ended": ended, "cause": cause, "at": at, "seconds": at * CONTROL_PERIOD}
 
     def ended(self, episode: RecordedEpisode) -> str:
         """How it ended, in a few words."""
         if episode.first_success is not None:
             return f"SUCCESS at {at(episode.first_success)} of {len(episode)}"
-        return "FAILED" if self.failure is None else f"FAILED: {self.failure.cause}, {CAUSES[self.failure.cause]}"
+        if self.failure is None:
+            return f"FAILED in {len(episode)} steps ({len(episode) * CONTROL_PERIOD:.2f} s)"
+        return f"FAILED: {self.failure.cause}, {CAUSES[self.failure.cause]}"
 
 
 def at(step: int) -> str:
@@ -115,25 +111,29 @@ def drawn_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecordi
     return np.flatnonzero(told)
 
 
-def verdict(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None) -> str:
-    """The verdict, in Markdown; without a :class:`Failure` a failed episode gets the plain facts."""
+def verdict(
+    heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None, small: bool = False
+) -> str:
+    """The verdict, in Markdown, with a ``small`` heading or a large one; without a :class:`Failure` a failed episode
+    gets the plain facts."""
     length = len(episode)
+    lines = [f"{length} steps"] if episode.success is None else [heading.ended(episode)]
     if episode.first_success is not None:
-        held = int(episode.success.sum()) if episode.success is not None else 0
-        lines = [f"## {heading.ended(episode)}"]
-        if episode.success is not None and not episode.success[-1]:
+        assert episode.success is not None
+        if not episode.success[-1]:
+            held = int(episode.success.sum())
             lines.append(f"It did not last: the task stood done in {held} steps, and at the end no more.")
     elif heading.failure is not None:
-        lines = [f"## {heading.ended(episode)}", *_why(heading.failure, episode)]
+        lines += _why(heading.failure, episode)
     elif episode.success is not None:
-        lines = [f"## FAILED in {length} steps ({length * CONTROL_PERIOD:.2f} s)", *_facts(episode)]
-    else:
-        lines = [f"## {length} steps"]
+        lines += _facts(episode)
     if ghost is not None:
         end, parting = ghost.episode.first_success, ghost.parts_at(episode)
         ended = "does not succeed" if end is None else f"succeeds at {at(end)}"
-        lines.insert(1, f"The blue ghost, with {ghost.by}, {ended}. They part at **{at(parting)}**.")
-    return "\n\n".join([*lines, " · ".join(heading.parts())]) + "\n"
+        lines.insert(1, f"**The blue ghost**, with {ghost.by}, {ended}; they part at **t = {parting}**.")
+    # Line after line: in a small window, paragraphs would not fit.
+    head = f"**{lines[0]}**  \n" if small else f"#### {lines[0]}\n\n"
+    return head + "  \n".join([*lines[1:], " · ".join(heading.parts())]) + "\n"
 
 
 def _why(failure: Failure, episode: RecordedEpisode) -> list[str]:
@@ -143,14 +143,9 @@ def _why(failure: Failure, episode: RecordedEpisode) -> list[str]:
     seen = f"Seen at {at(failure.at)} of {len(episode)}"
     if failure.step is not None and failure.step < len(episode.steps):
         seen += f", in {_step(episode, failure.step)}"
-    lines.append(f"{seen}.")
-    mended = [part for part, worked in failure.counterfactuals.items() if worked]
-    useless = [part for part, worked in failure.counterfactuals.items() if not worked]
-    told = [f"replacing {' or '.join(mended)} made it a success"] if mended else []
-    told += [f"replacing {' or '.join(useless)} did not help"] if useless else []
-    if told:
-        lines[-1] += " " + "; ".join(told).capitalize() + "."
-    return lines
+    useless = [part_words(part) for part, worked in failure.counterfactuals.items() if not worked]
+    helped = f" Replacing {' or '.join(useless)} did not help." if useless else ""
+    return [*lines, f"{seen}.{helped}"]
 
 
 def _facts(episode: RecordedEpisode) -> list[str]:
@@ -185,38 +180,52 @@ def _step(episode: RecordedEpisode, step: int) -> str:
 MARKS = {True: "✓", False: "✗", None: "·"}
 
 
-def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> None:
-    """The plan in ``root``/plan, with a text in Markdown wherever truth or the step in force change."""
+def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
+    """The plan in ``root``/plan, with a text in Markdown wherever truth or the step in force change.
+
+    Returns how many lines it takes in a small window. Where these are too many, conditions are told in short.
+    """
+    told = [condition for condition, _ in episode.steps]
+    if _lines(told, episode) > PLAN_LINES:
+        told = [short(condition) for condition in told]
     length = len(episode)
     columns = [
         np.full((length, 1), -1) if episode.in_force is None else episode.in_force[:, None],
         *(answers for answers in (episode.qaf, episode.believed) if answers is not None),
     ]
     states = np.concatenate(columns, axis=1)
-    changes = np.flatnonzero(np.concatenate([[True], (states[1:] != states[:-1]).any(axis=1)]))
+    changed = changes(states)
+    trust = [f"*{said.split(';')[0]}*" for said in episode.reasons[:1] if said.startswith("plan trusted")]
     texts = []
-    trust = [told for told in episode.reasons[:1] if told.startswith("plan trusted")]
-    for row in changes.tolist():
-        parts = [f"*{told.split(';')[0]}*" for told in trust]
+    for row in changed.tolist():
+        parts = list(trust)
         if episode.in_force is not None and episode.in_force[row] == NOBODY:
             answers = episode.answers
             none = answers is None or not answers[row].any()
             parts.append(f"**{'No condition holds' if none else 'No step stands out'}: all steps mixed**")
-        for step, (condition, skill) in enumerate(episode.steps):
+        for step, (_, skill) in enumerate(episode.steps):
             truth = None if episode.qaf is None else bool(episode.qaf[row, step])
-            line = f"{MARKS[truth]}  {step + 1}.  if {condition}"
+            line = f"{MARKS[truth]}  {step + 1}.  if {told[step]}"
             if episode.believed is not None and (believed := bool(episode.believed[row, step])) != truth:
                 line += f"  (evaluator: {MARKS[believed]})"
             leads = episode.in_force is not None and episode.in_force[row] == step
-            reason = (
-                f"  \n\u2003*{one_line(episode.reasons[step])}*" if episode.reasons and episode.reasons[step] else ""
-            )
+            reason = one_line(episode.reasons[step]) if episode.reasons else ""
             parts.append(
-                f"**{line}**  \n\u2003\u2003**→ {skill}**{reason}" if leads else f"{line}  \n\u2003\u2003{skill}"
+                f"**{line}**  \n\u2003\u2003**→ {skill}**" + (f"  \n\u2003*{reason}*" if reason else "")
+                if leads
+                else f"{line}  \n\u2003\u2003{skill}"
             )
         texts.append("  \n".join(parts))
     documents = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
-    stream.send_columns(f"{root}/plan", time_columns(changes), documents)
+    stream.send_columns(f"{root}/plan", time_columns(changed), documents)
+    return _lines(told, episode)
+
+
+def _lines(conditions: Sequence[str], episode: RecordedEpisode) -> int:
+    """The lines that a plan takes with these conditions, and the longest reason, in a small window."""
+    texts = [f"x  1.  if {condition}" for condition in conditions] + [skill for _, skill in episode.steps]
+    texts += [max(episode.reasons, key=len, default="")]
+    return sum(-(-len(text) // LINE) for text in texts)
 
 
 def farthest(episode: RecordedEpisode) -> float:

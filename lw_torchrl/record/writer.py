@@ -37,18 +37,25 @@ class RecordingWriter:
     """A rerun stream and where it goes: to memory first, so that no file and no viewer holds up rerun.
 
     ``prepare`` is called before each write, in whatever thread it is; it sends what the writer's owner holds back.
+    ``recording_id`` is of the recording in the file that is gone on with; None for a new one.
     """
 
     def __init__(
-        self, path: Path | None, connect: str | None, application_id: str, name: str, prepare: Callable[[], None]
+        self,
+        path: Path | None,
+        connect: str | None,
+        application_id: str,
+        name: str,
+        prepare: Callable[[], None],
+        recording_id: str | None = None,
     ) -> None:
-        self._file = None if path is None else RecordingFile(path)
+        self._file = None if path is None else RecordingFile(path, resume=recording_id is not None)
         self.previous = None if self._file is None else self._file.previous
         self._prepare = prepare
         self.troubles: list[str] = []
         self._lock, self._stop = threading.RLock(), threading.Event()
         self._closed = self._file_lost = self._viewer_lost = False
-        self.stream = rr.RecordingStream(application_id)
+        self.stream = rr.RecordingStream(application_id, recording_id=recording_id)
         self.stream.set_log_time_enabled(False)
         self.stream.set_log_tick_enabled(False)
         self._pieces = rr.binary_stream(self.stream)
@@ -121,13 +128,18 @@ class RecordingWriter:
 class RecordingFile:
     """A file that grows by pieces of a rerun stream; between two of them, it is a recording that any viewer opens.
 
-    An older file of its name, unless it is empty, is set aside as ``previous``, "run.previous.rrd" say.
+    An older file of its name, unless it is empty, is set aside as ``previous``, "run.previous.rrd" say; or else, with
+    ``resume``, pieces are added to its own, in the place of its index.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, resume: bool = False) -> None:
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
         self.previous: Path | None = None
+        if resume:
+            self._length = cut_to_messages(path)
+            self._file = os.open(path, os.O_RDWR)
+            return
         if path.is_file() and path.stat().st_size:
             names = (f"{path.stem}.previous{'' if i == 1 else f'-{i}'}{path.suffix}" for i in count(1))
             self.previous = next(free for name in names if not (free := path.with_name(name)).exists())
@@ -186,6 +198,23 @@ class RecordingFile:
         if self.previous is not None:
             os.replace(self.previous, self.path)
             self.previous = None
+
+
+def cut_to_messages(path: Path) -> int:
+    """Leave of a recording the messages that are there as a whole, and an end; returns where this is, in bytes."""
+    size, place = path.stat().st_size, HEADER_BYTES
+    with path.open("r+b") as file:
+        while True:
+            file.seek(place)
+            head = file.read(MESSAGE.size)
+            kind, length = MESSAGE.unpack(head) if len(head) == MESSAGE.size else (0, 0)
+            if kind == 0 or place + MESSAGE.size + length > size:
+                break
+            place += MESSAGE.size + length
+        file.seek(place)
+        file.write(END)
+        file.truncate()
+    return place
 
 
 class LiveViewer:

@@ -6,6 +6,7 @@ from commands import fails, run
 from rerun.chunk import RrdReader
 
 import lw_torchrl as lw
+from lw_torchrl.cli import options
 from lw_torchrl.record.tabs import Layout
 
 SHORT = ("--max-steps", 120, "--seed", 1000)
@@ -22,6 +23,18 @@ def test_an_expert_is_recorded_with_the_shipped_plan(capsys, tmp_path):
     assert "reach, episode 2, expert: " in printed
     assert f"lw-torchrl view {out}" in printed
     assert tabs(out) == ["overview", "reach-0", "reach-2"]
+
+
+def test_a_training_that_goes_on_logs_into_its_recording(tmp_path):
+    out = tmp_path / "policy.zip"
+    for value in (1.0, 2.0):
+        with options.make_logger("rerun", out) as logger:
+            logger.log_scalar("train/loss", value)
+        out.touch()  # a checkpoint
+    assert [path.name for path in (tmp_path / "logs").iterdir()] == ["policy.rrd"]
+    chunks = RrdReader(tmp_path / "logs" / "policy.rrd").stream().filter(content="/metrics/**")
+    rows = [chunk.to_record_batch() for chunk in chunks if not chunk.is_static]
+    assert [step for one in rows for step in one.column("global_step").to_pylist()] == [0, 1]
 
 
 @pytest.mark.parametrize("who", ["random", "wrong"])

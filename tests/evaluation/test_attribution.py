@@ -13,6 +13,7 @@ from torch import nn
 import lw_torchrl as lw
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation import attribute_failures
+from lw_torchrl.evaluation.beside_scripts import BesideScripts
 from lw_torchrl.evaluation.counterfactuals import own_evaluators, with_true_answers
 from lw_torchrl.evaluation.deciding import choose_pair, decide
 from lw_torchrl.evaluation.explanation import attended, chosen, last_stay_start, stall_step
@@ -88,6 +89,54 @@ def test_a_clumsy_skill_and_the_step_it_is_in():
     assert "lower the gripper around the drawer handle" in failure.why
     assert failure.evidence["mended_by_skill"] == 1.0
     assert 0 <= failure.at < STEPS
+
+
+class Weak(lw.ScriptedSkillActor):
+    """One whose hand hardly rises or sinks: in all steps, or in one."""
+
+    def __init__(self, plans, step=None):
+        super().__init__(plans)
+        self.step = step
+
+    def forward(self, tensordict):
+        action = super().forward(tensordict).get("action").clone()
+        there = True if self.step is None else tensordict.get("skill_weights")[:, self.step] > 0.5
+        action[:, 2] = torch.where(torch.as_tensor(there), 0.05 * action[:, 2], action[:, 2])
+        return tensordict.set("action", action)
+
+    def with_plans(self, plans):
+        return Weak(plans, self.step)
+
+
+@pytest.mark.parametrize(("step", "cause"), [(None, "actuation"), (1, "skill")])
+def test_a_motion_that_is_wrong_in_all_steps_is_no_skill(step, cause):
+    """Only one step has far to go on that axis, so a script in it mends either."""
+    plans = lw.Plans({"plate-slide-side": lw.load_plans("MT50")["plate-slide-side"]})
+    [failure] = lw.evaluate(
+        Weak(plans, step), tasks="plate-slide-side", episodes_per_task=1, stop_at_success=True, attribute=True,
+        **{**RUN, "max_steps": 120},
+    ).failures  # fmt: skip
+    assert failure.cause == cause
+    assert failure.counterfactuals["skill"] is True
+    assert ("as wrong in other steps" in failure.why) == (step is None)
+
+
+def test_a_fault_is_looked_for_in_other_steps():
+    wanted = torch.randn(60, 3, generator=torch.Generator().manual_seed(0)).clamp(-1.0, 1.0)
+    noise = 0.05 * torch.randn(60, 3, generator=torch.Generator().manual_seed(1))
+    in_force = (torch.arange(60) >= 30).long()
+    here = (in_force == 0).unsqueeze(-1)
+
+    def told(fault):
+        in_all = BesideScripts(fault(wanted) + noise, wanted, in_force).in_other_steps(0)
+        in_one = BesideScripts(torch.where(here, fault(wanted), wanted) + noise, wanted, in_force).in_other_steps(0)
+        return in_all, in_one
+
+    assert told(lambda action: action * torch.tensor([-1.0, 1.0, 1.0])) == (True, False), "a factor"
+    assert told(lambda action: action + torch.tensor([0.0, 0.4, 0.0])) == (True, False), "a shift"
+    assert told(torch.zeros_like) == (True, False), "at rest"
+    assert told(lambda action: action.roll(1, 0)) == (None, None), "neither"
+    assert BesideScripts(noise, wanted, torch.zeros(60)).in_other_steps(0) is None, "there are no others"
 
 
 def test_a_plan_that_leads_astray():

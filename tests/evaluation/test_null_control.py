@@ -77,7 +77,7 @@ def test_a_policy_that_is_shown_another_state_is_told(inside):
     assert (failure.cause, failure.counterfactuals) == ("perception", {"perception": True})
     assert "policy was shown another observation than the true one: number " in failure.why
     assert "was off by up to 0.1" in failure.why
-    assert failure.mended.by == "true observations"
+    assert failure.mended.by == "the true observations"
     assert not any(module._forward_pre_hooks for module in actor.modules()), "nothing stays on the policy"
 
 

@@ -103,6 +103,12 @@ class Recording:
         (times, *_), rows = self.times_or_none(entity, component), self.values(entity, component)
         return rows[-1] if times is None else rows[np.searchsorted(times, step, side="right") - 1]
 
+    def in_frame(self, entity, frame, part, step):
+        """A part of the pose of a frame, one of those that the entity has, at a step."""
+        steps, frames = (self.times(entity, "Transform3D:child_frame"), self.values(entity, "Transform3D:child_frame"))
+        rows = [i for i, (at, of) in enumerate(zip(steps, frames, strict=True)) if of == [frame] and at <= step]
+        return self.values(entity, f"Transform3D:{part}")[max(rows, key=lambda row: steps[row])][0]
+
     def times_or_none(self, entity, component):
         first, _ = self.columns[entity, component][0]
         return (self.times(entity, component) if "step" in first else None,)

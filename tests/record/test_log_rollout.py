@@ -37,12 +37,19 @@ def logged(path, *rollouts, **kwargs):
     return names, Recording(path)
 
 
+POSE = ("translation", "quaternion")
+
+
 def poses_in_the_file(found, name, step):
     """Body to (7,) position and quaternion (w last) at a step."""
     frames, poses = Layout.read(found.reader).pages[name].frames, {}
-    for mesh, body in frames.items():
-        entity = body or mesh  # what stands still has its mesh's own pose
-        pose = [found.at(entity, f"Transform3D:{part}", step)[0] for part in ("translation", "quaternion")]
+    for mesh, frame in frames.items():
+        if frame:
+            pose = [
+                found.in_frame(f"/{name}/scene/bodies", frame, part, step) for part in ("translation", "quaternion")
+            ]
+        else:  # what stands still has its mesh's own pose
+            pose = [found.at(mesh, f"Transform3D:{part}", step)[0] for part in ("translation", "quaternion")]
         poses[mesh.removeprefix("/meshes/").rpartition("-")[0].replace("\\", "")] = np.concatenate(pose)
     return poses
 
@@ -173,15 +180,15 @@ def test_a_failure_is_the_verdict(tmp_path, pushed):
     why = failure_of(failed, counterfactuals={"skill": True, "plan": False, "query": False})
     _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS, seed=SEED, policy="mine", failure=why)
     verdict = found.text("/push-0/verdict")
-    assert verdict.startswith("## FAILED: skill, a skill was clumsy\n\nIt came to rest 10 cm away.\n")
+    assert verdict.startswith("#### FAILED: skill, a skill was clumsy\n\nIt came to rest 10 cm away.  \n")
     skill = PLANS["push"].steps[1].skill
     assert f"Seen at t = 33 (0.41 s) of 60, in plan step 2, **“{skill}”**." in verdict
-    assert "Replacing skill made it a success; replacing plan or query did not help." in verdict
+    assert "Replacing the plan or the answers did not help." in verdict
     assert "push · episode 0 · seed 5 · mine" in verdict
     assert opening_step(tmp_path / "a.rrd") == 33
     (store,) = found.reader.blueprints()
     layout = " ".join(str(chunk.to_record_batch()) for chunk in found.reader.stream(store=store))
-    assert "push · episode 0 · seed 5 · mine · failed: skill" in layout
+    assert "push-0 · mine · failed: skill" in layout
 
 
 def test_what_mends_a_failure_is_a_ghost_beside_it(tmp_path, pushed):
@@ -193,7 +200,9 @@ def test_what_mends_a_failure_is_a_ghost_beside_it(tmp_path, pushed):
     why = failure_of(failed, mended=ghost)
     _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS, failure=why)
     verdict = found.text("/push-0/verdict")
-    assert "The blue ghost, with the reference plan, succeeds at t = 41 (0.51 s). They part at **t = 30" in verdict
+    assert (
+        "**The blue ghost**, with the reference plan, succeeds at t = 41 (0.51 s); they part at **t = 30**" in verdict
+    )
     steps = [f"ghost{step}" for step in mended[:41]["skill_weights"].argmax(-1).tolist()]
     assert found.states("/e1/0c_ghost_with_the_reference_plan", 41) == steps
     page = Layout.read(found.reader).pages["push-0"]
@@ -220,13 +229,15 @@ def test_an_overview_lists_failures_first_and_counts_causes(tmp_path, pushed):
         lw.log_rollout(logger, failed, PLANS, policy="mine", failure=failure_of(failed))
         logger.show_causes(result)
     found = Recording(tmp_path / "a.rrd")
-    title, _, _, _, *rows = found.text("/overview/table").splitlines()
-    assert title == "## 1 of 2 episodes failed · skill 1"
+    title, _, who, _, *rows = found.text("/overview/table").splitlines()
+    assert (title, who) == ("#### 1 of 2 episodes failed · skill 1", "By mine.")
     assert rows == [
-        "| ✗ | push-0-2 · episode 0 | mine | skill | 60 | 0.75 |",
-        "| ✓ | push · episode 0 | mine |  | 40 | 0.50 |",
+        "|  | episode | cause | ended |",
+        "|-|-|-|-|",
+        "| ✗ | push-0-2 · episode 0 | skill | t = 60 (0.75 s) |",
+        "| ✓ | push · episode 0 |  | t = 40 (0.50 s) |",
     ]
-    assert next(iter(found.shown_tabs())) == "Overview"
+    assert list(found.shown_tabs()) == ["Overview", "push-0-2 · failed: skill", "push-0 · success at 40"]
     assert found.shown_tabs()["Overview"] == ["Episodes", "Causes"]
     assert found.values("/overview/causes", "EncodedImage:media_type") == [["image/png"]]
     assert opening_step(tmp_path / "a.rrd") == 33
@@ -242,10 +253,17 @@ def test_a_ghost_of_the_robot_moves_what_moves(tmp_path, pushed):
     assert {mesh.replace("ghosts", "meshes") for mesh in ghosts} == {mesh for mesh in frames if frames[mesh]} - set(
         ghosts
     )
-    for body in ghosts.values():
-        other = body.replace("/ghost/", "/bodies/")
-        for part in ("Transform3D:translation", "Transform3D:quaternion"):
-            np.testing.assert_array_equal(found.array(body, part), found.array(other, part))
+    for part in POSE:
+        for step in (0, 17, 60):
+            poses = [
+                {
+                    frame.rpartition("/")[2]: found.in_frame(entity, frame, part, step)
+                    for mesh, frame in frames.items()
+                    if frame and mesh.startswith(kind)
+                }
+                for entity, kind in (("/push-0/scene/ghost", "/ghosts"), ("/push-0/scene/bodies", "/meshes"))
+            ]
+            assert poses[0] == poses[1]
 
 
 def test_without_a_failure_the_verdict_tells_facts(tmp_path, pushed):
@@ -254,7 +272,7 @@ def test_without_a_failure_the_verdict_tells_facts(tmp_path, pushed):
     failed["qaf"][:, 1] = False
     _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS)
     verdict = found.text("/push-0/verdict")
-    assert verdict.startswith("## FAILED in 60 steps (0.75 s)")
+    assert verdict.startswith("#### FAILED in 60 steps (0.75 s)")
     last = int(pushed["skill_weights"][-1].argmax())
     assert f"At the end plan step {last + 1}, **“{PLANS['push'].steps[last].skill}”**, was in force" in verdict
     assert f"condition 2, “{PLANS['push'].steps[1].condition}”" in verdict
@@ -266,7 +284,7 @@ def test_a_success_is_the_verdict(tmp_path, pushed):
     succeeded["next", "success"][:] = (torch.arange(60) == 40)[:, None]
     _, found = logged(tmp_path / "a.rrd", succeeded)
     verdict = found.text("/push-0/verdict")
-    assert verdict.startswith("## SUCCESS at t = 41 (0.51 s) of 60")
+    assert verdict.startswith("#### SUCCESS at t = 41 (0.51 s) of 60")
     assert "did not last: the task stood done in 1 steps" in verdict
     assert opening_step(tmp_path / "a.rrd") == 41
 

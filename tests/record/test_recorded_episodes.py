@@ -12,7 +12,8 @@ from recordings import PLAN, STEPS, Recording, make_objects, make_rollout, recor
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.record.lanes import EVENLY, NONE_HOLDS, short
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
-from lw_torchrl.record.tabs import Layout
+from lw_torchrl.record.scene import beside
+from lw_torchrl.record.tabs import ROBOT_EYE, Layout
 
 ROWS = [f"/e1/{i}_" + short(c).replace(" ", "_") for i, (c, _) in enumerate(STEPS, 1)]
 
@@ -89,9 +90,9 @@ def test_a_learned_evaluators_truth_stands_beside(tmp_path):
     rollout["qaf_logits"] = torch.where(rollout["qaf"], 3.0, -3.0)
     rollout["qaf_logits"][5:, 0] *= -1
     found = record(tmp_path / "a.rrd", rollout)
-    believed = found.states("/e1/1b_but_the_policy_was_told", 20)
-    exact = found.states(ROWS[0], 20)
-    assert [a == b for a, b in zip(believed, exact, strict=True)] == [True] * 5 + [False] * 15
+    exact = ["true" if true else "false" for true in rollout["qaf"][:, 0]]
+    wrong = {"true": "true, told false", "false": "false, told true"}
+    assert found.states(ROWS[0], 20) == exact[:5] + [wrong[true] for true in exact[5:]]
     texts = [row[0] for row in found.values("/push/plan", "TextDocument:text")]
     assert ["(evaluator:" in text for text in texts] == [
         step >= 5 for step in found.times("/push/plan", "TextDocument:text")
@@ -251,3 +252,30 @@ def test_wrong_objects_are_named(tmp_path):
         with pytest.raises(ValueError, match="task must be"):
             logger.log_episode(rollout, task="", objects={})
     assert Recording(tmp_path / "a.rrd").entities() == {"/__properties"}
+
+
+@pytest.mark.parametrize(
+    ("condition", "said"),
+    [
+        ("the robot's gripper is near the peg and the robot's gripper is open", "gripper near peg and open"),
+        (
+            "the robot's gripper is not left of the lid and the robot's gripper is not around the lid",
+            "gripper not left or around lid",
+        ),
+        (
+            "the stick is not touching the table and the stick is not above the box and the stick is right of the box",
+            "stick off table and not above but right of box",
+        ),
+        ("the lid is near the lid box and the lid is not near the box", "lid near lid box and not near box"),
+        ("whatever you say", "whatever you say"),
+    ],
+)
+def test_a_condition_in_short_says_the_same(condition, said):
+    assert short(condition) == said
+
+
+def test_names_of_things_in_one_place_stand_apart():
+    place = np.full((5, 3), 0.1, np.float32)
+    offsets = beside({"puck": place, "goal": place, "wall": place + 0.5}, ROBOT_EYE)
+    assert [name for name, offset in offsets.items() if offset.any()] == ["goal"]
+    assert np.linalg.norm(offsets["goal"]) > 0.03

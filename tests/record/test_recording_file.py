@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from recordings import Recording, make_rollout
+from recordings import PLAN, Recording, make_objects, make_rollout
 
-from lw_torchrl.record import RerunLogger
+from lw_torchrl.record import RerunLogger, join_recordings
+from lw_torchrl.record.joining import run_names
 from lw_torchrl.record.recording_file import is_whole, opened
 
 
@@ -137,3 +139,59 @@ def test_a_folder_that_may_not_be_written_to(tmp_path):
     tmp_path.chmod(0o500)
     with pytest.raises(PermissionError):
         RerunLogger(tmp_path / "a.rrd")
+
+
+def trained(path, rate, length=20):
+    """A recording of a training: two curves of a group, a table, an episode."""
+    rollout = make_rollout(length)
+    with RerunLogger(path) as logger:
+        logger.log_hparams({"rate": rate})
+        for step in range(5):
+            logger.log_metrics({"loss/bc": rate**step, "loss/latent": 2 * rate**step}, step)
+        logger.log_episode(rollout, task="push", objects=make_objects(rollout), plan=PLAN)
+    return path
+
+
+def test_two_runs_lie_over_one_another_and_side_by_side(tmp_path):
+    (tmp_path / "a").mkdir()
+    files = [trained(tmp_path / "a" / "run.rrd", 0.5), trained(tmp_path / "b.rrd", 0.9)]
+    joined = Recording(join_recordings([tmp_path / "a", files[1]], tmp_path / "both.rrd"))
+    for run, file in zip("ab", files, strict=True):
+        alone = Recording(file)
+        for curve in ("bc", "latent"):
+            place = f"/metrics/loss/{curve}"
+            assert joined.values(f"/{run}{place}", "Scalars:scalars") == alone.values(place, "Scalars:scalars")
+            assert joined.values(f"/{run}{place}", "SeriesLines:names")[-1] == [f"{curve} · {run}"]
+        for entity in ("/push/action", "/push/plan", "/e1/gripper"):
+            assert f"/{run}{entity}" in joined.entities()
+    curves = [f"/{run}/metrics/loss/{one}" for run in "ab" for one in ("bc", "latent")]
+    colors = [joined.values(curve, "SeriesLines:colors")[-1][0] for curve in curves]
+    assert len(set(colors)) == 4
+    assert joined.tabs() == ["push · side by side", "a/push", "b/push", "Metrics", "Hyperparameters"]
+    assert joined.shown_tabs()["Metrics"] == ["loss"]
+    assert joined.shown_tabs()["Hyperparameters"] == ["Hyperparameters · a", "Hyperparameters · b"]
+
+
+@pytest.mark.parametrize(
+    ("runs", "names", "message"),
+    [
+        (["a"], None, "paths must be of 2 to 4 recordings, got 1"),
+        (["a", "a"], None, "paths must be of different recordings"),
+        (["a", "b"], ["x", "x"], "names must be 2 different ones"),
+        (["a", "b"], ["x"], "names must be 2 different ones"),
+    ],
+)
+def test_runs_that_cannot_be_joined(tmp_path, runs, names, message):
+    for run in set(runs):
+        trained(tmp_path / f"{run}.rrd", 0.5)
+    with pytest.raises(ValueError, match=message):
+        join_recordings([tmp_path / f"{run}.rrd" for run in runs], tmp_path / "both.rrd", names=names)
+    assert not (tmp_path / "both.rrd").exists()
+
+
+def test_runs_are_called_by_what_tells_them_apart(tmp_path):
+    (tmp_path / "small").mkdir()
+    assert run_names([tmp_path / "small", Path("b.rrd")]) == ["small", "b"]
+    assert run_names([Path("small/run.rrd"), Path("large/run.rrd")]) == ["small", "large"]
+    assert run_names([Path("x/logs/run.rrd"), Path("y/logs/run.rrd")]) == ["x", "y"]
+    assert run_names([Path("x/run.rrd"), Path("x/run.rrd")]) == ["run-1", "run-2"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -11,13 +12,14 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from recordings import Recording
+from recordings import PLAN, Recording, make_objects, make_rollout
 from tensordict import TensorDict
 from torchrl.record import VideoRecorder
 from torchrl.record.loggers import Logger
 
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.record.tabs import Layout
+from lw_torchrl.record.writer import END, MESSAGE
 
 
 def test_it_is_a_torchrl_logger(tmp_path):
@@ -108,6 +110,57 @@ def test_counters_are_saved_and_restored(tmp_path):
         logger.load_state_dict(state)
         logger.log_scalar("loss", 1.0)
     assert Recording(tmp_path / "b.rrd").times("/metrics/loss", "Scalars:scalars", "global_step") == [2]
+
+
+def begin(path):
+    """A recording of a training with an episode; its logger is not closed."""
+    logger = RerunLogger(path)
+    logger.log_hparams({"lr": 0.1, "odd | name": "a | b"})
+    for value in (1.0, 2.0):
+        logger.log_scalar("loss/bc", value)
+    rollout = make_rollout()
+    logger.log_episode(rollout, task="push", objects=make_objects(rollout), plan=PLAN)
+    logger.flush()
+    return logger
+
+
+@pytest.mark.parametrize("end", ["closed", "killed", "cut"])
+def test_a_resumed_training_goes_on_in_its_recording(tmp_path, end):
+    path = tmp_path / "a.rrd"
+    first = begin(path)
+    content = path.read_bytes()
+    first.shutdown()
+    if end != "closed":
+        half = MESSAGE.pack(2, 1000) + b"x" * 50  # of what was being written
+        path.write_bytes(content if end == "killed" else content[: -len(END)] + half)
+    rollout = make_rollout(seed=1)
+    with RerunLogger(path, resume=True) as logger:
+        assert logger.episodes == ["push"]
+        logger.log_scalar("loss/bc", 3.0)
+        logger.log_hparams({"seed": 7})
+        second = logger.log_episode(rollout, task="push", objects=make_objects(rollout), plan=PLAN)
+    assert second == "push-2"
+    assert os.listdir(tmp_path) == ["a.rrd"]
+    found = Recording(path)
+    (after,) = found.reader.recordings()
+    assert (after.recording_id, after.application_id) == (first.experiment.get_recording_id(), first.application_id)
+    assert found.times("/metrics/loss/bc", "Scalars:scalars", "global_step") == [0, 1, 2]
+    assert found.values("/metrics/loss/bc", "Scalars:scalars") == [[1.0], [2.0], [3.0]]
+    assert {"push", "push-2", "Metrics", "Hyperparameters"} <= set(found.tabs())
+    assert {"/e1/gripper", "/e2/gripper"} <= found.entities()
+    table = found.values("/hparams", "TextDocument:text")[-1][0].splitlines()
+    assert table[2:] == ["| lr | 0.1 |", r"| odd \| name | a \| b |", "| seed | 7 |"]
+
+
+def test_resuming_begins_where_there_is_nothing_and_refuses_what_it_cannot_read(tmp_path):
+    with RerunLogger(tmp_path / "new.rrd", resume=True) as logger:
+        logger.log_scalar("loss", 1.0)
+    (tmp_path / "bad.rrd").write_bytes(b"no recording at all, but long enough")
+    with pytest.raises(ValueError, match=r"bad\.rrd.* is no rerun recording"):
+        RerunLogger(tmp_path / "bad.rrd", resume=True)
+    assert (tmp_path / "bad.rrd").read_bytes().startswith(b"no recording")
+    with pytest.raises(ValueError, match="resume=True needs path"):
+        RerunLogger(connect="127.0.0.1:1", resume=True)
 
 
 def pixels(found, entity):

@@ -22,12 +22,12 @@ def make(logger, tasks=("push", "reach"), *, rows=(0,), num_envs=2, length=8, **
 
 
 def content(path):
-    """All columns, by entity and component, with their times."""
+    """All columns, by entity and component, with their times, but for names that begin with the recording's id."""
     found = Recording(path)
     return {
         (entity, component): (found.times_or_none(entity, component), found.values(entity, component))
         for entity, component in found.columns
-        if not entity.startswith("/__")
+        if not entity.startswith("/__") and component != "Transform3D:child_frame"
     }
 
 
@@ -44,7 +44,7 @@ def test_live_is_what_is_logged_afterwards(tmp_path):
     # What fingers touch is asked when an episode is simulated again.
     second = {(entity, part): value for (entity, part), value in second.items() if "touches" not in entity}
     assert first.keys() == second.keys()
-    assert any("/bodies/" in entity for entity, _ in first)
+    assert any("/bodies" in entity for entity, _ in first)
     for key, value in first.items():
         assert str(value) == str(second[key]), key
 

@@ -131,7 +131,7 @@ with warnings.catch_warnings(record=True) as caught:
             longest = max(longest, time.monotonic() - began)
         state = logger.state_dict()
         logger.log_hparams({"lr": 1})
-assert state["local"]["counters"] == {"metrics/loss/bc": 60_000}
+assert state["local"]["counters"] == {"/metrics/loss/bc": 60_000}
 (warning,) = caught
 assert f"recording {given['path']!r} takes nothing more ({given['reason']}); what was" in str(warning.message), warning
 print("longest", longest)

@@ -179,7 +179,7 @@ def test_a_tab_is_brought_to_the_front(tmp_path, name, title, timeline):
         assert Recording(copy).entities() == Recording(tmp_path / "a.rrd").entities()
         assert Recording(copy).front() == (title, timeline)
     with (
-        pytest.raises(ValueError, match="episode must be one of 'overview', 'reach', 'reach-2', 'Metrics', got 'rea'"),
+        pytest.raises(ValueError, match="episode must be one of 'overview', 'Metrics', 'reach', 'reach-2', got 'rea'"),
         opened(tmp_path / "a.rrd", "rea"),
     ):
         pass
