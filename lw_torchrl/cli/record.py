@@ -26,7 +26,7 @@ def record(
     plans: tuple[str, ...] = (),
     attribute: bool = False,  # say why failed episodes failed, as evaluate does; for scripted and policies with plans
     reference: tuple[str, ...] = (),  # with --attribute, trusted plans for running failed episodes again
-    evaluator: Path | None = None,  # a network that answers the conditions, of `lw-torchrl train-evaluator`
+    evaluator: str | None = None,  # answers the conditions: a file of `train-evaluator`, or yours, my_module:evaluator
     suite: options.SuiteName = None,
     speed: options.Speed = 1.0,
     task_file: options.TaskFile = None,
@@ -72,17 +72,19 @@ def record(
     cast = []
     for who in filter(None, (policy, compare)):
         actor, shown, called = _cast(who, tasks, given, known, load, seed, max_steps, elsewhere)
-        if who == policy or hasattr(actor, "with_evaluator"):
-            actor = objects.with_evaluator(actor, evaluator, text_encoder)
-        cast.append((actor, shown, called))
+        asked = None
+        if who == policy or getattr(actor, "plans", None) is not None:
+            actor, asked = objects.with_evaluator(actor, evaluator, text_encoder)
+        cast.append((actor, shown, called, asked))
     rows: list[dict[str, Any]] = []
     recorded: list[list[str]] = []
     with replacing(out) as file, lw.RerunLogger(file, exp_name=out.stem) as logger:
-        for actor, shown, who in cast:
-            found = run_recorded(actor, tasks, plans=shown, episodes=episodes, progress=True, **episode_options)
+        for actor, shown, who, asked in cast:
+            how = episode_options | {"evaluator": asked}
+            found = run_recorded(actor, tasks, plans=shown, episodes=episodes, progress=True, **how)
             why: Mapping[tuple[str, int], lw.evaluation.Failure] = {}
             if attribute and shown is not None and hasattr(actor, "with_plans"):
-                failures = lw.attribute_failures(found, shown, actor=actor, reference=trusted, **episode_options)
+                failures = lw.attribute_failures(found, shown, actor=actor, reference=trusted, **how)
                 why = {(one.task, one.episode): one for one in failures}
                 if failures and not recorded:
                     logger.show_causes(_result(found, failures, episode_options, len(episodes)))
