@@ -16,6 +16,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import checked, missing_keys, shown
+from lw_torchrl._devices import device_of
 from lw_torchrl._files import AnyPath, replacing
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
@@ -64,7 +65,8 @@ def log_rollout(
             int64, "action" T×4 float32 in [-1, 1], as executed, and ("next", "success") T×1 bool. Optional are
             ("next", "executed_action") T×4, which is taken in the place of the action, "episode" T int64, "qaf" T×S
             bool, "qaf_plan" T int64, "qaf_logits" T×S float32 (positive: true), "skill_weights" T×S float32,
-            "action_corrected" T×1 and ("next", "reward") T×1 float32. Or batch size (N, T), an episode in each row.
+            "action_corrected" T×1, ("next", "reward") T×1 float32 and "pixels" T×H×W×3 uint8, what the policy saw. Or
+            batch size (N, T), an episode in each row.
         plans: what ``qaf`` answers; None for no plan.
         seed: of the environment; with ``episode`` it says how the episode began.
         name: of the episode in the recording; None takes "push-7", of task and episode, or else "push".
@@ -247,6 +249,8 @@ def run_recorded(
     suite: str | Suite | None = None,
     engine: Any = None,
     evaluator: QueryEvaluator | None = None,
+    stop_at_success: bool = False,
+    device: str | torch.device | None = None,
     progress: bool = False,
 ) -> list[FinishedEpisode]:
     """Episodes with all that :func:`lw_torchrl.log_rollout` shows of them, run as :func:`lw_torchrl.evaluate` does.
@@ -272,12 +276,17 @@ def run_recorded(
         evaluator = getattr(actor, "evaluator", None)
     elif answered is not None:
         exact = QAFTransform(answered)  # the answers acted on take its place in an episode
-    keys = list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *getattr(evaluator, "in_keys", ())]))
-    how: dict[str, Any] = {"noise_scale": noise_scale, "progress": progress, "keys": keys}
+    read = getattr(evaluator, "in_keys", ())
+    seen = {"pixels"} & {*getattr(actor, "in_keys", ()), *read}
+    keys = list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *read, *seen]))
+    how: dict[str, Any] = {"noise_scale": noise_scale, "progress": progress, "keys": keys, "device": device}
+    how["after_success"] = 0 if stop_at_success else None
     found = {}
     with running("recording", env, acting, dict.fromkeys(chosen, episodes), **how) as finished:
         for one in finished:
-            steps = one.steps if evaluator is None else evaluator(one.steps)
+            steps = one.steps
+            if evaluator is not None:
+                steps = evaluator(steps.to(device_of(evaluator))).cpu()
             found[one.task, one.episode] = one._replace(steps=steps if exact is None else exact(steps))
     return [found[task, episode] for task in chosen for episode in episodes]
 

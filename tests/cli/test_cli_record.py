@@ -1,5 +1,7 @@
 """``lw-torchrl record``: any task under any policy, two of them side by side, and why it failed."""
 
+import re
+
 import pytest
 import torch
 from commands import fails, run
@@ -18,11 +20,17 @@ def tabs(recording):
 
 def test_an_expert_is_recorded_with_the_shipped_plan(capsys, tmp_path):
     out = tmp_path / "recordings" / "reach.rrd"
-    printed = run(capsys, "record", "reach", "--episodes", 0, 2, *SHORT, "--out", out)
+    printed = run(capsys, "record", "reach", "--episodes", 0, 2, *SHORT, "--stop-at-success", "--out", out)
     assert "reach, episode 0, expert: success at step " in printed
     assert "reach, episode 2, expert: " in printed
     assert f"lw-torchrl view {out}" in printed
     assert tabs(out) == ["overview", "reach-0", "reach-2"]
+    pages = Layout.read(RrdReader(out)).pages
+    ended = [int(step) for step in re.findall(r"success at step (\d+)", printed)]
+    assert [page.row["at"] for page in pages.values()] == ended
+    chunks = [chunk for chunk in RrdReader(out).stream() if str(chunk.entity_path).endswith("/action")]
+    lengths = [len(chunk) for chunk in chunks if not chunk.is_static]
+    assert sorted(lengths) == sorted(ended), "nothing comes after the success"
 
 
 def test_a_training_that_goes_on_logs_into_its_recording(tmp_path):
@@ -130,6 +138,7 @@ def test_conditions_answered_by_an_evaluator_of_yours(capsys, tmp_path, monkeypa
         (("--suite", "metawold"), "did you mean 'metaworld'"),
         (("--policy", "experts"), "did you mean 'expert'"),
         (("--compare", "nowhere.zip"), "'nowhere.zip'"),
+        (("--device", "cuda:99"), "--device must be one of"),
         (("--reference", "MT10"), "--reference is for --attribute"),
         (("--out", "x.mp4"), "--out must end in '.rrd'"),
         (("--episodes", -1), "-1"),
