@@ -16,9 +16,10 @@ from torchrl.envs import Compose, Transform
 from lw_torchrl._checks import check_choice, counted
 from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.layout import METAWORLD, Layout
-from lw_torchrl.language.plans import AnyPlans, Plans
+from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.networks import with_weights_of
 from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.transforms.qaf import QAFTransform
 
@@ -147,8 +148,23 @@ class Encoder(Prepared):
         return cls(described_tasks(found), **options)
 
     def with_plans(self, plans: AnyPlans) -> Encoder:
-        """The same weights for other plans: training either trains both."""
-        raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} is conditioned on descriptions")
+        """The same weights for other plans: training either trains both.
+
+        Raises:
+            TypeError: it is not conditioned on plans.
+            ValueError: a weight's shape depends on the plans; such a class overrides this.
+        """
+        if self.plans is None:
+            told = "is conditioned on descriptions"
+            raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} {told}")
+        described = {"plans": as_plans(plans).to_json(), "options": self.config}
+        with torch.random.fork_rng(devices=[]):
+            made = type(self).from_description(described, self.text_encoder)
+        try:
+            return with_weights_of(self, made)
+        except RuntimeError as error:
+            which = str(error).partition("\n\t")[2].strip() or str(error)
+            raise ValueError(f"plans: weights of {type(self).__name__} are those of its own plans: {which}") from error
 
 
 class Policy(Prepared):
