@@ -26,7 +26,7 @@ def record(
     plans: tuple[str, ...] = (),
     attribute: bool = False,  # say why failed episodes failed, as evaluate does; for scripted and policies with plans
     reference: tuple[str, ...] = (),  # with --attribute, trusted plans for running failed episodes again
-    evaluator: Path | None = None,  # a network that answers the conditions, of `lw-torchrl train-evaluator`
+    evaluator: str | None = None,  # answers the conditions: a file of `train-evaluator`, or yours, my_module:evaluator
     suite: options.SuiteName = None,
     speed: options.Speed = 1.0,
     task_file: options.TaskFile = None,
@@ -34,6 +34,8 @@ def record(
     seed: int = 1000,  # fixes initial states, goals and noise
     noise: float = 0.1,  # standard deviation of the noise on the executed action
     max_steps: int | None = None,  # of an episode; the suite's if none is given, Meta-World's 500
+    stop_at_success: bool = False,  # end an episode at its first success, which makes the recording lighter
+    device: options.Device = "cpu",
     out: Path | None = None,  # the file; runs/recordings/TASK-POLICY.rrd if none is given; replaced if there
     json: options.Json = False,
 ) -> Output:
@@ -60,9 +62,11 @@ def record(
     label = names[0].replace("/", "-") if len(names) == 1 else f"{len(names)}-tasks"
     out = out or Path("runs/recordings") / f"{label}-{objects.name_of(policy)}.rrd"
     options.check_file("--out", out, ".rrd")
+    from lw_torchrl._devices import check_device
     from lw_torchrl.record.rollouts import run_recorded
 
     options.use_one_thread()
+    acting: dict[str, Any] = {"device": check_device("device", device)}
     trusted = options.read_plans(reference, known) if reference else None
     episode_options: dict[str, Any] = {"seed": seed, "noise_scale": noise, "max_steps": max_steps}
     episode_options["suite"] = elsewhere
@@ -72,17 +76,20 @@ def record(
     cast = []
     for who in filter(None, (policy, compare)):
         actor, shown, called = _cast(who, tasks, given, known, load, seed, max_steps, elsewhere)
-        if who == policy or hasattr(actor, "with_evaluator"):
-            actor = objects.with_evaluator(actor, evaluator, text_encoder)
-        cast.append((actor, shown, called))
+        asked = None
+        if who == policy or getattr(actor, "plans", None) is not None:
+            actor, asked = objects.with_evaluator(actor, evaluator, text_encoder)
+        cast.append((actor, shown, called, asked))
     rows: list[dict[str, Any]] = []
     recorded: list[list[str]] = []
     with replacing(out) as file, lw.RerunLogger(file, exp_name=out.stem) as logger:
-        for actor, shown, who in cast:
-            found = run_recorded(actor, tasks, plans=shown, episodes=episodes, progress=True, **episode_options)
+        for actor, shown, who, asked in cast:
+            how = episode_options | acting | {"evaluator": asked}
+            run = how | {"stop_at_success": stop_at_success, "progress": True}
+            found = run_recorded(actor, tasks, plans=shown, episodes=episodes, **run)
             why: Mapping[tuple[str, int], lw.evaluation.Failure] = {}
             if attribute and shown is not None and hasattr(actor, "with_plans"):
-                failures = lw.attribute_failures(found, shown, actor=actor, reference=trusted, **episode_options)
+                failures = lw.attribute_failures(found, shown, actor=actor, reference=trusted, **how)
                 why = {(one.task, one.episode): one for one in failures}
                 if failures and not recorded:
                     logger.show_causes(_result(found, failures, episode_options, len(episodes)))
@@ -110,7 +117,12 @@ def _result(found: Any, failures: Any, run: Mapping[str, Any], episodes: int) ->
     result, episode = lw.evaluation.EvaluationResult, lw.evaluation.EpisodeResult
     ended = [(one.task, one.episode, one.first_success) for one in found]
     tasks = list(dict.fromkeys(one.task for one in found))
-    config = {"tasks": tasks, "episodes_per_task": episodes, "seed": run["seed"], "max_steps": len(found[0].steps)}
+    config = {
+        "tasks": tasks,
+        "episodes_per_task": episodes,
+        "seed": run["seed"],
+        "max_steps": max(len(one.steps) for one in found),
+    }
     listed = tuple(episode(task, k, first is not None, first, None, None) for task, k, first in ended)
     return result(config, listed, failures=tuple(failures))
 

@@ -223,7 +223,7 @@ def _by_counterfactuals(
     if also is not None:
         words = f"Neither {PAIR_WORDS[cause]} nor {PAIR_WORDS[also]} alone mend it, both together do"
     elif how is not None:
-        words = f"With {how.by} the same episode succeeds, at step {len(how.steps) - 1}"
+        words = f"With {how.by} the same episode succeeds, at t = {len(how.steps)}"
         words += _certainty(decision, shares, share)
         words += "" if only is None else f". What is wrong in it is wrong in step {only + 1} alone"
         if cause == "actuation" and "skill" in set(mended) - set(counting):

@@ -64,6 +64,7 @@ class RecordedEpisode:
     target_poses: tuple[TargetPose | None, ...] = ()  # of each step; None where its skill is no scripted one
     layout: Layout = METAWORLD
     reasons: tuple[str, ...] = ()  # what the plan says of each step, how it was written for one
+    pixels: NDArray[np.uint8] | None = None  # T×H×W×3, what the policy or its evaluator saw
 
     @property
     def answers(self) -> NDArray[np.bool_] | None:
@@ -162,6 +163,10 @@ class RecordedEpisode:
             raise TypeError(f"objects must be named by non-empty strings, got {unnamed[0]!r}")
         places = {name: _array(value, f"objects[{name!r}]", (length, 3)) for name, value in objects.items()}
         places.setdefault(GRIPPER, observation[:, layout.positions[0]])
+        pixels = rollout.get("pixels", None)
+        if pixels is not None and (pixels.ndim != 4 or pixels.shape[-1] != 3 or pixels.dtype != torch.uint8):
+            got = f"{str(pixels.dtype).removeprefix('torch.')} of shape {'×'.join(map(str, pixels.shape))}"
+            raise ValueError(f"rollout['pixels'] must be uint8 of shape T×H×W×3, got {got}")
         executed = ("next", "executed_action")
         return cls(
             observation=observation,
@@ -176,6 +181,7 @@ class RecordedEpisode:
             steps=steps,
             layout=layout,
             reasons=tuple(getattr(step, "reason", "") for step in plan.steps) if plan is not None else (),
+            pixels=None if pixels is None else pixels.numpy(force=True),
         )
 
 

@@ -22,7 +22,17 @@ from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.rollouts import read_rollout
 from lw_torchrl.transforms.environment import base_env, refuse_changed
 
-_BEFORE = ("task_id", "episode", "qaf_plan", "observation", "qaf", "qaf_logits", "skill_weights", "action_corrected")
+_BEFORE = (
+    "task_id",
+    "episode",
+    "qaf_plan",
+    "observation",
+    "qaf",
+    "qaf_logits",
+    "skill_weights",
+    "action_corrected",
+    "pixels",
+)
 _AFTER = ("executed_action", "success", "reward")
 """Keys of a step: those of the state and the policy, those of what it led to."""
 

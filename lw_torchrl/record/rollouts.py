@@ -16,22 +16,25 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import checked, missing_keys, shown
+from lw_torchrl._devices import device_of
 from lw_torchrl._files import AnyPath, replacing
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.failure_records import Failure, MendedEpisode
 from lw_torchrl.evaluation.protocol import actor_plans, tasks_of
-from lw_torchrl.evaluation.running import make_env, running
+from lw_torchrl.evaluation.running import answered_by, make_env, running
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
+from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
 from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.suites.suite import Suite, known_suite, load_suite
+from lw_torchrl.transforms.qaf import QAFTransform
 
 _KEYS: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next", "success"), ("next", "reward")]
 _PLAN_KEYS = {"qaf", "skill_weights", "action_corrected"}
@@ -62,7 +65,8 @@ def log_rollout(
             int64, "action" T×4 float32 in [-1, 1], as executed, and ("next", "success") T×1 bool. Optional are
             ("next", "executed_action") T×4, which is taken in the place of the action, "episode" T int64, "qaf" T×S
             bool, "qaf_plan" T int64, "qaf_logits" T×S float32 (positive: true), "skill_weights" T×S float32,
-            "action_corrected" T×1 and ("next", "reward") T×1 float32. Or batch size (N, T), an episode in each row.
+            "action_corrected" T×1, ("next", "reward") T×1 float32 and "pixels" T×H×W×3 uint8, what the policy saw. Or
+            batch size (N, T), an episode in each row.
         plans: what ``qaf`` answers; None for no plan.
         seed: of the environment; with ``episode`` it says how the episode began.
         name: of the episode in the recording; None takes "push-7", of task and episode, or else "push".
@@ -244,6 +248,9 @@ def run_recorded(
     max_steps: int | None = None,
     suite: str | Suite | None = None,
     engine: Any = None,
+    evaluator: QueryEvaluator | None = None,
+    stop_at_success: bool = False,
+    device: str | torch.device | None = None,
     progress: bool = False,
 ) -> list[FinishedEpisode]:
     """Episodes with all that :func:`lw_torchrl.log_rollout` shows of them, run as :func:`lw_torchrl.evaluate` does.
@@ -253,6 +260,7 @@ def run_recorded(
     Args:
         plans: whose queries to answer; None for the actor's own.
         episodes: indices, of each task.
+        evaluator: a module; the episodes have its answers beside the exact ones.
         progress: show a bar where it takes longer than a second.
 
     Returns:
@@ -261,15 +269,25 @@ def run_recorded(
     answered = actor_plans(actor, plans)
     found_suite, chosen = tasks_of(tasks, answered, suite)
     options: dict[str, Any] = {"seed": seed, "max_steps": max_steps, "suite": found_suite, "engine": engine}
-    env = make_env(actor, answered, LanguageWorldEnv(list(chosen.values()), strict=True, **options))
+    env = make_env(actor, answered, LanguageWorldEnv(list(chosen.values()), strict=True, **options), evaluator)
     written = set() if answered is None else {"qaf", *actor.out_keys}
-    evaluator = getattr(actor, "evaluator", None)
-    keys = list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *getattr(evaluator, "in_keys", ())]))
-    how: dict[str, Any] = {"noise_scale": noise_scale, "progress": progress, "keys": keys}
+    acting, exact = answered_by(actor, evaluator), None
+    if evaluator is None:
+        evaluator = getattr(actor, "evaluator", None)
+    elif answered is not None:
+        exact = QAFTransform(answered)  # the answers acted on take its place in an episode
+    read = getattr(evaluator, "in_keys", ())
+    seen = {"pixels"} & {*getattr(actor, "in_keys", ()), *read}
+    keys = list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *read, *seen]))
+    how: dict[str, Any] = {"noise_scale": noise_scale, "progress": progress, "keys": keys, "device": device}
+    how["after_success"] = 0 if stop_at_success else None
     found = {}
-    with running("recording", env, actor, dict.fromkeys(chosen, episodes), **how) as finished:
+    with running("recording", env, acting, dict.fromkeys(chosen, episodes), **how) as finished:
         for one in finished:
-            found[one.task, one.episode] = one if evaluator is None else one._replace(steps=evaluator(one.steps))
+            steps = one.steps
+            if evaluator is not None:
+                steps = evaluator(steps.to(device_of(evaluator))).cpu()
+            found[one.task, one.episode] = one._replace(steps=steps if exact is None else exact(steps))
     return [found[task, episode] for task in chosen for episode in episodes]
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.record.conventions import GOLD, GREEN, STEEL, Color, changes, entity_path, rr, step_color, time_columns
 from lw_torchrl.record.meshes import GHOST, Motion, log_motion
+from lw_torchrl.record.metrics import send_images
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
 
 OBJECT_COLORS: tuple[Color, ...] = ((80, 170, 255), (255, 120, 90), (200, 130, 255), (90, 220, 210))
@@ -105,6 +106,17 @@ def log_scene(
         if motion is not None and ghost.motion is not None:
             frames |= log_motion(stream, f"{scene}/ghost", ghost.motion, known, drawn, ghost=True)
     return trails, frames
+
+
+def log_pictures(stream: Any, root: str, episode: RecordedEpisode, drawn: NDArray[np.int64]) -> float:
+    """What the policy saw, in ``root``/seen, where it changed in rows that are ``drawn``; returns its width over its
+    height, 0 where there is none."""
+    if episode.pixels is None:
+        return 0.0
+    rows = drawn[changes(episode.pixels[drawn].reshape(len(drawn), -1))]
+    send_images(stream, f"{root}/seen", time_columns(rows), episode.pixels[rows])
+    _, height, width, _ = episode.pixels.shape
+    return width / height
 
 
 def beside(things: dict[str, NDArray[np.float32]], eye: tuple[Point, Point]) -> dict[str, NDArray[np.float32]]:

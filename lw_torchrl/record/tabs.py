@@ -22,7 +22,7 @@ from lw_torchrl.record.lanes import log_lanes
 from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.overview import OVERVIEW, place, table
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
-from lw_torchrl.record.scene import Point, log_scene
+from lw_torchrl.record.scene import Point, log_pictures, log_scene
 from lw_torchrl.record.verdict import (
     Heading,
     decisive_step,
@@ -67,6 +67,7 @@ class Page:
     farthest: float  # of the distances, cm
     row: dict[str, Any]  # in the overview
     frames: dict[str, str]  # as log_motion gives them
+    pictures: float  # what the policy saw: width over height, 0 where it saw none
 
     def title(self, policy: bool = True) -> str:
         """The tab's: the episode's name, who acted if that is to be said, and how it ended, if that is known."""
@@ -91,7 +92,11 @@ class Page:
         """Scene and curves on the left, words and lanes on the right."""
         # Shares are the pixels that a view needs in a window of 1100×700; what is longer scrolls.
         plan = 60 + 15 * self.lines if self.lines else 0
-        left: list[tuple[float, Any]] = [(max(150, 500 - plan), self._scene())]
+        scene = self._scene()
+        if self.pictures:  # 0.3 of the width for one picture, 0.4 for two side by side
+            seen = min(0.2 + 0.1 * self.pictures, 0.5)
+            scene = rrb.Horizontal(scene, self._pictures(), column_shares=[1 - seen, seen])
+        left: list[tuple[float, Any]] = [(max(150, 500 - plan), scene)]
         left += [(plan, self._words("plan", "Plan"))] if plan else []
         left.append((105, rrb.Tabs(*(self._curve(name) for name in CURVES if name in self.curves))))
         right = self._lanes(self.lanes)
@@ -105,9 +110,10 @@ class Page:
         """
         page = replace(self, shown=shown, farthest=farthest)
         conditions = [lane for lane in self.lanes if _CONDITION.search(lane)]
-        behind = [view for _, view in page._lanes(conditions, "What held")]
+        behind: list[Any] = [view for _, view in page._lanes(conditions, "What held")]
         below: list[tuple[float, Any]] = [(100, page._curve("distance"))] if "distance" in page.curves else []
         below += page._lanes([lane for lane in self.lanes if lane not in conditions])
+        behind += [page._pictures()] if page.pictures else []
         scene = rrb.Tabs(page._scene(), *behind) if behind else page._scene()
         room = max(120, 487 - sum(share for share, _ in below))
         return _stacked([(118, page._words("verdict", title)), (room, scene), *below], title)
@@ -126,6 +132,9 @@ class Page:
             eye_controls=rrb.EyeControls3D(position=self.eye[0], look_target=self.eye[1]),
             overrides=shown,
         )
+
+    def _pictures(self) -> rrb.Spatial2DView:
+        return rrb.Spatial2DView(origin=f"{self.root}/seen", name="What it saw")
 
     def _words(self, part: str, name: str) -> rrb.TextDocumentView:
         return rrb.TextDocumentView(origin=f"{self.root}/{part}", name=name)
@@ -192,6 +201,7 @@ def send_page(
         farthest=farthest(episode),
         row=heading.row(episode, name),
         frames=frames,
+        pictures=log_pictures(stream, root, episode, drawn),
     )
 
 

@@ -1,5 +1,7 @@
 """``lw-torchrl record``: any task under any policy, two of them side by side, and why it failed."""
 
+import re
+
 import pytest
 import torch
 from commands import fails, run
@@ -18,11 +20,17 @@ def tabs(recording):
 
 def test_an_expert_is_recorded_with_the_shipped_plan(capsys, tmp_path):
     out = tmp_path / "recordings" / "reach.rrd"
-    printed = run(capsys, "record", "reach", "--episodes", 0, 2, *SHORT, "--out", out)
+    printed = run(capsys, "record", "reach", "--episodes", 0, 2, *SHORT, "--stop-at-success", "--out", out)
     assert "reach, episode 0, expert: success at step " in printed
     assert "reach, episode 2, expert: " in printed
     assert f"lw-torchrl view {out}" in printed
     assert tabs(out) == ["overview", "reach-0", "reach-2"]
+    pages = Layout.read(RrdReader(out)).pages
+    ended = [int(step) for step in re.findall(r"success at step (\d+)", printed)]
+    assert [page.row["at"] for page in pages.values()] == ended
+    chunks = [chunk for chunk in RrdReader(out).stream() if str(chunk.entity_path).endswith("/action")]
+    lengths = [len(chunk) for chunk in chunks if not chunk.is_static]
+    assert sorted(lengths) == sorted(ended), "nothing comes after the success"
 
 
 def test_a_training_that_goes_on_logs_into_its_recording(tmp_path):
@@ -91,6 +99,36 @@ def test_conditions_answered_by_a_network(capsys, tmp_path):
     assert "expert" in fails(capsys, "record", "reach", "--evaluator", file)
 
 
+OWN_EVALUATORS = """
+import torch
+import lw_torchrl as lw
+
+
+class Never(lw.QueryEvaluator):
+    def logits(self, observation, task_id):
+        return observation.new_full((*task_id.shape, self.plans.num_steps), -3.0)
+
+
+never = Never(lw.load_plans("MT10"))
+number = 3
+"""
+
+
+def test_conditions_answered_by_an_evaluator_of_yours(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "my_evaluators.py").write_text(OWN_EVALUATORS)
+    roles = lw.PlanConditionedActor(lw.Plans({"reach": lw.load_plans("MT10")["reach"]}), roles=True, width=8)
+    lw.save_actor(roles, "roles.zip")  # it reads exact truth, so it takes no evaluator inside
+    for policy, named in (("scripted", "Never"), ("roles.zip", "never")):
+        out = f"{named}.rrd"
+        more = "--policy", policy, "--evaluator", f"my_evaluators:{named}", "--max-steps", 20, "--out", out
+        assert "reach, episode 0" in run(capsys, "record", "reach", *more)
+    run(capsys, "evaluate", "roles.zip", "--evaluator", "my_evaluators:Never", "--episodes", 1, "--max-steps", 5)
+    more = "--policy", "scripted", "--evaluator", "my_evaluators:number"
+    assert "must name an lw.QueryEvaluator, or a class of these, it names 3" in fails(capsys, "record", "reach", *more)
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
@@ -100,6 +138,7 @@ def test_conditions_answered_by_a_network(capsys, tmp_path):
         (("--suite", "metawold"), "did you mean 'metaworld'"),
         (("--policy", "experts"), "did you mean 'expert'"),
         (("--compare", "nowhere.zip"), "'nowhere.zip'"),
+        (("--device", "cuda:99"), "--device must be one of"),
         (("--reference", "MT10"), "--reference is for --attribute"),
         (("--out", "x.mp4"), "--out must end in '.rrd'"),
         (("--episodes", -1), "-1"),

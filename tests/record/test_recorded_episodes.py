@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import time
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from recordings import PLAN, STEPS, Recording, make_objects, make_rollout, record
 
 from lw_torchrl.record import RerunLogger
@@ -279,3 +281,19 @@ def test_names_of_things_in_one_place_stand_apart():
     offsets = beside({"puck": place, "goal": place, "wall": place + 0.5}, ROBOT_EYE)
     assert [name for name, offset in offsets.items() if offset.any()] == ["goal"]
     assert np.linalg.norm(offsets["goal"]) > 0.03
+
+
+def test_pictures_that_the_policy_saw_stand_beside_the_scene(tmp_path):
+    rollout = make_rollout()
+    held = torch.arange(20) // 5  # a picture for five steps each
+    rollout["pixels"] = (held * 60).to(torch.uint8)[:, None, None, None].expand(20, 32, 64, 3)
+    found = record(tmp_path / "a.rrd", rollout)
+    assert found.times("/push/seen", "EncodedImage:blob") == [0, 5, 10, 15]
+    blobs = [bytes(blob[0]) for blob in found.values("/push/seen", "EncodedImage:blob")]
+    pictures = [np.asarray(Image.open(io.BytesIO(blob))) for blob in blobs]
+    assert [picture.shape for picture in pictures] == [(32, 64, 3)] * 4
+    assert [round(float(picture.mean()), -1) for picture in pictures] == [0, 60, 120, 180]
+    views = [value for (_, field), value in found.blueprint().items() if field == "display_name"]
+    assert ["What it saw"] in views
+    with pytest.raises(ValueError, match=r"rollout\['pixels'\] must be uint8 of shape T×H×W×3, got float32"):
+        record(tmp_path / "b.rrd", make_rollout(3).set("pixels", torch.zeros(3, 4, 4, 3)))
