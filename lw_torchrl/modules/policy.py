@@ -121,7 +121,7 @@ class Encoder(Prepared):
         """D + F, the width of ``encoding``."""
         return self.latent_size + self.features.width
 
-    def encode(self, *prepared: Tensor) -> Encoding:
+    def encode(self, *prepared: Any, **_: Any) -> Encoding:  # any signature overrides it
         """From what :meth:`prepare` gives."""
         raise NotImplementedError(f"{type(self).__name__} must override encode")
 
@@ -220,7 +220,7 @@ class Policy(Prepared):
         spec[self.out_keys_source[0]] = Bounded(-1.0, 1.0, (self.layout.action_size,))
         return spec
 
-    def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
+    def act(self, *prepared: Any, **_: Any) -> tuple[Tensor, ...]:  # any signature overrides it
         """From what :meth:`prepare` gives to a tensor for each of ``out_keys``; it can be vmapped over parameters."""
         raise NotImplementedError(f"{type(self).__name__} must override act")
 

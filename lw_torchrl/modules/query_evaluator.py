@@ -57,7 +57,7 @@ class QueryEvaluator(Prepared):
         self.in_keys: list[NestedKey] = ["observation", "task_id"]
         self.out_keys: list[NestedKey] = ["qaf_logits"]
 
-    def logits(self, *read: Tensor) -> Tensor:
+    def logits(self, *read: Any, **_: Any) -> Tensor:  # any signature overrides it
         """The tensors of ``in_keys`` to (B, S) float32."""
         raise NotImplementedError(f"{type(self).__name__} must override logits")
 
