@@ -13,7 +13,7 @@ from lw_torchrl.modules.networks import evaluating
 
 _OFTEN, _BRIEF = 0.4, 5  # the share of a step's states from which something is usual; states that are too few to say
 _SAME = 0.02  # how far an action may be from the script's and still be the script's
-_EXPLAINS = 0.5  # of what an action is off, what a fault that explains it may leave
+_HALF = 0.5  # of what actions are off: what a fault that explains it may leave, and what counts in other steps
 
 
 class BesideScripts(NamedTuple):
@@ -60,7 +60,8 @@ class BesideScripts(NamedTuple):
     def in_other_steps(self, step: int) -> bool | None:
         """Whether what is wrong in a step is wrong in the others too. It is read off the axis that is off most, as a
         factor of what scripts do or as a shift, and is there too if the same explains at least half of what is off in
-        the other steps; None where neither says what is wrong in the step, or it would not show in the others."""
+        the other steps. None where neither says what is wrong in the step, it would not show in the others, or these
+        are half as far off in another way."""
         known = self.wanted.isfinite().all(-1) & (self.in_force >= 0)
         inside, others = known & (self.in_force == step), known & (self.in_force != step)
         if min(int(inside.sum()), int(others.sum())) < _BRIEF:
@@ -69,10 +70,12 @@ class BesideScripts(NamedTuple):
         done, wanted = self.done[:, axis], self.wanted[:, axis]
         factor = (done * wanted)[inside].sum() / wanted[inside].square().sum().clamp(min=_SAME**2)
         faults = [factor * wanted, wanted + (done - wanted)[inside].mean()]
-        faults = [fault for fault in faults if _off(done - fault, inside) < _EXPLAINS * _off(done - wanted, inside)]
+        faults = [fault for fault in faults if _off(done - fault, inside) < _HALF * _off(done - wanted, inside)]
         faults = [fault for fault in faults if _off(fault - wanted, others) > _SAME]
-        most = _EXPLAINS * _off(done - wanted, others)
-        return any(_off(done - fault, others) < most for fault in faults) if faults else None
+        off = _off(done - wanted, others)
+        if any(_off(done - fault, others) < _HALF * off for fault in faults):
+            return True
+        return None if not faults or off > _HALF * _off(done - wanted, inside) else False
 
 
 def _off(values: Tensor, where: Tensor) -> float:

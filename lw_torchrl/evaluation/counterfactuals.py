@@ -89,6 +89,7 @@ class Counterfactuals:
         reference = Plans(different)
         try:
             other = actor.with_plans(reference)
+            reference = plans_of(other) or reference  # a policy may complete what it is given
             theirs = evaluator.with_plans(reference) if hasattr(evaluator, "with_plans") else evaluator
             self.other, self.other_evaluator, self.reference = other, theirs, reference
         except (AttributeError, ImportError, RuntimeError, TypeError, ValueError) as error:

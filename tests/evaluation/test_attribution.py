@@ -275,6 +275,22 @@ def test_a_policy_that_cannot_carry_out_the_reference_is_told():
     assert "plan" not in failure.counterfactuals
 
 
+class Completing(lw.ScriptedSkillActor):
+    """One that carries out more steps than the plans that it is given have."""
+
+    def with_plans(self, plans):
+        pairs = [(str(step.condition), step.skill) for step in lw.Plans(plans)[TASK].steps]
+        longer = lw.ConditionalPlan.from_pairs(TASK, [*pairs, pairs[0]])
+        return Completing(lw.Plans({TASK: longer}), skills=self._skills)
+
+
+def test_a_policy_that_completes_the_reference_is_replaced_with_what_it_carries_out():
+    actor = Completing(hopeless(), skills=clumsy(step=2)._skills)
+    [failure] = evaluated(actor, reference=REFERENCE).failures
+    assert {failure.cause, failure.also} == {"plan", "skill"}
+    assert len(failure.mended.plan.steps) == failure.mended.steps["skill_weights"].shape[1] == 4
+
+
 # ---- the same whatever runs beside
 
 
