@@ -56,5 +56,6 @@ def method_config(method: str, given: OnlineConfig | None = None) -> OnlineConfi
 
 __all__ = [
     "LEARNERS", "AdvantageConfig", "CriticConfig", "ExpertIterationConfig", "Learner", "NoiseConfig",
-    "OffPolicyConfig", "OffPolicyLearner", "OnlineConfig", "PPOConfig", "ReplayConfig", "ResidualConfig", "SACConfig", "TD3Config", "adamw", "method_config",
+    "OffPolicyConfig", "OffPolicyLearner", "OnlineConfig", "PPOConfig", "ReplayConfig", "ResidualConfig", "SACConfig",
+    "TD3Config", "adamw", "method_config",
 ]  # fmt: skip
