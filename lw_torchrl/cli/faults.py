@@ -7,7 +7,6 @@ import os
 import sysconfig
 from collections.abc import Iterator
 from functools import cache
-from importlib.metadata import distributions
 from pathlib import Path
 from traceback import walk_tb
 from types import FrameType
@@ -74,6 +73,8 @@ def _is_installed(file: str) -> bool:
 @cache
 def _extending() -> set[str]:
     """The installed packages that add to our tables."""
+    from importlib.metadata import distributions
+
     points = [point for found in distributions() for point in found.entry_points]
     return {point.module.partition(".")[0] for point in points if point.group.startswith("lw_torchrl.")}
 

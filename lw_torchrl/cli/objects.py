@@ -1,5 +1,7 @@
 """What `evaluate` and `record` both take: a policy's file or an object of yours, and a network for the conditions."""
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Callable
 from contextlib import suppress

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import sys
 
@@ -9,7 +10,8 @@ import pytest
 from commands import fails
 
 import lw_torchrl as lw
-from lw_torchrl.cli.faults import TRACEBACK, is_ours
+from lw_torchrl.cli import faults
+from lw_torchrl.cli.faults import TRACEBACK, in_users_module, is_ours
 from lw_torchrl.cli.main import COMMANDS, main
 from lw_torchrl.cli.parsing import in_its_words
 
@@ -104,3 +106,23 @@ def test_names_are_options_in_our_own_errors_alone():
     assert not is_ours(found.value)
     said = "got self.batch_size=3, 'max_steps' and /tmp/max_steps; set batch_size"
     assert in_its_words("train", COMMANDS["train"], said) == said.replace("set batch_size", "set --batch-size")
+
+
+@pytest.mark.parametrize("extends", [True, False])
+def test_an_installed_package_is_the_user_s_where_it_extends_ours(tmp_path, monkeypatch, extends):
+    place = tmp_path / "site-packages"
+    about = place / "installed_thing-1.dist-info"
+    about.mkdir(parents=True)
+    group = "lw_torchrl.policies" if extends else "others.things"
+    (about / "entry_points.txt").write_text(f"[{group}]\nMine = installed_thing:Mine\n")
+    (about / "METADATA").write_text("Name: installed-thing\nVersion: 1\n")
+    (place / "installed_thing.py").write_text("1 / 0\n")
+    monkeypatch.syspath_prepend(place)
+    monkeypatch.setattr(faults, "_extending", faults._extending.__wrapped__)
+    with pytest.raises(ZeroDivisionError) as found:
+        importlib.import_module("installed_thing")
+    found.value.__traceback__ = found.value.__traceback__.tb_next  # this test is no library
+    said = in_users_module(found.value)
+    assert said == (
+        f"{place}/installed_thing.py:1: ZeroDivisionError: division by zero, at `1 / 0`" if extends else None
+    )
