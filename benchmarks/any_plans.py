@@ -21,6 +21,7 @@ from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.canonical import canonical_plan, default_plan, most_trusted
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.suites import find_points
+from lw_torchrl.training import load_evaluator
 
 DEVELOPMENT = (
     "assembly", "bin-picking", "button-press", "button-press-wall", "coffee-pull", "dial-turn", "door-close",
@@ -32,7 +33,9 @@ TEST = tuple(task for task in lw.MT50 if task not in DEVELOPMENT and task not in
 """The other twenty."""
 PARAPHRASES = 10  # of each plan
 OURS, NATURAL = lw.load_plans("MT50", skills="MT10"), lw.load_plans("MT50")
-Rows = Literal["default", "ours", "natural", "palm2", "no-points", "dc", "one-hot", "no-roles", "models", "robustness"]
+Rows = Literal[
+    "default", "ours", "natural", "palm2", "no-points", "dc", "one-hot", "no-roles", "models", "robustness", "evaluator"
+]
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,10 @@ class Arguments:
     """PaLM 2's plans, a .json file of pairs; for "palm2"."""
     answers: Path | None = None
     """Answers of models, a .jsonl file; for "models"."""
+    evaluator: Path | None = None
+    """What answers conditions in the place of the simulator, of `lw-torchrl train-evaluator`; for "evaluator"."""
+    tasks: tuple[str, ...] = (*DEVELOPMENT, *TEST)
+    """Which of the 40."""
     out: Path = Path("runs/any_plans")
     """Folder for results.json and table.md; what is there is not done again."""
 
@@ -70,12 +77,15 @@ def main(arguments: Arguments) -> None:
                 continue
             policy = lw.load_actor(folder_of(arguments, method) / f"seed{seed}" / "policy.zip").eval()
             actor = policy if plans is None else policy.with_plans(plans)
-            tasks = [task for task in (*DEVELOPMENT, *TEST) if plans is None or task in plans]
+            tasks = [task for task in arguments.tasks if plans is None or task in plans]
             row, _, number = name.partition(", number ")
             # Of each of ten paraphrases fewer episodes, each with its own initial states.
             episodes = max(1, 2 * arguments.episodes // PARAPHRASES) if number else arguments.episodes
             how: dict[str, Any] = {"episodes_per_task": episodes, "noise_scale": 0.1, "progress": False}
             fixes = 10_000 + seed + 100 * int(number or 0)
+            if row == "evaluator" and plans is not None:
+                actor = policy.with_plans(Plans([plans[task] for task in tasks]))
+                how["evaluator"] = load_evaluator(required(arguments.evaluator, "evaluator"), actor.plans).eval()
             result = lw.evaluate(actor, tasks=tasks, seed=fixes, stop_at_success=True, **how)
             trust = {} if plans is None else {task: canonical_plan(plans[task]).trust for task in tasks}
             found[key] = {"row": row, "seed": seed, "success": result.success_once, "trust": trust}
@@ -100,7 +110,7 @@ def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans |
             yield row, row, Plans([OURS[task] for task in outside])
         elif row == "default":
             yield row, "pcbc", Plans([default_plan(NATURAL[task]).plan for task in outside])
-        elif row in ("ours", "natural"):
+        elif row in ("ours", "natural", "evaluator"):
             yield row, "pcbc", Plans([(OURS if row == "ours" else NATURAL)[task] for task in outside])
         elif row == "palm2":
             written = lw.load_plans(required(arguments.palm2, "palm2"))

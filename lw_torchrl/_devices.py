@@ -82,7 +82,9 @@ def in_blocks(policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[T
         n = tensordict.batch_size[0]
         padding = -n % size
         padded = torch.cat([tensordict, tensordict[:1].expand(padding)]) if padding else tensordict
-        outputs = torch.cat([policy(block.copy()) for block in padded.split(size)])
-        return tensordict.update(outputs[:n])
+        outputs = [policy(block.copy()) for block in padded.split(size)]
+        if not isinstance(outputs[0], TensorDictBase):
+            raise TypeError(f"a policy must return the TensorDict that it is given, got a {type(outputs[0]).__name__}")
+        return tensordict.update(torch.cat(outputs)[:n])
 
     return run

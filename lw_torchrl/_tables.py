@@ -3,15 +3,16 @@
 import re
 import warnings
 from collections import UserDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 Thing = TypeVar("Thing")
+Base = TypeVar("Base")
 _PLACE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
 
@@ -73,9 +74,10 @@ class Table(UserDict[str, Thing]):
                 warnings.warn(str(error), stacklevel=2)
         return len(self.data) > before
 
-    def __setitem__(self, name: str, thing: Any) -> None:
+    def __setitem__(self, name: str, thing: Thing | str) -> None:
         later = isinstance(thing, str) and _PLACE.fullmatch(thing)
-        super().__setitem__(name, thing if later else self.check(name, thing))
+        kept: Any = thing if later else self.check(name, thing)
+        super().__setitem__(name, kept)
 
     def __contains__(self, name: object) -> bool:
         return isinstance(name, str) and (name in self.data or name in plugins_of(self.group))
@@ -103,12 +105,15 @@ class Table(UserDict[str, Thing]):
         return made
 
 
-class Classes(Table[Any]):
+class Classes(Table[Any], Generic[Base]):
     """A table of classes derived from ``base``."""
 
-    def __init__(self, kind: str, base: type, group: str, entries: Mapping[str, Any]) -> None:
+    def __init__(self, kind: str, base: type[Base], group: str, entries: Mapping[str, Any]) -> None:
         self.base = base
         super().__init__(kind, group, entries)
+
+    def __setitem__(self, name: str, thing: type[Base] | str) -> None:
+        super().__setitem__(name, thing)
 
     def check(self, name: str, thing: Any) -> Any:
         if not isinstance(thing, type) or not issubclass(thing, self.base):
@@ -120,6 +125,9 @@ class Classes(Table[Any]):
 
 class Functions(Table[Any]):
     """A table of functions, or of classes that are called."""
+
+    def __setitem__(self, name: str, thing: Callable[..., Any] | str) -> None:
+        super().__setitem__(name, thing)
 
     def check(self, name: str, thing: Any) -> Any:
         if not callable(thing):

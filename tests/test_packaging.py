@@ -126,18 +126,23 @@ def test_extras_have_one_name_in_errors_and_pages():
 
 @pytest.mark.slow
 def test_mypy_finds_a_user_s_mistakes_outside_the_checkout(tmp_path):
-    """The package is found as it is installed, with ``make setup`` as a path."""
-    script = shutil.copy(Path(__file__).with_name("planted_errors.py"), tmp_path / "script.py")
-    lines = Path(script).read_text("utf-8").splitlines()
-    planted = [number for number, line in enumerate(lines, 1) if line.endswith("# planted")]
-    assert len(lines) == 60
+    """The package is found as it is installed, with ``make setup`` as a path. Overrides with names of their own, as the
+    docs show them, are no mistakes."""
+    planted = {}
+    for name in ("planted_errors.py", "planted_in_extensions.py"):
+        lines = Path(shutil.copy(Path(__file__).with_name(name), tmp_path)).read_text("utf-8").splitlines()
+        planted[name] = [number for number, line in enumerate(lines, 1) if line.endswith("# planted")]
+        assert len(lines) >= 60
     done = subprocess.run(
-        [sys.executable, "-m", "mypy", "--strict", "--config-file=", "--no-error-summary", "script.py"],
+        [sys.executable, "-m", "mypy", "--strict", "--config-file=", "--no-error-summary", *planted],
         cwd=tmp_path,
         env={name: value for name, value in os.environ.items() if name != "MYPYPATH"},
         capture_output=True,
         text=True,
     )
-    found = re.findall(r"^script\.py:(\d+): error: .*\[([a-z-]+)\]$", done.stdout, re.MULTILINE)
-    assert [int(line) for line, _ in found] == planted, done.stdout
-    assert [kind for _, kind in found] == ["attr-defined", "arg-type", "attr-defined"]
+    found = re.findall(r"^(planted_\w+\.py):(\d+): error: .*\[([a-z-]+)\]$", done.stdout, re.MULTILINE)
+    assert {name: [int(line) for file, line, _ in found if file == name] for name in planted} == planted, done.stdout
+    kinds = {name: [kind for file, _, kind in found if file == name] for name in planted}
+    assert kinds["planted_errors.py"] == ["attr-defined", "arg-type", "attr-defined"]
+    assigned = ["assignment"] * 3
+    assert kinds["planted_in_extensions.py"] == ["override", *assigned, "call-arg", "arg-type"]

@@ -10,7 +10,17 @@ from tyro.conf import Positional
 import lw_torchrl as lw
 from lw_torchrl._checks import counted, nearest
 from lw_torchrl._files import read_text, read_toml
-from lw_torchrl.cli.options import File, Json, SkillFile, TaskFile, is_suite, read_skills, read_suite, read_tasks
+from lw_torchrl.cli.options import (
+    File,
+    Json,
+    SkillFile,
+    TaskFile,
+    is_suite,
+    read_skills,
+    read_suite,
+    read_tasks,
+    tasks_of,
+)  # fmt: skip
 from lw_torchrl.cli.output import Output
 from lw_torchrl.language.nearest import nearest_skill
 from lw_torchrl.language.plan_text import PLAN_LIMIT
@@ -38,7 +48,8 @@ def check(
         return _check_suite(str(file), json)
     if not file.exists():
         raise FileNotFoundError(f"file: there is no {str(file)!r}")
-    known = read_tasks(task_file)
+    paths = sorted(file.glob("*.plan")) if file.is_dir() else [file]
+    known = read_tasks(task_file) if file.suffix == ".toml" else tasks_of(paths, task_file)
     output = Output(json)
     if file.suffix == ".toml":
         try:
@@ -49,7 +60,6 @@ def check(
         lines = [*(f"{file.name}: note: {note}" for note in notes), f"{file.name}: {counted(number, kind)}, valid"]
         row = {"file": file, f"{kind}s": number, "faults": [], "notes": notes}
         return output.show("files", [row], "\n".join(lines))
-    paths = sorted(file.glob("*.plan")) if file.is_dir() else [file]
     if not paths:
         raise ValueError(f"file: the folder {str(file)!r} holds no .plan files")
     table = read_skills(skill_file, known)
@@ -63,7 +73,7 @@ def check(
             print("\n".join([*faults, *(f"{path.name}: note: {note}" for note in notes), f"{path.name}: {found}"]))
     if faults := [fault for row in rows for fault in row["faults"]]:
         unknown = any(" is no task" in fault for fault in faults)
-        hint = "; tasks of yours come by --task-file" if unknown and task_file is None else ""
+        hint = "; tasks of yours come by --task-file, those of a suite by --import" if unknown and not task_file else ""
         output.fault = f"{counted(len(faults), 'fault')} in {counted(len(paths), 'file')}{hint}"
     return output.show("files", rows)
 

@@ -55,6 +55,7 @@ def collect(
             random; or a policy's file, of `lw-torchrl train`.
     """
     options.check_folder("--out", out)
+    there = ", which was there already" if (out / "metadata.json").is_file() else ""
     options.check_actor("policy", policy)
     elsewhere = options.read_suite(suite, tasks)
     chosen = options.simulated("tasks", options.one_or_many(tasks), options.read_tasks(task_file, tasks), elsewhere)
@@ -69,7 +70,7 @@ def collect(
     rows = [{"task": task, "success": rate, "episodes_run": runs[task]} for task, rate in rates.items()]
     columns: Columns = {"task": "task", "success": lambda row: f"{row['success']:.2f}", "episodes run": "episodes_run"}
     output = Output(json).table("tasks", rows, columns).show("dataset", made.root)
-    return output.show("steps", made.num_steps, f"{counted(made.num_steps, 'step')} in {made.root}")
+    return output.show("steps", made.num_steps, f"{counted(made.num_steps, 'step')} in {made.root}{there}")
 
 
 def data() -> None:

@@ -34,7 +34,7 @@ def evaluate(
     num_envs: int | None = None,  # environments stepped together; the result does not depend on it
     attribute: bool = False,  # say why failed episodes failed: a query, the plan, a skill or time; they run again
     reference: tuple[str, ...] = (),  # with --attribute, trusted plans to run failed episodes again, as for --plans
-    evaluator: Path | None = None,  # a network that answers the conditions, of `lw-torchrl train-evaluator`
+    evaluator: str | None = None,  # answers the conditions: a file of `train-evaluator`, or yours, my_module:evaluator
     out: Path | None = None,  # folder for results.json, success.png and rollout.rrd; with --attribute also failures.png
     device: options.Device = "cpu",
     json: options.Json = False,
@@ -69,13 +69,15 @@ def evaluate(
 
     options.use_one_thread()
     there = check_device("device", device)
+    asked = None  # that is not inside the policy
     if who == "expert":
         chosen = chosen or (lw.MT10 if elsewhere is None else tuple(elsewhere.plans or elsewhere.tasks))
         policy = None if elsewhere is None else suite_expert(elsewhere, chosen)
     else:
         there_too: dict[str, Any] = {"text_encoder": text_encoder, "suite": elsewhere, "speed": speed}
         load = partial(options.load_policy, seed=seed, plans=given, **there_too)
-        policy = objects.with_evaluator(objects.read_policy("checkpoint", who, given, load), evaluator, text_encoder)
+        policy = objects.read_policy("checkpoint", who, given, load)
+        policy, asked = objects.with_evaluator(policy, evaluator, text_encoder)
         if isinstance(policy, lw.Policy):
             known.update({task: found for task in policy.tasks if (found := policy.definition(task)) is not None})
             shown = set() if plans or objects.is_object(who) else demonstrated_tasks(checkpoint)
@@ -91,14 +93,15 @@ def evaluate(
     how |= {"stop_at_success": stop_at_success, "num_envs": num_envs, "device": there, "attribute": attribute}
     where: dict[str, Any] = {"suite": elsewhere} | ({} if max_steps is None else {"max_steps": max_steps})
     trusted = options.read_plans(reference, known) if reference else None
-    result = lw.evaluate(policy or lw.ExpertActor(chosen), reference=trusted, **how, **where)
+    result = lw.evaluate(policy or lw.ExpertActor(chosen), reference=trusted, evaluator=asked, **how, **where)
     output = Output(json).result(result)
     if attribute:
         failures = [one.to_json() for one in result.failures or ()]
         output.show("failures", failures, f"\n{result.failure_table()}")
     if out is not None:
         with held(out, "out", folder=True, wait=True):
-            told: dict[str, Any] = {"plans": None if own is None else own.fingerprint, "evaluator": evaluator}
+            answered = evaluator if evaluator is not None and Path(evaluator).is_file() else None
+            told: dict[str, Any] = {"plans": None if own is None else own.fingerprint, "evaluator": answered}
             told["checkpoint"] = None if who == "expert" or objects.is_object(who) else policy_file(checkpoint)
             result.save(out / "results.json", **told)
             lw.plot_success(result, out / "success.png", title=f"{checkpoint}, {episodes} episodes a task")
@@ -106,7 +109,7 @@ def evaluate(
                 lw.evaluation.plot_failures(result, out / "failures.png", title=str(checkpoint))
             if policy is not None:
                 first: list[str | Task] = list(result.config["tasks"][:3])
-                recorded = run_recorded(policy, first, seed=seed, noise_scale=noise, **where)
+                recorded = run_recorded(policy, first, seed=seed, noise_scale=noise, evaluator=asked, **where)
                 said: dict[str, Any] = {"seed": seed, "policy": objects.name_of(who), "suite": elsewhere}
                 write_recording(out / "rollout.rrd", recorded, own, **said)
         print(f"written to {out}")
@@ -121,8 +124,8 @@ def _default_tasks(policy: lw.Policy, shown: set[str], suite: lw.suites.Suite | 
     own = [task for task in chosen if (known_suite(task) is None if suite is None else task not in suite.tasks)]
     if len(own) == len(chosen):
         raise ValueError(
-            f"the simulator has none of the policy's tasks, {', '.join(own)}; name others with --tasks, or run these "
-            "in an engine of yours, in Python: docs/training.md"
+            f"the simulator has none of the policy's tasks, {', '.join(own)}; name others with --tasks, or the suite "
+            "that has these, --import my_module or --suite my_module:suite; for an engine of yours, docs/training.md"
         )
     if len(chosen) < len(policy.tasks):
         ran = counted(len(chosen), "task")

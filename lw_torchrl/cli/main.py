@@ -4,6 +4,7 @@ What an argument is, a comment beside it says, or the docstring if it takes more
 found, an :class:`~lw_torchrl.cli.output.Output`, where it has ``--json``.
 """
 
+import os
 import signal
 import sys
 import threading
@@ -19,6 +20,7 @@ import tyro
 
 from lw_torchrl import __version__
 from lw_torchrl._checks import nearest, shown
+from lw_torchrl.cli.faults import TRACEBACK, in_users_module, is_ours
 from lw_torchrl.cli.output import Output, complain, nobody_reads, sound_streams
 from lw_torchrl.cli.parsing import document, import_modules, in_its_words, parse, unpadded
 
@@ -70,7 +72,8 @@ ABOUT = """Language-World with TorchRL: policies carried by plans in English. --
 or evaluators of your own to their tables (docs/extending.md).
 
 Exit status: 0, done; 1, a bug of ours, with a traceback; 2, an error that you can fix, in one line on the standard
-error; 130, stopped by Ctrl-C; 141, nobody reads the output. What prints a table prints JSON with --json."""
+error, which names the line of a module of yours if it is there (LW_TORCHRL_TRACEBACK=1 shows the traceback); 130,
+stopped by Ctrl-C; 141, nobody reads the output. What prints a table prints JSON with --json."""
 
 _RESUMABLE = {"demo", "collect", "train", "train-evaluator", "reproduce", "offline", "online"}
 _RESUMABLE |= {"plan generate", "plan compare", "plan repair"}
@@ -88,14 +91,17 @@ def main(args: Sequence[str] | None = None) -> None:
         except Exception as error:
             if interrupts:  # raised within a library, Ctrl-C may surface as something else
                 _stop(given)
-            if not isinstance(error, (ValueError, TypeError, OSError, ImportError, RuntimeError)):
+            if os.environ.get(TRACEBACK) or (isinstance(error, BrokenPipeError) and nobody_reads()):
                 raise
-            if isinstance(error, BrokenPipeError) and nobody_reads():
+            if (message := in_users_module(error)) is not None:
+                message += f"; {TRACEBACK}=1 shows the traceback"
+            elif not isinstance(error, (ValueError, TypeError, OSError, ImportError, RuntimeError)):
                 raise
-            message = str(error)
-            _, args, table = _group(given)
-            if args and args[0] in table:
-                message = in_its_words(args[0], table[args[0]], message)
+            else:
+                message = str(error)
+                _, args, table = _group(given)
+                if is_ours(error) and args and args[0] in table:
+                    message = in_its_words(args[0], table[args[0]], message)
             complain(f"lw-torchrl: error: {message}")
             sys.exit(2)
 

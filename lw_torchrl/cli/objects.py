@@ -1,10 +1,15 @@
 """What `evaluate` and `record` both take: a policy's file or an object of yours, and a network for the conditions."""
 
+from __future__ import annotations
+
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import lw_torchrl as lw
+from lw_torchrl._tables import plugins_of
 from lw_torchrl.cli import options
 from lw_torchrl.language.plans import Plans
 
@@ -43,21 +48,44 @@ def read_policy(argument: str, who: str, plans: Plans | None, load: Callable[[Pa
     return found.with_plans(plans)
 
 
-def with_evaluator(policy: Any, evaluator: Path | None, text_encoder: str | None) -> Any:
-    """The policy with its conditions answered by the network of a file, if one is given."""
+def with_evaluator(policy: Any, evaluator: str | None, text_encoder: str | None) -> tuple[Any, Any]:
+    """The policy with an evaluator inside, if one is named, and None; or, of a policy that takes none, both."""
     if evaluator is None:
-        return policy
-    if getattr(policy, "plans", None) is None or not hasattr(policy, "with_evaluator"):
+        return policy, None
+    if getattr(policy, "plans", None) is None:
         raise ValueError(f"--evaluator is for a policy with plans, {type(policy).__name__} has none")
+    asked = _read_evaluator(evaluator, policy.plans, text_encoder)
+    with suppress(AttributeError, TypeError, ValueError):  # a policy of yours, or one that reads exact truth too
+        return policy.with_evaluator(asked), None
+    return policy, asked
+
+
+def _read_evaluator(named: str, plans: Plans, text_encoder: str | None) -> lw.QueryEvaluator:
     encoder = options.read_encoder(text_encoder)
-    return policy.with_evaluator(lw.training.load_evaluator(evaluator, policy.plans, text_encoder=encoder))
+    if not is_object(named) and (Path(named).exists() or not _is_class(named)):
+        return lw.training.load_evaluator(named, plans, text_encoder=encoder)
+    found = options.imported("--evaluator", named, "evaluator") if is_object(named) else lw.modules.EVALUATORS[named]
+    if isinstance(found, lw.QueryEvaluator):
+        return found.with_plans(plans)
+    if not isinstance(found, type) or not issubclass(found, lw.QueryEvaluator):
+        raise ValueError(
+            f"--evaluator {named!r} must name an lw.QueryEvaluator, or a class of these, it names {found!r:.80}"
+        )
+    return found.from_options(plans, {}, encoder)
 
 
-def check_evaluator(evaluator: Path | None, who: str) -> None:
-    """Refuse a network's file that is not there, and one for who asks no conditions."""
+def _is_class(name: str) -> bool:
+    """Whether a word is a class of yours: ours know nothing before they are trained."""
+    added = "lw_torchrl.modules" in sys.modules or bool(plugins_of("lw_torchrl.evaluators"))
+    return name.isidentifier() and added and name in lw.modules.EVALUATORS
+
+
+def check_evaluator(evaluator: str | None, who: str) -> None:
+    """Refuse an evaluator that is not there, and one for who asks no conditions."""
     if evaluator is None:
         return
     if who in options.ACTORS and who != "scripted":
         asks = "the scripted experts ask" if who == "expert" else f"{who} asks"
         raise ValueError(f"--evaluator is for a policy with plans, {asks} no conditions")
-    options.check_saved("evaluator", evaluator, "network", "train-evaluator")
+    if not is_object(evaluator) and not _is_class(evaluator):
+        options.check_saved("evaluator", Path(evaluator), "network", "train-evaluator")

@@ -6,6 +6,7 @@ What names and files alone can tell is checked without torch.
 from __future__ import annotations
 
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -18,10 +19,11 @@ from tyro.conf import arg
 
 import lw_torchrl as lw
 from lw_torchrl._checks import check_choice, unknown_name
-from lw_torchrl._files import absent_policy, shipped_policy
+from lw_torchrl._files import absent_policy, read_text, shipped_policy
 from lw_torchrl._tables import plugins_of
 from lw_torchrl.cli.parsing import own_module
 from lw_torchrl.language.plan_files import load_plans
+from lw_torchrl.language.plan_text import PLAN_LIMIT
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
 from lw_torchrl.language.tasks import TASKS, Task, load_tasks, resolve_tasks
@@ -35,6 +37,7 @@ ACTORS = ("expert", "scripted", "spoilt-60", "spoilt-30", "wrong", "random")
 """The names of :data:`lw_torchrl.data.BEHAVIOURS`."""
 CONDITIONS = ("pcbc", "dc", "one-hot")
 """Our names of :data:`lw_torchrl.modules.METHODS`."""
+_PLAN_OF_SUITE = re.compile(r"^def ([a-z0-9_]+?)__([a-z0-9_]+)\(", re.MULTILINE)
 _METHODS = (
     "pcbc, by plan; or a baseline: dc, by description, one-hot, by number; or a class of yours (docs/extending.md)."
 )
@@ -74,6 +77,16 @@ def read_tasks(task_file: Path | None, names: Sequence[str] = ()) -> Mapping[str
     if task_file is not None:
         raise ValueError(f"--task-file is for tasks of Meta-World, those named are of the suite {suite.name}")
     return suite.tasks
+
+
+def tasks_of(files: Sequence[Path], task_file: Path | None) -> Mapping[str, Task]:
+    """The tasks that plan files may speak of: those of the suite that the first is of, else as :func:`read_tasks`."""
+    from lw_torchrl.suites.suite import SUITES
+
+    first = files[0] if files and files[0].is_file() and files[0].suffix == ".plan" else None
+    found = None if first is None else _PLAN_OF_SUITE.search(read_text(first, PlanError, limit=PLAN_LIMIT))
+    name = "" if found is None else f"{found[1]}/{found[2]}".replace("_", "-")
+    return read_tasks(task_file, (name,) if found is not None and name.partition("/")[0] in SUITES else ())
 
 
 def read_skills(skill_file: Path | None, tasks: Mapping[str, Task]) -> Mapping[str, ScriptedSkill]:
@@ -238,10 +251,12 @@ def check_actor(argument: str, who: str) -> None:
 def imported(option: str, name: str, kind: str) -> Any:
     """What "package.module:name" names."""
     module, _, attribute = name.partition(":")
+    absent = f"{option} {name!r} names no {kind}"
+    found = own_module(absent, module)
     try:
-        return getattr(own_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"{option} {name!r} names no {kind}: {error}") from error
+        return getattr(found, attribute)
+    except AttributeError as error:
+        raise ValueError(f"{absent}: {error}") from None
 
 
 def read_encoder(name: str | None) -> TextEncoder | None:

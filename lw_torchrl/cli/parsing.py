@@ -170,11 +170,20 @@ def _refusal(prog: str, known: Mapping[str, Parameter], box: str) -> str:
     return re.sub(r"^Missing value for argument '(\S+)'.*", r"\1 must be given a value", text)
 
 
-def own_module(name: str) -> ModuleType:
-    """A module of the user's; the working folder is searched first."""
+def own_module(absent: str, name: str) -> ModuleType:
+    """A module of the user's; the working folder is searched first. Where there is none, the error begins with
+    ``absent``; what the module itself raises is passed on."""
     if "" not in sys.path:
         sys.path.insert(0, "")
-    return import_module(name)
+    if not all(part.isidentifier() for part in name.split(".")):
+        raise ValueError(f"{absent}: {name!r} is no module's name, which is like my_module or my_package.my_module")
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        if not f"{name}.".startswith(f"{error.name}."):  # one that it imports
+            raise
+        hint = f"; did you mean {name.removesuffix('.py')!r}?" if name.endswith(".py") else ""
+        raise ValueError(f"{absent}: {error}{hint}") from None
 
 
 IMPORTED: list[str] = []
@@ -190,10 +199,7 @@ def import_modules(given: Sequence[str]) -> list[str]:
             rest.append(word)
             continue
         name = next(words, "") if word == "--import" else word.removeprefix("--import=")
-        try:
-            own_module(name)
-        except (ImportError, ValueError) as error:
-            raise ValueError(f"--import {name!r} names no module: {error}") from error
+        own_module(f"--import {name!r} names no module", name)
         IMPORTED.append(name)
     return rest
 
@@ -247,4 +253,4 @@ def in_its_words(command: str, function: Callable[..., object], message: str) ->
         return typed.replace("--", "--no-", 1) if match[2] == "=False" else typed
 
     message = re.sub(r"^([a-z_]+)()(?=:| must| differ)", shown, message)
-    return re.sub(r"(?<![\w-])([a-z]+(?:_[a-z]+)+)(=False|=True)?\b", shown, message)
+    return re.sub(r"(?<![\w./'\"-])([a-z]+(?:_[a-z]+)+)(=False|=True)?\b", shown, message)

@@ -14,6 +14,7 @@ from lw_torchrl._files import read_text
 from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Columns, Output
 from lw_torchrl.language.formats import PLAN_FORMATS
+from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import Task, check_task
 
 
@@ -76,8 +77,8 @@ def read(
     Example: lw-torchrl plan read my-plans/coffee-pull.plan
 
     Args:
-        source: a .plan file, a folder of them, a .json file of pairs, "MT10" or "MT50"; or a language model's answer,
-            FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it.
+        source: a .plan file, a folder of them, a .json file of pairs, "MT10", "MT50" or a suite; or a language model's
+            answer, FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it.
     """
     from lw_torchrl.language.canonical import canonical_plan
 
@@ -91,10 +92,13 @@ def read(
             raise ValueError(f"{source}: no plan can be read, {decoded.reason}")
         plans = [decoded.plan]
     else:
-        known = options.read_tasks(task_file, () if task is None else (task,))
+        named = not file.exists() and source not in options.SETS and options.is_suite(source)
+        suite = options.read_suite(source) if named else None
+        files = sorted(file.glob("*.plan")) if file.is_dir() else [file]
+        known = options.tasks_of(files, task_file) if task is None else options.read_tasks(task_file, (task,))
         if task is not None:
-            check_task(task, known)
-        found = options.read_plans([source], known, option="FILE")
+            check_task(task, known if suite is None else suite.tasks)
+        found = options.read_plans([source], known, option="FILE") if suite is None else Plans(suite.plans or {})
         plans = [plan for plan in found.values() if task in (None, plan.task)]
         if not plans:
             raise ValueError(f"--task {task}: {source} has no plan for it")

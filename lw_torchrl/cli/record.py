@@ -26,7 +26,7 @@ def record(
     plans: tuple[str, ...] = (),
     attribute: bool = False,  # say why failed episodes failed, as evaluate does; for scripted and policies with plans
     reference: tuple[str, ...] = (),  # with --attribute, trusted plans for running failed episodes again
-    evaluator: Path | None = None,  # a network that answers the conditions, of `lw-torchrl train-evaluator`
+    evaluator: str | None = None,  # answers the conditions: a file of `train-evaluator`, or yours, my_module:evaluator
     suite: options.SuiteName = None,
     speed: options.Speed = 1.0,
     task_file: options.TaskFile = None,
@@ -76,19 +76,20 @@ def record(
     cast = []
     for who in filter(None, (policy, compare)):
         actor, shown, called = _cast(who, tasks, given, known, load, seed, max_steps, elsewhere)
-        if who == policy or hasattr(actor, "with_evaluator"):
-            actor = objects.with_evaluator(actor, evaluator, text_encoder)
-        cast.append((actor, shown, called))
+        asked = None
+        if who == policy or getattr(actor, "plans", None) is not None:
+            actor, asked = objects.with_evaluator(actor, evaluator, text_encoder)
+        cast.append((actor, shown, called, asked))
     rows: list[dict[str, Any]] = []
     recorded: list[list[str]] = []
     with replacing(out) as file, lw.RerunLogger(file, exp_name=out.stem) as logger:
-        for actor, shown, who in cast:
-            how = episode_options | acting | {"stop_at_success": stop_at_success, "progress": True}
-            found = run_recorded(actor, tasks, plans=shown, episodes=episodes, **how)
+        for actor, shown, who, asked in cast:
+            how = episode_options | acting | {"evaluator": asked}
+            run = how | {"stop_at_success": stop_at_success, "progress": True}
+            found = run_recorded(actor, tasks, plans=shown, episodes=episodes, **run)
             why: Mapping[tuple[str, int], lw.evaluation.Failure] = {}
             if attribute and shown is not None and hasattr(actor, "with_plans"):
-                again = episode_options | acting
-                failures = lw.attribute_failures(found, shown, actor=actor, reference=trusted, **again)
+                failures = lw.attribute_failures(found, shown, actor=actor, reference=trusted, **how)
                 why = {(one.task, one.episode): one for one in failures}
                 if failures and not recorded:
                     logger.show_causes(_result(found, failures, episode_options, len(episodes)))

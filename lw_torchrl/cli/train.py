@@ -104,7 +104,7 @@ def train(
     asked: dict[str, Any] = {"features": features, "width": width, "depth": depth}
     actor_options = {name: value for name, value in asked.items() if value is not None}
     reads_plans = METHODS[method].reads_plans
-    if reads_plans:
+    if mix is not None or METHODS[method].takes("mix"):
         actor_options["mix"] = mix or "latents"
     for option, value in (("mix", mix), ("latent-consistency", latent_consistency), ("evaluator", evaluator)):
         if value and not reads_plans:

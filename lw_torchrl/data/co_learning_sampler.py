@@ -185,7 +185,8 @@ class CoLearningSampler(GroupSampler):
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
         self._check_storage(storage)
         if isinstance(storage, GrowingStorage) and not storage.num_grown:
-            raise ValueError("target 'grown': nothing has come yet; extend the buffer before the first sample")
+            mend = "extend the buffer before the first sample, a Learner in observe: self.replay.extend(rows)"
+            raise ValueError(f"target 'grown': nothing has come yet; {mend}")
         index, info = super().sample(storage, batch_size)
         if not isinstance(storage, GrowingStorage):
             info["is_target"] = to_device_of(storage, self._layout(batch_size)[1] == 0)

@@ -218,11 +218,14 @@ def _by_counterfactuals(
     counting = [name for name in tried.mending(one) if not (same and name == "plan")]
     decision = decide(counting, shares, share)
     cause, also, how = decision.cause, decision.also, tried.mended(decision, which)
+    only = tried.step_of_motion(one) if cause == "actuation" else None
+    cause = cause if only is None else "skill"
     if also is not None:
         words = f"Neither {PAIR_WORDS[cause]} nor {PAIR_WORDS[also]} alone mend it, both together do"
     elif how is not None:
         words = f"With {how.by} the same episode succeeds, at t = {len(how.steps)}"
         words += _certainty(decision, shares, share)
+        words += "" if only is None else f". What is wrong in it is wrong in step {only + 1} alone"
         if cause == "actuation" and "skill" in set(mended) - set(counting):
             alone = f"A scripted skill in step {tried.step[which] + 1} alone suffices"
             words += f". {alone} too, but what is wrong there is as wrong in other steps"
@@ -238,7 +241,7 @@ def _by_counterfactuals(
         words += f". By the states alone it would be the {told.cause}: {told.blames[told.cause].why}"
     step, at, why = told.blames.get(cause, told.blames["undecided"])
     if cause == "skill" and also is None:
-        step, plan = tried.step[which], tried.plans[one.task]
+        step, plan = tried.step[which] if only is None else only, tried.plans[one.task]
         at, why = stall_step(one, step, plan.definition.layout), one.active_time(plan, step)
     elif cause == "perception":
         why = null.misled[which].words

@@ -1,6 +1,6 @@
 """What a policy does beside what scripts would do in the same states: whether a fault is one step's or every step's."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import torch
@@ -13,7 +13,7 @@ from lw_torchrl.modules.networks import evaluating
 
 _OFTEN, _BRIEF = 0.4, 5  # the share of a step's states from which something is usual; states that are too few to say
 _SAME = 0.02  # how far an action may be from the script's and still be the script's
-_EXPLAINS = 0.5  # of what an action is off, what a fault that explains it may leave
+_HALF = 0.5  # of what actions are off: what a fault that explains it may leave, and what counts in other steps
 
 
 class BesideScripts(NamedTuple):
@@ -22,6 +22,12 @@ class BesideScripts(NamedTuple):
     done: Tensor  # (T, A) float32
     wanted: Tensor  # (T, A) float32, infinite where the step in force has no script
     in_force: Tensor  # (T,) int64, the step in force, -1 for none
+
+    def followed_by(self, other: "BesideScripts | None") -> "BesideScripts":
+        """With another episode's states behind."""
+        if other is None:
+            return self
+        return BesideScripts(*(torch.cat(both) for both in zip(self, other, strict=True)))
 
     def part(self, numbers: Tensor) -> "BesideScripts":
         """Some of the action's numbers, (A,) bool."""
@@ -36,16 +42,26 @@ class BesideScripts(NamedTuple):
         """(T,) bool, where actions are not those of scripts."""
         return self.gaps > _SAME
 
-    def often_far(self, steps: Sequence[int]) -> bool:
+    def far(self, steps: Iterable[int]) -> float:
+        """In what share of its states the actions are far from the scripts', in that of these steps where most are."""
+        stays = [self.in_force == step for step in steps]
+        shares = [float((self.gaps[stay] > OTHER).float().mean()) for stay in stays if stay.sum() >= _BRIEF]
+        return max(shares, default=0.0)
+
+    def often_far(self, steps: Iterable[int]) -> bool:
         """Whether the actions are far from the scripts' in one of these steps of the plan, in a good part of its
         states."""
-        stays = [self.in_force == step for step in steps]
-        return any(bool((self.gaps[stay] > OTHER).float().mean() > _OFTEN) for stay in stays if stay.sum() >= _BRIEF)
+        return self.far(steps) > _OFTEN
+
+    def seldom_far(self, steps: Iterable[int]) -> bool:
+        """Whether there are few such states in each of these steps."""
+        return self.far(steps) < _OFTEN / 2
 
     def in_other_steps(self, step: int) -> bool | None:
         """Whether what is wrong in a step is wrong in the others too. It is read off the axis that is off most, as a
         factor of what scripts do or as a shift, and is there too if the same explains at least half of what is off in
-        the other steps; None where neither says what is wrong in the step, or there are no others to see."""
+        the other steps. None where neither says what is wrong in the step, it would not show in the others, or these
+        are half as far off in another way."""
         known = self.wanted.isfinite().all(-1) & (self.in_force >= 0)
         inside, others = known & (self.in_force == step), known & (self.in_force != step)
         if min(int(inside.sum()), int(others.sum())) < _BRIEF:
@@ -53,11 +69,13 @@ class BesideScripts(NamedTuple):
         axis = int((self.done - self.wanted)[inside].square().mean(0).argmax())
         done, wanted = self.done[:, axis], self.wanted[:, axis]
         factor = (done * wanted)[inside].sum() / wanted[inside].square().sum().clamp(min=_SAME**2)
-        faults = [fault for fault in (factor * wanted, wanted + (done - wanted)[inside].mean())]
-        faults = [fault for fault in faults if _off(done - fault, inside) < _EXPLAINS * _off(done - wanted, inside)]
-        least = min((_off(done - fault, others) for fault in faults), default=None)
+        faults = [factor * wanted, wanted + (done - wanted)[inside].mean()]
+        faults = [fault for fault in faults if _off(done - fault, inside) < _HALF * _off(done - wanted, inside)]
+        faults = [fault for fault in faults if _off(fault - wanted, others) > _SAME]
         off = _off(done - wanted, others)
-        return None if least is None else off > _SAME and least < _EXPLAINS * off
+        if any(_off(done - fault, others) < _HALF * off for fault in faults):
+            return True
+        return None if not faults or off > _HALF * _off(done - wanted, inside) else False
 
 
 def _off(values: Tensor, where: Tensor) -> float:

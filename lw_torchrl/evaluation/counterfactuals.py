@@ -79,7 +79,8 @@ class Counterfactuals:
         self.plans = plans = scripts.plans
         self.found: dict[str, dict[EpisodeId, FinishedEpisode | None]] = {}  # counterfactual to episodes that it mends
         self.step: dict[EpisodeId, int] = {}  # in which a script mends the episode
-        self.beside: dict[EpisodeId, BesideScripts] = {}  # where it failed, and where a script mends one step
+        self.beside: dict[EpisodeId, BesideScripts] = {}  # where it failed
+        self.with_script: dict[EpisodeId, dict[int, BesideScripts]] = {}  # and where a script was in charge of a step
         self.reference: Plans | None = None
         self.other = self.other_evaluator = None  # that carry out the reference
         different = [] if reference is None else [reference[task] for task in reference.differences(plans)]
@@ -88,6 +89,7 @@ class Counterfactuals:
         reference = Plans(different)
         try:
             other = actor.with_plans(reference)
+            reference = plans_of(other) or reference  # a policy may complete what it is given
             theirs = evaluator.with_plans(reference) if hasattr(evaluator, "with_plans") else evaluator
             self.other, self.other_evaluator, self.reference = other, theirs, reference
         except (AttributeError, ImportError, RuntimeError, TypeError, ValueError) as error:
@@ -132,13 +134,17 @@ class Counterfactuals:
     def _unmended(self, which: Iterable[EpisodeId], *names: str) -> list[EpisodeId]:
         return [one for one in which if not any(self._mends(name, one) for name in names)]
 
-    def _run(self, name: str, which: Sequence[EpisodeId], actor: Any, plans: Any, *options: Any) -> None:
+    def _run(
+        self, name: str, which: Sequence[EpisodeId], actor: Any, plans: Any, *options: Any
+    ) -> dict[EpisodeId, FinishedEpisode]:
+        again = {}
         if which and actor is not None and plans is not None:
             single = REPLACEMENTS.get(name)
             what = " and ".join(PAIR_WORDS[one] for one in name.split(" + ")) if single is None else single.words
             again = self.repeat(what, which, actor, plans, *options)
             kept = {one: None if episode.first_success is None else episode for one, episode in again.items()}
             self.found.setdefault(name, {}).update(kept)
+        return again
 
     def _scripted(self, actor: Any, plans: Plans | None, **where: Any) -> Any:
         if actor is None or plans is None:
@@ -160,8 +166,13 @@ class Counterfactuals:
         for turn in range(_TRIED_STEPS if told_of_steps else 0):
             which = self._unmended([w for w, steps in ranked.items() if len(steps) > turn], "skill")
             steps = {one: ranked[one][turn] for one in which}
-            self._run("skill", which, self._scripted(self.actor, self.plans, steps=steps), self.plans, self.evaluator)
+            scripted = self._scripted(self.actor, self.plans, steps=steps)
+            again = self._run("skill", which, scripted, self.plans, self.evaluator)
             self.step.update({one: steps[one] for one in which if self._mends("skill", one)})
+            for episode in set(which) & set(self.beside):
+                there = states_of(*episode, again[episode].steps, self.plans, None)
+                both = self.beside[episode].followed_by(beside_scripts(self.actor, there, self.scripts))
+                self.with_script.setdefault(episode, {})[steps[episode]] = both
         left = [one for one in ranked if not (self._mends("skill", one) and self._in_one_step(one))]
         for name, part in (("gripper", "gripper"), ("actuation", "displacement")):
             if self.plans.layout.gripper is not None:
@@ -172,35 +183,43 @@ class Counterfactuals:
         self._run("policy", left, self._scripted(self.actor, self.plans), self.plans, self.evaluator)
 
     def _motion(self, beside: BesideScripts) -> BesideScripts:
-        return beside.part(~self._fingers(beside))
+        return beside.part(torch.arange(beside.done.shape[-1]) != self._gripper_number)
 
-    def _fingers(self, beside: BesideScripts) -> Tensor:
+    def _gripper(self, beside: BesideScripts) -> BesideScripts:
+        return beside.part(torch.arange(beside.done.shape[-1]) == self._gripper_number)
+
+    @property
+    def _gripper_number(self) -> int:
         gripper = self.plans.layout.gripper
-        return torch.arange(beside.done.shape[-1]) == torch.tensor(-1 if gripper is None else gripper)
+        return -1 if gripper is None else gripper
 
     def _in_one_step(self, which: EpisodeId) -> bool:
-        """Whether the motion differs from the scripts' in one step of the plan and the policy is their equal elsewhere,
-        also in the steps that it gets to once a script has mended that one."""
-        episode, beside = self.found["skill"][which], self.beside.get(which)
-        assert episode is not None
-        if beside is None:
+        """Whether the motion differs from the scripts' in the step that a script mends, and the policy is their equal
+        elsewhere, also in the steps that it then gets to."""
+        if which not in self.beside:
             return False
-        mended = beside_scripts(self.actor, states_of(*which, episode.steps, self.plans, None), self.scripts)
-        if mended is not None:
-            both = zip(beside, mended, strict=True)
-            beside = self.beside[which] = BesideScripts(*(torch.cat(tensors) for tensors in both))
+        beside = self.with_script[which][self.step[which]]
         return len(beside.in_force[beside.unlike()].unique()) == 1 and bool(self._motion(beside).unlike().any())
 
     def mending(self, one: EpisodeStates) -> list[str]:
-        """What mends an episode. A script in one step does not count where scripts for the gripper or the motion in all
-        steps mend too, and only the gripper is wrong in it, or what is wrong there is as wrong in other steps; where
-        it is not, scripts for the motion do not count."""
+        """What mends an episode, without what does not count: scripts for a part of the action that is not far from
+        theirs, where another part is that mends too; a script in one step, where only the gripper is wrong in it, or
+        what is wrong there is as wrong in other steps, and scripts for that part in all steps mend too; where it is
+        not, scripts for the motion."""
         found = [name for name, results in self.found.items() if results.get(one.which) is not None]
-        beside, step = self.beside.get(one.which), self.step.get(one.which)
-        if beside is None or step is None or self.plans.layout.gripper is None:
+        beside, step, numbers = self.beside.get(one.which), self.step.get(one.which), range(one.truth.shape[1])
+        if beside is None or self.plans.layout.gripper is None:
             return found
-        motion, fingers = self._motion(beside), beside.part(self._fingers(beside))
-        others = [other for other in range(one.truth.shape[1]) if other != step]
+        if "gripper" in found and "actuation" in found:
+            motion, fingers = self._motion(beside), self._gripper(beside)
+            if fingers.often_far(numbers) and motion.seldom_far(numbers):
+                found.remove("actuation")
+            elif motion.often_far(numbers) and fingers.seldom_far(numbers):
+                found.remove("gripper")
+        if step is None:
+            return found
+        beside, others = self.with_script[one.which][step], [other for other in numbers if other != step]
+        motion, fingers = self._motion(beside), self._gripper(beside)
         in_others = motion.in_other_steps(step)
         if in_others is False and "actuation" in found:
             found.remove("actuation")
@@ -209,6 +228,17 @@ class Counterfactuals:
         if ("gripper" in found and by_gripper) or ("actuation" in found and in_all):
             found.remove("skill")
         return found
+
+    def step_of_motion(self, one: EpisodeStates) -> int | None:
+        """The one step in which the motion is wrong, as far as is seen where the episode failed and where a script was
+        in charge of a step; None where other steps are wrong as well, or that cannot be told."""
+        numbers = range(one.truth.shape[1])
+        for motion in map(self._motion, self.with_script.get(one.which, {}).values()):
+            for step in numbers:
+                others = [other for other in numbers if other != step]
+                if motion.often_far([step]) and motion.in_other_steps(step) is False and not motion.often_far(others):
+                    return step
+        return None
 
     def mended(self, decision: Decision, which: EpisodeId) -> MendedEpisode | None:
         """The episode as it goes with what counts replaced, under the plan that is then carried out."""

@@ -68,8 +68,9 @@ class Relations(Table[tuple[Comparison, ...]]):
         if not words or name != " ".join(words) or not re.fullmatch(r"[a-z][a-z '-]*", name):
             raise ValueError(f"a relation must be named by lower-case words, like 'left of', got {shown(name)}")
         taken = name not in self.data and any(name in list(table) for table in PREDICATES.maps)
-        if taken or words[0] in ("is", "isn't", "not") or {"and", "the", "a", "an"} & set(words):
-            raise ValueError(f"a relation may not be named {name!r}, which has a meaning of its own in a query")
+        own = [name] * taken + [one for one in words[:1] if one in ("is", "isn't", "not")]
+        if own := own + [one for one in words if one in ("and", "the", "a", "an")]:
+            raise ValueError(f"a relation may not be named {name!r}: {own[0]!r} has a meaning of its own in a query")
         if isinstance(parts, Comparison) or not parts or not all(isinstance(part, Comparison) for part in parts):
             raise ValueError(f"relation {name!r} must be a tuple of Comparison, at least one, got {shown(parts)}")
         return tuple(parts)

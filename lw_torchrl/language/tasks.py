@@ -140,7 +140,16 @@ def _check_name(name: str) -> str:
 _TABLE = dict(sorted(read_toml(files("lw_torchrl.language") / "data" / "tasks.toml", TaskError).items()))
 Tasks = Mapping[str, Task]
 TaskList = str | Task | Iterable[str | Task]
-TASKS: Tasks = MappingProxyType({name: Task.from_json(name, row) for name, row in _TABLE.items()})
+
+
+class _Shipped(dict[str, Task]):
+    """Shown by its name: as the default of an argument it stands in what ``help`` prints."""
+
+    def __repr__(self) -> str:
+        return f"lw.TASKS, the {len(self)} tasks from {min(self)} to {max(self)}"
+
+
+TASKS: Tasks = MappingProxyType(_Shipped((name, Task.from_json(name, row)) for name, row in _TABLE.items()))
 MT10: tuple[str, ...] = tuple(name for name, row in _TABLE.items() if row.get("mt10"))
 """TASKS maps the 50 names, sorted, to their :class:`Task`; MT10 names the ten of the MT10 set."""
 MT50: tuple[str, ...] = tuple(TASKS)

@@ -16,7 +16,7 @@ from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, check_flag, check_int, checked, shown
 from lw_torchrl._keys import as_keys, check_apart, dispatched, key_beside, read, write
-from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.plans import AnyPlans, Plans
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import DISTRIBUTIONS, ActionHead, DistributionName
@@ -270,6 +270,17 @@ class ConditionedActor(Policy):
         head = {name: options.pop(name) for name in _OF_HEAD if name in options}
         made = ENCODERS[check_choice("encoder", encoder, ENCODERS)]
         return cls(made.for_plans(plans, text_encoder=text_encoder, **options), **head)
+
+    def with_plans(self, plans: AnyPlans) -> ConditionedActor:
+        """An actor that carries out other plans with the same weights: training either trains both."""
+        if self.plans is None:
+            return super().with_plans(plans)
+        encoder, options = self.encoder.with_plans(plans), dict(self.config)
+        if self.head.actions != encoder.layout.action_size:
+            options["action_size"] = self.head.actions
+        other = ConditionedActor(encoder, **options)
+        other.head = self.head
+        return other.train(self.training)
 
     def describe(self) -> dict[str, Any]:
         told = self.encoder.describe()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +13,8 @@ from torch.distributions import Distribution
 from torchrl.modules import MLP, IndependentNormal, TanhNormal
 
 from lw_torchrl._checks import check_choice, check_flag, check_int, check_scale
+
+Module = TypeVar("Module", bound=nn.Module)
 
 
 @contextmanager
@@ -25,6 +27,20 @@ def evaluating(network: nn.Module) -> Iterator[None]:
     finally:
         for module, mode in modes:
             module.training = mode
+
+
+def with_weights_of(own: nn.Module, other: Module) -> Module:
+    """The other module, a fresh one, on the parameters and saved buffers of ``own``: training either trains both.
+
+    :class:`RuntimeError` if their names or shapes differ.
+    """
+    other.load_state_dict(own.state_dict())
+    for name, module in other.named_modules():
+        mine, passing = own.get_submodule(name), module._non_persistent_buffers_set
+        module._parameters.update(mine._parameters)
+        module._buffers.update({key: kept for key, kept in mine._buffers.items() if key not in passing})
+    other.train(own.training)
+    return other
 
 
 def unit_scale(vectors: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, Unpack
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from lw_torchrl._checks import check_choice, passes_on
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
+from lw_torchrl.modules.options import PlanActorOptions
 from lw_torchrl.modules.plan_attention import Answers
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description, plans_and_evaluator
@@ -55,7 +56,13 @@ class PlanConditionedActor(ConditionedActor):
     plans: Plans
 
     @passes_on(ConditionedActor.__init__, PlanEncoder.__init__)
-    def __init__(self, plans: AnyPlans, *, mix: Literal["latents", "actions"] = "latents", **options: Any) -> None:
+    def __init__(
+        self,
+        plans: AnyPlans,
+        *,
+        mix: Literal["latents", "actions"] = "latents",
+        **options: Unpack[PlanActorOptions],
+    ) -> None:
         check_choice("mix", mix, ("latents", "actions"))
         if mix == "actions" and options.get("distribution") is not None:
             raise ValueError("mix must be 'latents' with a distribution: a mean of several actions has no likelihood")

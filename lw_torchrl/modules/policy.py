@@ -13,12 +13,13 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs import Compose, Transform
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._checks import check_choice, counted
 from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.layout import METAWORLD, Layout
-from lw_torchrl.language.plans import AnyPlans, Plans
+from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.tasks import TASKS, Task
 from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.networks import with_weights_of
 from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.transforms.qaf import QAFTransform
 
@@ -70,7 +71,10 @@ class Prepared(TensorDictModuleBase):
         if not any(one.kind is one.VAR_KEYWORD for one in known.values()):
             for name in options:
                 check_choice(f"option of {cls.__name__}", name, [*known][1:])
-        return cls(plans, **options)
+        made = cls(plans, **options)
+        if "_modules" not in vars(made):
+            raise TypeError(f"__init__ of {cls.__name__} must begin with super().__init__()")
+        return made
 
     def transform(self) -> Transform | None:
         """A new transform that writes what it reads and the environment does not give; None for none."""
@@ -117,7 +121,7 @@ class Encoder(Prepared):
         """D + F, the width of ``encoding``."""
         return self.latent_size + self.features.width
 
-    def encode(self, *prepared: Tensor) -> Encoding:
+    def encode(self, *prepared: Any, **_: Any) -> Encoding:  # any signature overrides it
         """From what :meth:`prepare` gives."""
         raise NotImplementedError(f"{type(self).__name__} must override encode")
 
@@ -144,8 +148,23 @@ class Encoder(Prepared):
         return cls(described_tasks(found), **options)
 
     def with_plans(self, plans: AnyPlans) -> Encoder:
-        """The same weights for other plans: training either trains both."""
-        raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} is conditioned on descriptions")
+        """The same weights for other plans: training either trains both.
+
+        Raises:
+            TypeError: it is not conditioned on plans.
+            ValueError: a weight's shape depends on the plans; such a class overrides this.
+        """
+        if self.plans is None:
+            told = "is conditioned on descriptions"
+            raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} {told}")
+        described = {"plans": as_plans(plans).to_json(), "options": self.config}
+        with torch.random.fork_rng(devices=[]):
+            made = type(self).from_description(described, self.text_encoder)
+        try:
+            return with_weights_of(self, made)
+        except RuntimeError as error:
+            which = str(error).partition("\n\t")[2].strip() or str(error)
+            raise ValueError(f"plans: weights of {type(self).__name__} are those of its own plans: {which}") from error
 
 
 class Policy(Prepared):
@@ -201,13 +220,18 @@ class Policy(Prepared):
         spec[self.out_keys_source[0]] = Bounded(-1.0, 1.0, (self.layout.action_size,))
         return spec
 
-    def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
+    def act(self, *prepared: Any, **_: Any) -> tuple[Tensor, ...]:  # any signature overrides it
         """From what :meth:`prepare` gives to a tensor for each of ``out_keys``; it can be vmapped over parameters."""
         raise NotImplementedError(f"{type(self).__name__} must override act")
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return write(tensordict, self, self.act(*self.prepare(tensordict)))
+        prepared = self.prepare(tensordict)
+        acted = self.act(*_as_tuple(self, "prepare", prepared))
+        if len(_as_tuple(self, "act", acted)) != len(self.out_keys_source):
+            wanted = f"a tensor for each of out_keys, {', '.join(map(str, self.out_keys_source))}"
+            raise ValueError(f"act of {type(self).__name__} must return {wanted}, got {counted(len(acted), 'tensor')}")
+        return write(tensordict, self, acted)
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
         """Take statistics of observations (R, 39) float32 with weights (R,) of sum 1, in place; by default none."""
@@ -229,6 +253,14 @@ class Policy(Prepared):
     def with_plans(self, plans: AnyPlans) -> Policy:
         """The same weights under other plans; :class:`TypeError` if it is not conditioned on plans."""
         raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} has none")
+
+
+def _as_tuple(policy: Policy, method: str, given: Any) -> Any:
+    """What a method returned; :class:`TypeError` unless it is a tuple or a list."""
+    if not isinstance(given, (tuple, list)):
+        got = f"a tensor of shape {tuple(given.shape)}" if isinstance(given, Tensor) else f"a {type(given).__name__}"
+        raise TypeError(f"{method} of {type(policy).__name__} must return a tuple of tensors, got {got}")
+    return given
 
 
 def described_tasks(found: Mapping[str, Any]) -> list[str | Task]:

@@ -15,6 +15,7 @@ from lw_torchrl._checks import checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, write
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.networks import with_weights_of
 from lw_torchrl.modules.policy import Prepared, kind_of
 from lw_torchrl.modules.tables import Kinds, class_of
 from lw_torchrl.transforms.qaf import QAFTransform
@@ -56,7 +57,7 @@ class QueryEvaluator(Prepared):
         self.in_keys: list[NestedKey] = ["observation", "task_id"]
         self.out_keys: list[NestedKey] = ["qaf_logits"]
 
-    def logits(self, *read: Tensor) -> Tensor:
+    def logits(self, *read: Any, **_: Any) -> Tensor:  # any signature overrides it
         """The tensors of ``in_keys`` to (B, S) float32."""
         raise NotImplementedError(f"{type(self).__name__} must override logits")
 
@@ -78,13 +79,7 @@ class QueryEvaluator(Prepared):
 
     def with_plans(self, plans: Plans) -> QueryEvaluator:
         """One on the same weights for other plans; :class:`RuntimeError` if the weights differ in names or shapes."""
-        other = self.made_for(plans)
-        other.load_state_dict(self.state_dict())
-        for name, module in other.named_modules():
-            own, passing = self.get_submodule(name), module._non_persistent_buffers_set
-            module._parameters.update(own._parameters)
-            module._buffers.update({key: kept for key, kept in own._buffers.items() if key not in passing})
-        return other.train(self.training)
+        return with_weights_of(self, self.made_for(plans))
 
     def made_for(self, plans: Plans) -> QueryEvaluator:
         """Another of the same options for other plans, with fresh weights."""

@@ -9,13 +9,13 @@ from inspect import signature
 from typing import Any
 
 from lw_torchrl._checks import check_choice, checked, shown, unknown_name
-from lw_torchrl._tables import Classes, Table
+from lw_torchrl._tables import Base, Classes, Table
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.policy import Encoder, Policy, Prepared
 
 
-class Kinds(Classes):
+class Kinds(Classes[Base]):
     """A table of classes by their own names, which files have."""
 
     def check(self, name: str, thing: Any) -> Any:
@@ -116,7 +116,7 @@ METHODS = Methods(
 """The choices of ``train --method`` and ``reproduce --methods``: on plans, the task's description, its number."""
 
 
-def class_of(argument: str, table: Kinds, found: Mapping[str, Any]) -> Any:
+def class_of(argument: str, table: Kinds[Any], found: Mapping[str, Any]) -> Any:
     """The class that a description names; :class:`ValueError` says which module had it, or the nearest name.
 
     That module is named and never imported: a file may come from a stranger.

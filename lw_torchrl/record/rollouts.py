@@ -23,16 +23,18 @@ from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.failure_records import Failure, MendedEpisode
 from lw_torchrl.evaluation.protocol import actor_plans, tasks_of
-from lw_torchrl.evaluation.running import make_env, running
+from lw_torchrl.evaluation.running import answered_by, make_env, running
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
+from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
 from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.suites.suite import Suite, known_suite, load_suite
+from lw_torchrl.transforms.qaf import QAFTransform
 
 _KEYS: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next", "success"), ("next", "reward")]
 _PLAN_KEYS = {"qaf", "skill_weights", "action_corrected"}
@@ -246,6 +248,7 @@ def run_recorded(
     max_steps: int | None = None,
     suite: str | Suite | None = None,
     engine: Any = None,
+    evaluator: QueryEvaluator | None = None,
     stop_at_success: bool = False,
     device: str | torch.device | None = None,
     progress: bool = False,
@@ -257,6 +260,7 @@ def run_recorded(
     Args:
         plans: whose queries to answer; None for the actor's own.
         episodes: indices, of each task.
+        evaluator: a module; the episodes have its answers beside the exact ones.
         progress: show a bar where it takes longer than a second.
 
     Returns:
@@ -265,19 +269,25 @@ def run_recorded(
     answered = actor_plans(actor, plans)
     found_suite, chosen = tasks_of(tasks, answered, suite)
     options: dict[str, Any] = {"seed": seed, "max_steps": max_steps, "suite": found_suite, "engine": engine}
-    env = make_env(actor, answered, LanguageWorldEnv(list(chosen.values()), strict=True, **options))
+    env = make_env(actor, answered, LanguageWorldEnv(list(chosen.values()), strict=True, **options), evaluator)
     written = set() if answered is None else {"qaf", *actor.out_keys}
-    evaluator = getattr(actor, "evaluator", None)
-    seen = {"pixels"} & set(getattr(actor, "in_keys", ()))
-    keys = list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *getattr(evaluator, "in_keys", ()), *seen]))
+    acting, exact = answered_by(actor, evaluator), None
+    if evaluator is None:
+        evaluator = getattr(actor, "evaluator", None)
+    elif answered is not None:
+        exact = QAFTransform(answered)  # the answers acted on take its place in an episode
+    read = getattr(evaluator, "in_keys", ())
+    seen = {"pixels"} & {*getattr(actor, "in_keys", ()), *read}
+    keys = list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *read, *seen]))
     how: dict[str, Any] = {"noise_scale": noise_scale, "progress": progress, "keys": keys, "device": device}
     how["after_success"] = 0 if stop_at_success else None
     found = {}
-    with running("recording", env, actor, dict.fromkeys(chosen, episodes), **how) as finished:
+    with running("recording", env, acting, dict.fromkeys(chosen, episodes), **how) as finished:
         for one in finished:
+            steps = one.steps
             if evaluator is not None:
-                one = one._replace(steps=evaluator(one.steps.to(device_of(evaluator))).cpu())
-            found[one.task, one.episode] = one
+                steps = evaluator(steps.to(device_of(evaluator))).cpu()
+            found[one.task, one.episode] = one._replace(steps=steps if exact is None else exact(steps))
     return [found[task, episode] for task in chosen for episode in episodes]
 
 

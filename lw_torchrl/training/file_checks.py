@@ -131,5 +131,9 @@ def check_texts(stored: Mapping[str, Tensor], ours: Mapping[str, Tensor]) -> Non
 
 
 def first_line(error: Exception) -> str:
-    """What an error says, up to 400 characters of its first line."""
-    return (str(error).splitlines() or [type(error).__name__])[0][:400]
+    """What an error says, up to 400 characters of its first line, of a longer one whole words."""
+    line = (str(error).splitlines() or [type(error).__name__])[0]
+    if len(line) <= 400:
+        return line
+    end = next((at for mark in (", ", " ") if (at := line.rfind(mark, 300, 400)) > 0), 400)
+    return f"{line[:end]} ..."

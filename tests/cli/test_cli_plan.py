@@ -75,6 +75,21 @@ def test_read_says_what_became_of_each_step(capsys, tmp_path):
     assert {row[0] for row in rows("MT50", "--task", "soccer")} == {"soccer"}
 
 
+def test_plans_of_a_suite_s_tasks_are_read_and_checked(capsys, tmp_path):
+    file = tmp_path / "mine.plan"
+    plan = """# fetch/push: Push the puck to the target location.
+def fetch__push(robot):
+    if check("the robot's gripper is not near the puck"):
+        robot.move("the gripper to the puck")
+"""
+    file.write_text(plan)
+    assert "mine.plan: 1 step, valid" in run(capsys, "check", file)
+    assert "fetch/push" in run(capsys, "plan", "read", file)
+    assert {one["task"] for one in document(capsys, "plan", "read", "fetch")["plans"]} == {
+        *lw.suites.SUITES["fetch"].tasks
+    }
+
+
 @pytest.mark.parametrize("format", lw.PLAN_FORMATS)
 def test_read_takes_a_model_s_answer(capsys, tmp_path, format):
     plan = lw.load_plans("MT10")["reach"]

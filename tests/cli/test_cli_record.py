@@ -99,6 +99,36 @@ def test_conditions_answered_by_a_network(capsys, tmp_path):
     assert "expert" in fails(capsys, "record", "reach", "--evaluator", file)
 
 
+OWN_EVALUATORS = """
+import torch
+import lw_torchrl as lw
+
+
+class Never(lw.QueryEvaluator):
+    def logits(self, observation, task_id):
+        return observation.new_full((*task_id.shape, self.plans.num_steps), -3.0)
+
+
+never = Never(lw.load_plans("MT10"))
+number = 3
+"""
+
+
+def test_conditions_answered_by_an_evaluator_of_yours(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "my_evaluators.py").write_text(OWN_EVALUATORS)
+    roles = lw.PlanConditionedActor(lw.Plans({"reach": lw.load_plans("MT10")["reach"]}), roles=True, width=8)
+    lw.save_actor(roles, "roles.zip")  # it reads exact truth, so it takes no evaluator inside
+    for policy, named in (("scripted", "Never"), ("roles.zip", "never")):
+        out = f"{named}.rrd"
+        more = "--policy", policy, "--evaluator", f"my_evaluators:{named}", "--max-steps", 20, "--out", out
+        assert "reach, episode 0" in run(capsys, "record", "reach", *more)
+    run(capsys, "evaluate", "roles.zip", "--evaluator", "my_evaluators:Never", "--episodes", 1, "--max-steps", 5)
+    more = "--policy", "scripted", "--evaluator", "my_evaluators:number"
+    assert "must name an lw.QueryEvaluator, or a class of these, it names 3" in fails(capsys, "record", "reach", *more)
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [

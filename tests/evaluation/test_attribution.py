@@ -14,7 +14,7 @@ import lw_torchrl as lw
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation import attribute_failures
 from lw_torchrl.evaluation.beside_scripts import BesideScripts
-from lw_torchrl.evaluation.counterfactuals import own_evaluators, with_true_answers
+from lw_torchrl.evaluation.counterfactuals import Counterfactuals, own_evaluators, with_true_answers
 from lw_torchrl.evaluation.deciding import choose_pair, decide
 from lw_torchrl.evaluation.explanation import attended, chosen, last_stay_start, stall_step
 from lw_torchrl.record.rollouts import simulate_again
@@ -136,7 +136,28 @@ def test_a_fault_is_looked_for_in_other_steps():
     assert told(lambda action: action + torch.tensor([0.0, 0.4, 0.0])) == (True, False), "a shift"
     assert told(torch.zeros_like) == (True, False), "at rest"
     assert told(lambda action: action.roll(1, 0)) == (None, None), "neither"
+    nothing = torch.where(here, wanted, 0.0)
+    hidden = BesideScripts(nothing * -1.0, nothing, in_force).in_other_steps(0)
+    assert hidden is None, "a factor does not show where the script does nothing"
     assert BesideScripts(noise, wanted, torch.zeros(60)).in_other_steps(0) is None, "there are no others"
+
+
+def test_a_gripper_that_is_wrong_is_told_from_a_motion_that_is_not_quite_the_script_s():
+    """Motion that is a little off fails with the gripper open; scripts for either part mend that."""
+    in_force = torch.zeros(20, dtype=torch.int64)
+    wanted = torch.tensor([0.5, 0.0, 0.0, 1.0]).expand(20, 4)
+
+    def told(motion, effort):
+        done = torch.tensor([motion, 0.0, 0.0, effort]).expand(20, 4)
+        tried = Counterfactuals.__new__(Counterfactuals)
+        tried.plans, tried.step, tried.with_script = PLANS, {}, {}
+        tried.found = {name: {(TASK, 0): object()} for name in ("gripper", "actuation")}
+        tried.beside = {(TASK, 0): BesideScripts(done, wanted, in_force)}
+        return tried.mending(SimpleNamespace(which=(TASK, 0), truth=torch.ones(20, 1)))
+
+    assert told(0.4, -1.0) == ["gripper"]
+    assert told(-0.5, 0.9) == ["actuation"]
+    assert told(-0.5, -1.0) == told(0.4, 0.9) == ["gripper", "actuation"], "both are, or neither is"
 
 
 def test_a_plan_that_leads_astray():
@@ -252,6 +273,22 @@ def test_a_policy_that_cannot_carry_out_the_reference_is_told():
     with pytest.warns(UserWarning, match="the policy cannot carry it out"):
         [failure] = evaluated(Fixed(), reference=REFERENCE, max_steps=20).failures
     assert "plan" not in failure.counterfactuals
+
+
+class Completing(lw.ScriptedSkillActor):
+    """One that carries out more steps than the plans that it is given have."""
+
+    def with_plans(self, plans):
+        pairs = [(str(step.condition), step.skill) for step in lw.Plans(plans)[TASK].steps]
+        longer = lw.ConditionalPlan.from_pairs(TASK, [*pairs, pairs[0]])
+        return Completing(lw.Plans({TASK: longer}), skills=self._skills)
+
+
+def test_a_policy_that_completes_the_reference_is_replaced_with_what_it_carries_out():
+    actor = Completing(hopeless(), skills=clumsy(step=2)._skills)
+    [failure] = evaluated(actor, reference=REFERENCE).failures
+    assert {failure.cause, failure.also} == {"plan", "skill"}
+    assert len(failure.mended.plan.steps) == failure.mended.steps["skill_weights"].shape[1] == 4
 
 
 # ---- the same whatever runs beside

@@ -1,12 +1,15 @@
 """The 50 tasks against the published package, and the ways to name them."""
 
 import json
+from inspect import signature
+from pydoc import render_doc
 
 import language_world as oracle
 import numpy as np
 import pytest
 import torch
 
+import lw_torchrl as lw
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject
 from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.queries import parse_query, supported_queries
@@ -403,3 +406,10 @@ def test_a_missing_or_unreadable_file_of_tasks(tmp_path):
     (tmp_path / "latin.toml").write_bytes(b"# caf\xe9")
     with pytest.raises(TaskError, match=r"latin\.toml"):
         load_tasks(tmp_path / "latin.toml")
+
+
+@pytest.mark.parametrize("function", [lw.load_plans, lw.load_skills, lw.decode_plan, lw.plan_prompt])
+def test_help_begins_with_a_short_signature(function):
+    said = render_doc(function)
+    assert "lw.TASKS, the 50 tasks from assembly to window-open" in said
+    assert len(str(signature(function))) < 500

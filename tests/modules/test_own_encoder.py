@@ -7,10 +7,22 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
 
 import lw_torchrl as lw
+from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TEXT_DIMENSION
-from lw_torchrl.modules import ENCODERS, ConditionedActor, DescriptorEncoder, PlanEncoder, QValue, make_policy
+from lw_torchrl.modules import (
+    ENCODERS,
+    ConditionedActor,
+    DescriptorEncoder,
+    Encoder,
+    Encoding,
+    ObservationFeatures,
+    PlanEncoder,
+    QValue,
+    make_policy,
+)  # fmt: skip
 from lw_torchrl.training.algorithms.learner import encoder_like
 
 FOLDER = Path(__file__).parent.parent.parent / "examples" / "extending"
@@ -112,3 +124,39 @@ def test_what_is_no_encoding_is_named(own):
     actor = ConditionedActor(Bare(PLANS), width=8)
     with pytest.raises(TypeError, match=r"encode of Bare must return an Encoding\(latent, features\), got Tensor"):
         actor(**states())
+
+
+class Holding(Encoder):
+    """The share of a plan's conditions that hold, and, with ``by_skill``, a vector for each skill."""
+
+    plan_options = True
+
+    def __init__(self, plans, *, by_skill=False):
+        super().__init__()
+        self.plans, self.tasks, self.layout = plans, tuple(plans), plans.layout
+        self.config, self.latent_size = {"by_skill": by_skill}, 3
+        self.in_keys, self.out_keys = ["observation", "qaf"], ["encoding"]
+        self.features = ObservationFeatures("differences", 0.0, self.layout)
+        self.vectors = nn.Embedding(len(plans.skills) if by_skill else 1, 3)
+
+    def prepare(self, tensordict):
+        observation, qaf = self.read(tensordict)
+        return qaf.float(), self.features(observation)
+
+    def encode(self, holds, seen):
+        weights = holds / holds.sum(-1, keepdim=True).clamp(min=1.0)
+        return Encoding(holds.mean(-1, keepdim=True) * self.vectors.weight[0], seen, weights)
+
+
+def test_one_for_plans_carries_out_others_on_the_same_weights():
+    reach = Plans({"reach": PLANS["reach"]})
+    actor = ConditionedActor(Holding(reach), width=8)
+    actor.fit_normalization(torch.rand(50, 39))
+    other = actor.with_plans(PLANS)
+    assert (type(other), other.plans, other.tasks) == (ConditionedActor, PLANS, lw.MT10)
+    assert {id(one) for one in actor.parameters()} == {id(one) for one in other.parameters()}
+    assert other.encoder.features.mean is actor.encoder.features.mean
+    with pytest.raises(ValueError, match=r"weights of Holding are those of its own plans: .*vectors.weight"):
+        ConditionedActor(Holding(reach, by_skill=True)).with_plans(PLANS)
+    with pytest.raises(TypeError, match="conditioned on descriptions"):
+        DescriptorEncoder(PLANS).with_plans(PLANS)

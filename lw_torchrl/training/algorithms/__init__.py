@@ -4,7 +4,16 @@ from lw_torchrl._checks import check_choice
 from lw_torchrl._tables import Classes
 from lw_torchrl.training.algorithms.advantage import AdvantageConfig, AdvantageLearner
 from lw_torchrl.training.algorithms.expert_iteration import ExpertIterationConfig, ExpertIterationLearner
-from lw_torchrl.training.algorithms.learner import CriticConfig, Learner, NoiseConfig, OnlineConfig, ReplayConfig, adamw
+from lw_torchrl.training.algorithms.learner import (
+    CriticConfig,
+    Learner,
+    NoiseConfig,
+    OffPolicyConfig,
+    OffPolicyLearner,
+    OnlineConfig,
+    ReplayConfig,
+    adamw,
+)
 from lw_torchrl.training.algorithms.ppo import PPOConfig, PPOLearner
 from lw_torchrl.training.algorithms.sac import SACConfig, SACLearner
 from lw_torchrl.training.algorithms.td3 import ResidualConfig, ResidualLearner, TD3Config, TD3Learner
@@ -46,6 +55,7 @@ def method_config(method: str, given: OnlineConfig | None = None) -> OnlineConfi
 
 
 __all__ = [
-    "LEARNERS", "AdvantageConfig", "CriticConfig", "ExpertIterationConfig", "Learner", "NoiseConfig", "OnlineConfig",
-    "PPOConfig", "ReplayConfig", "ResidualConfig", "SACConfig", "TD3Config", "adamw", "method_config",
+    "LEARNERS", "AdvantageConfig", "CriticConfig", "ExpertIterationConfig", "Learner", "NoiseConfig",
+    "OffPolicyConfig", "OffPolicyLearner", "OnlineConfig", "PPOConfig", "ReplayConfig", "ResidualConfig", "SACConfig",
+    "TD3Config", "adamw", "method_config",
 ]  # fmt: skip

@@ -14,7 +14,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import LossModule, SoftUpdate
 
-from lw_torchrl._checks import Count, Natural, Probability, Scale, check_fields
+from lw_torchrl._checks import Count, Natural, Probability, Scale, check_choice, check_fields
 from lw_torchrl._tensor_archive import check_like, check_optimizer_state
 from lw_torchrl.modules.conditioned_actor import ConditionedActor, encoder_from_description
 from lw_torchrl.modules.critics import QValue
@@ -131,10 +131,25 @@ class Learner:
         self.optimizers: dict[str, torch.optim.Optimizer] = {}
         self.made = 0
         self._told: dict[str, list[Tensor]] = {}
+        kind = type(self)
+        if kind.learn is not Learner.learn and type(config).due is OnlineConfig.due:
+            what = f"config_type of {kind.__name__} must be derived from ReplayConfig or NoiseConfig"
+            raise TypeError(f"{what}, of whose configurations gradient steps are due, got {type(config).__name__}")
         self.make(critic)
+        if not isinstance(getattr(self, "loss", None), nn.Module):
+            raise TypeError(f"make of {kind.__name__} must set self.loss, a module that holds all that is trained")
 
     def make(self, critic: Any) -> None:
-        """Make ``loss`` and ``optimizers`` of ``policy`` and a critic that was given, or None."""
+        """Make ``loss`` and ``optimizers`` of ``policy`` and a critic that was given, or None: :meth:`q_value` makes
+        one then."""
+
+    def q_value(self, given: Any) -> QValue:
+        """The critic that is given, or one that sees what the policy sees, normalised as it is, in eval mode."""
+        if given is None:
+            return QValue(encoder_like(self.policy)).eval()
+        if not isinstance(given, QValue):
+            raise TypeError(f"critic must be a QValue, which judges actions, got {type(given).__name__}")
+        return given.eval()
 
     def act(self, state: TensorDictBase) -> TensorDictBase:
         """Write ``action`` (N, 4) float32, without the noise."""
@@ -148,7 +163,7 @@ class Learner:
         return state.get(policy.out_keys_source[2]) if of_steps else 1.0
 
     def observe(self, rows: TensorDictBase) -> None:
-        """Take rows (N, T) that came, time last."""
+        """Take rows (N, T) that came, time last; what samples from the buffer extends it here."""
 
     def learn(self, steps: int) -> None:
         """Make so many gradient steps."""
@@ -168,7 +183,8 @@ class Learner:
         return means
 
     def optimize(self, name: str, loss: Tensor) -> None:
-        """A step of an optimizer."""
+        """A step of an optimizer; :class:`ValueError` names the nearest if there is none of that name."""
+        check_choice("name of an optimizer", name, self.optimizers)
         self.optimizers[name].zero_grad()
         loss.backward()
         self.optimizers[name].step()
@@ -218,14 +234,6 @@ class OffPolicyLearner(Learner):
         actor, critics = loss.actor_network_params, loss.qvalue_network_params
         self.optimizers["actor"] = adamw(actor.values(True, True), self.config.actor_learning_rate)
         self.optimizers["critic"] = adamw(critics.values(True, True), self.config.critic_learning_rate)
-
-    def q_value(self, given: Any) -> QValue:
-        """The critic that is given, or one that sees what the policy sees, in eval mode."""
-        if given is None:
-            return QValue(encoder_like(self.policy)).eval()
-        if not isinstance(given, QValue):
-            raise TypeError(f"critic must be a QValue, which judges actions, got {type(given).__name__}")
-        return given.eval()
 
     def observe(self, rows: TensorDictBase) -> None:
         self.replay.extend(rows)
