@@ -327,10 +327,10 @@ class Layout:
 
     def save(self, stream: Any) -> None:
         """Write the new tabs as properties of a recording."""
-        for number in range(self._saved, len(self._entries)):
-            entry = self._entries[number]
-            stream.log(f"__properties/{_PROPERTY}/{number}", rr.AnyValues(entry=entry), static=True)
-        self._saved = len(self._entries)
+        while self._saved < len(self._entries):  # another thread may add some meanwhile
+            entry = self._entries[self._saved]
+            stream.log(f"__properties/{_PROPERTY}/{self._saved}", rr.AnyValues(entry=entry), static=True)
+            self._saved += 1
 
     def is_due(self, seconds: float) -> bool:
         """Whether to send the layout again, ``seconds`` later: rerun takes it only whole, and a page is 0.1 MB."""
