@@ -110,7 +110,7 @@ def _skill(text: str, row: Any, tasks: Tasks) -> ScriptedSkill:
     gain = given.get("gain", 10.0)
     given["gain"] = (gain,) * 3 if isinstance(gain, (int, float)) else gain
     given |= {key: tuple(given[key]) for key in ("gain", "offset") if isinstance(given.get(key), list)}
-    return ScriptedSkill(text, **given, variants=MappingProxyType(variants))
+    return ScriptedSkill(text, **given, variants=variants)
 
 
 @cache

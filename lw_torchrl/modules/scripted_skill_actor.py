@@ -69,7 +69,7 @@ class ScriptedSkillActor(ReadsPlans, Policy):
             raise ValueError(f"seed must be from -2**63 to 2**64 - 1, got {shown(seed)}")
         self.select = select
         self.draws = self.select == "random"
-        self._skills = skills
+        self._skills = None if skills is None else dict(skills)
         listed: Any = {plan.definition: [step.skill for step in plan.steps] for plan in self.plans.values()}
         self.program = SkillProgram(listed, skills)
         self.tables = PlanTables(self.plans)

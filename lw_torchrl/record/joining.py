@@ -22,8 +22,8 @@ MOST = 4
 
 @checked
 def join_recordings(paths: Sequence[AnyPath], target: AnyPath, *, names: Sequence[str] | None = None) -> Path:
-    """Write recordings of two to four runs as one: their training curves in the same views, and an episode that several
-    have, the same of the same task, side by side under one cursor.
+    """Write recordings of two to four runs as one: their training curves in the same views, and episodes of the same
+    name, which have the same task and number if nobody chose others, side by side under one cursor.
 
     Args:
         paths: recordings, or folders that hold one each.

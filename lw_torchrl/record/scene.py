@@ -26,6 +26,7 @@ PALM_HALF, PALM_RISE = (0.018, 0.062, 0.014), 0.012
 WRIST_HALF, WRIST_RISE = (0.012, 0.012, 0.055), 0.081
 TABLE_CENTER, TABLE_HALF = (0.0, 0.6, -0.010), (0.7, 0.4, 0.010)
 TABLE, GRID = (58, 64, 74), (92, 99, 112)
+SAME_THING = 0.05  # metres between a body's origin and the place of the thing that it is
 FOCAL, LABEL, LETTER = 160.0, 26.0, 6.5
 """In pixels, of the scene in a window of 1100×700: of its camera, the height of a name, the width of a letter."""
 
@@ -57,10 +58,12 @@ def log_scene(
 
     def point(path: str, position: NDArray[np.float32], label: str | None, radius: float, color: Color) -> None:
         labels = None if label is None else [label]
-        style = rr.Points3D.from_fields(radii=[radius], colors=[color], labels=labels)
-        stream.log(f"{scene}/{path}", style, static=True)
         rows = drawn[changes(position[drawn])]
-        stream.send_columns(f"{scene}/{path}", time_columns(rows), rr.Points3D.columns(positions=position[rows]))
+        still = position[rows] if len(rows) == 1 else None
+        style = rr.Points3D.from_fields(positions=still, radii=[radius], colors=[color], labels=labels)
+        stream.log(f"{scene}/{path}", style, static=True)
+        if still is None:
+            stream.send_columns(f"{scene}/{path}", time_columns(rows), rr.Points3D.columns(positions=position[rows]))
 
     def named(path: str, label: str, radius: float, color: Color) -> None:
         """A point with its name, which stands beside it if it would cover another there."""
@@ -108,6 +111,27 @@ def log_scene(
     return trails, frames
 
 
+def touched_things(motion: Motion, episode: RecordedEpisode) -> tuple[str, ...] | None:
+    """What the fingers touched in each row: the thing that the touched body is, if one is, or else the body's name."""
+    if motion.touched is None:
+        return None
+    touched = np.array(motion.touched[: len(episode)])
+    bodies = {motion.model.model.body(body).name for body in range(motion.model.model.nbody)}
+    names = {}
+    for body in set(touched.tolist()) & bodies:
+        rows = np.flatnonzero(touched == body)
+        place = motion.position[rows, motion.model.model.body(body).id]
+        away = {
+            name: float(np.linalg.norm(position[rows] - place, axis=1).mean())
+            for name, position in episode.objects.items()
+            if name != GRIPPER
+        }
+        nearest = min(away, key=away.__getitem__, default=None)
+        if nearest is not None and away[nearest] < SAME_THING:
+            names[body] = nearest
+    return tuple(names.get(body, body) for body in touched.tolist())
+
+
 def log_pictures(stream: Any, root: str, episode: RecordedEpisode, drawn: NDArray[np.int64]) -> float:
     """What the policy saw, in ``root``/seen, where it changed in rows that are ``drawn``; returns its width over its
     height, 0 where there is none."""
@@ -139,9 +163,9 @@ def beside(things: dict[str, NDArray[np.float32]], eye: tuple[Point, Point]) -> 
         def covered(lines: int, at: Any = at, wide: float = wide) -> float:
             shifted = at + np.array([0, lines * LABEL])
             gaps = [(np.abs(shifted - other), (wide + width) / 2) for other, width in taken]
-            return sum(float(((gap[:, 0] < both) & (gap[:, 1] < LABEL)).mean()) for gap, both in gaps)
+            return sum(float(((gap[:, 0] < both) & (gap[:, 1] < 0.85 * LABEL)).mean()) for gap, both in gaps)
 
-        lines = min((0, 1, -1, 2, -2, 3), key=lambda lines: covered(lines) + 0.05 * abs(lines))
+        lines = min((0, 1, -1, 2, -2, 3), key=lambda lines: covered(lines) + 0.1 * abs(lines))
         taken.append((at + np.array([0, lines * LABEL]), wide))
         found[name] = (up * lines * LABEL * float(depth.mean()) / FOCAL).astype(np.float32)
     return found

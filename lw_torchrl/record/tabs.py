@@ -22,7 +22,7 @@ from lw_torchrl.record.lanes import log_lanes
 from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.overview import OVERVIEW, place, table
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
-from lw_torchrl.record.scene import Point, log_pictures, log_scene
+from lw_torchrl.record.scene import Point, log_pictures, log_scene, touched_things
 from lw_torchrl.record.verdict import (
     Heading,
     decisive_step,
@@ -181,7 +181,7 @@ def send_page(
     ``meshes`` are those in the recording, as :func:`log_motion` has them.
     """
     root = entity_path(name)
-    touched = None if motion is None else motion.touched
+    touched = None if motion is None else touched_things(motion, episode)
     lanes = log_lanes(stream, entity_path(f"e{number}"), episode, heading.ended(episode), touched, ghost)
     eye = SIMPLE_EYE if motion is None else ROBOT_EYE
     drawn = drawn_steps(heading, episode, ghost)
@@ -279,17 +279,16 @@ class Layout:
 
     @classmethod
     def joined(cls, runs: Mapping[str, Layout]) -> Layout:
-        """The layout of recordings each of which lies below its run's name: curves in one view, and the same episode of
-        several runs side by side."""
+        """The layout of recordings each of which lies below its run's name: curves in one view, and episodes of
+        the same name side by side."""
         layout = cls()
-        same: dict[tuple[Any, ...], list[str]] = {}
+        same: dict[str, list[str]] = {}
         for run, one in runs.items():
             root = entity_path(run)
             for page in one.pages.values():
                 moved = page.below(run)
                 layout.add_page(moved.row["name"], moved)
-                known = page.row["task"], page.row["episode"]
-                same.setdefault(known if known[1] is not None else (page.row["name"],), []).append(moved.row["name"])
+                same.setdefault(page.row["name"], []).append(moved.row["name"])
             for title, names in one._compared:
                 layout.compare(f"{run}: {title}", [f"{run}/{name}" for name in names])
             for figure in one.figures:
@@ -299,9 +298,9 @@ class Layout:
                     for origin in origins:
                         own = title if kind == "metrics" else f"{title} · {run}"
                         layout.add_view(kind, title=own, origin=root + origin)
-        for known, names in same.items():
-            if len({name.partition("/")[0] for name in names}) > 1:
-                layout.compare(f"{' · episode '.join(map(str, known))} · side by side", names)
+        for name, names in same.items():
+            if len(names) > 1:
+                layout.compare(f"{name} · side by side", names)
         return layout
 
     @classmethod

@@ -67,15 +67,14 @@ def at(step: int) -> str:
 
 
 def decisive_step(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None) -> int:
-    """The step to look at first: the failure's, else the first success, else the last; one of :func:`telling_steps`."""
-    first, last = telling_steps(heading, episode, ghost)
-    if (
-        ghost is not None
-        and ghost.episode.first_success is not None
-        and not first <= _decisive(heading, episode) <= last
-    ):
-        return min(ghost.episode.first_success, last)
-    return _decisive(heading, episode)
+    """The step to look at first: the failure's, else the first success, else the last; one of :func:`telling_steps`.
+
+    Where a ghost that succeeds has not parted yet, or is gone, it is that of its success.
+    """
+    (_, last), seen = telling_steps(heading, episode, ghost), _decisive(heading, episode)
+    if ghost is None or ghost.episode.first_success is None or ghost.parts_at(episode) < seen <= last:
+        return seen
+    return min(ghost.episode.first_success, last)
 
 
 def _decisive(heading: Heading, episode: RecordedEpisode) -> int:
@@ -223,7 +222,8 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
 
 def _lines(conditions: Sequence[str], episode: RecordedEpisode) -> int:
     """The lines that a plan takes with these conditions, and the longest reason, in a small window."""
-    texts = [f"x  1.  if {condition}" for condition in conditions] + [skill for _, skill in episode.steps]
+    told = "  (evaluator: x)" if episode.believed is not None else ""
+    texts = [f"x  1.  if {condition}{told}" for condition in conditions] + [skill for _, skill in episode.steps]
     texts += [max(episode.reasons, key=len, default="")]
     return sum(-(-len(text) // LINE) for text in texts)
 

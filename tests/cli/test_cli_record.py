@@ -95,7 +95,7 @@ def test_conditions_answered_by_a_network(capsys, tmp_path):
     torch.manual_seed(0)
     lw.training.save_evaluator(lw.StateQueryEvaluator(lw.load_plans("MT10"), width=8), file)
     few = ("record", "reach", "--policy", "scripted", "--max-steps", 20, "--out", out)
-    assert "reach, episode 0, scripted: failed" in run(capsys, *few, "--evaluator", file)
+    assert "reach, episode 0, scripted: failed" in run(capsys, *few, "--evaluator", file, "--attribute")
     assert "expert" in fails(capsys, "record", "reach", "--evaluator", file)
 
 
