@@ -116,7 +116,8 @@ def both(*plants: Plant) -> Plant:
 
 
 class Fault(NamedTuple):
-    """What is planted, and the causes that are right: in the list, outside of it, or two at once."""
+    """What is planted, and the causes that are right: in the list, outside of it, two at once, or other faults of the
+    motion, in one step or in all."""
 
     kind: str
     causes: tuple[str, ...]
@@ -162,7 +163,15 @@ TWO: dict[str, Fault] = {
     "wrong condition, skill 10 cm off": Fault("two", ("plan", "skill"), both(in_plan(planted.denied), offset_skill)),
     "missing step, opposite answers": Fault("two", ("plan", "query"), both(in_plan(planted.without), lie())),
 }
-FAULTS: Mapping[str, Fault] = {**INSIDE, **OUTSIDE, **TWO}
+MOTION: dict[str, Fault] = {
+    "hand with x and y exchanged": Fault("motion", ("actuation",), setting(done=planted.exchanged)),
+    "a skill with x and y exchanged": Fault("motion", ("skill",), in_skill(planted.exchanged)),
+    "hand that drifts aside": Fault("motion", ("actuation",), setting(done=planted.drifting(0.6))),
+    "a skill that drifts aside": Fault("motion", ("skill",), in_skill(planted.drifting(0.6))),
+    "hand timid in small motions": Fault("motion", ("actuation",), setting(done=planted.timid)),
+    "a skill timid in small motions": Fault("motion", ("skill",), in_skill(planted.timid)),
+}
+FAULTS: Mapping[str, Fault] = {**INSIDE, **OUTSIDE, **TWO, **MOTION}
 
 
 @dataclass(frozen=True)
@@ -249,7 +258,8 @@ def table(found: Mapping[str, Mapping[str, list[dict[str, Any]]]]) -> str:
             right = sum(is_right(fault, one) for one in failures)
             cells = [str(count) if count else "" for count in counts]
             rows.append((name, policy, *cells, f"{right} of {len(failures)}"))
-    for kind, what in (("inside", "named right"), ("outside", "no sound part named"), ("two", "a planted one named")):
+    kinds = {"inside": "named right", "outside": "no sound part named", "two": "a planted one named"}
+    for kind, what in {**kinds, "motion": "named right"}.items():
         for policy in ("scripted", "learned"):
             some = [(FAULTS[name], one) for name, of in found.items() for one in of.get(policy, ())]
             some = [(fault, one) for fault, one in some if fault.kind == kind]

@@ -147,7 +147,27 @@ class InStep:
 
 def scaled(*factors: float) -> Callable[[Any], Tensor]:
     """The action times these, of an action or of what a policy wrote."""
-    return lambda given: (given if isinstance(given, Tensor) else given.get("action")) * torch.tensor(factors)
+    return lambda given: _action(given) * torch.tensor(factors)
+
+
+def exchanged(given: Any) -> Tensor:
+    """The action with x and y exchanged."""
+    return _action(given)[:, [1, 0, 2, 3]]
+
+
+def drifting(effort: float) -> Callable[[Any], Tensor]:
+    """The action with as much added along y."""
+    return lambda given: (_action(given) + torch.tensor([0.0, effort, 0.0, 0.0])).clamp(-1.0, 1.0)
+
+
+def timid(given: Any) -> Tensor:
+    """The action with its displacement to the fourth power: small motions hardly happen."""
+    action = _action(given)
+    return torch.cat((action[:, :3].sign() * action[:, :3].abs() ** 4, action[:, 3:]), -1)
+
+
+def _action(given: Any) -> Tensor:
+    return given if isinstance(given, Tensor) else given.get("action")
 
 
 def fingers(effort: float) -> Done:
