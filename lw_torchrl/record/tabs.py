@@ -363,7 +363,7 @@ class Layout:
         of_kinds: list[Any] = []
         for kind, shown in self._views.items():
             if shown:
-                grid = [_view(kind, title, origins) for title, origins in shown.items()]
+                grid = [_view(kind, title, origins) for title, origins in list(shown.items())]
                 of_kinds.append(grid[0] if kind == "hparams" and len(grid) == 1 else rrb.Grid(*grid, name=TABS[kind]))
         tabs += of_kinds + of_episodes if self._has_overview() else of_episodes + of_kinds
         front = None if tab is None else self._find(tab)
