@@ -140,6 +140,8 @@ class OnlineRun(Run):
         def train(checkpoint: Path) -> dict[str, Any]:
             trainer, tuned = self._make_trainer(work, file, checkpoint)
             trainer.train()
+            if trainer.logger is not None:
+                trainer.logger.shutdown()  # a worker's process ends without
             return {"actor": trainer.policy, "replay": trainer.replay, "history": trainer.history, **tuned}
 
         policy, description = kept_policy(file, {"run": self.describe(work.plans)}, train), read_description(file)
