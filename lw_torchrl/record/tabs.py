@@ -327,10 +327,10 @@ class Layout:
 
     def save(self, stream: Any) -> None:
         """Write the new tabs as properties of a recording."""
-        for number in range(self._saved, len(self._entries)):
-            entry = self._entries[number]
-            stream.log(f"__properties/{_PROPERTY}/{number}", rr.AnyValues(entry=entry), static=True)
-        self._saved = len(self._entries)
+        while self._saved < len(self._entries):  # another thread may add some meanwhile
+            entry = self._entries[self._saved]
+            stream.log(f"__properties/{_PROPERTY}/{self._saved}", rr.AnyValues(entry=entry), static=True)
+            self._saved += 1
 
     def is_due(self, seconds: float) -> bool:
         """Whether to send the layout again, ``seconds`` later: rerun takes it only whole, and a page is 0.1 MB."""
@@ -363,7 +363,7 @@ class Layout:
         of_kinds: list[Any] = []
         for kind, shown in self._views.items():
             if shown:
-                grid = [_view(kind, title, origins) for title, origins in shown.items()]
+                grid = [_view(kind, title, origins) for title, origins in list(shown.items())]
                 of_kinds.append(grid[0] if kind == "hparams" and len(grid) == 1 else rrb.Grid(*grid, name=TABS[kind]))
         tabs += of_kinds + of_episodes if self._has_overview() else of_episodes + of_kinds
         front = None if tab is None else self._find(tab)

@@ -101,6 +101,21 @@ def test_many_tabs_do_not_make_the_layout_dear():
     assert layout.is_due(seconds=5000.0)
 
 
+def test_a_tab_that_comes_while_others_are_saved_is_saved_too():
+    layout, saved = Layout(), []
+
+    class Stream:
+        def log(self, path, *_, **__):
+            saved.append(path)
+            if len(saved) == 1:  # as another thread would
+                layout.add_view("metrics", "late")
+
+    layout.add_view("metrics", "early")
+    layout.save(Stream())
+    layout.save(Stream())
+    assert saved == ["__properties/layout/0", "__properties/layout/1"]
+
+
 def test_counters_are_saved_and_restored(tmp_path):
     with RerunLogger(tmp_path / "a.rrd") as logger:
         logger.log_scalar("loss", 1.0)
