@@ -12,6 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from collecting import tree
@@ -219,6 +220,52 @@ def test_a_place_that_holds_something_is_left_alone(made, exported, tmp_path):
         with pytest.raises(ValueError, match=f"out must be .*{told}"):
             lw.import_dataset(exported("parquet"), out)
     assert [one.name for one in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    "given", [{"task": "hammer"}, {"episodes_per_task": 1}, {"suite": "fetch"}, {"behaviour": "mine"}]
+)
+def test_an_export_of_ours_comes_back_whole_or_not(exported, tmp_path, given):
+    with pytest.raises(ValueError, match=f"{next(iter(given))} must not be given: .* an export of a dataset of ours"):
+        lw.import_dataset(exported("parquet"), tmp_path / "out", **given)
+
+
+def edited(source, out, **features):
+    """A copy of a LeRobot dataset, with these words in its description."""
+    info = shutil.copytree(source, out) / "meta" / "info.json"
+    told = json.loads(info.read_text())
+    told["features"]["action"] |= features.pop("action", {})
+    info.write_text(json.dumps(told | features))
+    return out
+
+
+@pytest.mark.parametrize("shape", [None, 4, "abc", [7], [-1]])
+def test_lerobots_description_is_checked(exported, tmp_path, shape):
+    source = edited(exported("lerobot"), tmp_path / "in", action={"shape": shape})
+    with pytest.raises(ExchangeError, match=r"features.action.shape in meta/info.json must be a row's, \[4\]"):
+        lw.import_dataset(source, tmp_path / "out")
+    source = edited(exported("lerobot"), tmp_path / "float", total_frames=21.0)
+    with pytest.raises(ExchangeError, match=r"total_frames in meta/info.json must be a whole number, it is 21.0"):
+        lw.import_dataset(source, tmp_path / "out")
+
+
+def test_lerobots_tasks_are_numbers(exported, tmp_path):
+    path = shutil.copytree(exported("lerobot"), tmp_path / "in") / "meta" / "tasks.parquet"
+    tasks = pq.read_table(path).to_pydict()
+    pq.write_table(pa.table(tasks | {"task_index": [[one, one] for one in tasks["task_index"]]}), path)
+    with pytest.raises(ExchangeError, match=r"task_index in meta/tasks.parquet must hold one number in each row"):
+        lw.import_dataset(tmp_path / "in", tmp_path / "out")
+
+
+def test_statistics_without_numbers_are_left_out(tmp_path):
+    rows = {"obs": [[0.0] * 39] * 2, "action": [[0.0] * 4] * 2, "episode_index": [0, 0]}
+    pq.write_table(pa.table(rows), tmp_path / "theirs.parquet")
+    with pytest.warns(UserWarning, match="a dense reward: it is NaN"):
+        lw.import_dataset(tmp_path / "theirs.parquet", tmp_path / "ours", task="reach")
+    out = lw.export_dataset(tmp_path / "ours", "lerobot", tmp_path / "out")
+    stats = (out / "meta" / "stats.json").read_text()
+    assert "NaN" not in stats
+    assert "next.reward" not in json.loads(stats)
 
 
 def test_what_is_not_installed_is_named(made, monkeypatch, tmp_path):

@@ -17,6 +17,7 @@ DRAWS = np.random.default_rng(0)
 STATES = DRAWS.standard_normal((9, 39))
 ACTIONS = DRAWS.uniform(-1, 1, (9, 4)).astype(np.float32)
 LENGTHS = (4, 2, 3)
+ODD = (float("nan"), 0.3, -1.0)  # which are no booleans
 EPISODE = np.repeat(np.arange(3), LENGTHS)
 TASKS = np.repeat(["push-v3", "reach-v2-goal-observable", lw.TASKS["push"].description], LENGTHS)
 
@@ -98,6 +99,13 @@ def test_episodes_by_their_ends_and_actions_beyond(tmp_path):
         ({"action": [[0.0] * 4] * 8 + [[float("nan")] * 4]}, "action must hold finite numbers"),
         ({"action": [[0.0] * 4] * 8 + [None]}, "action must hold numbers, 1 of them are absent"),
         ({"action": [[0.0] * 4] * 8 + [[0.0] * 3]}, "action must hold as many numbers in each row"),
+        *(({"next.success": [0.0] * 8 + [odd]}, f"next.success must hold .* 0 and 1, it holds {odd}") for odd in ODD),
+        ({"next.done": [True] + [False] * 8}, "next.done must be true only where .* in row 0, episode_index 0 goes on"),
+        ({"frame_index": [0, 1, 3, 2, *range(5)]}, "frame_index must count up by 1 .* row 2 has 3 after 1"),
+        ({"task": ["reach"] * 3 + ["push"] * 6}, "task must be the same .* episode 0 has 'reach' and 'push'"),
+        ({"task": ["reach"] * 5 + [None] * 4}, "task must be the same .* episode 1 has 'reach' and None"),
+        ({"task": [["reach"]] * 9}, "task must hold texts, it holds list"),
+        ({"episode_index": [[0, 0]] * 9}, "episode_index must hold one number in each row, it holds 2"),
     ],
 )
 def test_what_lacks_is_named(tmp_path, changed, told):
@@ -105,6 +113,74 @@ def test_what_lacks_is_named(tmp_path, changed, told):
     with pytest.raises(ExchangeError, match=f"a.parquet'.*{told}"):
         lw.import_dataset(file, tmp_path / "out", episodes_per_task=1)
     assert [one.name for one in tmp_path.iterdir()] == ["a.parquet"]
+
+
+@pytest.mark.parametrize(
+    ("frames", "told"), [(None, "a.parquet' must hold whole"), ([*range(9)], "row 9 has 0 after 8")]
+)
+def test_two_files_with_the_same_episode_are_not_one(tmp_path, frames, told):
+    for name in "ab":
+        theirs(tmp_path / f"{name}.parquet", episode_index=[0] * 9, task=None, frame_index=frames)
+    with pytest.raises(ExchangeError, match=told):
+        lw.import_dataset(tmp_path, tmp_path / "out", task="push")
+
+
+@pytest.mark.parametrize("task", ["MT10", {"shove": "MT10"}])
+def test_a_set_of_tasks_is_no_task(tmp_path, task):
+    with pytest.raises(ValueError, match="task must be one task, 'MT10' is a set of 10"):
+        lw.import_dataset(theirs(tmp_path / "a.parquet"), tmp_path / "out", task=task)
+
+
+def test_places_that_are_none(tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "empty")
+    file = theirs(tmp_path / "a.parquet")
+    for out, told in ((tmp_path / "link", "is a link"), (tmp_path / "no" / "..", "has no name of its own")):
+        with pytest.raises(ValueError, match=f"out must be a new folder, or an empty one, .* {told}"):
+            lw.import_dataset(file, out)
+    with pytest.raises(ExchangeError, match="source must be a file or a folder, '/dev/null' is neither"):
+        lw.import_dataset("/dev/null", tmp_path / "out")
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["a.parquet", "empty", "link"]
+
+
+def robomimics(path, change=None):
+    """A file of one episode of reach; ``change`` is given its group."""
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        group = file.create_group("data/demo_0")
+        group.attrs["task"] = np.bytes_(b"reach")
+        group["obs/state"], group["actions"] = STATES, ACTIONS
+        if change:
+            change(h5py, group)
+    return path
+
+
+def test_hdf5_reads_what_it_needs(tmp_path):
+    def huge(h5py, group):
+        group.create_dataset("pictures", shape=(9, 10**12), dtype="f8", chunks=(1, 1000))
+
+    made = taken(robomimics(tmp_path / "a.hdf5", huge), tmp_path / "out", "lacks success|lacks the observation")
+    assert (made.num_steps, *made.config.tasks) == (9, "reach")
+
+
+def linked(h5py, group):
+    group["rewards"] = h5py.ExternalLink("other.hdf5", "/data/demo_0/actions")
+
+
+def virtual(h5py, group):
+    layout = h5py.VirtualLayout((9,), "f4")
+    layout[:] = h5py.VirtualSource("other.hdf5", "rewards", shape=(9,))
+    group.create_virtual_dataset("rewards", layout)
+
+
+def outside(h5py, group):
+    group.create_dataset("rewards", shape=(9,), dtype="u1", external=[("/etc/hostname", 0, 9)])
+
+
+@pytest.mark.parametrize("change", [linked, virtual, outside])
+def test_hdf5_reads_no_other_file(tmp_path, change):
+    with pytest.raises(ExchangeError, match=r"must hold all of its rows itself, data/demo_0/rewards .* another file"):
+        lw.import_dataset(robomimics(tmp_path / "a.hdf5", change), tmp_path / "out")
 
 
 def test_d4rls_flat_arrays(tmp_path):

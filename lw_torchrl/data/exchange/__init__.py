@@ -130,7 +130,8 @@ def import_dataset(
 
     Raises:
         ExchangeError: (a ValueError) ``source`` is damaged, of another format, or lacks what a dataset needs.
-        ValueError: a task that is none, more episodes than there are, or ``out`` is a file or not empty.
+        ValueError: a task that is none or a set of them, more episodes than there are, ``out`` is a file, a link or
+            not empty, or an option for files of others was given for an export of ours.
         ImportError: what the format needs is not installed; it says which extra brings it.
 
     Example:
@@ -148,9 +149,16 @@ def import_dataset(
     source, target = Path(source), _new_folder(out)
     if not source.exists():
         raise FileNotFoundError(f"source: there is no file or folder {str(source)!r}")
+    if not (source.is_file() or source.is_dir()):
+        raise ExchangeError(f"source must be a file or a folder, {str(source)!r} is neither")
     kind = _format_of(source) if format is None else format
     table: Table = _installed(kind, lambda: _of_format(kind).read(source))
     if table.about is not None:
+        given = {"task": task is not None, "episodes_per_task": episodes_per_task is not None}
+        given |= {"suite": suite != "metaworld", "behaviour": behaviour != "imported"}
+        if named := [name for name, was in given.items() if was]:
+            ours = f"{str(source)!r} is an export of a dataset of ours, which comes back whole, as it was"
+            raise ValueError(f"{' and '.join(named)} must not be given: {ours}")
         with TemporaryDirectory() as folder:
             made = incoming.own_description(table, source, Path(folder))
         return incoming.write_incoming(incoming.with_our_names(table, source), source, target, made)
@@ -162,8 +170,11 @@ def import_dataset(
 
 
 def _new_folder(out: AnyPath) -> Path:
-    """A folder that is not there, or empty; ValueError for another."""
+    """A folder that is not there, or empty, which can take its place by name; ValueError for another."""
     folder = Path(out)
+    if folder.is_symlink() or folder.name == "..":
+        what = "is a link" if folder.is_symlink() else "has no name of its own"
+        raise ValueError(f"out must be a new folder, or an empty one, {str(folder)!r} {what}")
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"out must be a folder, {str(folder)!r} is a file")
     if folder.is_dir() and any(folder.iterdir()):

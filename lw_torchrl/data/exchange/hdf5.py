@@ -37,6 +37,7 @@ _PATHS = {
     "reward_dense": "rewards",
     "done": "dones",
 }
+_KNOWN = {name for names in (*NAMES.values(), EPISODES["episode"], EPISODES["frame"]) for name in names}
 _TYPES = {"done": np.int64}  # as robomimic's own
 
 
@@ -66,14 +67,15 @@ def read(source: Path) -> Table:
 
     where = f"source: {str(source)!r}"
     paths = [source] if source.is_file() else sorted([*source.glob("*.hdf5"), *source.glob("*.h5")])
-    if len(paths) != 1:
+    if len(paths) != 1 or not paths[0].is_file():
         raise ExchangeError(f"{where} must hold one file of HDF5, it holds {len(paths)}")
     try:
         with h5py.File(paths[0], "r") as file:
+            check_whole(source, file)
             return _episodes(source, file) if "data" in file and _demos(file) else _flat(source, file)
     except ExchangeError:
         raise
-    except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError, MemoryError) as error:
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, RuntimeError, SystemError, MemoryError) as error:
         raise ExchangeError(f"{where} is no HDF5 of episodes, or damaged ({type(error).__name__}: {error})") from error
 
 
@@ -82,13 +84,34 @@ def _demos(file: Any) -> list[str]:
     return sorted(named, key=lambda name: int(name[5:]))
 
 
+def check_whole(source: Path, file: Any) -> None:
+    """Raise where an open file shows what is in other files: by a link, a virtual dataset, or storage outside."""
+    import h5py
+
+    odd: list[str] = []  # nothing may be raised inside a visit
+
+    def link(name: str, found: Any) -> None:
+        if isinstance(found, h5py.ExternalLink):
+            odd.append(f"{name} is a link to")
+
+    def item(name: str, found: Any) -> None:
+        if isinstance(found, h5py.Dataset) and (found.external or found.is_virtual):
+            odd.append(f"{name} shows")
+
+    file.visititems_links(link)
+    file.visititems(item)
+    if odd:
+        raise ExchangeError(f"source: {str(source)!r} must hold all of its rows itself, {odd[0]} another file")
+
+
 def columns_in(group: Any) -> dict[str, Array]:
-    """The arrays of numbers in a group and the groups inside it, by their names joined by dots."""
+    """The arrays of numbers in a group and the groups inside it whose names, joined by dots, are columns of ours."""
     found: dict[str, Array] = {}
 
     def note(name: str, item: Any) -> None:
-        if hasattr(item, "dtype") and item.dtype.kind in "biuf" and item.ndim:
-            found[name.replace("/", ".")] = item[()]
+        known = (named := name.replace("/", ".")) in _KNOWN
+        if known and hasattr(item, "dtype") and item.dtype.kind in "biuf" and item.ndim:
+            found[named] = item[()]
 
     group.visititems(note)
     return found
@@ -102,13 +125,17 @@ def _episodes(source: Path, file: Any) -> Table:
         lengths.append(len(next(iter(found.values()), ())))
         check_rows(source, found, int(group.attrs.get("num_samples", lengths[-1])))
         parts.append(found)
-        tasks.append(next((str(group.attrs[one]) for one in EPISODES["task"] if one in group.attrs), ""))
+        tasks.append(next((_text(group.attrs[one]) for one in EPISODES["task"] if one in group.attrs), ""))
     for name, part in zip(_demos(file), parts, strict=True):
         if part.keys() != parts[0].keys():
             odd = ", ".join(sorted(part.keys() ^ parts[0].keys()))
             raise ExchangeError(f"source: {str(source)!r}: {name} must have what demo_0 has, they differ in {odd}")
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return Table(columns, tuple(lengths), tuple(tasks), about=_about(source, file))
+
+
+def _text(value: Any) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
 def _about(source: Path, file: Any) -> dict[str, Any] | None:
@@ -124,8 +151,6 @@ def _flat(source: Path, file: Any) -> Table:
     columns = columns_in(file)
     action = of_names(columns, NAMES, "action")
     rows = len(columns[action[0]]) if action else 0
-    known = {other for others in NAMES.values() for other in others}
-    columns = {name: one for name, one in columns.items() if len(one) == rows or name in known}
     check_rows(source, columns, rows)
     lengths = lengths_of(source, columns)
     return Table(columns, lengths, ("",) * len(lengths))

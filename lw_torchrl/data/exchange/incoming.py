@@ -20,7 +20,7 @@ from lw_torchrl._progress import Progress
 from lw_torchrl.data import dataset
 from lw_torchrl.data.behaviours import Behaviour
 from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo
-from lw_torchrl.data.exchange.table import ABOUT, NAMES, OURS, Array, ExchangeError, Table, of_names
+from lw_torchrl.data.exchange.table import ABOUT, NAMES, OURS, Array, ExchangeError, Table, booleans, of_names
 from lw_torchrl.data.memory_map import describe_episode, write_rows
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.suites.suite import Suite
@@ -110,9 +110,10 @@ def as_ours(table: Table, source: Path, suite: Suite) -> tuple[Table, list[str]]
     for name in OURS:
         width = layout.action_size if name in _ACTIONS else getattr(layout, _SIZES.get(name, ""), 1)
         there = of_names(table.columns, NAMES, name)
-        fits = (table.columns[one].reshape(rows, -1) for one in there if table.columns[one][0].size == width)
-        if (column := next(fits, None)) is not None:
-            found[name] = _of_kind(source, name, column if name in _WIDE else column[:, 0])
+        fits = (one for one in there if table.columns[one][0].size == width)
+        if (named := next(fits, None)) is not None:
+            column = table.columns[named].reshape(rows, -1)
+            found[name] = _of_kind(source, name, named, column if name in _WIDE else column[:, 0])
         elif name in _NEEDED:
             sizes = (
                 ", ".join(f"{one} has {table.columns[one][0].size}" for one in there)
@@ -150,12 +151,12 @@ def as_ours(table: Table, source: Path, suite: Suite) -> tuple[Table, list[str]]
     return replace(table, columns=found), lacking
 
 
-def _of_kind(source: Path, name: str, column: Array) -> Array:
+def _of_kind(source: Path, name: str, named: str, column: Array) -> Array:
     if name not in _WIDE and not name.startswith("reward"):
-        return column.astype(bool)
+        return booleans(source, named, column)
     found = column.astype(np.float32)
     if not np.isfinite(found).all():
-        raise ExchangeError(f"source: {str(source)!r}: {name} must hold finite numbers, it has NaN or infinity")
+        raise ExchangeError(f"source: {str(source)!r}: {named} must hold finite numbers, it has NaN or infinity")
     return found
 
 
@@ -165,9 +166,9 @@ def task_names(table: Table, source: Path, suite: Suite, task: str | Mapping[str
     known |= {name.removeprefix(f"{suite.name}/"): name for name in suite.tasks}
     known |= {one.description: name for name, one in suite.tasks.items()}
     if isinstance(task, Mapping):
-        known |= {said: suite.named_tasks(name).popitem()[0] for said, name in task.items()}
+        known |= {said: _one_task(suite, name) for said, name in task.items()}
     elif task is not None:
-        return [*suite.named_tasks(task)] * len(table.tasks)
+        return [_one_task(suite, task)] * len(table.tasks)
     found = []
     for said in table.tasks:
         plain = re.sub(r"-v[0-9]+(-goal-(observable|hidden))?$", "", said.strip())
@@ -181,6 +182,12 @@ def task_names(table: Table, source: Path, suite: Suite, task: str | Mapping[str
             raise ValueError(f"{unknown_name('task', said, suite.tasks)}{more}")
         found.append(name)
     return found
+
+
+def _one_task(suite: Suite, name: str) -> str:
+    if len(found := suite.named_tasks(name)) != 1:
+        raise ValueError(f"task must be one task, {shown(name)} is a set of {len(found)}; 'reach', for example")
+    return next(iter(found))
 
 
 def foreign_description(

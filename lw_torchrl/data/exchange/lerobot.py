@@ -12,8 +12,8 @@ meta/lw_torchrl.json                              the metadata of a dataset of o
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,18 @@ from lw_torchrl._checks import shown
 from lw_torchrl._files import read_json
 from lw_torchrl._progress import Progress
 from lw_torchrl.data.exchange import video
-from lw_torchrl.data.exchange.parquet import as_arrow, files_of, read_arrow, read_numbers
-from lw_torchrl.data.exchange.table import ABOUT, NAMES, Array, ExchangeError, Table, check_rows, lengths_of
+from lw_torchrl.data.exchange.parquet import as_arrow, files_of, read_numbers
+from lw_torchrl.data.exchange.table import (
+    ABOUT,
+    NAMES,
+    Array,
+    ExchangeError,
+    Table,
+    check_rows,
+    lengths_of,
+    of_episodes,
+    one_each,
+)
 
 INFO, ABOUT_FILE = "meta/info.json", f"meta/{ABOUT}.json"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -114,7 +124,8 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
         whole[key] = {kind: one if kind == "count" else [[[v]] for v in one] for kind, one in _of_all(each).items()}
     for name, column in columns.items():
         each = _statistics(column, starts, lengths)
-        whole[name] = _of_all(each)
+        if np.isfinite(each["mean"]).all():  # JSON has no NaN
+            whole[name] = _of_all(each)
         episodes |= {f"stats/{name}/{kind}": one.tolist() for kind, one in each.items()}
     (folder / _EPISODES).parent.mkdir(parents=True)
     pq.write_table(pa.table(episodes), folder / _EPISODES)
@@ -173,7 +184,7 @@ def read(source: Path) -> Table:
         if not str(version).startswith("v3"):
             raise ExchangeError(f"{where} is of LeRobot's version {shown(version)}, this package reads v3.0")
         columns, _, _ = read_numbers(files_of(source / "data"))
-        tasks = read_arrow(source / "meta" / "tasks.parquet")
+        tasks, words, _ = read_numbers([source / "meta" / "tasks.parquet"])
         about = read_json(source / ABOUT_FILE, "source: our metadata") if (source / ABOUT_FILE).is_file() else None
         for name, feature in features.items():
             if feature["dtype"] not in ("video", "image", "string") and name not in columns:
@@ -182,19 +193,33 @@ def read(source: Path) -> Table:
         raise
     except (OSError, ValueError, KeyError, TypeError, AttributeError, StopIteration) as error:
         raise ExchangeError(f"{where} is no LeRobot dataset, or damaged ({type(error).__name__}: {error})") from error
-    check_rows(source, columns, rows := info.get("total_frames", -1))
-    if "index" in columns and not np.array_equal(columns["index"], np.arange(rows)):
+    rows = info.get("total_frames")
+    if type(rows) is not int:
+        raise ExchangeError(f"{where}: total_frames in {INFO} must be a whole number, it is {shown(rows)}")
+    check_rows(source, columns, rows)
+    columns = {name: _shaped(where, name, one, features.get(name)) for name, one in columns.items()}
+    if "index" in columns and not np.array_equal(columns["index"].reshape(-1), np.arange(rows)):
         raise ExchangeError(f"{where} is damaged: the index of its rows must go from 0 to {rows - 1}")
     lengths = lengths_of(source, columns)
-    name = next((name for name in ("name", "task", "__index_level_0__") if name in tasks.column_names), None)
-    if name is None or "task_index" not in columns or "task_index" not in tasks.column_names:
-        raise ExchangeError(f"{where} lacks tasks: meta/tasks.parquet must say which task_index is which task")
-    words = dict(zip(tasks.column("task_index").to_pylist(), tasks.column(name).to_pylist(), strict=True))
-    first = [0, *accumulate(lengths[:-1])]
-    named = [words.get(number) for number in columns["task_index"][first].tolist()]
+    name = next((name for name in ("name", "task", "__index_level_0__") if name in words), None)
+    if name is None or "task_index" not in columns or "task_index" not in tasks:
+        raise ExchangeError(
+            f"{where} lacks tasks: meta/tasks.parquet must say which task_index, a number, is which task"
+        )
+    number = one_each(source, "task_index in meta/tasks.parquet", tasks["task_index"])
+    told = dict(zip(number.tolist(), words[name].to_pylist(), strict=True))
+    named = of_episodes(source, "task_index", one_each(source, "task_index", columns["task_index"]), lengths, told)
     if None in named:
         raise ExchangeError(f"{where} is damaged: a task_index is not in meta/tasks.parquet")
-    columns = {
-        name: one.reshape(rows, *features[name]["shape"]) if name in features else one for name, one in columns.items()
-    }
     return Table(columns, lengths, tuple(map(str, named)), about=about)
+
+
+def _shaped(where: str, name: str, column: Array, feature: Any) -> Array:
+    """A column in the shape that the description gives it; ExchangeError where its rows have another size."""
+    if feature is None:
+        return column
+    shape, size = feature.get("shape"), column[0].size
+    if not isinstance(shape, list) or any(type(one) is not int for one in shape) or math.prod(shape) != size:
+        told = f"it is {shown(shape)}" if "shape" in feature else "it is absent"
+        raise ExchangeError(f"{where}: features.{name}.shape in {INFO} must be a row's, [{size}] for example, {told}")
+    return column.reshape(len(column), *shape)

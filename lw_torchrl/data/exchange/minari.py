@@ -18,6 +18,7 @@ import numpy as np
 
 from lw_torchrl._files import parse_json
 from lw_torchrl._progress import Progress
+from lw_torchrl.data.exchange.hdf5 import check_whole
 from lw_torchrl.data.exchange.table import ABOUT, EPISODES, HOLDS, NAMES, Array, ExchangeError, Table, check_rows
 
 _AFTER = ("success", "reward_sparse")
@@ -101,19 +102,23 @@ def _columns(episode: Mapping[str, Any]) -> dict[str, Array]:
 
 def read(source: Path) -> Table:
     """Read a dataset with Minari; ExchangeError if it is damaged, or none."""
+    import h5py
     import minari  # noqa: F401
     from minari.dataset.minari_storage import MinariStorage
 
     where = f"source: {str(source)!r}"
     place = source / "data" if (source / "data").is_dir() else source
     try:
+        if (file := place / "main_data.hdf5").exists():
+            with h5py.File(file, "r") as opened:
+                check_whole(source, opened)
         storage = MinariStorage.read(place)
         every = range(storage.total_episodes)
         parts = [_columns(episode) for episode in storage.get_episodes(every)]
         told = [*storage.get_episode_metadata(every)]
         about = parse_json(stated.encode()) if (stated := storage.metadata.get(ABOUT)) else None
         columns = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
-    except ImportError:
+    except (ImportError, ExchangeError):
         raise
     except Exception as error:  # a damaged file may raise anything
         raise ExchangeError(f"{where} is no dataset of Minari, or damaged ({type(error).__name__}: {error})") from error

@@ -20,6 +20,7 @@ from lw_torchrl.data.exchange.table import (
     Table,
     check_rows,
     lengths_of,
+    of_episodes,
     of_names,
 )
 
@@ -87,7 +88,7 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
 
 def files_of(source: Path) -> list[Path]:
     """The parquet files of a file or folder."""
-    return [source] if source.is_file() else sorted(source.rglob("*.parquet"))
+    return [source] if source.is_file() else sorted(path for path in source.rglob("*.parquet") if path.is_file())
 
 
 def read_arrow(path: Path) -> Any:
@@ -95,6 +96,8 @@ def read_arrow(path: Path) -> Any:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    if not path.is_file():
+        raise ExchangeError(f"source: there is no file {str(path)!r}")
     try:
         return pq.read_table(path, partitioning=None)
     except (pa.ArrowException, OSError) as error:
@@ -132,10 +135,11 @@ def read(source: Path) -> Table:
     rows = len(next(iter(columns.values()), ()))
     check_rows(source, columns, rows)
     lengths = lengths_of(source, columns)
+    if not of_names(columns, EPISODES, "frame"):
+        _check_files(paths, lengths)
     tasks = [""] * len(lengths)
     if named := of_names(others, EPISODES, "task"):
-        first = np.cumsum([0, *lengths[:-1]])
-        tasks = [str(text) for text in others[named[0]].take(first).to_pylist()]
+        tasks = _tasks(source, named[0], others[named[0]], lengths)
     about = None
     if (stated := metadata.get(ABOUT.encode())) is not None:
         try:
@@ -143,3 +147,26 @@ def read(source: Path) -> Table:
         except ValueError as error:
             raise ExchangeError(f"{where} is damaged: its {ABOUT} metadata cannot be read ({error})") from error
     return Table(columns, lengths, tuple(tasks), about=about)
+
+
+def _check_files(paths: list[Path], lengths: tuple[int, ...]) -> None:
+    """Raise where an episode is in two files: without frame_index nothing tells one from two of the same number."""
+    import pyarrow.parquet as pq
+
+    ends = np.cumsum([pq.read_metadata(path).num_rows for path in paths])
+    if odd := [path for path, end in zip(paths, ends, strict=True) if end not in np.cumsum([0, *lengths])]:
+        told = "its last one goes on in the next file, and no column frame_index says that it is the same"
+        raise ExchangeError(f"source: {str(odd[0])!r} must hold whole episodes: {told}")
+
+
+def _tasks(source: Path, name: str, column: Any, lengths: tuple[int, ...]) -> list[str]:
+    """The task of each episode, which its rows agree on; "" where they do not say."""
+    import pyarrow as pa
+
+    try:
+        coded = column.cast(pa.string()).combine_chunks().dictionary_encode()
+    except pa.ArrowException as error:
+        raise ExchangeError(f"source: {str(source)!r}: {name} must hold texts, it holds {column.type}") from error
+    words = dict(enumerate(coded.dictionary.to_pylist()))
+    number = coded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+    return [word or "" for word in of_episodes(source, name, number, lengths, words)]

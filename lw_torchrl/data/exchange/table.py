@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lw_torchrl._checks import counted
+from lw_torchrl._checks import counted, shown
 from lw_torchrl.data.dataset import DatasetError, Demonstrations
 from lw_torchrl.data.memory_map import map_rows, verify
 from lw_torchrl.language.plans import Plans
@@ -126,20 +126,62 @@ def of_names(columns: Mapping[str, Any], names: Mapping[str, list[str]], name: s
 
 
 def lengths_of(source: Path, columns: Mapping[str, Array]) -> tuple[int, ...]:
-    """The rows of each episode: until its number changes, or, without numbers, until it is done."""
+    """The rows of each episode: until its number changes, or, without numbers, until it is done.
+
+    ExchangeError where another column denies it: an episode that is done before its last row, or whose frames do not
+    count up by 1.
+    """
     rows = len(next(iter(columns.values())))
-    ends = [columns[name].reshape(rows) for kind in _ENDS for name in of_names(columns, NAMES, kind)]
+    named = [name for kind in _ENDS for name in of_names(columns, NAMES, kind)]
+    ends = {name: booleans(source, name, one_each(source, name, columns[name])) for name in named}
     if numbers := of_names(columns, EPISODES, "episode"):
-        episode = columns[numbers[0]].reshape(rows)
+        episode = one_each(source, numbers[0], columns[numbers[0]])
         change = np.flatnonzero(episode[1:] != episode[:-1]) + 1
         if len(np.unique(episode)) <= len(change):
             raise ExchangeError(f"source: {str(source)!r}: the rows of an episode must come one after another")
+        for name, end in ends.items():
+            if len(early := np.setdiff1d(np.flatnonzero(end[:-1]) + 1, change)):
+                where = f"it is true in row {early[0] - 1}, {numbers[0]} {episode[early[0]]} goes on"
+                raise ExchangeError(f"source: {str(source)!r}: {name} must be true only where an episode ends, {where}")
     elif ends:
-        change = np.flatnonzero(np.any([end[:-1].astype(bool) for end in ends], axis=0)) + 1
+        change = np.flatnonzero(np.any([end[:-1] for end in ends.values()], axis=0)) + 1
     else:
         wanted = ", ".join([*EPISODES["episode"], *(name for kind in _ENDS for name in NAMES[kind])])
         raise ExchangeError(f"source: {str(source)!r} lacks episodes: it has none of the columns {wanted}")
+    for name in of_names(columns, EPISODES, "frame"):
+        frame = one_each(source, name, columns[name])
+        if len(jump := np.setdiff1d(np.flatnonzero(frame[1:] != frame[:-1] + 1) + 1, change)):
+            told = f"row {jump[0]} has {frame[jump[0]]} after {frame[jump[0] - 1]}"
+            raise ExchangeError(f"source: {str(source)!r}: {name} must count up by 1 within an episode, {told}")
     return tuple(np.diff(np.concatenate([[0], change, [rows]])).tolist())
+
+
+def one_each(source: Path, name: str, column: Array) -> Array:
+    """A column of one number a row, (R,); ExchangeError for another."""
+    if column.size != len(column):
+        wide = column.size // len(column)
+        raise ExchangeError(f"source: {str(source)!r}: {name} must hold one number in each row, it holds {wide}")
+    return column.reshape(-1)
+
+
+def booleans(source: Path, name: str, column: Array) -> Array:
+    """A column of booleans, or of 0 and 1; ExchangeError for others."""
+    if column.dtype.kind != "b" and len(odd := column[~np.isin(column, (0, 1))]):
+        raise ExchangeError(f"source: {str(source)!r}: {name} must hold booleans, or 0 and 1, it holds {odd[0]}")
+    return column.astype(bool)
+
+
+def of_episodes(
+    source: Path, name: str, column: Array, lengths: tuple[int, ...], words: Mapping[int, Any]
+) -> list[Any]:
+    """The word of each episode, of its number in a column; ExchangeError where rows of an episode differ."""
+    first = np.cumsum([0, *lengths[:-1]])
+    if len(odd := np.flatnonzero(column != np.repeat(column[first], lengths))):
+        episode = int(np.searchsorted(np.cumsum(lengths), odd[0], side="right"))
+        both = " and ".join(shown(words.get(int(column[row]))) for row in (first[episode], odd[0]))
+        told = f"episode {episode} has {both}"
+        raise ExchangeError(f"source: {str(source)!r}: {name} must be the same in all rows of an episode, {told}")
+    return [words.get(number) for number in column[first].tolist()]
 
 
 def check_rows(source: Path, columns: Mapping[str, Array], rows: int) -> None:
