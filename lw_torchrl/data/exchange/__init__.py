@@ -158,7 +158,7 @@ def import_dataset(
         given |= {"suite": suite != "metaworld", "behaviour": behaviour != "imported"}
         if named := [name for name, was in given.items() if was]:
             ours = f"{str(source)!r} is an export of a dataset of ours, which comes back whole, as it was"
-            raise ValueError(f"{' and '.join(named)} must not be given: {ours}")
+            raise ValueError(f"{named[0]} must not be given: {ours}")
         with TemporaryDirectory() as folder:
             made = incoming.own_description(table, source, Path(folder))
         return incoming.write_incoming(incoming.with_our_names(table, source), source, target, made)
