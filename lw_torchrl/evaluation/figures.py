@@ -23,6 +23,7 @@ _FORMATS = (".png", ".svg", ".pdf", ".jpg", ".jpeg")
 Rates = Mapping[str, float | Sequence[float]]
 COLORS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d755d", "#e45756")
 _DASHES = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)), (0, (3, 3)))
+_LONG_LABEL = 50  # letters of a legend that do not stand in two columns
 _CAUSE_COLORS: dict[str, str] = {
     **{"query": "#4c78a8", "plan": "#f58518", "skill": "#54a24b", "out of time": "#b279a2", "undecided": "#bab0ac"},
     **{"not reproducible": "#d5cec9", "perception": "#72b7b2", "gripper": "#eeca3b", "actuation": "#9d755d"},
@@ -116,7 +117,7 @@ def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, titl
     failures, trials = attributed(result), result.config["episodes_per_task"]
     counts = count_causes(result.config["tasks"], failures)
     tasks = sorted((task for task in counts if sum(counts[task].values())), key=lambda t: (sum(counts[t].values()), t))
-    figure = new_figure(8.0, 1.9 + 0.27 * len(tasks))
+    figure = new_figure(8.0, 1.9 + 0.27 * len(tasks) + 0.1 * len({one.cause for one in failures}))
     axes = figure.subplots()
     left = np.zeros(len(tasks))
     for cause, meaning in CAUSES.items():
@@ -135,7 +136,8 @@ def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, titl
     axes.set_title(f"{title}\n{len(failures)} of {episodes} failed".strip())
     trim(axes)
     if failures:
-        figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+        columns = 2 if max(map(len, axes.get_legend_handles_labels()[1])) <= _LONG_LABEL else 1
+        figure.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
     return saved(figure, path)
 
 

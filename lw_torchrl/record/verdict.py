@@ -102,11 +102,12 @@ def telling_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecor
 
 
 def drawn_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None) -> NDArray[np.int64]:
-    """The steps at which the scene is drawn: each that is worth a look, every few of the others, and the last."""
+    """The steps at which the scene is drawn: those worth a look, or of many every other, 40 in a second; every few of
+    the rest; the one that tells, and the last."""
     first, last = telling_steps(heading, episode, ghost)
-    every = np.arange(len(episode))
-    told = (every >= first) & (every <= last) | (every % SELDOM == 0)
-    told[-1] = True
+    every, stride = np.arange(len(episode)), 1 if last - first <= AROUND_FAILURE else 2
+    told = (every >= first) & (every <= last) & (every % stride == 0) | (every % SELDOM == 0)
+    told[[min(decisive_step(heading, episode, ghost), len(episode) - 1), -1]] = True
     return np.flatnonzero(told)
 
 
