@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -71,13 +72,34 @@ def _read_evaluator(named: str, plans: Plans, text_encoder: str | None) -> lw.Qu
         raise ValueError(
             f"--evaluator {named!r} must name an lw.QueryEvaluator, or a class of these, it names {found!r:.80}"
         )
-    return found.from_options(plans, {}, encoder)
+    _check_yours(named, found)
+    return fresh_evaluator(named, found, plans, encoder)
+
+
+def fresh_evaluator(named: str, made: type[lw.QueryEvaluator], plans: Plans, encoder: Any) -> lw.QueryEvaluator:
+    """One of a class that --evaluator names, which is made of the plans alone."""
+    if made.from_options.__func__ is lw.QueryEvaluator.from_options.__func__:  # type: ignore[attr-defined]
+        try:
+            signature(made).bind(plans)
+        except TypeError as error:
+            raise ValueError(
+                f"--evaluator {named}: the class is made of the plans alone, its other arguments need defaults: {error}"
+            ) from None
+    return made.from_options(plans, {}, encoder)
 
 
 def _is_class(name: str) -> bool:
-    """Whether a word is a class of yours: ours know nothing before they are trained."""
+    """Whether a word is a class in the table of evaluators, to which a module of yours may have added."""
     added = "lw_torchrl.modules" in sys.modules or bool(plugins_of("lw_torchrl.evaluators"))
     return name.isidentifier() and added and name in lw.modules.EVALUATORS
+
+
+def _check_yours(named: str, made: type) -> None:
+    """Refuse a class of ours."""
+    if made.__module__.partition(".")[0] == "lw_torchrl":
+        raise ValueError(
+            f"--evaluator: {named} knows nothing before it is trained; give a file of `lw-torchrl train-evaluator`"
+        )
 
 
 def check_evaluator(evaluator: str | None, who: str) -> None:
@@ -87,5 +109,9 @@ def check_evaluator(evaluator: str | None, who: str) -> None:
     if who in options.ACTORS and who != "scripted":
         asks = "the scripted experts ask" if who == "expert" else f"{who} asks"
         raise ValueError(f"--evaluator is for a policy with plans, {asks} no conditions")
-    if not is_object(evaluator) and not _is_class(evaluator):
+    if is_object(evaluator):
+        return
+    if Path(evaluator).exists() or not _is_class(evaluator):
         options.check_saved("evaluator", Path(evaluator), "network", "train-evaluator")
+    else:
+        _check_yours(evaluator, lw.modules.EVALUATORS[evaluator])

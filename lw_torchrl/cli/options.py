@@ -37,7 +37,7 @@ ACTORS = ("expert", "scripted", "spoilt-60", "spoilt-30", "wrong", "random")
 """The names of :data:`lw_torchrl.data.BEHAVIOURS`."""
 CONDITIONS = ("pcbc", "dc", "one-hot")
 """Our names of :data:`lw_torchrl.modules.METHODS`."""
-_PLAN_OF_SUITE = re.compile(r"^def ([a-z0-9_]+?)__([a-z0-9_]+)\(", re.MULTILINE)
+_PLAN = re.compile(r"^def[ \t]+([a-z]\w*)[ \t]*\(", re.MULTILINE)
 _METHODS = (
     "pcbc, by plan; or a baseline: dc, by description, one-hot, by number; or a class of yours (docs/extending.md)."
 )
@@ -80,13 +80,20 @@ def read_tasks(task_file: Path | None, names: Sequence[str] = ()) -> Mapping[str
 
 
 def tasks_of(files: Sequence[Path], task_file: Path | None) -> Mapping[str, Task]:
-    """The tasks that plan files may speak of: those of the suite that the first is of, else as :func:`read_tasks`."""
+    """The tasks that plan files, all of one suite, may speak of: the suite's, else as :func:`read_tasks`."""
     from lw_torchrl.suites.suite import SUITES
 
-    first = files[0] if files and files[0].is_file() and files[0].suffix == ".plan" else None
-    found = None if first is None else _PLAN_OF_SUITE.search(read_text(first, PlanError, limit=PLAN_LIMIT))
-    name = "" if found is None else f"{found[1]}/{found[2]}".replace("_", "-")
-    return read_tasks(task_file, (name,) if found is not None and name.partition("/")[0] in SUITES else ())
+    found: dict[str, tuple[str, str]] = {}  # a suite to the first file of it, and that one's task
+    for file in files:
+        written = file.is_file() and file.suffix == ".plan"
+        if written and (plan := _PLAN.search(read_text(file, PlanError, limit=PLAN_LIMIT))):
+            task = plan[1].replace("__", "/", 1).replace("_", "-")
+            suite = task.partition("/")[0] if "/" in task else ""
+            found.setdefault(suite if suite in SUITES else "metaworld", (file.name, task))
+    if len(found) > 1:
+        told = " and ".join(f"{suite} ({file})" for suite, (file, _) in found.items())
+        raise ValueError(f"plans must be of one suite, got plans of {told}; give each suite's a folder of its own")
+    return read_tasks(task_file, tuple(task for suite, (_, task) in found.items() if suite != "metaworld"))
 
 
 def read_skills(skill_file: Path | None, tasks: Mapping[str, Task]) -> Mapping[str, ScriptedSkill]:

@@ -184,6 +184,10 @@ def own_module(absent: str, name: str) -> ModuleType:
             raise
         hint = f"; did you mean {name.removesuffix('.py')!r}?" if name.endswith(".py") else ""
         raise ValueError(f"{absent}: {error}{hint}") from None
+    except SyntaxError as error:
+        if error.filename:
+            raise
+        raise ValueError(f"{absent}: {error}") from None  # no text, but bytes with zeros
 
 
 IMPORTED: list[str] = []
@@ -209,6 +213,7 @@ _OPTIONS = {
     "checkpoint": ("out",),
     "episodes_per_task": ("episodes",),
     "gripper_noise_factor": ("gripper_noise",),
+    "method": ("condition", "methods"),
     "noise_scale": ("noise",),
     "path": ("recording",),
     "policy": ("behaviours",),
@@ -218,6 +223,7 @@ _OPTIONS = {
     "source": ("plans",),
     "task": ("tasks", "names"),
     "tasks": ("names",),
+    "with_plans": ("plans",),
 }
 _OPTIONS_OF = {
     "collect": {"checkpoint": "policy"},

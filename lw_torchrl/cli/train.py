@@ -15,6 +15,7 @@ from lw_torchrl._checks import check_choice
 from lw_torchrl._files import read_json
 from lw_torchrl._rendering import CAMERAS
 from lw_torchrl.cli import options
+from lw_torchrl.cli.objects import fresh_evaluator
 from lw_torchrl.cli.output import Output
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import resolve_tasks
@@ -170,7 +171,7 @@ def _evaluator(named: str, plans: Plans, encoder: Any) -> lw.QueryEvaluator:
     if named == "new":
         return lw.StateQueryEvaluator(plans)
     if not Path(named).exists():
-        return lw.modules.EVALUATORS[named].from_options(plans, {}, encoder)
+        return fresh_evaluator(named, lw.modules.EVALUATORS[named], plans, encoder)
     return lw.training.load_evaluator(named, plans, text_encoder=encoder)
 
 

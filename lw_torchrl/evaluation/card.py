@@ -52,7 +52,15 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
     if result is not None and tasks and (other := set(result.config["tasks"]) - tasks):
         raise ValueError(f"result must be of the policy's tasks, it does not know {', '.join(sorted(other))}")
     lines = ["---", "library_name: lw_torchrl", "pipeline_tag: robotics", "tags:", *(f"- {tag}" for tag in _TAGS)]
-    lines += [*_front(name, result), "---", "", f"# {_plain(name)}", "", *_about(actor, tasks, shown), ""]
+    lines += [
+        *_front(name, result),
+        "---",
+        "",
+        f"# {_plain(name).strip() or 'A policy'}",
+        "",
+        *_about(actor, tasks, shown),
+        "",
+    ]
     lines += ["## What it was trained on", "", *_trained(described, shown), "", "## Success", "", *_success(result), ""]
     lines += ["## Limits", "", *_limits(tasks, shown, result), "", "## How to load it", "", *_loading(policy, repo), ""]
     cited = (files("lw_torchrl.evaluation") / "data" / "citation.bib").read_text("utf-8").strip()
@@ -60,9 +68,16 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
 
 
 def _plain(value: Any) -> str:
-    """What a file says, which may be a stranger's, as one line without Markdown, HTML and YAML."""
+    """What a file says, which may be a stranger's, as one line without Markdown, links, HTML and YAML."""
     text = value if isinstance(value, str) else json.dumps(value)
-    return re.sub(r"[^\w .,:+/'()\[\]-]", "", " ".join(text.split()))[:200]
+    text = re.sub(r"[^\w .,:+/'()\[\]-]", "", " ".join(text.split()))[:200]
+    # [text](address) is a link, and so is an address alone.
+    return re.sub(r"(?<=[\]:])(?=[(\[/:])|(?<=\bwww)(?=\.)", " ", text, flags=re.IGNORECASE)
+
+
+def _quoted(text: str) -> str:
+    """A text in quotes, as Python, JSON and YAML read it back."""
+    return json.dumps(text, ensure_ascii=not text.isprintable())
 
 
 def _object(found: Any) -> dict[str, Any]:
@@ -88,7 +103,7 @@ def _front(name: str, result: EvaluationResult | None) -> list[str]:
     rate = f"{result.mean_success:.3f}"
     return [
         "model-index:",
-        f"- name: {_plain(name)}",
+        f"- name: {_quoted(name)}",
         "  results:",
         "  - task: {type: robotics}",
         f"    dataset: {{type: meta-world, name: {_plain(len(result.config['tasks']))} tasks}}",
@@ -133,7 +148,9 @@ def _success(result: EvaluationResult | None) -> list[str]:
     config, ends = result.config, result.success_at_end
     solved, runs = sum(one.success for one in result.episodes), len(result.episodes)
     least, most = wilson_interval(solved, runs)
-    how = f"{counted(config['episodes_per_task'], 'episode')} of each task, seed {config['seed']}, action noise "
+    how = (
+        f"{counted(config['episodes_per_task'], 'episode')} of each task, seed {_plain(config['seed'])}, action noise "
+    )
     noise = _plain(config["noise_scale"])
     lines = [f"{how}{noise}, success at any step. It is one policy, of one training seed.", ""]
     lines += ["| task | success | at the end |", "|---|---|---|"]
@@ -156,7 +173,7 @@ def _limits(tasks: set[str], shown: set[str], result: EvaluationResult | None) -
 
 
 def _loading(policy: AnyPath, repo: str) -> list[str]:
-    source = f'lw.from_pretrained("{_plain(repo)}")' if repo else f'lw.load_actor("{_plain(str(Path(policy).name))}")'
+    source = f"lw.from_pretrained({_quoted(repo)})" if repo else f"lw.load_actor({_quoted(Path(policy).name)})"
     return [
         "```python",
         "import lw_torchrl as lw",

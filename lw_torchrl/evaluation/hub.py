@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import re
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from lw_torchrl._checks import checked
-from lw_torchrl._files import AnyPath, replacing, write_text
+from lw_torchrl._files import AnyPath, replacing, shipped_policy, write_text
 from lw_torchrl.evaluation.card import policy_card
 from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.language.text import TextEncoder
@@ -15,6 +17,7 @@ from lw_torchrl.modules.policy import Policy
 from lw_torchrl.training.files import load_actor, policy_file
 
 POLICY_FILE, CARD = "policy.zip", "README.md"
+_REPOSITORY = re.compile(r"[\w.-]+/[\w.-]+")
 
 
 @checked
@@ -27,6 +30,9 @@ def save_pretrained(
         policy, result, repo: as of :func:`policy_card`, with its errors.
         folder: where they go; files of these names are replaced.
 
+    Raises:
+        IsADirectoryError: it holds a folder of one of these names; nothing is written.
+
     Example:
         >>> import os, tempfile
         >>> folder = tempfile.mkdtemp()
@@ -35,6 +41,9 @@ def save_pretrained(
         (['README.md', 'policy.zip'], 50)
     """
     card = policy_card(policy, result, repo=repo)
+    for name in (POLICY_FILE, CARD):
+        if (place := Path(folder) / name).is_dir():
+            raise IsADirectoryError(f"folder must have room for the file {name}, {str(place)!r} is a folder")
     with replacing(Path(folder) / POLICY_FILE) as temporary:
         temporary.write_bytes(policy_file(policy).read_bytes())
     write_text(Path(folder) / CARD, card)
@@ -83,15 +92,26 @@ def from_pretrained(source: AnyPath, *, revision: str | None = None, text_encode
         text_encoder: as of :func:`~lw_torchrl.load_actor`.
 
     Raises:
-        FileNotFoundError: a folder without a policy.
+        FileNotFoundError: a folder without a policy; or there is no such folder, and the Hub gives none.
         ImportError: it is no folder, and the extra ``[hub]`` is not installed.
-        ValueError: as of :func:`~lw_torchrl.load_actor`. Nothing in the file is run.
+        ValueError: it is a file or a shipped policy's name; or as of :func:`~lw_torchrl.load_actor`. Nothing in the
+            file is run.
 
     Source: ``transformers.PreTrainedModel.from_pretrained``.
     """
-    if Path(source).is_dir():
+    named = os.fspath(source)
+    if named and Path(named).is_dir():
         return load_actor(Path(source) / POLICY_FILE, text_encoder=text_encoder)
-    file = _hub().hf_hub_download(str(source), POLICY_FILE, revision=revision)
+    if Path(source).is_file() or named.endswith(".zip") or shipped_policy(named) is not None:
+        raise ValueError(f"source must be a folder or a repository, got {named!r}; lw.load_actor loads it")
+    if not _REPOSITORY.fullmatch(named):
+        raise FileNotFoundError(f"source: there is no folder {named!r}; a repository is named like 'me/my-policy'")
+    hub = _hub()
+    try:
+        file = hub.hf_hub_download(named, POLICY_FILE, revision=revision)
+    except (OSError, ValueError) as error:
+        told = f"there is no folder {named!r}, and the Hub gives no such repository"
+        raise FileNotFoundError(f"source: {told}: {error}") from error
     return load_actor(file, text_encoder=text_encoder)
 
 

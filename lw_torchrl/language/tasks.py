@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-_NAME = re.compile(r"([a-z][a-z0-9]*/)?[a-z][a-z0-9]*(-[a-z0-9]+)*")
+_NAME = re.compile(r"([a-z][a-z0-9]*(-[a-z0-9]+)*/)?[a-z][a-z0-9]*(-[a-z0-9]+)*")
 _OWN_IDS = 2**31 - 50  # so that an id is an int32 too
 _MOST_OBJECTS = 64  # the base queries are of all pairs of them
 

@@ -71,6 +71,11 @@ class Prepared(TensorDictModuleBase):
         if not any(one.kind is one.VAR_KEYWORD for one in known.values()):
             for name in options:
                 check_choice(f"option of {cls.__name__}", name, [*known][1:])
+        try:
+            signature(cls).bind(plans, **options)
+        except TypeError as error:
+            told = f"method must be a class made of the plans, whose other arguments have defaults; {cls.__name__}"
+            raise TypeError(f"{told}: {error}") from None
         made = cls(plans, **options)
         if "_modules" not in vars(made):
             raise TypeError(f"__init__ of {cls.__name__} must begin with super().__init__()")

@@ -15,6 +15,7 @@ from lw_torchrl._checks import checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, write
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.language.value_checks import finite, readable
 from lw_torchrl.modules.networks import with_weights_of
 from lw_torchrl.modules.policy import Prepared, kind_of
 from lw_torchrl.modules.tables import Kinds, class_of
@@ -62,7 +63,8 @@ class QueryEvaluator(Prepared):
         raise NotImplementedError(f"{type(self).__name__} must override logits")
 
     def answers(self, *read: Tensor) -> Tensor:
-        """:meth:`logits` as float32; :class:`TypeError` if they are no floats, :class:`ValueError` if not (B, S)."""
+        """:meth:`logits` as float32; :class:`TypeError` if they are no floats, :class:`ValueError` if not (B, S) or, on
+        the CPU, NaN."""
         found = self.logits(*read)
         what = f"logits of {type(self).__name__} must be"
         if not isinstance(found, Tensor) or not found.is_floating_point():
@@ -71,6 +73,8 @@ class QueryEvaluator(Prepared):
         if found.shape[-1:] != (self.plans.num_steps,):
             wanted = f"(B, {self.plans.num_steps}), a column for each step of the longest plan"
             raise ValueError(f"{what} {wanted}, got shape {tuple(found.shape)}")
+        if readable(found) and not finite(found.detach()) and found.isnan().any():
+            raise ValueError(f"{what} numbers, got NaN")
         return found.to(torch.float32)
 
     @dispatched

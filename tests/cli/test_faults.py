@@ -57,6 +57,54 @@ def test_a_module_that_is_not_there(tmp_path, monkeypatch, capsys, name, says):
     assert says in fails(capsys, "tasks", "--import", name)
 
 
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (b"x\0", "--import 'mine' names no module: source code string cannot contain null bytes"),
+        (b"import sys\nsys.exit(0)\n", "mine.py:2: SystemExit: 0, at `sys.exit(0)`; a module of yours must not end"),
+    ],
+)
+def test_a_module_of_bytes_and_one_that_ends_the_program(tmp_path, monkeypatch, capsys, text, says):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
+    (tmp_path / "mine.py").write_bytes(text)
+    assert f"error: {says}" in fails(capsys, "tasks", "--import", "mine")
+
+
+EVALUATORS = """
+import lw_torchrl as lw
+class Needs(lw.QueryEvaluator):
+    def __init__(self, plans, size):
+        super().__init__(plans)
+class Exits(lw.QueryEvaluator):
+    def logits(self, observation, task_id):
+        raise SystemExit(0)
+"""
+
+
+@pytest.mark.parametrize(
+    ("named", "says"),
+    [
+        ("StateQueryEvaluator", "--evaluator: StateQueryEvaluator knows nothing before it is trained; give a file of"),
+        ("lw_torchrl:StateQueryEvaluator", "StateQueryEvaluator knows nothing before it is trained"),
+        ("mine:Needs", "--evaluator mine:Needs: the class is made of the plans alone, its other arguments need def"),
+        ("mine:Exits", "mine.py:8: SystemExit: 0, at `raise SystemExit(0)`"),
+    ],
+)
+def test_an_evaluator_that_cannot_be_asked(tmp_path, monkeypatch, capsys, named, says):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
+    (tmp_path / "mine.py").write_text(EVALUATORS)
+    few = ("--tasks", "reach", "--episodes", 1, "--max-steps", 2)
+    assert says in fails(capsys, "evaluate", "few-shot-mt50", *few, "--import", "mine", "--evaluator", named)
+
+
+def test_plans_for_a_policy_without_plans(tmp_path, capsys):
+    lw.save_actor(lw.DescriptorConditionedActor("reach", width=8), tmp_path / "dc.zip")
+    said = fails(capsys, "evaluate", tmp_path / "dc.zip", "--plans", "MT10", "--episodes", 1)
+    assert "--plans is for policies with plans, DescriptorConditionedActor has none" in said
+
+
 POLICY = """
 import torch
 import lw_torchrl as lw

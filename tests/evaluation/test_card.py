@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import sys
 import tomllib
@@ -110,6 +111,27 @@ def test_a_strangers_file_puts_nothing_but_words_in_a_card(tmp_path):
     assert "The file does not say" not in policy_card(tmp_path / "p.zip")  # the versions it does
 
 
+def test_a_strangers_file_puts_no_link_in_a_card(tmp_path, monkeypatch):
+    evil = "[click me](https://evil.example/x) [a][b] www.evil.example"
+    told = {"run": {"seed": evil}, "training": {"optimizer": evil}, "data": {"tasks": [evil]}}
+    lw.save_actor(lw.DescriptorConditionedActor("reach", width=8), tmp_path / "p.zip", **told)
+    described = read_description(tmp_path / "p.zip") | {"versions": {evil: evil}}
+    monkeypatch.setattr("lw_torchrl.evaluation.card.read_description", lambda _: described)
+    card = policy_card(tmp_path / "p.zip").partition("## How to cite")[0]
+    assert card.count("click me") == 5
+    assert not re.search(r"\]\(|\]\[|\]:|://|www\.", card)
+
+
+@pytest.mark.parametrize("name", ["a: b", "[x", "- y", "it's: 'q", "null", "@@@", '"', "x #c", "1e5", "\x07", "日本"])
+def test_any_file_name_is_read_back_from_its_card(result, tmp_path, name):
+    lw.save_actor(lw.DescriptorConditionedActor(["push", "reach"], width=8), tmp_path / f"{name}.zip")
+    card = policy_card(tmp_path / f"{name}.zip", result)
+    yaml = pytest.importorskip("yaml").safe_load(card.split("---")[1])
+    assert yaml["model-index"][0]["name"] == name
+    assert ast.literal_eval(re.search(r"load_actor\((.*)\)", card)[1]) == f"{name}.zip"
+    assert re.search(r"^# \S", card, re.MULTILINE)
+
+
 def test_a_result_of_other_tasks_is_refused(result, tmp_path):
     lw.save_actor(lw.DescriptorConditionedActor("reach", width=8), tmp_path / "p.zip")
     with pytest.raises(ValueError, match="result must be of the policy's tasks, it does not know push"):
@@ -128,6 +150,34 @@ def test_a_folder_holds_a_policy_and_its_card(result, tmp_path):
     assert same(lw.from_pretrained(tmp_path / "mine"), lw.load_actor(SHIPPED))
     with pytest.raises(FileNotFoundError, match=r"policy\.zip"):
         lw.from_pretrained(tmp_path)
+
+
+def test_nothing_is_written_where_the_card_has_no_room(tmp_path):
+    (tmp_path / "README.md").mkdir()
+    with pytest.raises(IsADirectoryError, match=r"folder must have room for the file README\.md"):
+        save_pretrained(SHIPPED, tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["README.md"]
+
+
+@pytest.mark.parametrize(
+    ("source", "error", "says"),
+    [
+        ("p.zip", ValueError, r"must be a folder or a repository, got 'p\.zip'; lw\.load_actor loads it"),
+        (SHIPPED, ValueError, "lw.load_actor loads it"),
+        ("", FileNotFoundError, "there is no folder ''; a repository is named like 'me/my-policy'"),
+        ("my-plicy", FileNotFoundError, "there is no folder 'my-plicy'"),
+        ("/no/such/folder", FileNotFoundError, "there is no folder '/no/such/folder'; a repository"),
+        ("runs/mine", FileNotFoundError, "no folder 'runs/mine', and the Hub gives no such repository: 404"),
+    ],
+)
+def test_what_is_neither_a_folder_nor_on_the_hub_is_told(monkeypatch, tmp_path, source, error, says):
+    def download(repo, file, *, revision):
+        raise OSError("404")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(hf_hub_download=download))
+    with pytest.raises(error, match=says):
+        lw.from_pretrained(source)
 
 
 def test_a_policy_goes_to_the_hub_and_comes_back(result, tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ import torch
 import lw_torchrl as lw
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject
 from lw_torchrl.language.nearest import nearest_query
+from lw_torchrl.language.plans import parse_plan
 from lw_torchrl.language.queries import parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.tasks import (
@@ -181,6 +182,13 @@ def test_a_name_that_no_task_may_have(name):
     for function in (task_id, lambda given: Task(given, "Do it.", (NamedObject(GRIPPER, (0, 1, 2)),))):
         with pytest.raises(ValueError, match="lower-case words joined by hyphens"):
             function(name)
+
+
+def test_a_suite_s_name_may_have_a_hyphen():
+    task = Task("my-desk/hover-low", "Do it.", (NamedObject(GRIPPER, (0, 1, 2)),))
+    plan = lw.ConditionalPlan.from_pairs(task, [("the gripper is open", "wait at the gripper")])
+    assert "def my_desk__hover_low(robot):" in str(plan)
+    assert parse_plan(str(plan), tasks={task.name: task}).task == "my-desk/hover-low"
 
 
 @pytest.mark.parametrize("function", [check_task, task_id, get_task])

@@ -109,6 +109,16 @@ def test_its_own_tasks_and_texts_travel(tmp_path):
         lw.load_actor(tmp_path / "policy.zip", text_encoder=lambda texts: torch.zeros(len(texts), TEXT_DIMENSION))
 
 
+def test_one_that_needs_more_than_plans_is_no_method(own, monkeypatch):
+    class Needs(own):
+        def __init__(self, tasks, size):
+            super().__init__(tasks, size=size)
+
+    monkeypatch.setitem(ENCODERS, "Needs", Needs)
+    with pytest.raises(TypeError, match=r"method must be a class made of the plans.*; Needs: missing .*'size'"):
+        lw.modules.make_policy("Needs", lw.load_plans("MT10"))
+
+
 def test_what_is_no_encoder_and_options_of_one_are_refused():
     with pytest.raises(TypeError, match=r"about must be an Encoder, got Plans.*PlanEncoder\(plans\)"):
         ConditionedActor(PLANS)
