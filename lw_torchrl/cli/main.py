@@ -89,9 +89,12 @@ def main(args: Sequence[str] | None = None) -> None:
         except KeyboardInterrupt:
             _stop(given)
         except SystemExit as ended:  # of a module of yours: what was asked for is not done
-            if os.environ.get(TRACEBACK) or (message := in_users_module(ended)) is None:
+            if (message := in_users_module(ended)) is None:
                 raise
-            complain(f"lw-torchrl: error: {message}; a module of yours must not end the program")
+            message += "; a module of yours must not end the program"
+            if os.environ.get(TRACEBACK):
+                raise RuntimeError(message) from ended
+            complain(f"lw-torchrl: error: {message}")
             sys.exit(2)
         except Exception as error:
             if interrupts:  # raised within a library, Ctrl-C may surface as something else

@@ -110,7 +110,7 @@ def from_pretrained(source: AnyPath, *, revision: str | None = None, text_encode
     try:
         file = hub.hf_hub_download(named, POLICY_FILE, revision=revision)
     except (OSError, ValueError) as error:
-        told = f"there is no folder {named!r}, and the Hub gives no such repository"
+        told = f"there is no folder {named!r}, and the Hub gave no policy"
         raise FileNotFoundError(f"source: {told}: {error}") from error
     return load_actor(file, text_encoder=text_encoder)
 

@@ -191,3 +191,10 @@ def test_scripted_writes_what_it_found(capsys, tmp_path):
     use = json.loads((tmp_path / "scripted" / "plan_use.json").read_text())
     assert len(use["push"]["chosen"]) == len(lw.load_plans("MT10")["push"].steps)
     assert (tmp_path / "scripted" / "success.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_plans_of_two_suites_are_not_checked_together(capsys, tmp_path):
+    (tmp_path / "a.plan").write_text("def reach(robot):\n")
+    (tmp_path / "b.plan").write_text("def fetch__push(robot):\n")
+    said = fails(capsys, "check", tmp_path)
+    assert "FILE must be of one suite, got plans of metaworld (a.plan) and fetch (b.plan); give each" in said

@@ -143,6 +143,9 @@ def test_a_traceback_on_request(tmp_path, monkeypatch):
     monkeypatch.setenv(TRACEBACK, "1")
     with pytest.raises(ZeroDivisionError):
         main(["tasks", "--import", "mine"])
+    (tmp_path / "mine_too.py").write_text("raise SystemExit\n")
+    with pytest.raises(RuntimeError, match=r"mine_too\.py:1: SystemExit"):
+        main(["tasks", "--import", "mine_too"])
 
 
 def test_names_are_options_in_our_own_errors_alone():

@@ -167,7 +167,7 @@ def test_nothing_is_written_where_the_card_has_no_room(tmp_path):
         ("", FileNotFoundError, "there is no folder ''; a repository is named like 'me/my-policy'"),
         ("my-plicy", FileNotFoundError, "there is no folder 'my-plicy'"),
         ("/no/such/folder", FileNotFoundError, "there is no folder '/no/such/folder'; a repository"),
-        ("runs/mine", FileNotFoundError, "no folder 'runs/mine', and the Hub gives no such repository: 404"),
+        ("runs/mine", FileNotFoundError, "no folder 'runs/mine', and the Hub gave no policy: 404"),
     ],
 )
 def test_what_is_neither_a_folder_nor_on_the_hub_is_told(monkeypatch, tmp_path, source, error, says):
