@@ -244,6 +244,9 @@ def test_lerobots_description_is_checked(exported, tmp_path, shape):
     source = edited(exported("lerobot"), tmp_path / "in", action={"shape": shape})
     with pytest.raises(ExchangeError, match=r"features.action.shape in meta/info.json must be a row's, \[4\]"):
         lw.import_dataset(source, tmp_path / "out")
+    source = edited(exported("lerobot"), tmp_path / "none", features={"action": None})
+    with pytest.raises(ExchangeError, match=r"action in meta/info.json must be a table, it is None"):
+        lw.import_dataset(source, tmp_path / "out")
     source = edited(exported("lerobot"), tmp_path / "float", total_frames=21.0)
     with pytest.raises(ExchangeError, match=r"total_frames in meta/info.json must be a whole number, it is 21.0"):
         lw.import_dataset(source, tmp_path / "out")

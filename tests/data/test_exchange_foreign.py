@@ -163,6 +163,14 @@ def test_hdf5_reads_what_it_needs(tmp_path):
     assert (made.num_steps, *made.config.tasks) == (9, "reach")
 
 
+def test_groups_end_where_they_end(tmp_path):
+    def early(h5py, group):
+        group["dones"] = group["timeouts"] = [0, 1, 0, 0, 0, 0, 0, 0, 1]
+
+    with pytest.raises(ExchangeError, match="truncated must be true only where an episode ends, it is true in row 1"):
+        lw.import_dataset(robomimics(tmp_path / "a.hdf5", early), tmp_path / "out")
+
+
 def linked(h5py, group):
     group["rewards"] = h5py.ExternalLink("other.hdf5", "/data/demo_0/actions")
 

@@ -146,6 +146,10 @@ def as_ours(table: Table, source: Path, suite: Suite) -> tuple[Table, list[str]]
         found["reward_dense"] = np.full(rows, np.nan, dtype=np.float32)
         lacking.append("a dense reward: it is NaN, take reward='sparse' or 'cost'")
     found["reward_sparse"] = found["success"].astype(np.float32)
+    for name in ("terminated", "truncated"):  # robomimic's "dones" may tell of success
+        if len(early := np.flatnonzero(found.get(name, last) & ~last)):
+            told = f"it is true in row {early[0]}, where an episode goes on"
+            raise ExchangeError(f"source: {str(source)!r}: {name} must be true only where an episode ends, {told}")
     terminated = found.get("terminated", np.zeros(rows, dtype=bool)) & last
     found |= {"done": last, "terminated": terminated, "truncated": last & ~terminated}
     return replace(table, columns=found), lacking
@@ -154,7 +158,8 @@ def as_ours(table: Table, source: Path, suite: Suite) -> tuple[Table, list[str]]
 def _of_kind(source: Path, name: str, named: str, column: Array) -> Array:
     if name not in _WIDE and not name.startswith("reward"):
         return booleans(source, named, column)
-    found = column.astype(np.float32)
+    with np.errstate(over="ignore"):  # it is told as infinity
+        found = column.astype(np.float32)
     if not np.isfinite(found).all():
         raise ExchangeError(f"source: {str(source)!r}: {named} must hold finite numbers, it has NaN or infinity")
     return found

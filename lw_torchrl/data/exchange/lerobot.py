@@ -183,6 +183,9 @@ def read(source: Path) -> Table:
         version, features = info["codebase_version"], info["features"]
         if not str(version).startswith("v3"):
             raise ExchangeError(f"{where} is of LeRobot's version {shown(version)}, this package reads v3.0")
+        whole = {"features": features} | (features if isinstance(features, dict) else {})
+        if odd := [name for name, one in whole.items() if not isinstance(one, dict)]:
+            raise ExchangeError(f"{where}: {odd[0]} in {INFO} must be a table, it is {shown(whole[odd[0]])}")
         columns, _, _ = read_numbers(files_of(source / "data"))
         tasks, words, _ = read_numbers([source / "meta" / "tasks.parquet"])
         about = read_json(source / ABOUT_FILE, "source: our metadata") if (source / ABOUT_FILE).is_file() else None

@@ -109,14 +109,14 @@ def read(source: Path) -> Table:
     where = f"source: {str(source)!r}"
     place = source / "data" if (source / "data").is_dir() else source
     try:
-        if (file := place / "main_data.hdf5").exists():
+        if (file := place / "main_data.hdf5").is_file():
             with h5py.File(file, "r") as opened:
                 check_whole(source, opened)
         storage = MinariStorage.read(place)
         every = range(storage.total_episodes)
         parts = [_columns(episode) for episode in storage.get_episodes(every)]
         told = [*storage.get_episode_metadata(every)]
-        about = parse_json(stated.encode()) if (stated := storage.metadata.get(ABOUT)) else None
+        about = parse_json(str(stated).encode()) if (stated := storage.metadata.get(ABOUT)) else None
         columns = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
     except (ImportError, ExchangeError):
         raise
