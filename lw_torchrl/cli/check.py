@@ -20,7 +20,7 @@ from lw_torchrl.cli.options import (
     read_suite,
     read_tasks,
     tasks_of,
-)  # fmt: skip
+)
 from lw_torchrl.cli.output import Output
 from lw_torchrl.language.nearest import nearest_skill
 from lw_torchrl.language.plan_text import PLAN_LIMIT
