@@ -18,7 +18,9 @@ else:
             self._name = name
 
         def __getattr__(self, attribute: str) -> Any:
-            return getattr(import_module(self._name), attribute)
+            found = getattr(import_module(self._name), attribute)
+            setattr(self, attribute, found)
+            return found
 
     rr, rrb = _Later("rerun"), _Later("rerun.blueprint")
 

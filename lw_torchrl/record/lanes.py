@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lw_torchrl.language.relations import PREDICATES, STATES
 from lw_torchrl.record.conventions import (
@@ -42,12 +43,12 @@ class Lanes:
     states: dict[str, tuple[str, Color]] = field(default_factory=dict)
     paths: list[str] = field(default_factory=list)
 
-    def send(self, stream: Any, name: str, first: int, states: Sequence[str], looks: Mapping[str, Any]) -> None:
+    def send(self, stream: Any, name: str, first: int, states: NDArray[np.str_], looks: Mapping[str, Any]) -> None:
         """Add a lane whose first state is that of step ``first``; ``looks`` are colours, or words and colours."""
         for state, look in looks.items():
             self.states[state] = look if isinstance(look[0], str) else (state, look)
-        rows = changes(np.array(states)[:, None])
-        entries = [*(states[row] for row in rows), ""]
+        rows = changes(states[:, None])
+        entries = [*states[rows].tolist(), ""]
         times = time_columns(np.array([*rows, len(states)]) + first)
         # This apostrophe counts as a letter.
         path = self.root + entity_path(name.replace("'", "\u02bc").replace(" ", "_"))
@@ -69,9 +70,9 @@ def log_lanes(
     columns = max([len(episode.steps), *found])
     width = len(str(columns))
     if episode.success is not None and episode.first_success is None:
-        lanes.send(stream, f"{0:0{width}} verdict", 1, [ended] * len(episode), {ended: FAILED})
+        lanes.send(stream, f"{0:0{width}} verdict", 1, np.repeat(ended, len(episode)), {ended: FAILED})
     elif episode.success is not None:
-        states = np.where(episode.success, "success", "not yet").tolist()
+        states = np.where(episode.success, "success", "not yet")
         lanes.send(stream, f"{0:0{width}} verdict", 1, states, {"success": TRUE, "not yet": FALSE})
     if episode.in_force is not None:
         _send_steps(stream, lanes, f"{0:0{width}}b plan step", episode)
@@ -86,14 +87,15 @@ def log_lanes(
                 wrong = told[:, column] != episode.qaf[:, column]
                 truth = np.where(wrong, np.where(told[:, column], "false, told true", "true, told false"), truth)
             looks = {"true": TRUE, "false": FALSE, "false, told true": WRONG, "true, told false": WRONG}
-            lanes.send(stream, f"{number} {condition}", 0, truth.tolist(), looks)
+            lanes.send(stream, f"{number} {condition}", 0, truth, looks)
     opening = episode.observation[:, episode.layout.opening]
-    states = np.where(opening > STATES[OPEN][0].threshold, OPEN, CLOSED).tolist()
+    states = np.where(opening > STATES[OPEN][0].threshold, OPEN, CLOSED)
     looks = {OPEN: STEEL, CLOSED: GOLD}
-    for row, thing in enumerate(touched[: len(episode)] if touched is not None else ()):
-        if thing != NOTHING:
-            states[row] += f", touches {thing}"
-            looks.setdefault(states[row], TOUCHES_CLOSED if states[row].startswith(CLOSED) else TOUCHES_OPEN)
+    if touched is not None:
+        things = np.array(touched[: len(episode)])
+        states = np.where(things == NOTHING, states, np.char.add(np.char.add(states, ", touches "), things))
+        for state in np.unique(states).tolist():
+            looks.setdefault(state, TOUCHES_CLOSED if state.startswith(CLOSED) else TOUCHES_OPEN)
     lanes.send(stream, "gripper", 0, states, looks)
     return lanes
 
@@ -106,8 +108,7 @@ def _send_steps(stream: Any, lanes: Lanes, name: str, episode: RecordedEpisode, 
     looks: dict[str, Any] = {f"{kind}{i}": (label, step_color(i)) for i, label in enumerate(named)}
     answered = True if episode.answers is None else episode.answers.any(axis=1)
     nobody = np.where(np.broadcast_to(answered, len(episode)), EVENLY, NONE_HOLDS)
-    steps = np.array([f"{kind}{step}" for step in episode.in_force])
-    states = np.where(episode.in_force == NOBODY, nobody, steps).tolist()
+    states = np.where(episode.in_force == NOBODY, nobody, np.array([*looks])[episode.in_force])
     lanes.send(stream, name, 0, states, looks | {NONE_HOLDS: FALSE, EVENLY: FALSE})
 
 

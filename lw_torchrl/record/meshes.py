@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.record.conventions import changes, entity_path, rr, time_columns
+from lw_torchrl.record.conventions import entity_path, rr, time_columns
 from lw_torchrl.suites.engine import RowModel
 
 SHOWN_GROUPS = (0, 1, 2)  # Meta-World keeps what only collides in group 4
@@ -61,11 +61,29 @@ def model_geometry(model: RowModel) -> ModelGeometry:
     return _prepared[model.path]
 
 
+Known = dict[str, bytes | None]
+"""The meshes that are in a recording, and the pose that each has of itself: none yet, or b"" where it has one in each
+episode."""
+
+
+def log_meshes(stream: Any, model: RowModel, known: Known) -> None:
+    """Add the meshes of a model that are not in the recording yet, ahead of its first episode."""
+    for _, name, mesh in model_geometry(model).meshes:
+        if (path := entity_path("meshes", name)) not in known:
+            _log_mesh(stream, path, mesh, known)
+
+
+def _log_mesh(stream: Any, path: str, mesh: Vertices, known: Known, *, ghost: bool = False) -> None:
+    known[path] = None
+    look: dict[str, Any] = {"albedo_factor": GHOST, "vertex_colors": None} if ghost else {}
+    stream.log(path, rr.Mesh3D(**(mesh | look)), static=True)
+
+
 def log_motion(
     stream: Any,
     root: str,
     motion: Motion,
-    known: dict[str, bytes],
+    known: Known,
     drawn: NDArray[np.int64] | None = None,
     *,
     ghost: bool = False,
@@ -73,7 +91,7 @@ def log_motion(
     """The poses of the bodies below ``root``, row t at step t; and their meshes below /meshes, once a recording.
 
     Args:
-        known: the meshes that are in the recording, and the pose that each has of itself; new ones are added.
+        known: the recording's meshes; new ones are added.
         drawn: the rows to draw, the first one among them; None for all.
         ghost: draw translucent meshes, below /ghosts, and only of what moves.
 
@@ -83,36 +101,37 @@ def log_motion(
     geometry = model_geometry(motion.model)
     last = len(motion.position) - 1
     drawn = np.arange(last + 1) if drawn is None else np.append(drawn[drawn < last], last)
+    poses = np.concatenate([motion.position[drawn], motion.quaternion[drawn][..., [1, 2, 3, 0]]], axis=2)
+    moves = np.ones(poses.shape[:2], bool)
+    moves[1:] = (poses[1:] != poses[:-1]).any(axis=2)
     frames: dict[str, str] = {}
-    placed: list[tuple[str, NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]] = []
+    placed: dict[str, tuple[NDArray[np.int64], NDArray[np.float32]]] = {}
     for body, name, mesh in geometry.meshes:
         path = entity_path("ghosts" if ghost else "meshes", name)
-        place, turn = motion.position[drawn, body], motion.quaternion[drawn, body][:, [1, 2, 3, 0]]
-        moved = changes(np.concatenate([place, turn], axis=1))
+        place, turn = poses[:, body, :3], poses[:, body, 3:]
+        moved = np.flatnonzero(moves[:, body])
         pose = b"" if len(moved) > 1 else place[0].tobytes() + turn[0].tobytes()
         if ghost and pose:
             continue
         if path not in known:
+            _log_mesh(stream, path, mesh, known, ghost=ghost)
+        if known[path] is None:
             known[path] = pose
-            look: dict[str, Any] = {"albedo_factor": GHOST, "vertex_colors": None} if ghost else {}
-            still = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
-            stream.log(path, rr.Mesh3D(**(mesh | look)), *([still] if pose else []), static=True)
+            if pose:
+                still = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
+                stream.log(path, still, static=True)
         # What stands where it stood in the first episode needs no frame, which costs a page two kilobytes.
         if pose and known[path] == pose:
             frames[path] = ""
             continue
         frames[path] = f"{stream.get_recording_id()[-8:]}{root}/{geometry.bodies[body]}"
-        if frames[path] not in [frame for frame, *_ in placed]:
-            placed.append((frames[path], drawn[moved], place[moved], turn[moved]))
+        placed.setdefault(frames[path], (drawn[moved], poses[moved, body]))
     if placed:  # all in one: an entity for each body would weigh as much again
-        rows = np.concatenate([rows for _, rows, _, _ in placed])
+        rows, every = (np.concatenate(parts) for parts in zip(*placed.values(), strict=True))
         order = np.argsort(rows, kind="stable")
-        names = np.repeat([frame for frame, *_ in placed], [len(rows) for _, rows, _, _ in placed])
-        columns = rr.Transform3D.columns(
-            translation=np.concatenate([place for *_, place, _ in placed])[order],
-            quaternion=np.concatenate([turn for *_, turn in placed])[order],
-            child_frame=names[order].tolist(),
-        )
+        names = np.repeat([*placed], [len(own) for own, _ in placed.values()])[order].tolist()
+        every = every[order]
+        columns = rr.Transform3D.columns(translation=every[:, :3], quaternion=every[:, 3:], child_frame=names)
         stream.send_columns(root, time_columns(rows[order]), columns)
     return frames
 

@@ -91,6 +91,7 @@ class RecordedEpisode:
             return None
         return int(self.success.argmax()) + 1
 
+    @cached_property
     def distance(self) -> NDArray[np.float32] | None:
         """T float32, metres: how far what the skill in force moves is from where it goes; NaN where it goes nowhere."""
         if self.in_force is None:

@@ -29,7 +29,7 @@ from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.record import metrics
 from lw_torchrl.record.conventions import CONTROL_PERIOD, METRIC_TIMELINE, entity_path, rr, time_columns
-from lw_torchrl.record.meshes import Motion
+from lw_torchrl.record.meshes import Known, Motion, log_meshes
 from lw_torchrl.record.metrics import check_name
 from lw_torchrl.record.overview import OVERVIEW
 from lw_torchrl.record.recorded_episode import MendedRecording, PlanLike, RecordedEpisode
@@ -37,6 +37,7 @@ from lw_torchrl.record.resuming import Begun
 from lw_torchrl.record.tabs import TABS, Layout, send_page
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.record.writer import RecordingWriter, check_address, check_path
+from lw_torchrl.suites.engine import RowModel
 
 BUFFERED_SCALARS = 1024
 
@@ -107,7 +108,7 @@ class RerunLogger(Logger):
         self._counters = {} if begun is None else begun.counters
         self._hparams = {} if begun is None else begun.hparams
         self._layout, self._sent = Layout() if begun is None else begun.layout, 0.0
-        self._meshes = {} if begun is None else begun.meshes
+        self._meshes: Known = {} if begun is None else {**begun.meshes}
         self._recording_id = None if begun is None else begun.recording_id
         super().__init__(exp_name=name, log_dir=str(self.path.parent) if self.path else os.curdir)
 
@@ -354,6 +355,11 @@ class RerunLogger(Logger):
             page = send_page(stream, len(self.episodes) + 1, name, heading, episode, motion, ghost, self._meshes)
             self._layout.add_page(name, page)
         return name
+
+    def prepare(self, model: RowModel) -> None:
+        """Add the shapes of a model's bodies now, half a second's work, which its first page is spared."""
+        with self._adding:
+            log_meshes(self._open(), model, self._meshes)
 
     def show_causes(self, result: EvaluationResult) -> None:
         """Put :func:`lw_torchrl.evaluation.plot_failures` of a result into the overview of several episodes."""

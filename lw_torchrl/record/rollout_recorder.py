@@ -7,34 +7,23 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import AnyPlans, as_plans
-from lw_torchrl.record.meshes import Motion, model_geometry
+from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.rollouts import read_rollout
 from lw_torchrl.transforms.environment import base_env, refuse_changed
 
-_BEFORE = (
-    "task_id",
-    "episode",
-    "qaf_plan",
-    "observation",
-    "qaf",
-    "qaf_logits",
-    "skill_weights",
-    "action_corrected",
-    "pixels",
-)
+_OF_EPISODE = ("task_id", "episode", "qaf_plan")
+_BEFORE = ("observation", "qaf", "qaf_logits", "skill_weights", "action_corrected", "pixels")
 _AFTER = ("executed_action", "success", "reward")
-"""Keys of a step: those of the state and the policy, those of what it led to."""
+"""Keys of an episode, the same in all its steps; of the state and the policy; of what a step led to."""
 
 
 class RolloutRecorder(Transform):
@@ -103,7 +92,7 @@ class RolloutRecorder(Transform):
                 raise ValueError(f"rows must be below {len(env.row_tasks)}, the environment's rows, got {row}")
         if self.plans is not None:
             self.plans.require(env.row_tasks[row] for row in self.rows)
-        self._running = {row: _Row(env, row) for row in self.rows}
+        self._running = {row: _Row(env, row, self.logger) for row in self.rows}
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         for row in _named(tensordict.get("_reset", None), self.rows):
@@ -115,7 +104,7 @@ class RolloutRecorder(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         # All at once: to get them one by one takes as long as the rest.
         before, after = dict(tensordict.items()), dict(next_tensordict.items())
-        done = after["done"].reshape(-1).tolist()
+        done = _array(after["done"]).reshape(-1)
         for row in _named(before.get("_step"), self.rows):
             running = self._running[row]
             running.take(before, after)
@@ -143,59 +132,89 @@ class RolloutRecorder(Transform):
 
 
 class _Row:
-    def __init__(self, env: LanguageWorldEnv, row: int) -> None:
+    def __init__(self, env: LanguageWorldEnv, row: int, logger: RerunLogger) -> None:
         self.task = env.task_of_row[row]
         self.ended = 0
         self.seed = env.seed
-        self._env, self._row, self._batched = env, row, bool(env.batch_size)
+        self._env, self._row = env, row
+        self._part: Any = row if env.batch_size else ...
         # An engine of one's own may have no bodies.
         engine: Any = env.engine
         self._engine = engine if hasattr(engine, "poses") else None
         self._model = None if self._engine is None else self._engine.model(row)
         if self._model is not None:
-            model_geometry(self._model)
-        self._steps: list[dict[NestedKey, NDArray[Any]]] = []
-        self._poses: list[list[NDArray[Any]]] = []
-        self._recorded = self._stepped = False
+            logger.prepare(self._model)
+        # The episode so far: keys of the state and of what a step led to, with a place for each step there can be.
+        self._said: dict[str, NDArray[Any]] = {}
+        self._before: dict[str, NDArray[Any]] = {}
+        self._after: dict[str, NDArray[Any]] = {}
+        self._poses: tuple[NDArray[np.float32], ...] = ()
+        self._steps, self._recorded, self._stepped = 0, False, False
 
     def begin(self, *, recorded: bool) -> None:
         self.seed = self._env.seed
-        self._recorded, self._stepped = recorded, False
-        self._look()
+        self._steps, self._recorded, self._stepped = 0, recorded, False
+        self._before, self._after = {}, {}
+        if recorded and self._engine is not None:
+            most, bodies = self._env.max_steps + 1, len(self._engine.poses(self._row).position)
+            self._poses = np.empty((most, bodies, 3), np.float32), np.empty((most, bodies, 4), np.float32)
+            self._look()
 
     def take(self, before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> None:
         """Note a step: what it was decided on and what it led to."""
         self._stepped = True
-        if self._recorded:
-            step: dict[NestedKey, NDArray[Any]] = {key: self._of(before[key]) for key in _BEFORE if key in before}
-            self._steps.append(step | {("next", key): self._of(after[key]) for key in _AFTER if key in after})
-            self._look()
+        if not self._recorded:
+            return
+        if not self._before:
+            self._said = {key: self._of(before[key]) for key in _OF_EPISODE if key in before}
+            self._before = {key: self._column(before[key]) for key in _BEFORE if key in before}
+            self._after = {key: self._column(after[key]) for key in _AFTER if key in after}
+        step, part = self._steps, self._part
+        # A copy: some environments write into their tensors again.
+        for key, column in self._before.items():
+            column[step] = _array(before[key])[part]
+        for key, column in self._after.items():
+            column[step] = _array(after[key])[part]
+        self._steps = step + 1
+        self._look()
 
     def finish(self) -> tuple[TensorDict | None, Motion | None]:
         """The episode so far, (T,), and its motion; afterwards none runs. None where no step was noted."""
         self.ended += self._stepped
-        steps, poses = self._steps, self._poses
-        self._steps, self._poses = [], []
-        self._recorded = self._stepped = False
+        steps, self._steps, self._recorded, self._stepped = self._steps, 0, False, False
         if not steps:
             return None, None
-        columns: Any = {key: torch.from_numpy(np.stack([step[key] for step in steps])) for key in steps[0]}
-        rollout = TensorDict(columns, [len(steps)])
+        columns: Any = {key: np.full((steps, *value.shape), value) for key, value in self._said.items()}
+        columns |= {key: column[:steps] for key, column in self._before.items()}
+        columns["next"] = {key: column[:steps] for key, column in self._after.items()}
+        rollout = TensorDict(columns, [steps])
         if self._model is None:
             return rollout, None
-        positions, quaternions = (np.stack(rows).astype(np.float32) for rows in zip(*poses, strict=True))
-        return rollout, Motion(self._model, positions, quaternions)
+        positions, quaternions = self._poses
+        return rollout, Motion(self._model, positions[: steps + 1], quaternions[: steps + 1])
 
     def _of(self, values: Tensor) -> NDArray[Any]:
-        """A copy of this row's part of a tensor of all rows: some environments write into theirs again."""
-        array = values.numpy(force=True)
-        return np.array(array[self._row] if self._batched else array)
+        """This row's part of a tensor of all rows."""
+        return np.array(_array(values)[self._part])
+
+    def _column(self, values: Tensor) -> NDArray[Any]:
+        part = self._of(values)
+        return np.empty((self._env.max_steps, *part.shape), part.dtype)
 
     def _look(self) -> None:
         if self._recorded and self._engine is not None:
-            self._poses.append([np.array(values) for values in self._engine.poses(self._row)])
+            positions, quaternions = self._poses
+            positions[self._steps], quaternions[self._steps] = self._engine.poses(self._row)
 
 
-def _named(mask: Tensor | None, rows: Sequence[int]) -> list[int]:
+def _array(values: Tensor) -> NDArray[Any]:
+    """A tensor as an array, which shares its memory where it can; the quick way first."""
+    try:
+        return values.numpy()
+    except (RuntimeError, TypeError):  # it has a gradient, or is a GPU's
+        return values.numpy(force=True)
+
+
+def _named(mask: Tensor | None, rows: Sequence[int]) -> Sequence[int]:
     """Those of ``rows`` that a mask names, all where there is none."""
-    return list(rows) if mask is None else [row for row in rows if mask.reshape(-1)[row]]
+    return rows if mask is None else [row for row in rows if mask.reshape(-1)[row]]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.record.conventions import GOLD, GREEN, STEEL, Color, changes, entity_path, rr, step_color, time_columns
-from lw_torchrl.record.meshes import GHOST, Motion, log_motion
+from lw_torchrl.record.meshes import GHOST, Known, Motion, log_motion
 from lw_torchrl.record.metrics import send_images
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
 
@@ -38,7 +38,7 @@ def log_scene(
     root: str,
     episode: RecordedEpisode,
     motion: Motion | None,
-    known: dict[str, bytes],
+    known: Known,
     drawn: NDArray[np.int64],
     eye: tuple[Point, Point],
     ghost: MendedRecording | None = None,
@@ -73,7 +73,7 @@ def log_scene(
             point(f"names{entity_path(label)}", things[label] + away, label, 0.0005, color)
 
     def lines(path: str, strips: NDArray[np.float32], radius: float, color: Color) -> None:
-        look = {"colors": [color] * len(drawn), "radii": [radius] * len(drawn)}
+        look = {"colors": np.tile(np.array(color, np.uint8), (len(drawn), 1)), "radii": np.full(len(drawn), radius)}
         stream.send_columns(f"{scene}/{path}", time_columns(drawn), rr.LineStrips3D.columns(strips=strips, **look))
 
     goal = np.ascontiguousarray(episode.observation[:, episode.layout.positions[-1]])
@@ -212,6 +212,6 @@ def _log_target(stream: Any, scene: str, episode: RecordedEpisode, drawn: NDArra
             colors[rows], shown[rows] = (*step_color(step), 255), True
     rows = drawn[changes(np.concatenate([start, end, colors, shown[:, None]], axis=1)[drawn])]
     start, end, colors, shown, times = start[rows], end[rows], colors[rows], shown[rows], time_columns(rows)
-    look = {"colors": colors[shown], "radii": [0.004] * int(shown.sum())}
+    look = {"colors": colors[shown], "radii": np.full(shown.sum(), 0.004)}
     arrows = rr.Arrows3D.columns(origins=start[shown], vectors=(end - start)[shown], **look)
     stream.send_columns(f"{scene}/target", times, arrows.partition(shown.astype(int)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 from lw_torchrl._checks import unknown_name
@@ -19,7 +19,7 @@ from lw_torchrl.record.conventions import (
     rrb,
 )
 from lw_torchrl.record.lanes import log_lanes
-from lw_torchrl.record.meshes import Motion
+from lw_torchrl.record.meshes import Known, Motion
 from lw_torchrl.record.overview import OVERVIEW, place, table
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
 from lw_torchrl.record.scene import Point, log_pictures, log_scene, touched_things
@@ -174,7 +174,7 @@ def send_page(
     episode: RecordedEpisode,
     motion: Motion | None,
     ghost: MendedRecording | None,
-    meshes: dict[str, bytes],
+    meshes: Known,
 ) -> Page:
     """Log the recording's ``number``-th episode, under ``name``; returns what its views are to show.
 
@@ -243,7 +243,7 @@ class Layout:
     def add_page(self, name: str, page: Page) -> None:
         """Give an episode a tab."""
         self.pages[name] = page
-        self._entries.append(json.dumps(["page", name, asdict(page)]))
+        self._entries.append(json.dumps(["page", name, vars(page)]))
 
     def compare(self, title: str, names: Sequence[str]) -> None:
         """Show episodes beside one another in a tab."""

@@ -231,7 +231,7 @@ def _lines(conditions: Sequence[str], episode: RecordedEpisode) -> int:
 
 def farthest(episode: RecordedEpisode) -> float:
     """The largest distance of what a skill moves from where it goes, cm; 1 where there is none."""
-    distance = episode.distance()
+    distance = episode.distance
     return 1.0 if distance is None else max(1.0, 100 * float(np.nanmax(distance)))
 
 
@@ -240,10 +240,11 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
     rows = np.arange(len(episode))
     sent = ["action"]
     _send(stream, f"{root}/action", rows, episode.action, action_names(episode.layout))
-    if (distance := episode.distance()) is not None:
+    if (distance := episode.distance) is not None:
         # One line in centimetres, in the colour of the step in force.
         assert episode.in_force is not None
-        colors = [FALSE if step == NOBODY else step_color(step) for step in episode.in_force.tolist()]
+        steps = range(int(episode.in_force.max()) + 1)
+        colors = np.array([*map(step_color, steps), FALSE], np.uint8)[episode.in_force]  # NOBODY, -1, takes the last
         columns = [*rr.Scalars.columns(scalars=distance * 100), *rr.SeriesLines.columns(colors=colors)]
         stream.send_columns(f"{root}/distance", time_columns(rows), columns)
         sent.append("distance")

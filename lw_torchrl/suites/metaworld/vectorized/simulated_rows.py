@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lw_torchrl._checks import check_int
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.suites.cameras import SeenRows
-from lw_torchrl.suites.engine import EngineStep, RowModel, checked_step, seeds_of_rows
+from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
 from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask, StateView, sensor_index
 from lw_torchrl.suites.metaworld.vectorized.tables import TaskReward, TaskSources
@@ -38,6 +38,7 @@ class SimulatedRow:
         self.builder = builder
         self._model = shared.model
         self._data = mujoco.MjData(shared.model)
+        self.bodies = BodyPoses(self._data.xpos, self._data.xquat)  # as they are now
         self._places = shared.compiled[0].copy(), shared.compiled[1].copy()
         self._substeps: int = builder.frame_skip
         self.mocap: Array = self._data.mocap_pos[0]  # that the hand is drawn to
@@ -215,6 +216,10 @@ class ThreadedEngine(SeenRows):
 
     def _seen(self, row: int) -> tuple[RowModel, Any]:
         return self._rows[row].seen()
+
+    def poses(self, row: int) -> BodyPoses:
+        position, quaternion = self._rows[row].bodies
+        return BodyPoses(position.copy(), quaternion.copy())
 
     def close(self) -> None:
         """End the threads."""
