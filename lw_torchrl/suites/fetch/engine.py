@@ -110,6 +110,7 @@ class _Row:
         self.goal: Array = np.zeros(3)
 
         hand = self._model.body("robot0:gripper_link").id
+        self.bodies = BodyPoses(data.xpos, data.xquat)  # as they are now
         self._hand = data.xpos[hand], data.xquat[hand]
         self._mocap = data.mocap_pos[0], data.mocap_quat[0]
         self._fingers = [int(self._model.joint(name).qposadr[0]) for name in _FINGERS]

@@ -168,7 +168,7 @@ def available_cores() -> int:
 class ThreadedEngine(SeenRows):
     """An engine whose physics runs in threads, by default one a core; rows of one of the ``keys`` share a model."""
 
-    _rows: list[Any]  # each with ``seen``
+    _rows: list[Any]  # each with ``seen`` and ``bodies``
 
     def __init__(self, keys: Sequence[str], layout: Layout, num_threads: int | None) -> None:
         threads = check_int("num_threads", available_cores() if num_threads is None else num_threads, minimum=1)
