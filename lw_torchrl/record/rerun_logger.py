@@ -32,9 +32,10 @@ from lw_torchrl.record.conventions import CONTROL_PERIOD, METRIC_TIMELINE, entit
 from lw_torchrl.record.meshes import Known, Motion, log_meshes
 from lw_torchrl.record.metrics import check_name
 from lw_torchrl.record.overview import OVERVIEW
+from lw_torchrl.record.page import send_page
 from lw_torchrl.record.recorded_episode import MendedRecording, PlanLike, RecordedEpisode
 from lw_torchrl.record.resuming import Begun
-from lw_torchrl.record.tabs import TABS, Layout, send_page
+from lw_torchrl.record.tabs import TABS, Layout
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.record.writer import RecordingWriter, check_address, check_path
 from lw_torchrl.suites.engine import RowModel

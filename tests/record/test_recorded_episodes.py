@@ -13,9 +13,10 @@ from recordings import PLAN, STEPS, Recording, make_objects, make_rollout, recor
 
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.record.lanes import EVENLY, NONE_HOLDS, short
+from lw_torchrl.record.page import ROBOT_EYE
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
 from lw_torchrl.record.scene import beside
-from lw_torchrl.record.tabs import ROBOT_EYE, Layout
+from lw_torchrl.record.tabs import Layout
 
 ROWS = [f"/e1/{i}_" + short(c).replace(" ", "_") for i, (c, _) in enumerate(STEPS, 1)]
 

@@ -1,0 +1,206 @@
+"""The page of an episode: what is logged of it, and its views, in a tab or in a column beside others."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from lw_torchrl.record.conventions import (
+    EPISODE_TIMELINE,
+    SECONDS_TIMELINE,
+    Color,
+    entity_path,
+    rr,
+    rrb,
+)
+from lw_torchrl.record.lanes import log_lanes
+from lw_torchrl.record.meshes import Known, Motion
+from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
+from lw_torchrl.record.scene import Point, log_pictures, log_scene, touched_things
+from lw_torchrl.record.verdict import (
+    Heading,
+    decisive_step,
+    drawn_steps,
+    farthest,
+    log_curves,
+    log_plan,
+    telling_steps,
+    verdict,
+)
+
+MANY_LANES = 9  # beside more, a small window has little room for the verdict
+_CONDITION = re.compile(r"/0*[1-9]\d*_[^/]*$")  # how lanes of conditions are called, as log_lanes has it
+
+# From behind the robot's right shoulder, over a table whose middle is at (0, 0.6, 0); with the arm, from the front.
+SIMPLE_EYE: tuple[Point, Point] = ((0.54, 0.23, 0.46), (0.03, 0.63, 0.10))
+ROBOT_EYE: tuple[Point, Point] = ((0.54, 0.18, 0.47), (-0.02, 0.62, 0.13))
+
+CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
+    "distance": ("Distance to the target, cm", None),
+    "action": ("Action", (-1.2, 1.2)),
+    "reward": ("Reward", None),
+    "skill_weights": ("Skill weights", (-0.1, 1.1)),
+    "corrected": ("How much of the correction counts", (-0.1, 1.1)),
+}
+"""Each curve's title, and the range of its numbers where they have one."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """What was logged of an episode, as far as its views depend on it."""
+
+    root: str
+    trails: Collection[str]  # entities that are shown up to the cursor
+    eye: tuple[Point, Point]  # where the scene is seen from, and what is looked at
+    shown: tuple[int, int]  # the first and last step worth a look
+    decisive: int  # the step to open it at
+    curves: Collection[str]
+    lines: int  # of the plan's text, in a small window; 0 where there is no plan
+    lanes: Sequence[str]  # their entities
+    states: dict[str, tuple[str, Color]]  # of the lanes: words and colour
+    farthest: float  # of the distances, cm
+    row: dict[str, Any]  # in the overview
+    frames: dict[str, str]  # as log_motion gives them
+    pictures: float  # what the policy saw: width over height, 0 where it saw none
+
+    def title(self, policy: bool = True) -> str:
+        """The tab's: the episode's name, who acted if that is to be said, and how it ended, if that is known."""
+        ended = {"failed": "failed", "success": f"success at {self.row['at']}"}.get(self.row["ended"])
+        if self.row["cause"]:
+            ended = f"failed: {self.row['cause']}"
+        return " · ".join(filter(None, [self.row["name"], self.row["policy"] if policy else None, ended]))
+
+    def below(self, run: str) -> Page:
+        """The page where all entities of its recording lie below that of a ``run``, whose name it takes too."""
+        root, row = entity_path(run), self.row
+        return replace(
+            self,
+            root=root + self.root,
+            trails=[root + path for path in self.trails],
+            lanes=[root + path for path in self.lanes],
+            frames={root + mesh: frame for mesh, frame in self.frames.items()},
+            row=row | {"name": f"{run}/{row['name']}", "title": f"{run}: {row['title']}"},
+        )
+
+    def tab(self, title: str) -> rrb.Horizontal:
+        """Scene and curves on the left, words and lanes on the right."""
+        # Shares are the pixels that a view needs in a window of 1100×700; what is longer scrolls.
+        plan = 60 + 15 * self.lines if self.lines else 0
+        scene = self._scene()
+        if self.pictures:  # 0.3 of the width for one picture, 0.4 for two side by side
+            seen = min(0.2 + 0.1 * self.pictures, 0.5)
+            scene = rrb.Horizontal(scene, self._pictures(), column_shares=[1 - seen, seen])
+        left: list[tuple[float, Any]] = [(max(150, 500 - plan), scene)]
+        left += [(plan, self._words("plan", "Plan"))] if plan else []
+        left.append((105, rrb.Tabs(*(self._curve(name) for name in CURVES if name in self.curves))))
+        right = self._lanes(self.lanes)
+        right.insert(0, (max(100, 605 - sum(share for share, _ in right)), self._words("verdict", "Verdict")))
+        return rrb.Horizontal(_stacked(left), _stacked(right), column_shares=[9, 10], name=title)
+
+    def column(self, title: str, shown: tuple[int, int], farthest: float) -> rrb.Vertical:
+        """Verdict, scene, distance and main lanes in a column, beside others that show the same steps and centimetres.
+
+        What held is behind the scene.
+        """
+        page = replace(self, shown=shown, farthest=farthest)
+        conditions = [lane for lane in self.lanes if _CONDITION.search(lane)]
+        behind: list[Any] = [view for _, view in page._lanes(conditions, "What held")]
+        below: list[tuple[float, Any]] = [(100, page._curve("distance"))] if "distance" in page.curves else []
+        below += page._lanes([lane for lane in self.lanes if lane not in conditions])
+        behind += [page._pictures()] if page.pictures else []
+        scene = rrb.Tabs(page._scene(), *behind) if behind else page._scene()
+        room = max(120, 487 - sum(share for share, _ in below))
+        return _stacked([(118, page._words("verdict", title)), (room, scene), *below], title)
+
+    def _scene(self) -> rrb.Spatial3DView:
+        first, now = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.cursor_relative()
+        timelines = EPISODE_TIMELINE, SECONDS_TIMELINE
+        trail = rrb.VisibleTimeRanges([rr.VisibleTimeRange(name, start=first, end=now) for name in timelines])
+        shown: dict[Any, Any] = {path: trail for path in self.trails}
+        shown |= {mesh: rr.CoordinateFrame(frame) for mesh, frame in self.frames.items() if frame}
+        return rrb.Spatial3DView(
+            origin=f"{self.root}/scene",
+            contents=["$origin/**", *self.frames],
+            name="Scene",
+            line_grid=False,
+            eye_controls=rrb.EyeControls3D(position=self.eye[0], look_target=self.eye[1]),
+            overrides=shown,
+        )
+
+    def _pictures(self) -> rrb.Spatial2DView:
+        return rrb.Spatial2DView(origin=f"{self.root}/seen", name="What it saw")
+
+    def _words(self, part: str, name: str) -> rrb.TextDocumentView:
+        return rrb.TextDocumentView(origin=f"{self.root}/{part}", name=name)
+
+    def _lanes(self, lanes: Sequence[str], name: str = "What went on") -> list[tuple[float, Any]]:
+        if not lanes:
+            return []
+        labels, colors = zip(*self.states.values(), strict=True)
+        styles = rr.StateConfiguration(values=list(self.states), labels=labels, colors=colors)
+        origin = lanes[0].rpartition("/")[0]
+        view = rrb.StateTimelineView(
+            origin=origin, contents=lanes, name=name, time_view=_window(self.shown), defaults=[styles]
+        )
+        return [(50 + 40 * len(lanes), view)]
+
+    def _curve(self, name: str) -> rrb.TimeSeriesView:
+        title, limits = CURVES[name]
+        if name == "distance":  # a small view has no room for the axis' numbers
+            limits, title = (-0.05 * self.farthest, 1.05 * self.farthest), f"{title} (up to {self.farthest:.0f})"
+        return rrb.TimeSeriesView(
+            origin=f"{self.root}/{name}",
+            name=title,
+            axis_x=_window(self.shown),
+            axis_y=None if limits is None else rrb.ScalarAxis(range=limits, zoom_lock=True),
+        )
+
+
+def _stacked(parts: Sequence[tuple[float, Any]], name: str | None = None) -> rrb.Vertical:
+    return rrb.Vertical(*(view for _, view in parts), row_shares=[share for share, _ in parts], name=name)
+
+
+def send_page(
+    stream: Any,
+    number: int,
+    name: str,
+    heading: Heading,
+    episode: RecordedEpisode,
+    motion: Motion | None,
+    ghost: MendedRecording | None,
+    meshes: Known,
+) -> Page:
+    """Log the recording's ``number``-th episode, under ``name``; returns what its views are to show.
+
+    ``meshes`` are those in the recording, as :func:`log_motion` has them.
+    """
+    root = entity_path(name)
+    touched = None if motion is None else touched_things(motion, episode)
+    lanes = log_lanes(stream, entity_path(f"e{number}"), episode, heading.ended(episode), touched, ghost)
+    eye = SIMPLE_EYE if motion is None else ROBOT_EYE
+    drawn = drawn_steps(heading, episode, ghost)
+    trails, frames = log_scene(stream, root, episode, motion, meshes, drawn, eye, ghost)
+    text = verdict(heading, episode, ghost, small=len(lanes.paths) > MANY_LANES)
+    stream.log(f"{root}/verdict", rr.TextDocument(text, media_type="text/markdown"), static=True)
+    return Page(
+        root,
+        trails=trails,
+        eye=eye,
+        shown=telling_steps(heading, episode, ghost),
+        decisive=decisive_step(heading, episode, ghost),
+        curves=log_curves(stream, root, episode),
+        lines=log_plan(stream, root, episode) if episode.steps else 0,
+        lanes=lanes.paths,
+        states=lanes.states,
+        farthest=farthest(episode),
+        row=heading.row(episode, name),
+        frames=frames,
+        pictures=log_pictures(stream, root, episode, drawn),
+    )
+
+
+def _window(shown: tuple[int, int]) -> Any:
+    first, last = (rr.TimeRangeBoundary.absolute(seq=step) for step in shown)
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
