@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import nn
 
 import lw_torchrl as lw
@@ -170,3 +171,13 @@ def test_one_for_plans_carries_out_others_on_the_same_weights():
         ConditionedActor(Holding(reach, by_skill=True)).with_plans(PLANS)
     with pytest.raises(TypeError, match="conditioned on descriptions"):
         DescriptorEncoder(PLANS).with_plans(PLANS)
+
+
+def test_an_encoder_of_plans_that_gives_no_attention_is_named():
+    class Bare(Holding):
+        def encode(self, holds, seen):
+            return super().encode(holds, seen)._replace(weights=None)
+
+    told = states() | {"qaf": torch.zeros(4, 6, dtype=torch.bool)}
+    with pytest.raises(TypeError, match="encode of Bare must return weights, the attention over the steps"):
+        ConditionedActor(Bare(PLANS), width=8)(TensorDict(told, [4]))
