@@ -164,7 +164,7 @@ class ConditionedActor(Policy):
             name, got = type(self.encoder).__name__, type(found).__name__
             raise TypeError(f"encode of {name} must return an Encoding(latent, features), got {got}")
         if (found.weights is None) != (self.plans is None):
-            what = "no weights, since it has no plans" if self.plans is None else "weights, the attention over the steps"
+            what = "weights, the attention over the steps" if self.plans is not None else "no weights without plans"
             raise TypeError(f"encode of {type(self.encoder).__name__} must return {what}")
         return found
 

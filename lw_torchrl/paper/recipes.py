@@ -140,7 +140,7 @@ class OfflineRecipe:
     distance: Literal["l1", "l2"] = "l1"  # to what is imitated; the mean of open and close would half open the gripper
     temperature: Scale = 3.0  # of IQL's actor
     alpha: Scale = 2.5  # of TD3+BC, the weight of the value beside the imitation
-    alpha_l1: Scale = 0.1  # of TD3+BC and CQL with imitation by l1, the weight of values in deviations of their task
+    alpha_l1: Scale = 1.0  # of TD3+BC and CQL with imitation by l1, the weight of values in deviations of their task
     cql_weight: Scale = 1.0  # of CQL's penalty
     steps: Count = 4000  # minibatches of every actor; of the value, ``value_steps``
     value_steps: Count = 4000
