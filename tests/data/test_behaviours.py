@@ -395,8 +395,10 @@ def test_what_is_refused(tmp_path, policy, options, error, message):
 
 def test_a_module_and_a_function_act_as_the_same_policy_does(tmp_path):
     """A TensorDictModule of any network, a function, and a module with plans, which is shown their answers."""
-    torch.manual_seed(0)
-    network = torch.nn.Sequential(torch.nn.Linear(39, 4), torch.nn.Tanh())
+
+    def network(observation):  # a sum of products depends on the number of rows in its last bit, on some processors
+        return (observation[..., :4] - observation[..., 4:8]).clamp(-1.0, 1.0)
+
     module = TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
 
     def function(tensordict):
@@ -405,7 +407,7 @@ def test_a_module_and_a_function_act_as_the_same_policy_does(tmp_path):
     by_module = collect(tmp_path / "module", policy=module, behaviour="mine")
     assert same_rows(by_module, collect(tmp_path / "function", policy=function, behaviour="mine", num_envs=2))
     rows = load_rows(by_module)
-    torch.testing.assert_close(rows["unclipped_action"], network(rows["observation"]).detach())
+    torch.testing.assert_close(rows["unclipped_action"], network(rows["observation"]))
     assert by_module.config.policy.fingerprint == policy_fingerprint(module)
     assert read_metadata(tmp_path / "function").config.policy == Behaviour("mine", "policy")
     network[0].weight.data *= 2
