@@ -396,9 +396,17 @@ def test_what_is_refused(tmp_path, policy, options, error, message):
 def test_a_module_and_a_function_act_as_the_same_policy_does(tmp_path):
     """A TensorDictModule of any network, a function, and a module with plans, which is shown their answers."""
 
-    def network(observation):  # a sum of products depends on the number of rows in its last bit, on some processors
-        return (observation[..., :4] - observation[..., 4:8]).clamp(-1.0, 1.0)
+    class Scaled(
+        torch.nn.Module
+    ):  # a sum of products depends on the number of rows in its last bit, on some processors
+        def __init__(self):
+            super().__init__()
+            self.weight = torch.nn.Parameter(torch.tensor([1.0, -2.0, 3.0, 0.5]))
 
+        def forward(self, observation):
+            return (observation[..., :4] * self.weight).clamp(-1.0, 1.0)
+
+    network = Scaled()
     module = TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
 
     def function(tensordict):
@@ -407,10 +415,10 @@ def test_a_module_and_a_function_act_as_the_same_policy_does(tmp_path):
     by_module = collect(tmp_path / "module", policy=module, behaviour="mine")
     assert same_rows(by_module, collect(tmp_path / "function", policy=function, behaviour="mine", num_envs=2))
     rows = load_rows(by_module)
-    torch.testing.assert_close(rows["unclipped_action"], network(rows["observation"]))
+    torch.testing.assert_close(rows["unclipped_action"], network(rows["observation"]).detach())
     assert by_module.config.policy.fingerprint == policy_fingerprint(module)
     assert read_metadata(tmp_path / "function").config.policy == Behaviour("mine", "policy")
-    network[0].weight.data *= 2
+    network.weight.data *= 2
     with pytest.raises(DatasetError, match="another configuration"):
         collect(tmp_path / "module", policy=module, behaviour="mine")
 
