@@ -108,7 +108,7 @@ def _send_steps(stream: Any, lanes: Lanes, name: str, episode: RecordedEpisode, 
     looks: dict[str, Any] = {f"{kind}{i}": (label, step_color(i)) for i, label in enumerate(named)}
     answered = True if episode.answers is None else episode.answers.any(axis=1)
     nobody = np.where(np.broadcast_to(answered, len(episode)), EVENLY, NONE_HOLDS)
-    states = np.where(episode.in_force == NOBODY, nobody, np.array([*looks])[episode.in_force])
+    states = np.where(episode.in_force == NOBODY, nobody, np.array([*looks, ""])[episode.in_force])
     lanes.send(stream, name, 0, states, looks | {NONE_HOLDS: FALSE, EVENLY: FALSE})
 
 

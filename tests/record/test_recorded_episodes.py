@@ -145,6 +145,13 @@ def test_without_a_plan_every_column_is_numbered(tmp_path):
     assert "/e1/3_condition" in found.entities()
 
 
+def test_without_a_plan_nor_a_condition_that_holds_no_step_is_in_force(tmp_path):
+    rollout = make_rollout(5).exclude("skill_weights")
+    rollout["qaf"] = torch.zeros(5, 3, dtype=torch.bool)
+    found = record(tmp_path / "a.rrd", rollout, plan=None)
+    assert found.values("/e1/0b_plan_step", "StateChange:state") == [[NONE_HOLDS], [""]]
+
+
 def test_a_goal_that_is_an_object_has_one_label(tmp_path):
     rollout = make_rollout(5)
     objects = {"target location": rollout["observation"][:, 36:39]}
