@@ -69,11 +69,12 @@ episode."""
 def log_meshes(stream: Any, model: RowModel, known: Known) -> None:
     """Add the meshes of a model that are not in the recording yet, ahead of its first episode."""
     for _, name, mesh in model_geometry(model).meshes:
-        if (path := entity_path("meshes", name)) not in known:
-            _log_mesh(stream, path, mesh, known)
+        _log_mesh(stream, entity_path("meshes", name), mesh, known)
 
 
 def _log_mesh(stream: Any, path: str, mesh: Vertices, known: Known, *, ghost: bool = False) -> None:
+    if path in known:
+        return
     known[path] = None
     look: dict[str, Any] = {"albedo_factor": GHOST, "vertex_colors": None} if ghost else {}
     stream.log(path, rr.Mesh3D(**(mesh | look)), static=True)
@@ -113,8 +114,7 @@ def log_motion(
         pose = b"" if len(moved) > 1 else place[0].tobytes() + turn[0].tobytes()
         if ghost and pose:
             continue
-        if path not in known:
-            _log_mesh(stream, path, mesh, known, ghost=ghost)
+        _log_mesh(stream, path, mesh, known, ghost=ghost)
         if known[path] is None:
             known[path] = pose
             if pose:

@@ -7,14 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from lw_torchrl.record.conventions import (
-    EPISODE_TIMELINE,
-    SECONDS_TIMELINE,
-    Color,
-    entity_path,
-    rr,
-    rrb,
-)
+from lw_torchrl.record.conventions import EPISODE_TIMELINE, SECONDS_TIMELINE, Color, entity_path, rr, rrb
 from lw_torchrl.record.lanes import log_lanes
 from lw_torchrl.record.meshes import Known, Motion
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode

@@ -104,7 +104,7 @@ class RolloutRecorder(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         # All at once: to get them one by one takes as long as the rest.
         before, after = dict(tensordict.items()), dict(next_tensordict.items())
-        done = _array(after["done"]).reshape(-1)
+        done = after["done"].numpy(force=True).reshape(-1)
         for row in _named(before.get("_step"), self.rows):
             running = self._running[row]
             running.take(before, after)
@@ -156,7 +156,7 @@ class _Row:
         self._steps, self._recorded, self._stepped = 0, recorded, False
         self._before, self._after = {}, {}
         if recorded and self._engine is not None:
-            most, bodies = self._env.max_steps + 1, len(self._engine.poses(self._row).position)
+            most, bodies = self._env.max_steps + 1, self._engine.model(self._row).model.nbody
             self._poses = np.empty((most, bodies, 3), np.float32), np.empty((most, bodies, 4), np.float32)
             self._look()
 
@@ -172,9 +172,9 @@ class _Row:
         step, part = self._steps, self._part
         # A copy: some environments write into their tensors again.
         for key, column in self._before.items():
-            column[step] = _array(before[key])[part]
+            column[step] = before[key].numpy(force=True)[part]
         for key, column in self._after.items():
-            column[step] = _array(after[key])[part]
+            column[step] = after[key].numpy(force=True)[part]
         self._steps = step + 1
         self._look()
 
@@ -195,7 +195,7 @@ class _Row:
 
     def _of(self, values: Tensor) -> NDArray[Any]:
         """This row's part of a tensor of all rows."""
-        return np.array(_array(values)[self._part])
+        return np.array(values.numpy(force=True)[self._part])
 
     def _column(self, values: Tensor) -> NDArray[Any]:
         part = self._of(values)
@@ -205,14 +205,6 @@ class _Row:
         if self._recorded and self._engine is not None:
             positions, quaternions = self._poses
             positions[self._steps], quaternions[self._steps] = self._engine.poses(self._row)
-
-
-def _array(values: Tensor) -> NDArray[Any]:
-    """A tensor as an array, which shares its memory where it can; the quick way first."""
-    try:
-        return values.numpy()
-    except (RuntimeError, TypeError):  # it has a gradient, or is a GPU's
-        return values.numpy(force=True)
 
 
 def _named(mask: Tensor | None, rows: Sequence[int]) -> Sequence[int]:

@@ -218,6 +218,7 @@ class ThreadedEngine(SeenRows):
         return self._rows[row].seen()
 
     def poses(self, row: int) -> BodyPoses:
+        """As :meth:`SeenRows.poses`, whoever holds the model that the row shares."""
         position, quaternion = self._rows[row].bodies
         return BodyPoses(position.copy(), quaternion.copy())
 
