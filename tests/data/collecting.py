@@ -1,17 +1,21 @@
-"""A small dataset for the tests of collecting, the bytes of a folder, and a stop in the midst of it."""
+"""Small datasets and policies for the tests of collecting, the bytes of a folder, and a stop in the midst of it."""
 
 from __future__ import annotations
 
 import json
 
+import torch
+
+import lw_torchrl as lw
 from lw_torchrl.data import collect_demonstrations
 from lw_torchrl.data.dataset import read_metadata
-from lw_torchrl.data.memory_map import describe_episode, map_rows
+from lw_torchrl.data.memory_map import describe_episode, load_rows, map_rows
 from lw_torchrl.data.missing_episodes import EpisodeFiles
 
 TASKS = ("push", "reach")
 NOISE = (0.0, 0.3)
 STEPS, EPISODES, SEED = 14, 3, 5
+PLANS = lw.load_plans("MT10")
 
 
 def collect(root, tasks=TASKS, **changed):
@@ -47,3 +51,15 @@ def interrupt_after(monkeypatch, episodes):
         put(self, *args)
 
     monkeypatch.setattr(EpisodeFiles, "put", stopping)
+
+
+def trained(kind="plan", seed=0, **options):
+    """A tiny policy; of other weights for another seed."""
+    torch.manual_seed(seed)
+    if kind == "plan":
+        return lw.PlanConditionedActor(PLANS, width=8, depth=1, **options)
+    return lw.DescriptorConditionedActor(("push", "reach"), width=8, depth=1, **options)
+
+
+def same_rows(one, other):
+    return (load_rows(one) == load_rows(other)).all()

@@ -1,0 +1,214 @@
+"""Policies that act in a dataset, trained ones and any module or function; what is refused."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from collecting import PLANS, SEED, STEPS, collect, interrupt_after, same_rows, trained, tree
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+
+import lw_torchrl as lw
+from lw_torchrl.data import Behaviour, DatasetError
+from lw_torchrl.data.behaviours import policy_fingerprint
+from lw_torchrl.data.dataset import read_metadata
+from lw_torchrl.data.memory_map import load_rows
+
+
+@pytest.mark.parametrize("kind", ["plan", "description"])
+def test_a_policy_acts_as_in_an_evaluation(tmp_path, kind):
+    actor = trained(kind).train()
+    options = dict(noise_scale=0.1, gripper_noise_factor=1.0, noise_hold=1)
+    made = collect(tmp_path / "demos", policy=actor, behaviour="tiny", num_envs=3, **options)
+    assert actor.training, "it is left as it was"
+    result = lw.evaluate(
+        actor,
+        tasks=("push", "reach"),
+        episodes_per_task=3,
+        seed=SEED,
+        noise_scale=0.1,
+        max_steps=STEPS,
+        record_actions=True,
+        progress=False,
+    )
+    rows = load_rows(made)
+    for info, episode in zip(made.episodes, result.episodes, strict=True):
+        assert (info.task, info.episode) == (episode.task, episode.episode)
+        assert torch.equal(rows["action"][info.start : info.start + info.length], episode.actions)
+    assert made.config.behaviour == "tiny"
+
+
+def test_a_policy_with_a_distribution_acts_without_exploring(tmp_path):
+    actor = trained(distribution="tanh_normal").train()
+    one = collect(tmp_path / "one", policy=actor, behaviour="tiny")
+    torch.manual_seed(99)
+    assert tree(collect(tmp_path / "other", policy=actor, behaviour="tiny", num_envs=2).root) == tree(one.root)
+    still = collect(tmp_path / "still", policy=actor, behaviour="tiny", noise_scale=0.0)
+    state = TensorDict({"observation": load_rows(still)["observation"][:64].clone()}, [64])
+    state["task_id"] = load_rows(still)["task_id"][:64].clone()
+    with torch.no_grad(), lw_deterministic():
+        actor.eval()(lw.QAFTransform(PLANS)(state))
+    assert torch.allclose(state["action"], load_rows(still)["action"][:64], atol=1e-5)
+
+
+def lw_deterministic():
+    from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+    return set_exploration_type(ExplorationType.DETERMINISTIC)
+
+
+def test_an_interrupted_collection_of_a_policy_goes_on_with_the_same_alone(tmp_path, monkeypatch):
+    root, actor = tmp_path / "demos", trained()
+    whole = collect(tmp_path / "whole", policy=actor, behaviour="tiny")
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, 2)
+        with pytest.raises(KeyboardInterrupt):
+            collect(root, policy=actor, behaviour="tiny", num_envs=2)
+    before = tree(root)
+    for other in (trained(seed=1), trained(mix="actions")):
+        with pytest.raises(DatasetError, match=r"half-made dataset.*policy.fingerprint \('\w+', now '\w+'\)"):
+            collect(root, policy=other, behaviour="tiny")
+    with torch.no_grad():
+        next(actor.parameters()).add_(1e-3)
+    with pytest.raises(DatasetError, match=r"policy.fingerprint"):
+        collect(root, policy=actor, behaviour="tiny")
+    with torch.no_grad():
+        next(actor.parameters()).copy_(next(trained().parameters()))
+    with pytest.raises(DatasetError, match=r"policy.name \('tiny', now 'other'\)"):
+        collect(root, policy=actor, behaviour="other")
+    assert tree(root) == before
+    assert tree(collect(root, policy=actor, behaviour="tiny").root) == tree(whole.root)
+
+
+def test_a_damaged_dataset_of_a_policy_is_mended_by_the_same_policy(tmp_path):
+    actor = trained()
+    made = collect(tmp_path / "demos", policy=actor, behaviour="tiny")
+    before = tree(made.root)
+    path = made.root / "data" / "observation.memmap"
+    content = bytearray(path.read_bytes())
+    content[5] ^= 255
+    path.write_bytes(content)
+    damaged = tree(made.root)
+    with pytest.raises(DatasetError, match=r"policy\.fingerprint"):
+        collect(made.root, policy=trained(seed=1), behaviour="tiny")
+    assert tree(made.root) == damaged
+    with pytest.warns(UserWarning, match="5 of 6 episodes are kept"):
+        collect(made.root, policy=actor, behaviour="tiny")
+    assert tree(made.root) == before
+
+
+def nan(policy):
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.fill_(torch.nan)
+    return policy
+
+
+class Odd(lw.Policy):
+    """Writes another action than it should."""
+
+    def __init__(self, wrong):
+        super().__init__()
+        self.tasks, self.config, self.wrong = ("push", "reach"), {}, wrong
+        self.in_keys, self.out_keys = ["observation"], ["deed" if wrong == "key" else "action"]
+
+    def prepare(self, tensordict):
+        return tuple(self.read(tensordict))
+
+    def act(self, observation):
+        dtype = torch.float64 if self.wrong == "dtype" else torch.float32
+        return (observation[..., : 3 if self.wrong == "shape" else 4].to(dtype),)
+
+
+@pytest.mark.parametrize(
+    ("policy", "options", "error", "message"),
+    [
+        (trained(), dict(behaviour=None), ValueError, "behaviour must name the policy in the dataset"),
+        (
+            trained(),
+            dict(behaviour="random"),
+            ValueError,
+            "behaviour must be a label of its own, 'random' is another's",
+        ),
+        (trained(), dict(behaviour="noisy"), ValueError, "behaviour must be a label of its own, 'noisy' is another's"),
+        (trained(), dict(behaviour=" x"), ValueError, "name must be a label"),
+        (trained(), dict(behaviour=7), TypeError, "behaviour must be a string, got 7"),
+        (trained(), dict(behaviour="a\nb"), ValueError, "name must be a label"),
+        ("random", dict(behaviour="expert"), ValueError, "label of its own, 'expert' is another's"),
+        ("expert", dict(behaviour="spoilt-30"), ValueError, "label of its own"),
+        (Behaviour("wrong", right=0.9), dict(behaviour=None), ValueError, "label of its own"),
+        (Behaviour("mine", "policy"), {}, ValueError, "give the policy itself"),
+        ("raondm", {}, ValueError, "policy must be one of 'expert'.*did you mean 'random'"),
+        (None, {}, TypeError, "policy must be a name, a Behaviour, a module or a function, got NoneType"),
+        (lambda state: state, {}, ValueError, "must write 'action'"),
+        (lambda state: state, dict(behaviour=None), ValueError, "behaviour must name the policy in the dataset"),
+        (Behaviour("theirs", "imported"), {}, ValueError, "is of others: import_dataset"),
+        (trained("description"), dict(tasks=("push", "drawer-open")), ValueError, "not made for drawer-open"),
+        (nan(trained()), {}, ValueError, "NaN"),
+        (Odd("key"), {}, ValueError, "must write 'action'"),
+        (
+            lambda state: state["observation"],
+            {},
+            TypeError,
+            "must return the TensorDict that it is given, got a Tensor",
+        ),
+        (torch.nn.Linear(39, 4), {}, TypeError, "must be a Policy, a TensorDictModule, or a function .*; got a Linear"),
+        (Odd("dtype"), {}, ValueError, "must be float32"),
+        (Odd("shape"), {}, ValueError, r"must be float32 of shape \(2, 4\), got torch.float32 of shape \(2, 3\)"),
+        (lw.ScriptedSkillActor(PLANS, "random"), {}, ValueError, "would depend on num_envs and on interruptions"),
+        (lw.modules.ActorEnsemble([lw.ScriptedSkillActor(PLANS, "random")]), {}, ValueError, "draws in the order"),
+        (lw.ScriptedSkillActor(PLANS, skills=lw.load_skills()), {}, TypeError, "skills of your own"),
+    ],
+)
+def test_what_is_refused(tmp_path, policy, options, error, message):
+    with pytest.raises(error, match=message):
+        collect(tmp_path / "demos", policy=policy, num_envs=2, **{"behaviour": "mine", **options})
+    assert not (tmp_path / "demos" / "metadata.json").exists()
+
+
+def test_a_module_and_a_function_act_as_the_same_policy_does(tmp_path):
+    """A TensorDictModule of any network, a function, and a module with plans, which is shown their answers."""
+
+    class Scaled(torch.nn.Module):  # no sum of products, whose last bit may depend on the number of rows
+        def __init__(self):
+            super().__init__()
+            self.weight = torch.nn.Parameter(torch.tensor([1.0, -2.0, 3.0, 0.5]))
+
+        def forward(self, observation):
+            return (observation[..., :4] * self.weight).clamp(-1.0, 1.0)
+
+    network = Scaled()
+    module = TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
+
+    def function(tensordict):
+        return tensordict.set("action", network(tensordict["observation"]))
+
+    by_module = collect(tmp_path / "module", policy=module, behaviour="mine")
+    assert same_rows(by_module, collect(tmp_path / "function", policy=function, behaviour="mine", num_envs=2))
+    rows = load_rows(by_module)
+    torch.testing.assert_close(rows["unclipped_action"], network(rows["observation"]).detach())
+    assert by_module.config.policy.fingerprint == policy_fingerprint(module)
+    assert read_metadata(tmp_path / "function").config.policy == Behaviour("mine", "policy")
+    network.weight.data *= 2
+    with pytest.raises(DatasetError, match="another configuration"):
+        collect(tmp_path / "module", policy=module, behaviour="mine")
+
+    class Planned(TensorDictModule):
+        plans = PLANS
+
+    shown = lambda observation, qaf: observation[..., :4].tanh() * qaf[..., :1]  # noqa: E731
+    planned = Planned(shown, in_keys=["observation", "qaf"], out_keys=["action"])
+    made = collect(tmp_path / "planned", policy=planned, behaviour="planned")
+    rows = lw.QAFTransform(PLANS)(load_rows(made).select("observation", "task_id", "expert_action").clone())
+    torch.testing.assert_close(rows["expert_action"], rows["observation"][:, :4].tanh() * rows["qaf"][:, :1])
+
+
+def test_a_fingerprint_is_of_all_that_a_policy_does():
+    base = policy_fingerprint(trained())
+    assert policy_fingerprint(trained()) == base
+    others = [trained(seed=1), trained(mix="actions"), trained(features="raw"), trained("description")]
+    others.append(trained().with_plans({**PLANS, "reach": PLANS["reach"].__class__("reach", PLANS["reach"].steps[:1])}))
+    others.append(trained(text_encoder=lambda texts: torch.randn(len(texts), 384, generator=torch.Generator())))
+    found = [base, *map(policy_fingerprint, others)]
+    assert len(set(found)) == len(found)
+    assert policy_fingerprint(trained().bfloat16()) != base
