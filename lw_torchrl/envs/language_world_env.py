@@ -24,7 +24,7 @@ from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, d
 from lw_torchrl.envs.seeding import EpisodeCounter, check_worker, stated_episode
 from lw_torchrl.envs.workers import OneThread, one_thread_at_a_time, torchrl_worker
 from lw_torchrl.language.tasks import Task, one_layout
-from lw_torchrl.suites.engine import Engine
+from lw_torchrl.suites.engine import Engine, EngineStep
 from lw_torchrl.suites.metaworld.engines import make_engine
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
@@ -86,6 +86,7 @@ class LanguageWorldEnv(EnvBase):
         RuntimeError: a step of a row that has ended; a reset or step in a forked process that did not make it, or while
             another thread is in one, or draws.
         TypeError: it is pickled or copied; pass the function that makes it.
+        ValueError: the step of an engine of your own returns no EngineStep.
         ImportError: a rendering library named by MUJOCO_GL is missing, or the vectorized engine does not know the
             installed version of Meta-World or MuJoCo.
 
@@ -256,6 +257,9 @@ class LanguageWorldEnv(EnvBase):
     def _simulate(self, action: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """One step of the simulation of some rows, and their reward, (N,) float64."""
         result = self._engine.step(action, rows)
+        if not isinstance(result, EngineStep):
+            engine, got = type(self._engine).__name__, type(result).__name__
+            raise ValueError(f"engine: the step of {engine} must return an EngineStep, got {got}")
         self._report(result.fault & rows, "its simulation became unstable")
         np.copyto(self._rows.observation, result.observation, casting="same_kind", where=rows[:, None])
         success = result.success & rows

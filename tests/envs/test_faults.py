@@ -156,6 +156,15 @@ def with_fake(**options) -> tuple[lw.LanguageWorldEnv, FakeEngine]:
     return env, env._engine
 
 
+def test_a_step_that_returns_something_else_is_named(monkeypatch):
+    env, engine = with_fake()
+    state = env.reset()
+    monkeypatch.setattr(engine, "step", lambda action, active: tuple(FakeEngine.step(engine, action, active)))
+    with pytest.raises(ValueError, match=r"^engine: the step of FakeEngine must return an EngineStep, got tuple$"):
+        advance(env, state, torch.zeros(3, 4))
+    env.close()
+
+
 def test_an_engine_of_ones_own():
     env, engine = with_fake(reward="dense", num_threads=2)
     assert engine.tasks == FEW
