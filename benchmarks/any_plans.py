@@ -34,8 +34,9 @@ TEST = tuple(task for task in lw.MT50 if task not in DEVELOPMENT and task not in
 PARAPHRASES = 10  # of each plan
 OURS, NATURAL = lw.load_plans("MT50", skills="MT10"), lw.load_plans("MT50")
 Rows = Literal[
-    "default", "ours", "natural", "palm2", "no-points", "dc", "one-hot", "no-roles", "models", "robustness", "evaluator"
-]
+    "default", "ours", "natural", "own-words", "palm2", "no-points", "dc", "one-hot", "no-roles", "models",
+    "robustness", "evaluator",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,10 @@ def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans |
             yield row, "pcbc", Plans([default_plan(NATURAL[task]).plan for task in outside])
         elif row in ("ours", "natural", "evaluator"):
             yield row, "pcbc", Plans([(OURS if row == "ours" else NATURAL)[task] for task in outside])
+        elif row == "own-words":  # whole plans of writers who saw the tasks, their things' names and the query language
+            for style, written in read_json(Path(__file__).parent / "data" / "own_words.json", "plans").items():
+                plans = [ConditionalPlan.from_pairs(task, written[task]) for task in outside]
+                yield f"own words, {style}", "pcbc", Plans(plans)
         elif row == "palm2":
             written = lw.load_plans(required(arguments.palm2, "palm2"))
             yield row, "pcbc", Plans([written[task] for task in outside])

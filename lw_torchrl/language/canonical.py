@@ -29,7 +29,7 @@ from lw_torchrl.language.wording import (
     things,
 )
 
-RULES = 1
+RULES = 2
 """The version of the rules by which plans are read, which a policy's file keeps; raised when they change."""
 TRUSTED = 0.75
 """A plan keeps its own conditions if in this share of usual states it does what its motion needs."""
@@ -194,6 +194,8 @@ def _template(task: Task, steps: Sequence[CanonicalStep], last: CanonicalStep) -
     """The motion of a plan, ``last``, at the thing that the plan names, with conditions that cover the usual states."""
     if last.manner == "reach":
         return tuple(steps)
+    if any(one.verb == "carry" and (one.moved, one.target) == (last.moved, last.target) for one in steps):
+        last = replace(last, verb="carry")
     point = _touched(task, steps)
     above, near, over, level = (
         check_query(f"the gripper is {relation} the {point}", task)
@@ -231,11 +233,12 @@ def _template(task: Task, steps: Sequence[CanonicalStep], last: CanonicalStep) -
 
 
 def _touched(task: Task, steps: Sequence[CanonicalStep]) -> str:
-    """Where the hand acts: on the thing that it first goes to."""
-    hands = (one.target for one in steps if one.moved == GRIPPER != one.target and not is_goal(task, one.target))
-    found = next(hands, None) or first_thing(task)
-    assert found is not None
-    return point_on(task, found)
+    """Where the hand acts: on the thing that it first comes down to, else on the one that it first goes over."""
+    hands = [one for one in steps if one.moved == GRIPPER != one.target and not is_goal(task, one.target)]
+    found = next(iter(sorted(hands, key=lambda one: one.verb == "approach")), None)
+    name = first_thing(task) if found is None else found.target
+    assert name is not None
+    return point_on(task, name)
 
 
 def _has_sides(steps: Sequence[CanonicalStep]) -> bool:

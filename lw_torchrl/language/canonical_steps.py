@@ -140,8 +140,9 @@ def _told(step: CanonicalStep, written: str | None, seen: bool) -> dict[str, Any
 
 
 def motion_of(steps: Sequence[CanonicalStep]) -> CanonicalStep | None:
-    """The last step that moves something."""
-    return next((one for one in reversed(steps) if one.verb in ("carry", "move", "push", "pull", "reach")), None)
+    """The last step that moves a thing; in a plan without one, the last that brings the gripper to its place."""
+    moving = [one for one in steps if one.verb in ("carry", "move", "push", "pull")]
+    return next(reversed(moving or [one for one in steps if one.verb == "reach"]), None)
 
 
 def step_vectors(plan: CanonicalPlan) -> list[list[float]]:

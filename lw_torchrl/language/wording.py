@@ -10,6 +10,7 @@ from typing import Literal
 
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, typed
+from lw_torchrl.language.phrases import HANDS, plain
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.skills import WORDS
 from lw_torchrl.language.tasks import Task
@@ -27,7 +28,6 @@ _PLACES = {name: frozenset(words) for name, words in WORDS["canonical"]["places"
 _KNOWN = frozenset().union(*_VERBS.values()) | {"align", "slide", "sweep"}
 _NO_NAME = {"location", "target", "reach", "other", "side", "top", "edge"}  # words of names that name nothing alone
 _GOAL = r"(?:the )?(?:reach |reacher )?(?:goal|target|destination)(?: (?:location|position|area|place|point|bin|spot))?"
-_HANDS = {GRIPPER: GRIPPER, "gripper": GRIPPER, "hand": GRIPPER, "fingers": GRIPPER}
 # "above the dial to turn it left": a later step's business
 _PURPOSE = re.compile(r"(?<=>) (?:in order )?to \w+ it\b.*")
 _TOOL = re.compile(r"(?<!line )(?<!level )(?<!aligned )\bwith <([^>]*)>")
@@ -99,7 +99,7 @@ def point_on(task: Task, name: str) -> str:
 @lru_cache(maxsize=256)
 def _names(task: Task) -> dict[str, str]:
     """Regular expressions of words to the name of what they call, the longest first."""
-    found = {name: name for name in task.object_names} | _HANDS
+    found = HANDS | {name: name for name in task.object_names}
     words: dict[str, str] = {}
     for name in things(task):
         for word in re.findall(r"[a-z]+", name.replace("'s", "")):
@@ -155,8 +155,8 @@ class _Facts:
 def read_steps(plan: ConditionalPlan) -> tuple[Reading | None, ...]:
     """What each step says; None for a step that says nothing that can be read."""
     task = plan.definition
-    texts = [mark(step.skill, task) for step in plan.steps]
     facts = [_Facts.of(step) for step in plan.steps]
+    texts = _without_it([plain(mark(step.skill, task)) for step in plan.steps], facts, task)
     grasping = any(_grasps(text, one) for text, one in zip(texts, facts, strict=True))
     read = [
         _Step(step, task, text, one, grasping).read() for step, text, one in zip(plan.steps, texts, facts, strict=True)
@@ -164,6 +164,18 @@ def read_steps(plan: ConditionalPlan) -> tuple[Reading | None, ...]:
     if not any(one and one.verb not in ("approach", "descend", "beside") for one in read):
         read = [_sent(one, text) for one, text in zip(read, texts, strict=True)]
     return tuple(_pushed_or_pulled(read))
+
+
+def _without_it(texts: Iterable[str], facts: Iterable[_Facts], task: Task) -> list[str]:
+    """Texts in which "pull it" says what is pulled: what the step before was done to, else the first thing."""
+    found, before = [], first_thing(task)
+    for text, one in zip(texts, facts, strict=True):
+        meant = before or (one.near[-1] if one.near else None)
+        text = re.sub(r"^(\w+) (?:it|them)\b", rf"\1 <{meant}>", text) if meant is not None else text
+        found.append(text)
+        named = (name for name in re.findall(r"<([^>]*)>", text) if name != GRIPPER and not is_goal(task, name))
+        before = next(named, before)
+    return found
 
 
 def _sent(read: Reading | None, text: str) -> Reading | None:
@@ -316,7 +328,8 @@ class _Step:
         return same_thing(self.task, first, thing) != same_thing(self.task, second, thing)
 
     def _pairs(self) -> list[tuple[str, str]]:
-        clauses = self.step.condition.clauses
+        """The things that the condition compares; what is at another already is not to come to it."""
+        clauses = [one for one in self.step.condition.clauses if one.negated or one.predicate not in ("near", "around")]
         return [(c.subject, c.object) for c in clauses if c.object is not None and GRIPPER not in (c.subject, c.object)]
 
     def _compared_point(self, moved: str, target: str) -> str:

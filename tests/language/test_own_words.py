@@ -1,0 +1,108 @@
+"""Steps in words of one's own: what people say is read as what the shipped plans say in theirs."""
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import lw_torchrl as lw
+from lw_torchrl.language.canonical import canonical_plan
+from lw_torchrl.language.named_objects import NamedObject
+from lw_torchrl.language.phrases import plain
+from lw_torchrl.language.plans import ConditionalPlan
+from lw_torchrl.language.wording import mark, read_steps
+
+PLANS = lw.load_plans("MT50")
+SAYINGS = json.loads((Path(__file__).parent / "sayings.json").read_text("utf-8"))
+"""Skills of 30 shipped plans, and four paraphrases of each by a writer who saw neither rules nor plans."""
+G = "robot's gripper"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("hover over the mug", "move <{G}> over <mug>"),
+        ("carefully go straight down to it", "lower <{G}> to it"),
+        ("reach for the mug", "move <{G}> for <mug>"),
+        ("approach the mug", "move <{G}> to <mug>"),
+        ("over the mug", "move <{G}> over <mug>"),
+        ("line yourself up over the mug", "line <{G}> up over <mug>"),
+        ("go on until the mug is between your fingers", "lower <{G}> around <mug>"),
+        ("move until the mug is right below you", "move <{G}> above <mug>"),
+        ("descend until the fingertips touch the mug", "lower <{G}> to <mug>"),
+        ("get a firm grip on the mug", "grasp <mug>"),
+        ("take hold of the mug", "grasp <mug>"),
+        ("take the mug", "grasp <mug>"),
+        ("get the mug to the goal", "carry <mug> to <target location>"),
+        ("wrap your fingers around the mug", "grasp <{G}> around <mug>"),
+        ("bring your fingers together on the mug", "close <{G}> around <mug>"),
+        ("spread the fingers", "open <{G}>"),
+        ("keep dragging the mug back", "dragg <mug> back"),
+        ("keep pulling the mug back", "pull <mug> back"),
+        ("give the mug a good shove to the left", "push <mug> to the left"),
+        ("use the robot arm to shove the mug left", "push <mug> left"),
+        ("yank the mug along the negative y axis", "pull <mug> backward"),
+        ("apply a downward force to the mug", "press <mug> down"),
+        ("line the mug up with the goal", "carry <mug> in line with <target location>"),
+        ("let the mug down", "lower <mug> down"),
+        ("put the gripper above the mug", "put <{G}> above <mug>"),
+    ],
+)  # fmt: skip
+def test_many_words_become_those_that_the_rules_know(text, said):
+    assert plain(mark(text, lw.TASKS["coffee-pull"])) == said.format(G=G)
+
+
+@pytest.mark.parametrize("skills", ["own", "MT10"])
+def test_the_words_of_shipped_plans_are_known(skills):
+    for task, plan in lw.load_plans("MT50", skills=skills).items():
+        for step in plan.steps:
+            marked = mark(step.skill, lw.TASKS[task])
+            assert plain(marked) == marked
+
+
+def steps_of(plan):
+    return [(one.verb, one.moved, one.target, one.manner, one.direction) for one in canonical_plan(plan).steps]
+
+
+def test_nine_of_ten_paraphrases_are_read_as_what_they_paraphrase():
+    alike = []
+    for plan in PLANS.values():
+        for number, step in enumerate(plan.steps):
+            for text in SAYINGS.get(step.skill, ()):
+                said = [(one.condition, text if one is step else one.skill) for one in plan.steps]
+                alike.append(steps_of(ConditionalPlan.from_pairs(plan.definition, said)) == steps_of(plan))
+                assert read_steps(ConditionalPlan.from_pairs(plan.definition, said))[number] is not None
+    assert len(alike) > 450
+    assert sum(alike) >= 0.9 * len(alike)
+
+
+def test_it_is_what_the_step_before_was_done_to():
+    held = "gripper is near the stick handle and gripper is closed"
+    steps = ("gripper is near the stick handle and gripper is open", "grab the stick"), (held, "aim it at the thermos")
+    plan = ConditionalPlan.from_pairs("stick-pull", [*steps, (held, "then poke it into the thermos")])
+    assert [(one.moved, one.target) for one in read_steps(plan)[1:]] == [("stick", "thermos")] * 2
+
+
+def test_a_thing_called_like_a_hand_is_a_thing():
+    task = replace(
+        lw.TASKS["push"], name="shake", objects=(*lw.TASKS["push"].objects[:1], NamedObject("hand", (4, 5, 6)))
+    )
+    assert mark("take the hand with your fingers", task) == f"take <hand> with your <{G}>"
+
+
+@given(st.lists(st.sampled_from(["go", "to", "the mug", "it", "until", "is", "between", "on", "a", "keep", "lying"])))
+def test_any_text_is_rewritten_and_no_thing_comes_from_nowhere(words):
+    marked = mark(" ".join(words), lw.TASKS["coffee-pull"])
+    found = plain(marked)
+    assert found.count("<mug>") <= marked.count("<mug>")
+
+
+def test_a_text_of_any_length_takes_no_time():
+    started = time.perf_counter()
+    for text in ("go " + "to " * 80_000, "line <mug> " + "a " * 80_000, "until " * 40_000):
+        plain(text)
+    assert time.perf_counter() - started < 5
