@@ -156,7 +156,25 @@ def read_steps(plan: ConditionalPlan) -> tuple[Reading | None, ...]:
     """What each step says; None for a step that says nothing that can be read."""
     task = plan.definition
     facts = [_Facts.of(step) for step in plan.steps]
-    texts = _without_it([plain(mark(step.skill, task)) for step in plan.steps], facts, task)
+    marked = [mark(step.skill, task) for step in plan.steps]
+    read = _read(plan, _without_it([plain(text) for text in marked], facts, task), facts)
+    if all(one is None or one.verb in _NO_MOTION for one in read):  # "grab it and pull" in a step
+        read = _read(plan, _without_it([_last_clause(text) for text in marked], facts, task), facts)
+    return read
+
+
+_NO_MOTION = {"approach", "beside", "descend", "close", "open"}
+
+
+def _last_clause(text: str) -> str:
+    """What comes last, of a thing that came first: "grab <mug> and pull it back" is "pull <mug> back"."""
+    first, _, second = text.rpartition(" and ")
+    thing = next((name for name in re.findall(r"<[^>]*>", first) if name != f"<{GRIPPER}>"), "it")
+    return plain(re.sub(r"\b(?:it|them)\b", thing, second, count=1)) if first else plain(text)
+
+
+def _read(plan: ConditionalPlan, texts: list[str], facts: list[_Facts]) -> tuple[Reading | None, ...]:
+    task = plan.definition
     grasping = any(_grasps(text, one) for text, one in zip(texts, facts, strict=True))
     read = [
         _Step(step, task, text, one, grasping).read() for step, text, one in zip(plan.steps, texts, facts, strict=True)

@@ -87,6 +87,16 @@ def test_it_is_what_the_step_before_was_done_to():
     assert [(one.moved, one.target) for one in read_steps(plan)[1:]] == [("stick", "thermos")] * 2
 
 
+def test_two_motions_in_a_step_are_the_last_where_a_plan_has_no_other():
+    over, near = "gripper not above the drawer handle", "gripper near the drawer handle"
+    steps = (over, "hover over the drawer handle"), (near, "grab the handle and yank it back")
+    *_, found = read_steps(ConditionalPlan.from_pairs("drawer-open", steps))
+    assert (found.verb, found.target, found.direction) == ("pull", "drawer handle", "toward")
+    closed = near + " and gripper is closed"
+    plan = ConditionalPlan.from_pairs("drawer-open", [*steps, (closed, "pull the drawer back")])
+    assert [one.verb for one in read_steps(plan)] == ["approach", "close", "move"]
+
+
 def test_a_thing_called_like_a_hand_is_a_thing():
     task = replace(
         lw.TASKS["push"], name="shake", objects=(*lw.TASKS["push"].objects[:1], NamedObject("hand", (4, 5, 6)))
