@@ -163,6 +163,7 @@ def read_steps(plan: ConditionalPlan) -> tuple[Reading | None, ...]:
     return read
 
 
+_IT = re.compile(r"^(\w+) (?:it|them|her|him)\b")
 _NO_MOTION = {"approach", "beside", "descend", "close", "open"}
 
 
@@ -189,7 +190,9 @@ def _without_it(texts: Iterable[str], facts: Iterable[_Facts], task: Task) -> li
     found, before = [], first_thing(task)
     for text, one in zip(texts, facts, strict=True):
         meant = before or (one.near[-1] if one.near else None)
-        text = re.sub(r"^(\w+) (?:it|them)\b", rf"\1 <{meant}>", text) if meant is not None else text
+        if meant is not None and (said := _IT.match(text)):
+            meant = GRIPPER if f"<{meant}>" in text else meant  # "park it over <mug>", which is the mug already
+            text = f"{said[1]} <{meant}>{text[said.end() :]}"
         found.append(text)
         named = (name for name in re.findall(r"<([^>]*)>", text) if name != GRIPPER and not is_goal(task, name))
         before = next(named, before)
