@@ -20,7 +20,7 @@ from lw_torchrl.evaluation import count_solved
 from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.language.wording import role_object
+from lw_torchrl.language.things import role_object
 from lw_torchrl.modules.relative_positions import PlanRoles
 from lw_torchrl.paper.imitation import ImitationRun
 from lw_torchrl.paper.recipes import EXECUTIONS, PRESETS, SETTINGS, Member, Preset

@@ -12,22 +12,9 @@ from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.tasks import Task
+from lw_torchrl.language.things import GOAL, first_thing, is_goal, point_on, role_object, same_thing, thing_of, things
 from lw_torchrl.language.usual_states import covered
-from lw_torchrl.language.wording import (
-    GOAL,
-    Direction,
-    Reading,
-    Verb,
-    compared_with_gripper,
-    first_thing,
-    is_goal,
-    point_on,
-    read_steps,
-    role_object,
-    same_thing,
-    thing_of,
-    things,
-)
+from lw_torchrl.language.wording import Direction, Reading, Verb, compared_with_gripper, read_steps
 
 RULES = 2
 """The version of the rules by which plans are read, which a policy's file keeps; raised when they change."""

@@ -10,7 +10,8 @@ from typing import Any, Literal, get_args
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import Query
 from lw_torchrl.language.skills import WORDS
-from lw_torchrl.language.wording import GOAL, Direction, Verb
+from lw_torchrl.language.things import GOAL
+from lw_torchrl.language.wording import Direction, Verb
 
 Manner = Literal["grasp", "push", "press", "pull", "reach"]
 """What a step is done for, which says how the hand comes: to grasp from above, to push from the side."""

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from lw_torchrl.language.queries import Query
 from lw_torchrl.language.tasks import Task, task_id
-from lw_torchrl.language.wording import Verb, role_object
+from lw_torchrl.language.things import role_object
+from lw_torchrl.language.wording import Verb
 
 _THINGS = ((0.0, 0.6, 0.02), (0.2, 0.7, 0.02), (-0.2, 0.7, 0.02), (0.0, 0.8, 0.02))
 _State = tuple[tuple[float, float, float], float, float, frozenset[str]]

@@ -15,7 +15,7 @@ from lw_torchrl.language.layout import places
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, coordinate_indices
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.language.wording import GOAL, role_object
+from lw_torchrl.language.things import GOAL, role_object
 from lw_torchrl.modules.observation_features import squash
 from lw_torchrl.transforms.random_yaw import turn_observation, turn_vectors
 

@@ -7,10 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.language import canonical, phrases, wording
+from lw_torchrl.language import canonical, phrases, things, wording
 from lw_torchrl.language.canonical import TRUSTED, canonical_plan, default_plan
 from lw_torchrl.language.canonical_steps import step_vectors
-from lw_torchrl.language.wording import GOAL, first_thing, mark, read_steps, role_object
+from lw_torchrl.language.things import GOAL, first_thing, mark, role_object
+from lw_torchrl.language.wording import read_steps
 
 OWN, MT10_SKILLS = lw.load_plans("MT50"), lw.load_plans("MT50", skills="MT10")
 G = "robot's gripper"
@@ -102,7 +103,7 @@ def test_the_canonical_form_of_a_canonical_plan_is_itself(task):
 
 
 def test_nothing_of_a_plan_comes_from_the_shipped_plans_or_skills():
-    for module in (canonical, phrases, wording):
+    for module in (canonical, phrases, things, wording):
         source = inspect.getsource(module)
         assert not any(name in source for name in ("load_plans", "load_skills", "skills_for", "usual_goal"))
 

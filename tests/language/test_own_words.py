@@ -14,7 +14,8 @@ from lw_torchrl.language.canonical import canonical_plan
 from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.phrases import plain
 from lw_torchrl.language.plans import ConditionalPlan
-from lw_torchrl.language.wording import mark, read_steps
+from lw_torchrl.language.things import mark
+from lw_torchrl.language.wording import read_steps
 
 PLANS = lw.load_plans("MT50")
 SAYINGS = json.loads((Path(__file__).parent / "sayings.json").read_text("utf-8"))
