@@ -222,7 +222,7 @@ def _template(task: Task, steps: Sequence[CanonicalStep], last: CanonicalStep) -
 def _touched(task: Task, steps: Sequence[CanonicalStep]) -> str:
     """Where the hand acts: on the thing that it first comes down to, else on the one that it first goes over."""
     hands = [one for one in steps if one.moved == GRIPPER != one.target and not is_goal(task, one.target)]
-    found = next(iter(sorted(hands, key=lambda one: one.verb == "approach")), None)
+    found = min(hands, key=lambda one: one.verb == "approach", default=None)
     name = first_thing(task) if found is None else found.target
     assert name is not None
     return point_on(task, name)

@@ -37,8 +37,6 @@ _REWRITINGS = [
     for said, plain in group
 ]
 _SYNONYMS = {word: verb for verb, words in _WORDS["synonyms"].items() for word in words}
-
-
 _LONGEST = 500  # characters; nobody says a step in more, and rewritings take their square in time
 
 
