@@ -171,6 +171,13 @@ MOTION: dict[str, Fault] = {
     "hand timid in small motions": Fault("motion", ("actuation",), setting(done=planted.timid)),
     "a skill timid in small motions": Fault("motion", ("skill",), in_skill(planted.timid)),
 }
+KINDS = {
+    "inside": "named right",
+    "outside": "no sound part named",
+    "two": "a planted one named",
+    "motion": "named right",
+}
+"""Kinds of faults, and what counts as right."""
 FAULTS: Mapping[str, Fault] = {**INSIDE, **OUTSIDE, **TWO, **MOTION}
 
 
@@ -189,6 +196,8 @@ class Arguments:
     at_most: int = 16
     """Failures of a fault that are attributed, of the tasks in turn."""
     max_steps: int = 150
+    learned: Path | None = None
+    """File of the learned policy; by default it is trained, once, in the folder out."""
     out: Path = Path("runs/faults")
     """Folder for the results of each unit, the policy and the tables."""
 
@@ -231,7 +240,7 @@ def failures_of(fault: Fault, policy: str, args: Arguments, learned: Any, refere
 
 def train(args: Arguments) -> Any:
     """A policy that imitates the scripted skills under the plans, trained once."""
-    file, data = args.out / "learned.zip", args.out / "demonstrations"
+    file, data = args.learned or args.out / "learned.zip", args.out / "demonstrations"
     if file.is_file():
         return lw.load_actor(file)
     tasks = dict.fromkeys((*BUILT_ON, *TASKS, *args.tasks))
@@ -258,28 +267,41 @@ def table(found: Mapping[str, Mapping[str, list[dict[str, Any]]]]) -> str:
             right = sum(is_right(fault, one) for one in failures)
             cells = [str(count) if count else "" for count in counts]
             rows.append((name, policy, *cells, f"{right} of {len(failures)}"))
-    kinds = {"inside": "named right", "outside": "no sound part named", "two": "a planted one named"}
-    for kind, what in {**kinds, "motion": "named right"}.items():
-        for policy in ("scripted", "learned"):
-            some = [(FAULTS[name], one) for name, of in found.items() for one in of.get(policy, ())]
-            some = [(fault, one) for fault, one in some if fault.kind == kind]
-            if some:
-                right = sum(is_right(*one) for one in some)
-                told.append(f"{kind}, {policy}: {what} {right} of {len(some)}, {right / len(some):.3f}")
-                if kind == "outside":
-                    exact = sum(one["cause"] in fault.causes for fault, one in some)
-                    told[-1] += f"; the fault itself {exact / len(some):.3f}"
-                if kind == "two":
-                    exact = sum({one["cause"], one["also"]} == set(fault.causes) for fault, one in some)
-                    told[-1] += f"; both {exact / len(some):.3f}"
+    for (kind, policy), (right, count) in scores(found).items():
+        said = f"{kind}, {policy}: {KINDS[kind]} {right} of {count}, {right / count:.3f}"
+        some = [(FAULTS[name], one) for name, of in found.items() for one in of.get(policy, ())]
+        some = [(fault, one) for fault, one in some if fault.kind == kind]
+        if kind == "outside":
+            exact = sum(one["cause"] in fault.causes for fault, one in some)
+            said += f"; the fault itself {exact / len(some):.3f}"
+        if kind == "two":
+            exact = sum({one["cause"], one["also"]} == set(fault.causes) for fault, one in some)
+            said += f"; both {exact / len(some):.3f}"
+        told.append(said)
     return markdown_table(("planted", "policy", *CAUSES, "right"), rows) + "\n\n" + "\n".join(told) + "\n"
+
+
+def scores(found: Mapping[str, Mapping[str, list[dict[str, Any]]]]) -> dict[tuple[str, str], tuple[int, int]]:
+    """Kind of fault and policy to the number of failures whose cause was named right, and of all."""
+    counts: dict[tuple[str, str], tuple[int, int]] = {}
+    for kind in KINDS:
+        for policy in ("scripted", "learned"):
+            right = [
+                is_right(FAULTS[name], failure)
+                for name, by_policy in found.items()
+                if FAULTS[name].kind == kind
+                for failure in by_policy.get(policy, ())
+            ]
+            if right:
+                counts[kind, policy] = sum(right), len(right)
+    return counts
 
 
 def is_right(fault: Fault, failure: Mapping[str, Any]) -> bool:
     return failure["cause"] in (*fault.causes, *(HARMLESS if fault.kind == "outside" else ()))
 
 
-def main(args: Arguments) -> None:
+def main(args: Arguments) -> dict[str, dict[str, list[dict[str, Any]]]]:
     reference = lw.load_plans(REFERENCE)
     reference.require(args.tasks)
     learned = train(args) if "learned" in args.policies else None
@@ -297,6 +319,7 @@ def main(args: Arguments) -> None:
             print(f"{name}, {policy}: {counts}; {(perf_counter() - start) / 60:.1f} minutes", flush=True)
             write_text(args.out / f"seed-{args.seed}.md", table(found))
     print(table(found))
+    return found
 
 
 if __name__ == "__main__":
