@@ -44,7 +44,7 @@ class Arguments:
     )  # fmt: skip
     """Checks to run. Together they take about 8 minutes on two cores."""
     palm2: Path | None = None
-    """PaLM 2's plans, a .json file of (condition, skill) pairs, which we do not ship. Without it they are not checked."""
+    """PaLM 2's plans, a .json file of (condition, skill) pairs, not shipped. Without it they are not checked."""
     write: bool = False
     """Write the goldens instead of checking them."""
 
