@@ -10,12 +10,12 @@ import torch
 import tyro
 
 import lw_torchrl as lw
+from benchmarks.paper.imitation import ImitationRun
+from benchmarks.paper.recipes import PRESETS, SETTINGS, Preset
+from benchmarks.paper.runs import execute_run
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import count_solved
 from lw_torchrl.evaluation.summary import markdown_table
-from lw_torchrl.paper.imitation import ImitationRun
-from lw_torchrl.paper.recipes import PRESETS, SETTINGS, Preset
-from lw_torchrl.paper.runs import execute_run
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Arguments:
     seeds: tuple[int, ...] = (0,)
     """Of demonstrations, weights and minibatches."""
     out: Path = Path("runs/reproduce")
-    """The experiments' folder: datasets and runs that `lw-torchrl reproduce` left there are used."""
+    """The experiments' folder: datasets and runs that `python -m benchmarks.paper` left there are used."""
 
 
 def preset(setting: str, option: str, weight: float) -> Preset:

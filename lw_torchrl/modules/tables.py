@@ -113,7 +113,7 @@ METHODS = Methods(
         "one-hot": Method("DescriptorConditionedActor", {"condition": "one-hot"}),
     },
 )
-"""The choices of ``train --method`` and ``reproduce --methods``: on plans, the task's description, its number."""
+"""The choices of ``train --method``: on plans, the task's description, its number."""
 
 
 def class_of(argument: str, table: Kinds[Any], found: Mapping[str, Any]) -> Any:

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 from commands import fails, run
+from lw_torchrl.paper.demo import QUICK
 
 import lw_torchrl as lw
 import lw_torchrl.cli.main as cli
 from lw_torchrl.cli.main import main
 from lw_torchrl.cli.output import BROKEN_PIPE
 from lw_torchrl.cli.parsing import arguments
-from lw_torchrl.paper.demo import QUICK
 
 COMMANDS = (
     "demo",

@@ -8,10 +8,10 @@ from types import MappingProxyType
 
 import pytest
 from commands import document, fails, run
-
-import lw_torchrl as lw
 from lw_torchrl.paper import recipes, runs
 from lw_torchrl.paper.recipes import PRESETS, DataSetting, Member
+
+import lw_torchrl as lw
 
 TINY = """
 from dataclasses import replace

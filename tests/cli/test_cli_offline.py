@@ -5,10 +5,10 @@ import shutil
 
 import pytest
 from commands import document, fails, run
-
-import lw_torchrl as lw
 from lw_torchrl.paper import offline
 from lw_torchrl.paper.recipes import OFFLINE_TABLES
+
+import lw_torchrl as lw
 
 SMALL = dict(width=16, depth=1, critic_depth=1, batch_size=20)
 TINY = f"""

@@ -5,9 +5,9 @@ from functools import partial
 
 import pytest
 from commands import document, fails, run
+from lw_torchrl.paper import online, runs
 
 import lw_torchrl as lw
-from lw_torchrl.paper import online, runs
 
 TINY = """
 from functools import partial

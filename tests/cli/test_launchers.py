@@ -3,7 +3,6 @@
 import sys
 
 import pytest
-
 from lw_torchrl.cli.runs import run_command, run_commands
 
 FAILS = ["plans", "no-such-folder"]

@@ -249,11 +249,12 @@ def test_an_argument_may_begin_with_a_dash_or_hold_spaces(tmp_path):
 def test_the_words_of_the_command_line_are_those_of_the_library():
     from typing import get_args
 
+    from lw_torchrl.paper.online import WEAKEST
+    from lw_torchrl.paper.recipes import MIXTURES, OFFLINE_METHODS
+
     from lw_torchrl.data import BEHAVIOURS
     from lw_torchrl.data.exchange import FORMATS
     from lw_torchrl.modules import METHODS
-    from lw_torchrl.paper.online import WEAKEST
-    from lw_torchrl.paper.recipes import MIXTURES, OFFLINE_METHODS
     from lw_torchrl.training import LEARNERS
 
     assert tuple(BEHAVIOURS) == options.ACTORS

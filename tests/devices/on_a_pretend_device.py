@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import test_offline as offline
 import torch
+from lw_torchrl.paper.runs import execute_run, load_result
 from pretend_device import COPIES, MODULE, PRETEND, WAITS
 from small_training import CONFIG, PLANS, SMALL, assert_same, collect_demos, flat, make_actor
 from tensordict import TensorDict
@@ -18,7 +19,6 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose
 
 import lw_torchrl as lw
-from lw_torchrl.paper.runs import execute_run, load_result
 
 ACTORS = {
     "plan": lambda: make_actor(feature_noise=0.0),

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from lw_torchrl.evaluation.many_plans import _PlanOfRow, evaluate_plans
 from tensordict import TensorDict
 
 import lw_torchrl as lw
-from lw_torchrl.evaluation.many_plans import _PlanOfRow, evaluate_plans
 from lw_torchrl.language.tasks import task_id
 
 PLANS = lw.load_plans("MT10")

@@ -4,10 +4,10 @@ import shutil
 from dataclasses import replace
 
 import pytest
+from lw_torchrl.paper.recipes import PRESETS
 from tiny_runs import ENSEMBLE, PRESET, TINY, TINY_ONE_SHOT, a_run, execute, rates, stop_training
 
 import lw_torchrl as lw
-from lw_torchrl.paper.recipes import PRESETS
 
 WATCHED = replace(PRESET, evaluations=4)
 AFTER = [53, 56, 58]  # of 60 steps

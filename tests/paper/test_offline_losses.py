@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from lw_torchrl.paper.offline_losses import L1CQLLoss, L1IQLLoss, L1TD3BCLoss, in_deviations_of_task
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
 import lw_torchrl as lw
-from lw_torchrl.paper.offline_losses import L1CQLLoss, L1IQLLoss, L1TD3BCLoss, in_deviations_of_task
 
 PLANS = lw.Plans([lw.load_plans("MT10")[task] for task in ("drawer-open", "reach")])
 SMALL = {"width": 16, "depth": 1}

@@ -9,10 +9,6 @@ from itertools import pairwise
 
 import pytest
 import torch
-
-import lw_torchrl as lw
-from lw_torchrl.data.behaviours import BEHAVIOURS
-from lw_torchrl.data.dataset import read_metadata
 from lw_torchrl.paper.offline import DISTRIBUTIONS, Advantages, BehaviourDataset, OfflineRun, offline_runs, write_table
 from lw_torchrl.paper.recipes import (
     MIXTURES,
@@ -24,6 +20,10 @@ from lw_torchrl.paper.recipes import (
     Portion,
 )
 from lw_torchrl.paper.runs import EVALUATION_SEED, Work, execute_run
+
+import lw_torchrl as lw
+from lw_torchrl.data.behaviours import BEHAVIOURS
+from lw_torchrl.data.dataset import read_metadata
 
 PLANS = lw.load_plans("MT10")
 TINY = OfflineRecipe(steps=6, value_steps=6, batch_size=10, width=16, depth=1, critic_depth=1)

@@ -7,6 +7,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from lw_torchrl.paper import imitation, runs
+from lw_torchrl.paper.imitation import SCRIPTED, ImitationRun
+from lw_torchrl.paper.recipes import PRESETS, SETTINGS, Member
+from lw_torchrl.paper.runs import load_result
 from tiny_runs import (
     ENSEMBLE,
     FOCUS,
@@ -27,10 +31,6 @@ from tiny_runs import (
 
 import lw_torchrl as lw
 from lw_torchrl.modules import METHODS
-from lw_torchrl.paper import imitation, runs
-from lw_torchrl.paper.imitation import SCRIPTED, ImitationRun
-from lw_torchrl.paper.recipes import PRESETS, SETTINGS, Member
-from lw_torchrl.paper.runs import load_result
 from lw_torchrl.training.files import demonstration_seeds
 
 

@@ -6,11 +6,11 @@ from functools import partial
 
 import pytest
 import torch
+from lw_torchrl.paper import online
+from lw_torchrl.paper.online import Elsewhere, OnlineRun, tune_step
 
 import lw_torchrl as lw
 from lw_torchrl.evaluation import PlanUse, weakest_step
-from lw_torchrl.paper import online
-from lw_torchrl.paper.online import Elsewhere, OnlineRun, tune_step
 
 PLANS = lw.load_plans("MT10")
 

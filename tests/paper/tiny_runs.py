@@ -5,10 +5,11 @@ from dataclasses import replace
 from functools import partial
 from unittest.mock import patch
 
-import lw_torchrl as lw
 from lw_torchrl.paper import runs
 from lw_torchrl.paper.imitation import ImitationRun
 from lw_torchrl.paper.recipes import PRESETS, DataSetting, Execution, Member
+
+import lw_torchrl as lw
 
 PLANS = lw.load_plans("MT50")
 TINY = DataSetting("tiny", "reach", 2)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 
 import pytest
+from lw_torchrl.planners.comparing import compare_plans, no_plans, write_report
 
 import lw_torchrl as lw
 from lw_torchrl.planners import answer_path
 from lw_torchrl.planners import comparing as module
 from lw_torchrl.planners.answer_files import ignored_files
-from lw_torchrl.planners.comparing import compare_plans, no_plans, write_report
 
 PLANS = lw.load_plans("MT10")
 SHORT = {"episodes": 4, "max_steps": 60, "progress": False}

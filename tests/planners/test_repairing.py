@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 from fake_server import PLANS, FakeServer, asked_for, completion, serving
+from lw_torchrl.planners.comparing import compare_plans
 
 import lw_torchrl as lw
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.structured import write_structured
 from lw_torchrl.language.tasks import TASKS
 from lw_torchrl.planners.checking import check_plan
-from lw_torchrl.planners.comparing import compare_plans
 from lw_torchrl.planners.repairing import plan_facts, repair_plans
 
 

@@ -6,11 +6,11 @@ from dataclasses import asdict, replace
 
 import pytest
 import torch
+from lw_torchrl.paper.imitation import ImitationRun
+from lw_torchrl.paper.recipes import PRESETS, SETTINGS
 from small_training import CONFIG, assert_same, collect_demos, everything, make_actor, make_replay, make_trainer
 
 import lw_torchrl as lw
-from lw_torchrl.paper.imitation import ImitationRun
-from lw_torchrl.paper.recipes import PRESETS, SETTINGS
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning
 from lw_torchrl.training.files import read_description
 

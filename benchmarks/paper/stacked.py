@@ -72,7 +72,7 @@ class StackedBehavioralCloning(Training):
         ...     load = lambda: lw.LanguageWorldExperienceReplay(root + "/demos", transform=lw.QAFTransform(plans))
         ...     actors = [lw.PlanConditionedActor(plans), lw.PlanConditionedActor(plans)]
         ...     config = lw.BehavioralCloningConfig(steps=5, batch_size=16)
-        ...     lw.training.StackedBehavioralCloning(actors, [load(), load()], config).train().shape
+        ...     StackedBehavioralCloning(actors, [load(), load()], config).train().shape
         torch.Size([2])
 
     Source: paper section 'Conditional Plan Experiments', which trains 50 one-shot models; ``torch.func``.

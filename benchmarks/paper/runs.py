@@ -3,22 +3,20 @@
 import json
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import differences
 from lw_torchrl._devices import CPU, check_device
-from lw_torchrl._files import held, write_json, write_text
+from lw_torchrl._files import held
 from lw_torchrl.data import collect_demonstrations
-from lw_torchrl.evaluation import EvaluationResult, MethodComparison, evaluate, summarize
+from lw_torchrl.evaluation import EvaluationResult, evaluate
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import TASKS
-from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.suites.suite import find_suite
 from lw_torchrl.training import load_actor, save_actor
@@ -37,9 +35,7 @@ class Work:
     out: Path
     tasks: tuple[str, ...] = ()
     progress: bool = True
-    text_encoder: TextEncoder | None = None
     device: torch.device = CPU
-    make_logger: Callable[[Path], Logger] | None = None
 
 
 class Dataset(ABC):
@@ -68,7 +64,6 @@ class Run(ABC):
     method: str
     seed: int  # of data, initial weights and minibatches
     episodes: int  # evaluated for each task
-    encoder_name: str = ""  # that of the text encoder, for another than ours: "my_texts:encode"
     any_device = False  # whether its networks can be trained and evaluated on a GPU
 
     @property
@@ -144,42 +139,31 @@ def execute_run(
     *,
     tasks: str | Sequence[str] | None = None,
     progress: bool = True,
-    text_encoder: TextEncoder | None = None,
     device: str | torch.device = "cpu",
-    make_logger: Callable[[Path], Logger] | None = None,
 ) -> EvaluationResult:
-    """Do a run, or what is left of it; its result is written last, to ``out/run.folder/results.json``.
+    """Execute a run, or the rest of it, and return its evaluation. Its result is written last, to results.json.
 
     Args:
-        run: what to do.
+        run: the run.
         plans: a plan for each of its tasks.
         out: the experiments' folder.
-        tasks: to evaluate, of a run of the paper; of one with a policy for each target, the targets among them.
-        text_encoder: of a run of the paper, texts to vectors (n, E) float32, which its ``encoder_name`` names.
-        device: of a run of the paper, where networks work; a run begun on one can be finished on another.
-        make_logger: of an online run, a TorchRL logger for a policy's file, for the training.
+        tasks: the tasks to evaluate; None for all of the run.
+        progress: show progress bars.
+        device: device of the networks, for runs that support others than the CPU.
 
     Returns:
-        The evaluation of the last step's policy on seeds that no training used, action noise 0.1. ``config["run"]``
-        says what was done, ``config["seconds"]`` how long this call took. More is said by some runs:
-
-        - of the paper, of several evaluations, ``config["best"]``: ``of`` how many ``rates`` has each task's best
-          success rate. The earlier ones are in ``evaluations/<steps>.json``;
-        - online, ``config["history"]``: what became of each round. Of a run of one step, ``config["tuned"]``: which;
-          ``config["before"]``: the start's success in the same episodes; ``config["elsewhere"]``: as of
-          :class:`~lw_torchrl.paper.online.Elsewhere`.
+        The evaluation of the last step's policy on seeds that no training used, with action noise 0.1.
+        ``config["run"]`` describes the run, ``config["seconds"]`` is the duration of this call, and with several
+        evaluations ``config["best"]`` holds their number and each task's best success rate among them.
 
     Raises:
-        ValueError: ``out`` holds the same run of another configuration, or evaluated in other tasks.
+        ValueError: ``out`` holds the same run with another configuration, or evaluated on other tasks.
 
     Source: paper section 'Conditional Plan Experiments'.
     """
-    work = Work(plans, out, run.evaluated(tasks), progress, text_encoder, check_device("device", device), make_logger)
+    work = Work(plans, out, run.evaluated(tasks), progress, check_device("device", device))
     if work.device.type != "cpu" and not run.any_device:
         raise ValueError(f"device must be the CPU for {type(run).__name__}, got {device}")
-    if (text_encoder is None) != (not run.encoder_name):
-        named = f"the run has an encoder_name, and only there; it has {run.encoder_name!r}"
-        raise ValueError(f"text_encoder must be given where {named}")
     if (done := load_result(run, plans, out, work.tasks)) is not None:
         return done
     with held(out / run.folder, "out", folder=True, wait=True):
@@ -209,29 +193,6 @@ def kept_policy(file: Path, described: dict[str, Any], train: Callable[[Path], M
     checkpoint.unlink(missing_ok=True)  # another process may have done so, where files cannot be locked
     check_description(file, described)
     return load_actor(file)
-
-
-def joined(results: Sequence[EvaluationResult]) -> EvaluationResult:
-    """One result of those of several tasks, evaluated alike."""
-    tasks = [task for one in results for task in one.config["tasks"]]
-    return EvaluationResult(results[0].config | {"tasks": tasks}, tuple(e for one in results for e in one.episodes))
-
-
-def compare(
-    results: Iterable[tuple[Run, EvaluationResult]], published: Mapping[str, Mapping[str, float]] | None = None
-) -> MethodComparison:
-    """Runs compared by their labels, over seeds, beside published rates; those of several tasks are taken together."""
-    found: dict[str, dict[int, list[EvaluationResult]]] = {}
-    for run, result in results:
-        found.setdefault(run.label, {}).setdefault(run.seed, []).append(result)
-    each = {label: summarize({seed: joined(of) for seed, of in seeds.items()}) for label, seeds in found.items()}
-    return MethodComparison(each, published)
-
-
-def write_summary(path: Path, text: str, numbers: Mapping[str, Any]) -> None:
-    """A table as ``path``.md, its numbers as ``path``.json."""
-    write_json(path.with_name(f"{path.name}.json"), numbers)
-    write_text(path.with_name(f"{path.name}.md"), text)
 
 
 def own_tasks(plans: Plans) -> dict[str, Any]:

@@ -9,21 +9,22 @@ import torch
 from torch import Tensor
 from torchrl.objectives import CQLLoss, IQLLoss, LossModule, TD3BCLoss
 
+from benchmarks.paper import recipes
+from benchmarks.paper.comparison import compare, plot_methods, write_summary
+from benchmarks.paper.offline_losses import L1CQLLoss, L1IQLLoss, L1TD3BCLoss
+from benchmarks.paper.recipes import OfflineMethod, OfflineRecipe, OfflineTable, Portion
+from benchmarks.paper.runs import Dataset, Run, Work, kept_policy, own_tasks, plain
 from lw_torchrl._checks import check_choice
 from lw_torchrl._files import held
 from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
 from lw_torchrl.data import BEHAVIOURS, LanguageWorldExperienceReplay, TaskBalancedSampler
-from lw_torchrl.evaluation import EvaluationResult, plot_methods
+from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules import DescriptorEncoder, PlanEncoder, QValue, Value
 from lw_torchrl.modules.policy import Encoder, Policy
 from lw_torchrl.modules.tables import METHODS, make_policy
 from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
-from lw_torchrl.paper import recipes
-from lw_torchrl.paper.offline_losses import L1CQLLoss, L1IQLLoss, L1TD3BCLoss
-from lw_torchrl.paper.recipes import OfflineMethod, OfflineRecipe, OfflineTable, Portion
-from lw_torchrl.paper.runs import Dataset, Run, Work, compare, kept_policy, own_tasks, plain, write_summary
 from lw_torchrl.training import OfflineConfig, OfflineTrainer
 from lw_torchrl.training.behavioral_cloning import bc_loss
 from lw_torchrl.training.envelope import check_same_description

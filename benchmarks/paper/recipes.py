@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.resources import files
 from itertools import product
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -94,10 +94,9 @@ def _preset(name: str, every: Mapping[str, Any], own: Mapping[str, Any]) -> Pres
     return Preset(**given)
 
 
-_TABLE = read_toml(files("lw_torchrl.paper") / "data" / "recipes.toml", ValueError)
+_TABLE = read_toml(Path(__file__).parent / "data" / "recipes.toml", ValueError)
 SETTINGS = MappingProxyType({name: DataSetting(name, **setting) for name, setting in _TABLE["settings"].items()})
 EXECUTIONS = {name: Execution(name, **_tuples(execution)) for name, execution in _TABLE["executions"].items()}
-TARGET = EXECUTIONS["target"]
 _MEMBERS = {name: Member(**member) for name, member in _TABLE["members"].items()}
 PRESETS: Mapping[str, Mapping[str, Preset]] = MappingProxyType(
     {
@@ -121,7 +120,7 @@ class OfflineMethod:
     """How a policy is learned from a mixture."""
 
     name: str  # in folders and tables
-    loss: str  # a name of :data:`lw_torchrl.paper.offline.DISTRIBUTIONS`
+    loss: str  # a name of :data:`benchmarks.paper.offline.DISTRIBUTIONS`
     keep: EpisodeFilter | None = None  # which episodes it sees; None for all
     critic: bool = False  # whether it has a critic, which may be conditioned otherwise than the actor
     version: int = 1  # raised by 1 whenever the method changes, so that earlier results are refused
@@ -170,7 +169,7 @@ def _table(tasks: str, runs: Sequence[Mapping[str, Any]]) -> OfflineTable:
     return OfflineTable(tasks, rows)
 
 
-_TABLES = read_toml(files("lw_torchrl.paper") / "data" / "offline.toml", ValueError)
+_TABLES = read_toml(Path(__file__).parent / "data" / "offline.toml", ValueError)
 TASK_SETS = MappingProxyType({"MT10": MT10} | {name: tuple(tasks) for name, tasks in _TABLES["task_sets"].items()})
 MIXTURES: Mapping[str, tuple[Portion, ...]] = MappingProxyType(
     {name: tuple(Portion(*portion) for portion in mixture.items()) for name, mixture in _TABLES["mixtures"].items()}

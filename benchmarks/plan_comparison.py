@@ -1,4 +1,9 @@
-"""compare_plans: recorded answers of models, decoded, carried out by scripted skills, and shown."""
+"""python -m benchmarks.plan_comparison DIR: compare language models by the plans that they wrote.
+
+Every answer is decoded, and all plans are carried out by scripted skills in one simulation.
+"""
+
+from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -8,12 +13,15 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Literal
 
-from lw_torchrl._checks import counted, differences
-from lw_torchrl._files import AnyPath, read_json, write_json, write_text
+import torch
+import tyro
+
+from benchmarks.many_plans import evaluate_plans
+from benchmarks.paper.published import published_plans
+from lw_torchrl._checks import differences
+from lw_torchrl._files import read_json, write_json, write_text
 from lw_torchrl._progress import Progress
 from lw_torchrl.evaluation.figures import plot_sorted_tasks
-from lw_torchrl.evaluation.many_plans import evaluate_plans
-from lw_torchrl.evaluation.published import published_plans
 from lw_torchrl.evaluation.statistics import mean_rate
 from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.canonical import worth
@@ -21,7 +29,6 @@ from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plan_decoding import decode_plan
 from lw_torchrl.language.plan_files import save_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.language.tasks import TASKS, Tasks
 from lw_torchrl.planners.answer_files import answer_text, recorded_answers
 
 _SAVE_SECONDS = 5.0
@@ -30,7 +37,7 @@ Group = tuple[str, str]  # model, format
 
 @dataclass(frozen=True)
 class ComparedAnswer:
-    """How an answer fared."""
+    """A decoded answer and the success of its plan."""
 
     model: str
     format: str
@@ -133,68 +140,55 @@ class PlanComparison:
 
 
 def compare_plans(
-    source: AnyPath,
+    source: Path,
     *,
     episodes: int = 20,
     seed: int = 1000,
     choose: Literal["random", "first"] = "random",
     noise_scale: float = 0.0,
     max_steps: int = 500,
-    num_envs: int = 256,
-    num_threads: int | None = None,
-    tasks: Tasks = TASKS,
-    resume: AnyPath | None = None,
+    resume: Path | None = None,
     progress: bool = True,
 ) -> PlanComparison:
-    """Decode recorded answers, and carry out all their plans by scripted skills in one simulation.
+    """Decode recorded answers, and carry out all plans by scripted skills in one simulation.
 
     Args:
         source: a folder or a .jsonl file, as for :class:`~lw_torchrl.FilePlanner`.
-        episodes, seed, choose, noise_scale, max_steps, num_envs, num_threads: as for
-            :func:`~lw_torchrl.evaluation.evaluate_plans`.
-        tasks: where tasks' names are looked up, as from :func:`~lw_torchrl.load_tasks`.
-        resume: a file that keeps how plans fared, every few seconds; what it has is not run again.
+        episodes, seed, choose, noise_scale, max_steps: as for :func:`~benchmarks.many_plans.evaluate_plans`.
+        resume: a file for intermediate results, written every few seconds. Plans in it are not carried out again.
         progress: show progress bars.
-
-    Example:
-        >>> import lw_torchrl as lw
-        >>> path = lw.planners.answer_path("answers", "by hand", "chain_py", "reach", 0)
-        >>> path.parent.mkdir(parents=True)
-        >>> _ = path.write_text(lw.encode_plan(lw.load_plans("MT10")["reach"], "chain_py"))
-        >>> compare_plans("answers", episodes=2).mean("by hand", "chain_py")
-        1.0
 
     Source: paper section 'LLM Experiments'.
     """
     found = recorded_answers(source)
     settings = dict(episodes=episodes, seed=seed, choose=choose, noise_scale=noise_scale, max_steps=max_steps)
-    fared = _read(resume, settings)
+    successes = _read(resume, settings)
     listed = [(model, *place, text) for model, answers in found.items() for place, text in answers.items()]
     decoded = []
     with Progress("decoding", len(listed), "answer", show=progress) as bar:
         for _, format, task, _, text in listed:
-            decoded.append(decode_plan(answer_text(text), task, format, tasks=tasks))
+            decoded.append(decode_plan(answer_text(text), task, format))
             bar.update(1)
     plans = {_key(one.scripted): one.scripted for one in decoded if one.scripted is not None}
-    to_do = {key: plan for key, plan in plans.items() if key not in fared}
+    to_do = {key: plan for key, plan in plans.items() if key not in successes}
     if to_do:
         keys, saved = list(to_do), [monotonic()]
 
         def note(index: int, success: tuple[bool, ...]) -> None:
-            fared[keys[index]] = success
+            successes[keys[index]] = success
             if resume is not None and monotonic() - saved[0] > _SAVE_SECONDS:
-                _write(resume, settings, fared)
+                _write(resume, settings, successes)
                 saved[0] = monotonic()
 
-        options: dict[str, Any] = {**settings, "num_envs": num_envs, "num_threads": num_threads, "progress": progress}
+        options: dict[str, Any] = {**settings, "progress": progress}
         evaluate_plans(list(to_do.values()), on_plan=note, **options)
         if resume is not None:
-            _write(resume, settings, fared)
+            _write(resume, settings, successes)
     answers = []
     for (model, format, task, attempt, _), one in zip(listed, decoded, strict=True):
         reason = one.reason or ("" if one.scripted is not None else "no step has a skill near a scripted one")
         steps = 0 if one.scripted is None else len(one.scripted.steps)
-        success = (False,) * episodes if one.scripted is None else fared[_key(one.scripted)]
+        success = (False,) * episodes if one.scripted is None else successes[_key(one.scripted)]
         dropped = len(one.steps) - steps
         told = (False, 0.0, 0.0) if one.plan is None else worth(one.plan)
         said = (model, format, task, attempt, steps, dropped, reason, success)
@@ -210,31 +204,23 @@ def _mean(numbers: Sequence[float]) -> float:
     return sum(numbers) / len(numbers) if numbers else float("nan")
 
 
-def _read(file: AnyPath | None, settings: Mapping[str, Any]) -> dict[str, tuple[bool, ...]]:
-    if file is None or not Path(file).exists():
+def _read(file: Path | None, settings: Mapping[str, Any]) -> dict[str, tuple[bool, ...]]:
+    if file is None or not file.exists():
         return {}
-    found = read_json(file, "resume: the kept results")
-    was = found.get("settings")
-    if was != settings:
-        differ = ", ".join(differences(was if isinstance(was, dict) else {}, settings))
-        raise ValueError(f"resume: {str(file)!r} is of other settings: {differ}; choose another folder, or delete it")
-    fared = found.get("fared")
-    said = fared.values() if isinstance(fared, dict) else [None]
-    if not all(isinstance(one, str) and len(one) == settings["episodes"] and not set(one) - {*"01"} for one in said):
-        raise ValueError(f"resume: {str(file)!r} is damaged; delete it to run all plans again")
-    return {key: tuple(one == "1" for one in found["fared"][key]) for key in found["fared"]}
+    kept = read_json(file, "resume: the intermediate results")
+    if kept["settings"] != settings:
+        differ = ", ".join(differences(kept["settings"], settings))
+        raise ValueError(f"resume: {str(file)!r} has other settings: {differ}; choose another folder, or delete it")
+    return {key: tuple(bit == "1" for bit in bits) for key, bits in kept["success"].items()}
 
 
-def _write(file: AnyPath, settings: Mapping[str, Any], fared: Mapping[str, Sequence[bool]]) -> None:
-    bits = {key: _bits(success) for key, success in fared.items()}
-    write_json(Path(file), {"settings": dict(settings), "fared": bits})
+def _write(file: Path, settings: Mapping[str, Any], successes: Mapping[str, Sequence[bool]]) -> None:
+    bits = {key: _bits(success) for key, success in successes.items()}
+    write_json(file, {"settings": dict(settings), "success": bits})
 
 
 def _bits(success: Sequence[bool]) -> str:
     return "".join(map(str, map(int, success)))
-
-
-_REASONS = 3  # the commonest are told of
 
 
 def write_report(comparison: PlanComparison, folder: Path) -> list[Path]:
@@ -271,27 +257,25 @@ any; the best by the even episodes, and counted in the odd ones.
     return [*(file for file in written if file.is_file()), folder / "best"]
 
 
-def no_plans(comparison: PlanComparison) -> list[str]:
-    """Lines that say how many answers have no plan, and the commonest reasons."""
+def no_plans(comparison: PlanComparison, most: int = 3) -> list[str]:
+    """Lines with the number of answers that have no plan, and the most frequent reasons."""
     reasons = [one.reason.replace(f" for {one.task}", " for the task") for one in comparison.answers if one.reason]
     if not reasons:
         return []
-    head = f"{counted(len(reasons), 'answer')} {'has' if len(reasons) == 1 else 'have'} no plan:"
-    return [head, *(f"{times}: {reason}" for reason, times in Counter(reasons).most_common(_REASONS))]
+    return [
+        f"answers without a plan: {len(reasons)}",
+        *(f"{times}: {why}" for why, times in Counter(reasons).most_common(most)),
+    ]
 
 
 def _write_best(comparison: PlanComparison, folder: Path) -> None:
-    """The best plans in place of those of an earlier report; files of other kinds stay."""
-    written: list[Path] = []
+    """Write the best plans; .plan files of an earlier report are deleted."""
+    for format in PLAN_FORMATS:
+        for path in folder.glob(f"*/{format}/*.plan"):
+            path.unlink()
     for model, format in comparison.groups:
         if plans := comparison.best_plans(model, format):
-            written += save_plans(plans, folder / model / format)
-    old = [path for format in PLAN_FORMATS for path in folder.glob(f"*/{format}/*.plan")]
-    for path in set(old).difference(written):
-        path.unlink()
-        for empty in (path.parent, path.parent.parent):
-            with suppress(OSError):  # it is not empty, or gone
-                empty.rmdir()
+            save_plans(plans, folder / model / format)
 
 
 def _draw(
@@ -311,3 +295,42 @@ def _draw(
             if common <= set(means):
                 published[f"{model}, {format}, published"] = {task: means[task] for task in common}
     plot_sorted_tasks(even, file, published=published, order="own", of="answer", title=title)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Compare models by the plans that they wrote. Stopped and started again, the command resumes.
+
+    Writes results.json, summary.md, models.png and formats.png, and to best/MODEL/FORMAT the plan of each task that
+    succeeded most often, for --plans of other commands.
+    """
+
+    source: tyro.conf.Positional[Path]
+    """A folder MODEL/FORMAT/TASK-ATTEMPT.EXT, as `lw-torchrl plan generate` writes it, or a .jsonl file of answers."""
+    episodes: int = 20
+    """Episodes per plan, with the same initial states for all plans of a task."""
+    seed: int = 1000
+    """Random seed of initial states, goals and the choice among true steps."""
+    choose: Literal["random", "first"] = "random"
+    """Which of several true steps acts: a random one, as in the paper, or the first."""
+    noise: float = 0.0
+    """Standard deviation of the noise on the executed action."""
+    max_steps: int = 500
+    """Steps of an episode."""
+    out: Path = Path("runs/compare")
+    """Folder for the results."""
+
+
+def main(args: Arguments) -> None:
+    settings: dict[str, Any] = {"episodes": args.episodes, "seed": args.seed, "choose": args.choose}
+    settings |= {"noise_scale": args.noise, "max_steps": args.max_steps}
+    comparison = compare_plans(args.source, resume=args.out / "success.json", **settings)
+    print(f"{comparison.table()}\n\n{comparison.task_table()}\n")
+    print("\n".join(no_plans(comparison)))
+    for path in write_report(comparison, args.out):
+        print(f"written to {path}")
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main(tyro.cli(Arguments))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from functools import cache
-from importlib.resources import files
+from pathlib import Path
 from typing import Any, Literal
 
 from lw_torchrl._checks import check_choice, checked
@@ -16,7 +16,7 @@ WHICH = {"last": "published, last", "best": "published, best of the last 10 eval
 
 @cache
 def _table(name: str = "published") -> dict[str, Any]:
-    return json.loads((files("lw_torchrl.evaluation") / f"data/{name}.json").read_text(encoding="utf-8"))
+    return json.loads((Path(__file__).parent / "data" / f"{name}.json").read_text("utf-8"))
 
 
 @checked

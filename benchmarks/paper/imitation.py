@@ -10,6 +10,9 @@ from typing import Any, Literal
 import torch
 from torchrl.envs import Compose
 
+from benchmarks.paper.recipes import DataSetting, Execution, Member, Preset
+from benchmarks.paper.runs import Dataset, Run, Work, load_result, own_tasks, plain
+from benchmarks.paper.stacked import StackedBehavioralCloning
 from lw_torchrl._checks import unknown_name
 from lw_torchrl._progress import Progress
 from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, TaskBalancedSampler
@@ -19,9 +22,7 @@ from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.modules import ActorEnsemble, DemonstratedActor, ScriptedSkillActor
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.tables import METHODS, make_policy
-from lw_torchrl.paper.recipes import DataSetting, Execution, Member, Preset
-from lw_torchrl.paper.runs import Dataset, Run, Work, joined, load_result, own_tasks, plain
-from lw_torchrl.training import BehavioralCloningTrainer, StackedBehavioralCloning
+from lw_torchrl.training import BehavioralCloningTrainer
 from lw_torchrl.training.envelope import check_description
 from lw_torchrl.training.files import describe_data, load_actor, save_actor
 from lw_torchrl.transforms import RandomYaw
@@ -95,7 +96,6 @@ class ImitationRun(Run):
     preset: Preset  # how to train
     episodes: int = 20  # evaluated for each task
     plans_name: str = ""  # part of the folder's name, for other plans than ours
-    encoder_name: str = ""  # that of the text encoder, for another than ours: "my_texts:encode"
     any_device = True
 
     def __post_init__(self) -> None:
@@ -104,9 +104,8 @@ class ImitationRun(Run):
 
     @property
     def group(self) -> Path:
-        """The folder of the setting, the preset, the plans and the texts: what methods are compared in."""
-        own = self.plans_name, self.encoder_name.replace(":", ".")
-        return Path(self.setting.name) / "-".join(filter(None, (self.preset.name, *own)))
+        """The folder of the setting, the preset and the plans, within which methods are compared."""
+        return Path(self.setting.name) / "-".join(filter(None, (self.preset.name, self.plans_name)))
 
     @property
     def folder(self) -> Path:
@@ -157,8 +156,6 @@ class ImitationRun(Run):
                 described["evaluations"] = self.preset.evaluations
         if not self.reads_plans:
             described |= own_tasks(plans)
-        if self.encoder_name and self.method != SCRIPTED:
-            described["text_encoder"] = self.encoder_name
         return plain(described)
 
     def learn(self, work: Work) -> tuple[Any, dict[str, Any]]:
@@ -171,7 +168,7 @@ class ImitationRun(Run):
         if all(file.is_file() for file in files):
             for file in files:
                 check_description(file, described)
-                policies.append(load_actor(file, text_encoder=work.text_encoder))
+                policies.append(load_actor(file))
         else:
             members, replays = self._train(work, targets or ())
             for file, replay, *actors in zip(files, replays, *members, strict=True):
@@ -230,7 +227,7 @@ class ImitationRun(Run):
                     if number < len(preset.members)
                     else Plans({t: work.plans[t] for t in resolve_tasks(self.setting.base)})
                 )
-                actors.append(make_policy(member.method, known, text_encoder=work.text_encoder, **member.options))
+                actors.append(make_policy(member.method, known, **member.options))
             checkpoint = work.out / self.folder / f"checkpoint-{number}.zip"
             options: dict[str, Any] = {"checkpoint": checkpoint, "progress": work.progress, "device": work.device}
             trainer: BehavioralCloningTrainer | StackedBehavioralCloning
@@ -263,6 +260,12 @@ class ImitationRun(Run):
         transform = Compose(*([] if queries is None else [queries]), *member.turned(actor))
         options |= {"label": self.preset.label, "after_success": self.preset.after_success, "device": work.device}
         return LanguageWorldExperienceReplay(roots, sampler=sampler, transform=transform, **options)
+
+
+def joined(results: Sequence[EvaluationResult]) -> EvaluationResult:
+    """One result of those of several tasks, evaluated alike."""
+    tasks = [task for one in results for task in one.config["tasks"]]
+    return EvaluationResult(results[0].config | {"tasks": tasks}, tuple(e for one in results for e in one.episodes))
 
 
 def _mean(actors: Sequence[Policy]) -> Any:

@@ -12,7 +12,6 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
-from lw_torchrl._checks import Count, Scale, checked
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.evaluation.running import ROWS, running
 from lw_torchrl.language.plans import ConditionalPlan, Plans
@@ -25,18 +24,17 @@ from lw_torchrl.suites.suite import Suite, find_suite
 _PLACE = "place"
 
 
-@checked
 def evaluate_plans(
     plans: Sequence[ConditionalPlan],
     *,
-    episodes: Count = 20,
+    episodes: int = 20,
     seed: int,
     choose: Literal["random", "first"] = "random",
     skills: Mapping[str, ScriptedSkill] | None = None,
-    noise_scale: Scale = 0.0,
+    noise_scale: float = 0.0,
     max_steps: int | None = None,
     suite: str | Suite | None = None,
-    num_envs: Count = ROWS,
+    num_envs: int = ROWS,
     num_threads: int | None = None,
     progress: bool = True,
     on_plan: Callable[[int, tuple[bool, ...]], object] | None = None,
@@ -53,15 +51,6 @@ def evaluate_plans(
         skills: the scripted skills by text; None for the shipped ones, :func:`~lw_torchrl.load_skills`.
         noise_scale, max_steps, suite, num_envs, num_threads, progress: as for :func:`evaluate`.
         on_plan: told the index of a plan, and how it fared, once all its episodes are done.
-
-    Raises:
-        ValueError: a wrong argument, a skill that is no scripted one, or plans that mean different tasks by one name.
-
-    Example:
-        >>> import lw_torchrl as lw
-        >>> plan = lw.load_plans("MT10")["reach"]
-        >>> lw.evaluation.evaluate_plans([plan, plan], episodes=2, seed=1_000)
-        [(True, True), (True, True)]
 
     Source: paper section 'LLM Experiments', 'Scripted Skills'.
     """
