@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 from held_evaluators import PLANS, ROWS, evaluated, learned, same
-from lw_torchrl.evaluation.evaluator_report import condition_drift
 from pictures import why_no_pictures
 from random_states import PLANS as STATES_PLANS
 from random_states import RandomStates
@@ -13,6 +12,7 @@ from torch import nn
 from torchrl.envs import Compose, SerialEnv, TransformedEnv, check_env_specs
 
 import lw_torchrl as lw
+from benchmarks.evaluator_report import condition_drift
 from lw_torchrl._devices import BLOCK
 from lw_torchrl.evaluation.counterfactuals import TrueAnswers, own_evaluators, with_true_answers
 from lw_torchrl.record.rollouts import run_recorded

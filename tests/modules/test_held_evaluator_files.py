@@ -6,11 +6,11 @@ import zipfile
 import pytest
 import torch
 from held_evaluators import PLANS, evaluated, learned, letters, same
-from lw_torchrl.evaluation.evaluator_report import condition_drift
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import lw_torchrl as lw
+from benchmarks.evaluator_report import condition_drift
 from lw_torchrl._tensor_archive import write_archive
 from lw_torchrl.training.behavioral_cloning import EvaluatorAnchor
 

@@ -10,9 +10,9 @@ import sys
 
 import pytest
 from commands import fails
-from lw_torchrl.planners.comparing import compare_plans
 
 import lw_torchrl as lw
+from benchmarks.plan_comparison import compare_plans
 from lw_torchrl.planners import model_server
 from lw_torchrl.planners.model_server import serve_model
 

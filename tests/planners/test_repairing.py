@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 from fake_server import PLANS, FakeServer, asked_for, completion, serving
-from lw_torchrl.planners.comparing import compare_plans
 
 import lw_torchrl as lw
+from benchmarks.plan_comparison import compare_plans
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.structured import write_structured
 from lw_torchrl.language.tasks import TASKS

@@ -1,4 +1,4 @@
-"""Terms on skills' latents in training: none changes nothing, and one is obeyed by both trainers."""
+"""Terms on skills' latents in training: weight 0 changes nothing, others add to the loss."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ from dataclasses import asdict, replace
 
 import pytest
 import torch
-from lw_torchrl.paper.imitation import ImitationRun
-from lw_torchrl.paper.recipes import PRESETS, SETTINGS
 from small_training import CONFIG, assert_same, collect_demos, everything, make_actor, make_replay, make_trainer
 
 import lw_torchrl as lw
-from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning
+from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.training.files import read_description
 
 BEFORE = {
@@ -76,38 +74,6 @@ def test_stopped_and_started_again_it_ends_with_the_same_bits(demos, tmp_path, s
     assert_same(everything(resumed), everything(whole))
 
 
-def test_every_loss_is_the_one_it_has_alone(demos):
-    config = replace(ON, steps=30)
-    actors = [make_actor(seed) for seed in range(3)]
-    together = StackedBehavioralCloning(actors, [make_replay(demos) for _ in actors], config, progress=False)
-    losses = torch.stack([together.step() for _ in range(30)])
-    together.write_back()
-    for number in range(3):
-        alone = make_trainer(demos, actor=make_actor(number), config=replace(config, seed=config.seed + number))
-        own = torch.stack([alone.step() for _ in range(30)])
-        torch.testing.assert_close(losses[:, number], own, atol=1e-4, rtol=1e-4)
-        weight = actors[number].encoder.texts[0].weight
-        torch.testing.assert_close(weight, alone.actor.encoder.texts[0].weight, atol=1e-3, rtol=1e-3)
-    plain = make_trainer(demos, actor=make_actor(0), config=replace(CONFIG, steps=30))
-    assert losses[0, 0] - plain.step() > 0.05
-
-
-def test_stacked_it_resumes_too(demos, tmp_path):
-    def trainer(checkpoint=None):
-        actors = [make_actor(seed) for seed in range(2)]
-        replays = [make_replay(demos) for _ in actors]
-        return StackedBehavioralCloning(actors, replays, ON, checkpoint=checkpoint, progress=False)
-
-    whole, path = trainer(), tmp_path / "c.zip"
-    losses = torch.stack([whole.step() for _ in range(8)])
-    first = trainer(path)
-    for _ in range(4):
-        first.step()
-    first.save()
-    second = trainer(path)
-    assert torch.equal(torch.stack([second.step() for _ in range(4)]), losses[4:])
-
-
 def test_without_it_files_say_what_they_said_and_no_term_is_taken(demos, tmp_path, monkeypatch):
     """A file from before goes on, and so does one of now in the library of before."""
     path = tmp_path / "c.zip"
@@ -131,16 +97,6 @@ def test_a_checkpoint_of_another_weight_is_refused(demos, tmp_path):
             make_trainer(demos, path, config=other)
 
 
-def test_a_run_says_of_its_training_what_it_said():
-    recipe = PRESETS["strong"]["zero-shot"]
-    described = ImitationRun(SETTINGS["zero-shot"], "pcbc", 0, recipe).describe(lw.load_plans("MT50"))
-    assert set(described["training"]) == BEFORE
-    with_it = replace(recipe, training=replace(recipe.training, latent_contrast=0.1))
-    described = ImitationRun(SETTINGS["zero-shot"], "pcbc", 0, with_it).describe(lw.load_plans("MT50"))
-    assert described["training"]["latent_contrast"] == 0.1
-    assert "latent_consistency" not in described["training"]
-
-
 @pytest.mark.parametrize("option", ["latent_consistency", "latent_contrast"])
 def test_what_is_refused(demos, option):
     for wrong in (-1.0, float("nan")):
@@ -150,6 +106,4 @@ def test_what_is_refused(demos, option):
     problem = f"{option} is for policies with plans, whose skills have latents; DescriptorConditionedActor has none"
     with pytest.raises(ValueError, match=problem):
         BehavioralCloningTrainer(lw.DescriptorConditionedActor("MT10"), make_replay(demos), config)
-    with pytest.raises(ValueError, match=problem):
-        StackedBehavioralCloning([lw.DescriptorConditionedActor("MT10")], [make_replay(demos)], config)
     BehavioralCloningTrainer(lw.DescriptorConditionedActor("MT10"), make_replay(demos), CONFIG)

@@ -86,6 +86,8 @@ def test_actors_that_differ_in_more_than_weights_and_plans_are_refused(demos):
 def test_the_actor_with_a_loss_that_is_not_finite_is_named(demos):
     broken = make("plan", 0)
     torch.nn.init.constant_(broken.head.network[0].weight, float("nan"))
-    trainer = StackedBehavioralCloning([make("plan", 0), broken], [replay(demos), replay(demos)], CONFIG, progress=False)
+    trainer = StackedBehavioralCloning(
+        [make("plan", 0), broken], [replay(demos), replay(demos)], CONFIG, progress=False
+    )
     with pytest.raises(ValueError, match="the loss of actor 1 is nan at step 0"):
         trainer.step()
