@@ -290,7 +290,7 @@ def _draw(
     even = {name: {task: found[task][:least] for task in sorted(common)} for name, found in rates.items()}
     published = {}
     for model, format in groups:
-        with suppress(ValueError):  # the paper has no such group
+        with suppress(KeyError):  # the paper has no such model
             means = {task: sum(one) / len(one) for task, one in published_plans(model, format).items()}
             if common <= set(means):
                 published[f"{model}, {format}, published"] = {task: means[task] for task in common}

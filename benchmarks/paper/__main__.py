@@ -168,7 +168,7 @@ def summarize_imitation(chosen: Sequence[ImitationRun], load: Any, out: Path) ->
                 best[label] = {task: [one["rates"][task] for one in rated] for task in rated[0]["rates"]}
         means = {label: {task: sum(of) / len(of) for task, of in rates.items()} for label, rates in best.items()}
         setting = members[-1].setting.name
-        comparison = compare(results, means | ({} if only_scripted else published_curves(setting, ("PCBC", "DC"))))
+        comparison = compare(results, means | ({} if only_scripted else published_curves(setting, "PCBC", "DC")))
         folder, curves = out / group, {} if only_scripted else published_curves(setting)
         print(f"\n{group}\n{comparison.headline()}")
         text = f"{comparison.headline()}\n\n{comparison.per_task()}\n"

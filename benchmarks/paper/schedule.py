@@ -130,7 +130,7 @@ def _ray(commands: Sequence[Sequence[str]]) -> Iterator[tuple[int, str | Excepti
     try:
         import ray
     except ImportError as error:
-        raise ImportError("--launcher ray needs Ray: pip install 'lw_torchrl[bench]'") from error
+        raise ImportError("--launcher ray needs Ray: pip install 'lw_torchrl[ray]'") from error
     started = not ray.is_initialized()
     if started:
         ray.init(log_to_driver=False, include_dashboard=False, logging_level=logging.WARNING)

@@ -64,17 +64,6 @@ class StackedBehavioralCloning(Training):
     Raises:
         ValueError: not as many buffers as actors, one twice, or actors of different options.
 
-    Example:
-        >>> import lw_torchrl as lw, tempfile
-        >>> plans = lw.load_plans("MT10")
-        >>> with tempfile.TemporaryDirectory() as root:
-        ...     _ = lw.collect_demonstrations("reach", episodes_per_task=1, root=root + "/demos", max_steps=80)
-        ...     load = lambda: lw.LanguageWorldExperienceReplay(root + "/demos", transform=lw.QAFTransform(plans))
-        ...     actors = [lw.PlanConditionedActor(plans), lw.PlanConditionedActor(plans)]
-        ...     config = lw.BehavioralCloningConfig(steps=5, batch_size=16)
-        ...     StackedBehavioralCloning(actors, [load(), load()], config).train().shape
-        torch.Size([2])
-
     Source: paper section 'Conditional Plan Experiments', which trains 50 one-shot models; ``torch.func``.
     """
 

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from lw_torchrl.cli import exchange, online, options
+from lw_torchrl.cli import exchange, options
 from lw_torchrl.cli.main import COMMANDS, GROUPS
 
 HEAVY = ("torch", "torchrl", "mujoco", "metaworld", "rerun", "matplotlib")
@@ -237,4 +237,3 @@ def test_the_words_of_the_command_line_are_those_of_the_library():
     assert tuple(BEHAVIOURS) == options.ACTORS
     assert get_args(exchange.ExchangeFormat) == FORMATS
     assert tuple(METHODS) == options.CONDITIONS
-    assert online.WEAKEST == WEAKEST
