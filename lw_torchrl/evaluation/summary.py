@@ -78,26 +78,16 @@ class Summary:
             },
         }
 
-    def table(self, beside: Mapping[str, Mapping[str, float]] | None = None) -> str:
-        """The headline, then a row per task, as text in columns.
-
-        Args:
-            beside: more columns, name to (task to rate); "-" where a task is
-                missing. Their names stand in full below the table.
-        """
-        columns = dict(beside or {})
-        head = "".join(f" {f'({k + 1})':>6}" for k in range(len(columns)))
+    def table(self) -> str:
+        """Return the headline, then a row per task, as text in columns."""
         solved = f"{self.solved} of {len(self.tasks)} tasks >= {self.threshold:g}"
         lines = [f"mean {self.mean}, IQM {self.iqm}; {solved}; {counted(len(self.seeds), 'seed')}"]
-        lines.append(f"{'task':28} {'mean':>6} {'min':>6} {'max':>6}{head}")
+        lines.append(f"{'task':28} {'mean':>6} {'min':>6} {'max':>6}")
         seeds = self.by_seed.values()
         total = TaskSummary(self.mean.value, min(seeds), max(seeds))
-        for name, found in [*self.per_task.items(), ("mean", total)]:
-            tasks = self.tasks if found is total else (name,)
-            there = [None if set(tasks) - set(rates) else _mean(rates, tasks) for rates in columns.values()]
-            cells = "".join(f" {'-':>6}" if rate is None else f" {rate:6.2f}" for rate in there)
-            lines.append(f"{name:28} {found.mean:6.2f} {found.min:6.2f} {found.max:6.2f}{cells}")
-        return "\n".join([*lines, *(f"({k + 1}) {name}" for k, name in enumerate(columns))])
+        for name, row in [*self.per_task.items(), ("mean", total)]:
+            lines.append(f"{name:28} {row.mean:6.2f} {row.min:6.2f} {row.max:6.2f}")
+        return "\n".join(lines)
 
 
 @checked
@@ -185,10 +175,6 @@ def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResul
                 raise ValueError(f"results must share {key}, got {got}")
     rates: dict[str, Any] = {task: [result.success_once[task] for result in named.values()] for task in tasks}
     return summarize_rates(rates, seeds=list(named), **options)
-
-
-def _mean(rates: Mapping[str, float], tasks: Sequence[str]) -> float:
-    return sum(rates[task] for task in tasks) / len(tasks)
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -23,7 +23,7 @@ needs_no_gpu = pytest.mark.skipif(torch.accelerator.is_available(), reason="need
 @pytest.mark.slow
 @pytest.mark.parametrize("which", ["not slow", "slow"])
 def test_on_a_pretend_device_nobody_waits(which):
-    paths = [str(HERE), *(str(HERE.parent / room) for room in ("training", "objectives", "paper")), *sys.path]
+    paths = [str(HERE), *(str(HERE.parent / room) for room in ("training", "objectives")), *sys.path]
     done = subprocess.run(
         [
             sys.executable,
