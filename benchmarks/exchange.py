@@ -1,4 +1,4 @@
-"""python -m benchmarks.exchange: 100,000 rows in each format of others, seconds out and in, and megabytes."""
+"""python -m benchmarks.exchange: seconds to export and import 100,000 rows in each format, and megabytes."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def main(
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
         made = lw.collect_demonstrations("MT10", episodes_per_task=episodes, root=root / "demos")
-        print(f"{made.num_steps} rows, ours: {_size(root / 'demos'):.1f} MB")
-        print("| format | out | in | MB |\n|---|---|---|---|")
+        print(f"{made.num_steps} rows, {_size(root / 'demos'):.1f} MB as a dataset")
+        print("| format | export | import | size |\n|---|---|---|---|")
         for kind in FORMATS:
             out, back = [], []
             for number in range(repeats + 1):

@@ -118,15 +118,6 @@ def _co_learning(settings: Settings, count: int) -> list[Row]:
     return _compare(name, draws, settings.pick(30, 3), rival, targets=True)
 
 
-class _Regrouping(lw.TaskBalancedSampler):
-    """The same sampler, that groups all rows again whenever one came."""
-
-    def add(self, index: object) -> None:
-        self._empty()
-
-    extend = add
-
-
 def _trajectories(count: int, task: torch.Tensor, first: int) -> TensorDict:
     """Rows with all that a collector gives, each trajectory of 500."""
     rows = _rows(count, task)
@@ -161,17 +152,14 @@ def _growing(settings: Settings, count: int) -> list[Row]:
         return turn
 
     rounds = settings.pick(15, 3)
-    regrouped = _Regrouping()
     draws = {
         "ours": balanced(lw.TaskBalancedSampler()),
-        "again": balanced(regrouped),
         "random": balanced(RandomSampler()),
     }
     found = take_turns(draws, rounds, warm_up=3)
     name = f"TaskBalancedSampler, {come} rows come and {BATCH} of {count:,} are drawn"
     unit = {"unit": "µs", "scale": 1e6}
     result = [
-        compare(name, found["ours"], "all rows grouped again", found["again"], **unit),  # type: ignore[arg-type]
         compare(
             name,
             found["ours"],

@@ -1,4 +1,4 @@
-"""A policy by plain PyTorch on exported data: a parquet file, a network, a loop; only the evaluation is ours.
+"""Train a policy with plain PyTorch on an exported dataset: LeRobot's parquet files, a network and a loop.
 
 python examples/plain_pytorch.py             # drawer-open, reach and window-open, under a minute
 python examples/plain_pytorch.py --steps 50  # only to see it run
@@ -39,15 +39,19 @@ def exported_rows(root: str, demonstrations: int) -> TensorDataset:
     """Observations, tasks and the experts' actions, up to 20 steps after each episode's first success."""
     how = {"noise_scale": [0.0, 0.1, 0.2], "redraw_failures": True}
     lw.collect_demonstrations(TASKS, episodes_per_task=demonstrations, root=f"{root}/demos", **how)
-    table = pq.read_table(lw.export_dataset(f"{root}/demos", "parquet", f"{root}/out") / "data.parquet")
-    column = {name: np.array(table.column(name).to_pylist()) for name in ("task", "next.success", "episode_index")}
-    wanted = np.zeros(len(table), dtype=bool)
-    for episode in range(column["episode_index"][-1] + 1):
-        rows = np.flatnonzero(column["episode_index"] == episode)
-        wanted[rows[: column["next.success"][rows].argmax() + 21]] = True
-    numbers = [table.column(name).combine_chunks().flatten().to_numpy() for name in ("observation", "expert_action")]
-    observation, action = (torch.tensor(flat.reshape(len(table), -1)[wanted]) for flat in numbers)
-    task = torch.tensor([lw.task_id(name) for name in column["task"][wanted]])
+    out = lw.export_dataset(f"{root}/demos", "lerobot", f"{root}/out")
+    names = {row["task_index"]: row["name"] for row in pq.read_table(out / "meta/tasks.parquet").to_pylist()}
+    table = pq.read_table(out / "data")
+    episode, success = (table.column(name).to_numpy() for name in ("episode_index", "next.success"))
+    used = np.zeros(len(table), dtype=bool)
+    for number in range(episode[-1] + 1):
+        rows = np.flatnonzero(episode == number)
+        used[rows[: success[rows].argmax() + 21]] = True
+    numbers = [
+        table.column(name).combine_chunks().flatten().to_numpy() for name in ("observation.state", "expert_action")
+    ]
+    observation, action = (torch.tensor(flat.reshape(len(table), -1)[used]) for flat in numbers)
+    task = torch.tensor([lw.task_id(names[index]) for index in table.column("task_index").to_numpy()[used]])
     return TensorDataset(observation, task, action)
 
 

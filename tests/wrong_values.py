@@ -108,7 +108,8 @@ WRONG: dict[str, list[Any]] = {
     "TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase]": [None, 3, "expert", []],
     "TensorDictModuleBase | list[TensorDictModuleBase]": [3, "a", [], [3], None],
     "Mapping[str, Any]": [3, "one", ["one"]],
-    "ExchangeFormat": ["no such", 3, None, []],
+    "ExportFormat": ["no such", 3, None, []],
+    "ImportFormat": ["no such", 3, []],
     "str | Mapping[str, str]": [3, "reech", [], {"theirs": "reech"}, {"theirs": 3}],
 }
 for name in [
@@ -257,8 +258,8 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "decode_plan": {"text": str(PLAN), "format": "chain_py", "task": "reach"},
         "encode_plan": {"plan": PLAN, "format": "chain_py"},
         "evaluate": {"actor": actor, **run},
-        "export_dataset": {"root": root, "format": "parquet", "out": folder / "none"},
-        "import_dataset": {"source": theirs(folder / "theirs.parquet"), "out": folder / "none"},
+        "export_dataset": {"root": root, "format": "lerobot", "out": folder / "none"},
+        "import_dataset": {"source": theirs(folder / "theirs"), "out": folder / "none"},
         "from_pretrained": {"source": folder},
         "load_actor": {"path": lw_saved(lw.save_actor, actor, folder / "actor.zip")},
         "load_evaluator": {
@@ -285,9 +286,13 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
 
 
 def theirs(path: Any) -> Any:
-    """A file of somebody else's rows of a task in their own words."""
-    rows = {"obs": [[0.0] * 39], "action": [[0.0] * 4], "episode_index": [0], "task": ["theirs"]}
-    pq.write_table(pa.table(rows), path)
+    """A LeRobot dataset of somebody else's rows of a task in their own words."""
+    rows = {"observation.state": [[0.0] * 39], "action": [[0.0] * 4], "episode_index": [0], "task_index": [0]}
+    for folder in ("meta", "data"):
+        (path / folder).mkdir(parents=True)
+    pq.write_table(pa.table(rows), path / "data" / "file.parquet")
+    (path / "meta" / "info.json").write_text('{"codebase_version": "v2.1", "total_frames": 1}')
+    (path / "meta" / "tasks.jsonl").write_text('{"task_index": 0, "task": "theirs"}')
     return path
 
 

@@ -218,7 +218,7 @@ def _check(output: Output, parts: list[Demonstrations]) -> None:
         if broken := len(part.episodes) - len(whole_episodes(part, progress=True)):
             damaged.append({"folder": part.root, "episodes": broken})
             share = f"{broken} of {counted(len(part.episodes), 'episode')} differ from their checksums"
-            mend = "the same collect_demonstrations runs these again"
+            mend = "delete the folder and collect the dataset again"
             output.fault = output.fault or f"{str(part.root)!r} is damaged: {share}; {mend}"
     sound = f"\nchecked: all rows of {counted(len(parts), 'dataset')} are as they were written"
     output.show("damaged", damaged, None if damaged else sound)

@@ -14,14 +14,14 @@ from lw_torchrl.cli import options
 from lw_torchrl.cli.output import Columns, Output
 from lw_torchrl.language.tasks import TASKS
 
-ExchangeFormat = Literal["parquet", "lerobot", "hdf5", "minari"]
-"""The names of :data:`lw_torchrl.data.exchange.FORMATS`."""
+ExportFormat = Literal["lerobot", "minari"]
+ImportFormat = Literal["lerobot", "minari", "robomimic"]
 
 
 def export(
     folder: Positional[Annotated[Path, arg(metavar="FOLDER")]],  # of `lw-torchrl collect`
     /,
-    to: ExchangeFormat,
+    to: ExportFormat,
     out: Path,  # the folder to write, new or empty
     plans: options.PlanSources = (),
     suite: options.SuiteName = None,
@@ -32,7 +32,7 @@ def export(
     Example: lw-torchrl data export demos/mt10 --to lerobot --out lerobot/mt10
 
     Args:
-        to: parquet, one file of all rows; lerobot, LeRobot's of version 3; hdf5, robomimic's; or minari.
+        to: lerobot, version 3 of LeRobot's format; or minari.
         plans: whose conditions are answered for each row; by default those that the suite ships.
     """
     options.check_new_folder("--out", out)
@@ -47,10 +47,10 @@ def export(
 
 
 def import_(
-    source: Positional[Annotated[Path, arg(metavar="SOURCE")]],  # a file or folder of parquet, LeRobot, HDF5 or Minari
+    source: Positional[Annotated[Path, arg(metavar="SOURCE")]],  # LeRobot or Minari folder, or HDF5
     /,
     out: Path,  # the dataset's folder, new or empty
-    format: ExchangeFormat | None = None,  # of the source; by default as its files say
+    format: ImportFormat | None = None,  # of the source; by default as its files say
     task: str | None = None,  # of all its episodes, where it does not say
     suite: options.SuiteName = None,
     behaviour: str = "imported",  # the label of its episodes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from fractions import Fraction
 from math import gcd, isclose
 from typing import Any
@@ -22,21 +21,6 @@ from lw_torchrl.language.tasks import MT50, TASKS, task_id
 GROWN = "grown"  # the target that is what a buffer was extended with
 
 
-def _check_target(target: Any) -> str | Tensor:
-    if isinstance(target, str):
-        return target if "/" in target else check_choice("target", target, (GROWN, *TASKS))
-    wanted = "target must be a task's name or one bool for each episode"
-    try:
-        mask = torch.as_tensor(target)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise TypeError(f"{wanted}, got {target!r}") from error
-    if mask.dtype != torch.bool or mask.dim() != 1:
-        raise TypeError(f"{wanted}, got {mask.dtype} of shape {tuple(mask.shape)}; a buffer that grows has 'grown'")
-    if mask.all() or not mask.any():
-        raise ValueError(f"target must have true and false episodes, all {len(mask)} are {bool(mask.any())}")
-    return mask.clone()
-
-
 def _check_fraction(fraction: Any) -> Fraction:
     if isinstance(fraction, bool) or not isinstance(fraction, (float, Fraction)):
         raise TypeError(f"target_fraction must be a float or a Fraction, got {fraction!r} ({type(fraction).__name__})")
@@ -50,28 +34,27 @@ def _check_fraction(fraction: Any) -> Fraction:
 
 
 class CoLearningSampler(GroupSampler):
-    """Half of every minibatch from the target's demonstrations, half in equal numbers from the base tasks; exactly.
+    """Exactly half of every minibatch from the target's demonstrations, half in equal numbers from the base tasks.
 
-    Target and base tasks are drawn without replacement, each in passes of its own: every row of a group comes once
-    before any comes again. An epoch, at whose end ``ran_out`` is true, is the pass that takes the most batches. The
-    sampler draws from the replay buffer's generator; its state continues with the same batches.
+    Target and base tasks are drawn without replacement, each in its own passes: every row of a group comes once before
+    any comes again. An epoch, at whose end ``ran_out`` is true, is the pass that takes the most batches. The sampler
+    draws from the replay buffer's generator; a restored state continues with the same batches.
 
-    The target "grown" stands for the rows that the buffer was extended with: each is drawn with the same probability,
-    with replacement. The demonstrations of all tasks are the base.
+    The target "grown" means the rows that the buffer was extended with, drawn uniformly with replacement. The
+    demonstrations of all tasks are the base.
 
-    Where a target by name is itself a base task, its base demonstrations are left out. A batch holds the target's rows,
-    then those of the base tasks in the order of their ids, and one more column, ``is_target`` (B,) bool.
+    If a target by name is itself a base task, its base demonstrations are left out. A batch holds the target's rows,
+    then those of the base tasks in the order of their ids, and the column ``is_target`` (B,) bool.
 
     Args:
-        target: "grown"; a task's name, for all demonstrations of the task, or in a storage that joins datasets, those
-            of the last one that has any; or one bool for each of ``replay.demonstrations.episodes``, in their order.
+        target: "grown"; or a task's name, for all demonstrations of the task, in a storage that joins datasets those of
+            the last dataset that has any.
         target_fraction: the target's share of a minibatch, between 0 and 1, such as 0.5, 1/3 or Fraction(2, 7).
-        task_key, episode_key: the entries of the storage that hold the task, and, for a mask, the episode.
+        task_key: the entry of the storage that holds the task.
 
     Raises:
-        ValueError: a mask that is all true or all false. At sampling: a batch size that cannot be exact, with the
-            nearest that can; no row of the target or of a base task; a mask of another number of episodes; "grown"
-            without a storage that grows, or another target with one.
+        ValueError: at sampling, a batch size that cannot be exact, with the nearest that can; no row of the target or
+            of a base task; "grown" without a growing buffer, or another target with one.
 
     Example:
         >>> import torch
@@ -90,21 +73,21 @@ class CoLearningSampler(GroupSampler):
 
     def __init__(
         self,
-        target: str | Sequence[bool] | Tensor,
+        target: str,
         *,
         target_fraction: float | Fraction = 0.5,
         task_key: NestedKey = "task_id",
-        episode_key: NestedKey = ("collector", "traj_ids"),
     ) -> None:
-        self.target, self.target_fraction = _check_target(target), _check_fraction(target_fraction)
+        if not (isinstance(target, str) and "/" in target):  # another suite's task otherwise
+            check_choice("target", target, (GROWN, *TASKS))
+        self.target, self.target_fraction = target, _check_fraction(target_fraction)
         check_key("task_key", task_key)
-        check_key("episode_key", episode_key)
-        self.task_key, self.episode_key = task_key, episode_key
+        self.task_key = task_key
         super().__init__()
 
     @property
     def _grown(self) -> bool:
-        return isinstance(self.target, str) and self.target == GROWN
+        return self.target == GROWN
 
     def _covered(self, storage: Storage) -> int:
         return storage.num_joined if isinstance(storage, GrowingStorage) else len(storage)
@@ -112,25 +95,19 @@ class CoLearningSampler(GroupSampler):
     def _check_storage(self, storage: Storage) -> None:
         if isinstance(storage, GrowingStorage) != self._grown:
             if self._grown:
-                raise ValueError("target 'grown' needs a buffer that grows, LanguageWorldExperienceReplay(..., grow=)")
-            named = repr(self.target) if isinstance(self.target, str) else "a mask"
-            raise ValueError(f"target must be 'grown', since the buffer grows, got {named}")
+                raise ValueError("target 'grown' needs a growing buffer, LanguageWorldExperienceReplay(..., grow=)")
+            raise ValueError(f"target must be 'grown', since the buffer grows, got {self.target!r}")
 
     def _targets(self, storage: Storage, task: Tensor) -> Tensor:
         """Whether each row is the target's: (R,) bool."""
-        if isinstance(self.target, str):
-            mine = task == task_id(self.target)
-            if not mine.any():
-                there = ", ".join(MT50[i] if 0 <= i < len(MT50) else str(i) for i in task.unique().tolist())
-                raise ValueError(f"target: the storage has no row of {self.target!r}; its tasks are {there}")
-            if isinstance(storage, JoinedStorage):
-                part = storage.part()
-                mine &= part == part[mine].max()
-            return mine
-        episode = torch.unique(column(storage, self.episode_key).reshape(-1), return_inverse=True)[1]
-        if (episodes := int(episode.max()) + 1) != len(self.target):
-            raise ValueError(f"target must have one bool for each of the {episodes} episodes, got {len(self.target)}")
-        return self.target.to(episode.device)[episode]
+        mine = task == task_id(self.target)
+        if not mine.any():
+            tasks = ", ".join(MT50[i] if 0 <= i < len(MT50) else str(i) for i in task.unique().tolist())
+            raise ValueError(f"target: the storage has no row of {self.target!r}; its tasks are {tasks}")
+        if isinstance(storage, JoinedStorage):
+            part = storage.part()
+            mine &= part == part[mine].max()
+        return mine
 
     def _label(self, storage: Storage) -> Tensor:
         self._check_storage(storage)
@@ -146,10 +123,6 @@ class CoLearningSampler(GroupSampler):
         label[base] = 1 + torch.unique(task[base], return_inverse=True)[1]
         return label
 
-    def _keys(self, storage: Storage, rows: Tensor) -> Tensor | None:
-        by_task = isinstance(self.target, str) and not isinstance(storage, JoinedStorage)
-        return column(storage, self.task_key, rows) if by_task else None
-
     def row_weights(self, storage: Storage) -> Tensor:
         """Each row's mean share of a minibatch: (R,) float32, 0 for a row that is left out."""
         label = self._label(storage)
@@ -164,7 +137,7 @@ class CoLearningSampler(GroupSampler):
         return torch.where(label >= 0, (share / sizes)[label.clamp(min=0)], 0.0)
 
     def _shares(self, batch_size: int) -> Tensor:
-        base = len(self._passes.size) - (not self._grown)
+        base = len(self._size) - (not self._grown)
         part, whole = self.target_fraction.numerator, self.target_fraction.denominator
         unit = whole * base // gcd(base, whole - part)
         if batch_size % unit:
@@ -176,7 +149,7 @@ class CoLearningSampler(GroupSampler):
         return torch.tensor([mine] * (not self._grown) + [(batch_size - mine) // base] * base)
 
     def add(self, index: Any, *, storage: Storage | None = None) -> None:
-        """Note that rows were written or overwritten; those of a growing buffer are in no group."""
+        """Note that rows were written; the rows of a growing buffer's ring are in no group."""
         if not self._grown:
             super().add(index)
 
@@ -185,8 +158,7 @@ class CoLearningSampler(GroupSampler):
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
         self._check_storage(storage)
         if isinstance(storage, GrowingStorage) and not storage.num_grown:
-            mend = "extend the buffer before the first sample, a Learner in observe: self.replay.extend(rows)"
-            raise ValueError(f"target 'grown': nothing has come yet; {mend}")
+            raise ValueError("target 'grown': extend the buffer before the first sample")
         index, info = super().sample(storage, batch_size)
         if not isinstance(storage, GrowingStorage):
             info["is_target"] = to_device_of(storage, self._layout(batch_size)[1] == 0)
@@ -199,8 +171,8 @@ class CoLearningSampler(GroupSampler):
 
     def _identity(self) -> dict[str, Tensor]:
         fraction = torch.tensor([self.target_fraction.numerator, self.target_fraction.denominator])
-        target = torch.tensor(task_id(self.target)) if isinstance(self.target, str) else self.target.clone()
-        return {"target": torch.tensor([-1]) if self._grown else target, "target_fraction": fraction}
+        target = torch.tensor(-1 if self._grown else task_id(self.target))
+        return {"target": target, "target_fraction": fraction}
 
     def state_dict(self) -> dict[str, Any]:
         """The shuffled order, how far each pass has come, the target and the ratio."""

@@ -1,57 +1,44 @@
-"""A demonstration dataset's description: how it was made, which episodes it holds, and its metadata.json.
+"""A demonstration dataset's description: how it was collected, which episodes it holds, and its metadata.json.
 
-root/data/            the rows, one a step, in TorchRL's TED layout; see :mod:`.memory_map`
-root/metadata.json    written last: without it the dataset is not finished. Nothing in it is taken on trust
-root/.partial/        while collecting: config.json, versions.json and the episodes; see :mod:`.missing_episodes`
+root/data/            the rows, one for each step, in TorchRL's TED layout; see :mod:`.memory_map`
+root/metadata.json    written last: a folder without it is not a finished dataset
+root/.partial/        while collecting: begun.json and the episodes; see :mod:`.missing_episodes`
 root/.lock            held while collecting
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from reprlib import repr as short
-from typing import Any, TypeVar
+from typing import Any
 
 from lw_torchrl._checks import check_fields, check_int, check_scale
 from lw_torchrl._files import AnyPath, read_json, write_json
 from lw_torchrl.data.behaviours import EXPERT, NOISY, Behaviour, check_own_label
 from lw_torchrl.language.layout import METAWORLD, Layout
-from lw_torchrl.language.tasks import MT50, resolve_tasks
+from lw_torchrl.language.tasks import resolve_tasks
 
 DATA, METADATA, PARTIAL, LOCK = "data", "metadata.json", ".partial", ".lock"
-_MOST = 2**63 - 1
-Parsed = TypeVar("Parsed")
 
 
 class DatasetError(ValueError):
-    """A folder that holds no finished dataset of this format."""
-
-
-class DamagedDatasetError(DatasetError):
-    """A dataset whose files are not as they were written; the same :func:`collect_demonstrations` repairs it."""
-
-
-def _whole_number(argument: str, given: Any, minimum: int) -> int:
-    if (value := check_int(argument, given, minimum=minimum)) > _MOST:
-        raise ValueError(f"{argument} must be below 2**63, got a number of {len(str(value))} digits")
-    return value
+    """A folder that holds no finished dataset of this format, or a damaged one."""
 
 
 def _own_tasks(tasks: tuple[str, ...], layout: Layout) -> tuple[str, ...]:
     """The names of another suite's tasks, sorted; the suite itself need not be installed."""
-    named = all(isinstance(task, str) and task.startswith(f"{layout.name}/") for task in tasks)
-    if not tasks or not named or len(set(tasks)) != len(tasks):
-        raise ValueError(f"tasks must be different ones named '{layout.name}/...', got {short(tasks)}")
+    if not tasks or not all(task.startswith(f"{layout.name}/") for task in tasks):
+        raise ValueError(f"tasks must be named '{layout.name}/...', got {short(tasks)}")
     return tuple(sorted(tasks))
 
 
 @dataclass(frozen=True)
 class CollectConfig:
-    """How demonstrations are made, by the arguments of :func:`collect_demonstrations`; equal configurations give equal
-    datasets. ``tasks`` are names, sorted; ``noise_scale`` holds a number for each episode in turn, (0.0,) for none."""
+    """The arguments of :func:`collect_demonstrations` that decide what it collects: equal ones give equal datasets.
+    ``tasks`` are names, sorted; ``noise_scale`` holds a number for each episode in turn, (0.0,) for none."""
 
     tasks: tuple[str, ...]
     episodes_per_task: int
@@ -65,32 +52,39 @@ class CollectConfig:
     layout: Layout = METAWORLD
 
     def __post_init__(self) -> None:
-        if not isinstance(self.policy, Behaviour):
-            raise TypeError(f"policy must be a Behaviour, got {self.policy!r}")
         check_own_label(self.policy)
         check_fields(self)
         if not self.noise_scale:
             raise ValueError("noise_scale must hold at least one number, got an empty sequence")
         checked = {
             "tasks": resolve_tasks(self.tasks) if self.layout == METAWORLD else _own_tasks(self.tasks, self.layout),
-            "episodes_per_task": _whole_number("episodes_per_task", self.episodes_per_task, 1),
-            "seed": _whole_number("seed", self.seed, -_MOST),
+            "episodes_per_task": check_int("episodes_per_task", self.episodes_per_task, minimum=1),
+            "seed": check_int("seed", self.seed),
             "noise_scale": tuple(check_scale("noise_scale", scale) for scale in self.noise_scale),
-            "noise_hold": _whole_number("noise_hold", self.noise_hold, 1),
+            "noise_hold": check_int("noise_hold", self.noise_hold, minimum=1),
             "gripper_noise_factor": check_scale("gripper_noise_factor", self.gripper_noise_factor),
-            "max_steps": _whole_number("max_steps", self.max_steps, 1),
+            "max_steps": check_int("max_steps", self.max_steps, minimum=1),
         }
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON; ``policy`` is left out for the expert, and ``layout`` for Meta-World's, as older datasets do."""
-        found = {each.name: getattr(self, each.name) for each in fields(self)}
-        found |= {"tasks": list(self.tasks), "noise_scale": list(self.noise_scale)}
-        for key, usual in (("policy", EXPERT), ("layout", METAWORLD)):
-            if (stated := found.pop(key)) != usual:
-                found[key] = stated.to_json()
-        return found
+        """As JSON; without ``policy`` for the expert, and without ``layout`` for Meta-World's."""
+        config = {each.name: getattr(self, each.name) for each in fields(self)}
+        config |= {"tasks": list(self.tasks), "noise_scale": list(self.noise_scale)}
+        for key, default in (("policy", EXPERT), ("layout", METAWORLD)):
+            if (value := config.pop(key)) != default:
+                config[key] = value.to_json()
+        return config
+
+    @classmethod
+    def from_json(cls, config: Mapping[str, Any]) -> CollectConfig:
+        """The configuration that :meth:`to_json` gave."""
+        options = {**config, "tasks": tuple(config["tasks"]), "noise_scale": tuple(config["noise_scale"])}
+        for key, parse in (("policy", Behaviour.from_json), ("layout", Layout.from_json)):
+            if key in options:
+                options[key] = parse(options[key])
+        return cls(**options)
 
     @property
     def behaviour(self) -> str:
@@ -145,119 +139,57 @@ class Demonstrations:
 
 FORMAT = "lw_torchrl.demonstrations"
 FORMAT_VERSION = 2
-_BAD = (ValueError, TypeError, KeyError, OverflowError, RecursionError)
 
 
-def write_metadata(made: Demonstrations) -> None:
+def write_metadata(demonstrations: Demonstrations) -> None:
     """Write the metadata, which makes the dataset a finished one."""
-    stated: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "config": made.config.to_json()}
-    stated |= {key: getattr(made, key) for key in ("versions", "task_ids", "attempts")}
-    columns = {key: [getattr(episode, key) for episode in made.episodes] for key in EpisodeInfo.__dataclass_fields__}
-    write_json(made.root / METADATA, stated | {"episodes": columns})
+    metadata: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "config": demonstrations.config.to_json()}
+    metadata |= {key: getattr(demonstrations, key) for key in ("versions", "task_ids", "attempts")}
+    names = EpisodeInfo.__dataclass_fields__
+    metadata["episodes"] = {name: [getattr(episode, name) for episode in demonstrations.episodes] for name in names}
+    write_json(demonstrations.root / METADATA, metadata)
 
 
 def read_metadata(root: AnyPath) -> Demonstrations:
-    """Describe the dataset in a folder; DatasetError if it is half-written, damaged, or of another version."""
+    """Describe the dataset in a folder; DatasetError if it is unfinished, damaged, or of another version."""
     folder = Path(root)
     path = folder / METADATA
     if not folder.is_dir():
         raise FileNotFoundError(f"root: no dataset folder {str(folder)!r}; make one with collect_demonstrations")
     if (folder / PARTIAL).is_dir() and not path.is_file():
-        what = f"root: the dataset in {str(folder)!r} is half-written"
-        raise DatasetError(f"{what}; run the same collect_demonstrations again, and it carries on")
+        unfinished = f"root: the dataset in {str(folder)!r} is unfinished"
+        raise DatasetError(f"{unfinished}; the same collect_demonstrations resumes it")
     if not path.is_file():
-        raise DatasetError(f"root: {str(folder)!r} holds no {METADATA}, so it is no dataset of {FORMAT}")
+        raise DatasetError(f"root: {str(folder)!r} is not a dataset: it has no {METADATA}")
     try:
-        found = read_json(path, "root: the metadata")
-        stated = found["format"], found["version"]
-        if stated != (FORMAT, FORMAT_VERSION) or isinstance(stated[1], float):
-            raise DatasetError(
-                f"root: {str(path)!r} is of format {short(stated[0])} version {short(stated[1])}; this package reads "
-                f"{FORMAT!r} version {FORMAT_VERSION}. Collect it again with the same collect_demonstrations"
-            )
-        config = parse_config(found["config"])
-        episodes = _episodes(_object("episodes", found["episodes"], EpisodeInfo.__dataclass_fields__), config)
-        last = {episode.task: episode.episode for episode in episodes}
-        attempts = _object("attempts", found["attempts"], config.tasks)
-        if any(_integer(f"attempts of {task}", attempts[task]) != last[task] + 1 for task in config.tasks):
-            raise ValueError("the attempts are not those of the episodes")
-        versions, task_ids = parse_versions(found["versions"]), _object("task_ids", found["task_ids"], config.tasks)
-        if len({_integer(f"task_ids of {task}", number) for task, number in task_ids.items()}) != len(task_ids):
-            raise ValueError(f"task_ids must differ, got {short(task_ids)}")
-        return Demonstrations(folder, config, versions, task_ids, episodes, attempts)
+        return parse_metadata(read_json(path, "root: the metadata"), folder)
     except DatasetError:
         raise
-    except _BAD as error:
-        told = f"{type(error).__name__}: {str(error)[:500]}"
-        again = "the same collect_demonstrations makes the dataset again"
-        raise DamagedDatasetError(f"root: {str(path)!r} is damaged ({told}); {again}") from error
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise damaged(f"the metadata {str(path)!r} are damaged ({type(error).__name__}: {error})") from error
 
 
-def read_partial(path: Path, parse: Callable[[Any], Parsed]) -> Parsed:
-    """What ``parse`` makes of a JSON file of a half-made dataset; a damaged file is a :class:`DatasetError`."""
-    try:
-        return parse(read_json(path, "root: the file"))
-    except _BAD as error:
-        again = f"delete {str(path.parent.parent)!r} to start again"
-        raise DatasetError(f"root: {str(path)!r} is damaged ({str(error)[:500]}); {again}") from error
+def damaged(what: str) -> DatasetError:
+    """The error for a dataset whose files differ from what was written; the caller raises it."""
+    return DatasetError(f"root: {what}; delete the folder and collect the dataset again")
 
 
-def parse_config(stated: Any) -> CollectConfig:
-    """A configuration from its JSON; ValueError, TypeError or OverflowError if it is none."""
-    there = stated if isinstance(stated, Mapping) else {}
-    readers: dict[str, Callable[[Any], Any]] = {"policy": Behaviour.from_json, "layout": Layout.from_json}
-    names = [name for name in CollectConfig.__dataclass_fields__ if name not in readers or name in there]
-    found = _object("config", stated, names)
-    for name, longest in (("tasks", len(MT50)), ("noise_scale", None)):
-        if not isinstance(found[name], list) or (longest and len(found[name]) > longest):
-            raise ValueError(f"{name} must be a list, of at most {longest or 'any'} entries, got {short(found[name])}")
-    options: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in found.items()}
-    config = CollectConfig(**options | {key: read(found[key]) for key, read in readers.items() if key in found})
-    if list(config.tasks) != found["tasks"]:
-        raise ValueError(f"tasks must be sorted, got {short(found['tasks'])}")
-    return config
-
-
-def _object(name: str, stated: Any, keys: Any) -> dict[str, Any]:
-    if not isinstance(stated, Mapping) or set(stated) != set(keys):
-        raise ValueError(f"{name} must be an object of {', '.join(keys)}, got {short(stated)}")
-    return dict(stated)
-
-
-def _integer(name: str, stated: Any, minimum: int = 0, maximum: int = _MOST) -> int:
-    if type(stated) is not int or not minimum <= stated <= maximum:
-        raise ValueError(f"{name} must be an integer in [{minimum}, {maximum}], got {short(stated)}")
-    return stated
-
-
-def parse_versions(stated: Any) -> dict[str, str]:
-    """Package name to version, from its JSON; ValueError if it is none."""
-    if not isinstance(stated, dict) or not all(isinstance(v, str) and len(v) <= 100 for v in stated.values()):
-        raise ValueError(f"versions must be names and short texts, got {short(stated)}")
-    return stated
-
-
-def _episodes(columns: dict[str, Any], config: CollectConfig) -> tuple[EpisodeInfo, ...]:
-    """The episodes from their columns: sorted, as many of each task as configured, row after row."""
-    number = len(config.tasks) * config.episodes_per_task
-    for name, column in columns.items():
-        if not isinstance(column, list) or len(column) != number:
-            raise ValueError(f"episodes: {name} must be a list of {number}, got {short(column)}")
-    expected = [task for task in config.tasks for _ in range(config.episodes_per_task)]
-    if columns["task"] != expected:
-        raise ValueError(f"episodes: task must be {short(expected)}, got {short(columns['task'])}")
-    found: list[EpisodeInfo] = []
+def parse_metadata(metadata: Mapping[str, Any], folder: Path) -> Demonstrations:
+    """The description in metadata; DatasetError if they are of another version."""
+    if (metadata["format"], metadata["version"]) != (FORMAT, FORMAT_VERSION):
+        version = f"{short(metadata['format'])} version {short(metadata['version'])}"
+        raise DatasetError(
+            f"root: {str(folder)!r} has the format {version}, this package reads {FORMAT!r} version {FORMAT_VERSION}; "
+            "collect it again"
+        )
+    config = CollectConfig.from_json(metadata["config"])
+    columns = [metadata["episodes"][name] for name in EpisodeInfo.__dataclass_fields__]
+    episodes = tuple(EpisodeInfo(*row) for row in zip(*columns, strict=True))
+    tasks = [task for task in config.tasks for _ in range(config.episodes_per_task)]
     start = 0
-    for row in zip(*(columns[key] for key in EpisodeInfo.__dataclass_fields__), strict=True):
-        info = EpisodeInfo(*row)
-        follows = found and found[-1].task == info.task
-        _integer("episodes: episode", info.episode, found[-1].episode + 1 if follows else 0)
-        _integer("episodes: start", info.start, start, start)
-        start += _integer("episodes: length", info.length, 1, config.max_steps)
-        if info.first_success is not None:
-            _integer("episodes: first_success", info.first_success, 1, info.length)
-        if info.success is not (info.first_success is not None):
-            raise ValueError(f"episodes: success must be {info.first_success is not None}, got {short(info.success)}")
-        _integer("episodes: checksum", info.checksum, 0, 2**32 - 1)
-        found.append(info)
-    return tuple(found)
+    for task, episode in zip(tasks, episodes, strict=True):
+        if (episode.task, episode.start) != (task, start) or not 0 < episode.length <= config.max_steps:
+            raise ValueError(f"episode {episode.episode} of {episode.task!r} does not fit the others")
+        start += episode.length
+    task_ids = {task: int(metadata["task_ids"][task]) for task in config.tasks}
+    return Demonstrations(folder, config, metadata["versions"], task_ids, episodes, metadata["attempts"])

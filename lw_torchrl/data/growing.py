@@ -1,4 +1,4 @@
-"""GrowingStorage: demonstrations on disk, and behind them rows that are written during training."""
+"""GrowingStorage: demonstrations on disk, followed by rows that are written during training."""
 
 from __future__ import annotations
 
@@ -20,35 +20,32 @@ from lw_torchrl.data import trajectories
 from lw_torchrl.data.storage import DEMONSTRATION, DONE, REWARD, TRAJECTORY, JoinedStorage, column_name
 from lw_torchrl.data.trajectories import NONE_OPEN, Columns, OpenTrajectories
 
-ONE_PROCESS = (
-    "a buffer that grows is of one process, others would write to a copy: extend it with what a collector yields"
-)
+ONE_PROCESS = "a growing buffer cannot be shared between processes: extend it with the batches that a collector yields"
 
 
 class GrowingStorage(JoinedStorage):
-    """A :class:`JoinedStorage` with a ring of rows behind it, allocated once, whose oldest are overwritten.
+    """A :class:`JoinedStorage` followed by a ring of rows that are written during training.
 
     The rows of the parts come first and stay; the i-th row ever written is at ``num_joined + i % grow``. A replay
-    buffer over it needs a :class:`GrowingWriter` and ``collate_fn=lambda batch: batch``. Samples have one column more,
-    ``is_demonstration`` (B,) bool: true of the parts' rows, false of those written.
+    buffer over it needs a :class:`GrowingWriter` and ``collate_fn=lambda batch: batch``. Samples also have
+    ``is_demonstration`` (B,) bool: true for the parts' rows, false for written ones.
 
     Batches may have any dimensions, the last of which is time. ``("collector", "traj_ids")`` gets new numbers, above
     those of the parts: a trajectory keeps its number from batch to batch as long as its newest row is in the ring, and
     no other trajectory ever gets it. A row follows another if both have the collector's id, the other is not done, and
-    its "next" is bit for bit this row; else a trajectory begins.
+    its "next" equals this row bit for bit; otherwise a trajectory begins.
 
     Args:
         parts, rows, n_steps, gamma: as for :class:`JoinedStorage`; ("collector", "traj_ids") and ("next", "done") are
             needed. A row looks fewer than n steps ahead until the rows that follow it are written.
-        grow: rows of the ring.
-        admit: called with the columns of each batch, returns those to store, or raises.
-        check: called with the columns of a restored state; it raises if they are wrong.
+        grow: number of rows of the ring.
+        admit: called with the columns of each batch; returns the columns to store, or raises.
 
     Attributes:
-        num_joined, count: rows of the parts, and rows ever written.
+        num_joined, count: number of rows of the parts, and of rows ever written.
 
     Raises:
-        ValueError: as for :class:`JoinedStorage`; at writing, too many rows, or what :func:`collected_rows` refuses.
+        ValueError: as for :class:`JoinedStorage`; at writing, too many rows, or rows that do not fit the parts.
 
     Example:
         >>> from tensordict import TensorDict
@@ -58,8 +55,8 @@ class GrowingStorage(JoinedStorage):
         ...     time = torch.arange(number)
         ...     after = {"time": time + 1, "done": (time == number - 1)[:, None]}
         ...     ids = torch.full((number,), trajectory)
-        ...     found = {"time": time, "task_id": ids * 0, "collector": {"traj_ids": ids}, "next": after}
-        ...     return TensorDict(found, [number])
+        ...     columns = {"time": time, "task_id": ids * 0, "collector": {"traj_ids": ids}, "next": after}
+        ...     return TensorDict(columns, [number])
         >>> storage, writer = GrowingStorage([rows(6, 0)], grow=4), GrowingWriter()
         >>> replay = TensorDictReplayBuffer(storage=storage, writer=writer, collate_fn=lambda batch: batch)
         >>> for _ in range(2):
@@ -77,16 +74,13 @@ class GrowingStorage(JoinedStorage):
         *,
         grow: int,
         admit: Callable[[Columns], Columns] | None = None,
-        check: Callable[[Columns], None] | None = None,
         **steps: Any,
     ) -> None:
         self.grow, self.count = check_int("grow", grow, minimum=1), 0
-        self._admit, self._check = admit, check
+        self._admit = admit
         super().__init__([part.exclude(DEMONSTRATION) for part in parts], rows, **steps)
         if absent := [column_name(key) for key in (TRAJECTORY, DONE) if key not in self._columns]:
             raise ValueError(f"grow={self.grow} needs the columns {', '.join(absent)}, which parts do not have")
-        if not trajectories.shared_keys(self._columns):
-            raise ValueError("parts must have a column and its ('next', ...), by which it shows what follows what")
         known = [int(leaf.max()) for leaf in self._columns[TRAJECTORY] if len(leaf)]
         self._number, self._open = max(known, default=-1) + 1, NONE_OPEN
         joined = int(self._ends[-1])
@@ -122,24 +116,24 @@ class GrowingStorage(JoinedStorage):
         return {**found, DEMONSTRATION: index < self.num_joined} if DEMONSTRATION in keys else found
 
     def extend(self, batch: TensorDictBase) -> Tensor:
-        """Write the rows of a batch; their places, int64 of the batch's shape."""
-        found: Columns = trajectories.collected_rows(batch, self._ring)
-        number = len(found[DONE])
+        """Write the rows of a batch; return their places, int64 of the batch's shape."""
+        columns: Columns = trajectories.collected_rows(batch, self._ring)
+        number = len(columns[DONE])
         if not 0 < number <= self.grow:
             raise ValueError(f"batch must have 1 to {self.grow} rows, as many as grow says, got {number}")
         if self._admit is not None:
-            found = self._admit(found)
+            columns = self._admit(columns)
         written = self.count, self._number  # rows and trajectories
-        previous, numbers, opened = trajectories.link_rows(found, self._open, self._ring, *written)
-        if (cut := len(numbers.unique()) - len(found[TRAJECTORY].unique())) > number // 2:
+        previous, numbers, opened = trajectories.link_rows(columns, self._open, self._ring, *written)
+        if (cut := len(numbers.unique()) - len(columns[TRAJECTORY].unique())) > number // 2:
             warnings.warn(
-                f"batch: {cut} of {number} rows are not the ('next', ...) of the rows before them, though of the same "
-                "trajectory, which had not ended; each begins a trajectory. Are rows or steps left out?",
+                f"batch: {cut} of {number} rows differ from ('next', ...) of the row before in their trajectory; each "
+                "begins a trajectory. Were rows left out?",
                 stacklevel=2,
             )
-        found = {**found, TRAJECTORY: numbers.view(found[TRAJECTORY].shape)}
+        columns = {**columns, TRAJECTORY: numbers.view(columns[TRAJECTORY].shape)}
         serial = torch.arange(self.count, self.count + number)
-        self._write(serial, found, previous)
+        self._write(serial, columns, previous)
         here = opened.last >= self.count - self.grow
         self._open = OpenTrajectories(*(part[here] for part in opened))
         self._number = max(self._number, int(numbers.max()) + 1)
@@ -171,7 +165,7 @@ class GrowingStorage(JoinedStorage):
             behind = self._previous[behind % self.grow]
 
     def _empty(self) -> None:  # type: ignore[override]
-        """Forget the rows of the ring; numbers of trajectories are not reused."""
+        """Drop the rows of the ring; numbers of trajectories are not reused."""
         self.count, self._open = 0, NONE_OPEN
         self._set_last_cursor(None)
         self._bump_mutation_revision()
@@ -189,11 +183,9 @@ class GrowingStorage(JoinedStorage):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore a state; :class:`ValueError` if it is of other columns, another ``grow``, or other demonstrations."""
+        """Restore a state; ValueError if it has other columns, another ``grow``, or other demonstrations."""
         super().load_state_dict(state_dict)
         count, number, rows, opened = trajectories.check_grown_state(state_dict, self._ring)
-        if self._check is not None and count:
-            self._check(rows)
         self._empty()
         self.count, self._number, self._open = count, max(number, self._number), opened
         if not count:
@@ -224,7 +216,7 @@ class GrowingStorage(JoinedStorage):
 
 
 class GrowingWriter(Writer):
-    """Writes what a buffer is extended with to its :class:`GrowingStorage`."""
+    """Writes the rows that extend a buffer to its :class:`GrowingStorage`."""
 
     _storage: GrowingStorage
 
@@ -240,7 +232,7 @@ class GrowingWriter(Writer):
         return index
 
     def add(self, data: TensorDictBase) -> Tensor:
-        """Write one step, of one row or of (N,) rows; their places, int64 of its shape."""
+        """Write one step, of one row or of (N,) rows; return their places, int64 of its shape."""
         return self.extend(data if data.ndim else data.unsqueeze(0)).view(data.shape)
 
     def _empty(self, empty_write_count: bool = True) -> None:
@@ -250,6 +242,6 @@ class GrowingWriter(Writer):
         return {}
 
     def load_state_dict(self, state_dict: Any) -> None:
-        """Nothing: the storage knows how many rows were written."""
+        """Do nothing: the storage knows how many rows were written."""
 
     dumps = loads = load_state_dict

@@ -1,11 +1,7 @@
-"""The episodes of an unfinished dataset: a file for each one that was run, and running the missing ones."""
+"""The episodes of an unfinished dataset: a file for each finished episode, and running the missing ones."""
 
-import errno
-import stat
-import zipfile
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +15,9 @@ from lw_torchrl._files import replacing
 from lw_torchrl._progress import Progress
 from lw_torchrl.data.behaviours import SegmentActor, segment_plans
 from lw_torchrl.data.dataset import CollectConfig, DatasetError
-from lw_torchrl.data.memory_map import COLUMNS, columns_of, row_bytes
+from lw_torchrl.data.memory_map import COLUMNS
 from lw_torchrl.envs.episodes import policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.policy import Policy, plans_of, transform_of
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
@@ -31,35 +26,23 @@ from lw_torchrl.transforms.qaf import QAFTransform
 
 _STORED = [key for key in COLUMNS if key != ("collector", "traj_ids")]
 _FAILED = b"FAILED"
-_HEADERS = 2**16  # bytes of a file beside its rows, at the most
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-
-
-def _file_name(task: str) -> str:
-    return task.replace("/", "+")
 
 
 class EpisodeFiles:
-    """The episodes so far, one file each, so that a kill costs only those under way; FAILED stands for one not kept."""
+    """A file for each episode, so that a kill loses only running episodes. FAILED marks a failure to redraw."""
 
-    def __init__(self, folder: Path, tasks: Sequence[str], max_steps: int, layout: Layout = METAWORLD) -> None:
-        self.folder, self.max_steps, self.layout = folder, max_steps, layout
-        self.tasks = {_file_name(task): task for task in tasks}
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
 
     def _path(self, task: str, episode: int) -> Path:
-        return self.folder / f"{_file_name(task)}.{episode}.npz"
+        return self.folder / f"{task.replace('/', '+')}.{episode}.npz"
 
     def put(self, task: str, episode: int, steps: TensorDictBase | None) -> None:
-        content = _FAILED
-        if steps is not None:
-            stream = BytesIO()
-            np.savez(stream, **{"/".join(key): steps.get(key).numpy() for key in _STORED})
-            content = stream.getvalue()
-        try:
-            with replacing(self._path(task, episode), sync=False) as path:  # a damaged one is run again
-                path.write_bytes(content)
-        except OSError as error:
-            raise write_failed(self.folder, len(content), error) from error
+        with replacing(self._path(task, episode), sync=False) as path, path.open("wb") as file:
+            if steps is None:
+                file.write(_FAILED)
+            else:
+                np.savez(file, **{"/".join(key): steps.get(key).numpy() for key in _STORED})
 
     def has(self, task: str, episode: int) -> bool:
         return self._path(task, episode).is_file()
@@ -68,48 +51,14 @@ class EpisodeFiles:
         return self._path(task, episode).stat().st_size != len(_FAILED)
 
     def get(self, task: str, episode: int) -> TensorDict:
-        """An episode's rows; any exception where the file is damaged."""
-        content = self._content(self._path(task, episode))
-        with zipfile.ZipFile(BytesIO(content)) as archive:
-            if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
-                raise ValueError("it is compressed")
-        with np.load(BytesIO(content), allow_pickle=False) as found:
-            columns = {key: torch.from_numpy(found["/".join(key)]) for key in _STORED}
-        length = len(columns["episode",])
-        for key, column in columns.items():
-            tail, dtype = columns_of(self.layout)[key]
-            if column.shape != (length, *tail) or column.dtype != dtype:
-                raise ValueError(f"{'/'.join(key)} must be {dtype} of shape {(length, *tail)}")
-        if not 0 < length <= self.max_steps or (columns["episode",] != episode).any():
-            raise ValueError("it is another episode")
-        return TensorDict(columns, [length])
-
-    def _content(self, path: Path) -> bytes:
-        found = path.lstat()
-        if not stat.S_ISREG(found.st_mode) or found.st_size > self.max_steps * row_bytes(self.layout) + _HEADERS:
-            raise ValueError("it is no file, or larger than an episode can be")
-        return path.read_bytes()
-
-    def drop_damaged(self) -> None:
-        """Remove the files that cannot be read, so that their episodes are run again."""
-        for path in self.folder.glob("*.npz"):
-            task, _, number = path.stem.rpartition(".")
-            if task not in self.tasks or not number.isdecimal():
-                continue
-            if path.is_dir() and not path.is_symlink():
-                raise DatasetError(f"root: {str(path)!r} is a folder, and no episode's file; move it elsewhere")
-            try:
-                if self._content(path) != _FAILED:
-                    self.get(self.tasks[task], int(number))
-            except Exception:  # whatever is wrong with it, the episode can be run again
-                path.unlink()
-
-
-def write_failed(folder: Path, size: int, error: OSError) -> OSError:
-    """The error for something that could not be written while collecting; the caller raises it."""
-    until = "there is room" if error.errno in _NO_ROOM else "that is mended"
-    what = f"root: writing {size} bytes to {str(folder)!r} failed: {error.strerror or error}. Nothing is lost"
-    return OSError(error.errno, f"{what}: once {until}, the same collect_demonstrations carries on")
+        """The rows of an episode; DatasetError if its file is damaged."""
+        path = self._path(task, episode)
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                columns = {key: torch.from_numpy(arrays["/".join(key)]) for key in _STORED}
+            return TensorDict(columns, [len(columns["episode",])])
+        except Exception as error:  # zipfile and numpy raise many kinds of errors
+            raise DatasetError(f"root: {str(path)!r} is damaged ({error}); delete this file to run it again") from error
 
 
 _Actor = Callable[[TensorDictBase], TensorDictBase]

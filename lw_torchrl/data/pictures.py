@@ -1,4 +1,4 @@
-"""Pictures of a dataset's rows: its episodes are run again, action by action, and drawn; a file of PNGs an episode.
+"""Pictures of a dataset's rows: its episodes are run again and rendered, to a file of PNGs for each episode.
 
 root/pictures/<cameras>-<height>x<width>-every<k>/<task>.<episode>.zip    "0.png", "1.png", ...: of steps 0, k, 2k, ...
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,6 @@ from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.transforms.camera import CameraTransform
 
 _TOGETHER = 8  # episodes run again at once
-_LARGEST = 64 * 2**20  # bytes of a file of pictures
 
 
 @dataclass(frozen=True)
@@ -56,33 +55,19 @@ class Pictures:
         return -(-episode.length // self.every)
 
     def read(self, root: Path, episode: EpisodeInfo) -> Tensor:
-        """Those of an episode, (n, height, width·C, 3) uint8; DatasetError if its file is missing or damaged."""
+        """The pictures of an episode, (n, height, width·C, 3) uint8; DatasetError if its file is missing or damaged."""
         from PIL import Image
 
-        path, count = self.file(root, episode), self.count(episode)
+        path = self.file(root, episode)
+        pictures = np.empty((self.count(episode), *self.shape), dtype=np.uint8)
         try:
-            if path.stat().st_size > _LARGEST:
-                raise ValueError("it is larger than an episode's pictures can be")
             with zipfile.ZipFile(path) as archive:
-                names = [f"{number}.png" for number in range(count)]
-                if archive.namelist() != names or any(one.compress_type for one in archive.infolist()):
-                    raise ValueError(f"it must hold {count} pictures, stored")
-                pictures = np.empty((count, *self.shape), dtype=np.uint8)
-                for number, name in enumerate(names):
-                    with Image.open(io.BytesIO(archive.read(name)), formats=["PNG"]) as picture:
-                        if picture.mode != "RGB" or picture.size != (self.shape[1], self.shape[0]):
-                            raise ValueError(f"{name} is {picture.mode} of {picture.size} pixels")
+                for number in range(len(pictures)):
+                    with Image.open(archive.open(f"{number}.png"), formats=["PNG"]) as picture:
                         pictures[number] = np.asarray(picture)
-        except Exception as error:  # a damaged file may raise anything
-            raise DatasetError(f"root: {str(path)!r} is damaged ({error}); add_pictures makes it anew") from error
+        except Exception as error:  # zipfile and PIL raise many kinds of errors
+            raise DatasetError(f"root: {str(path)!r} is damaged ({error}); delete it and call add_pictures") from error
         return torch.from_numpy(pictures)
-
-    def missing(self, root: Path, episode: EpisodeInfo) -> bool:
-        """Whether an episode's file is missing, or damaged and so to be written anew."""
-        with suppress(DatasetError):
-            self.read(root, episode)
-            return False
-        return True
 
 
 @checked
@@ -95,20 +80,19 @@ def add_pictures(
     every: int = 1,
     progress: bool = True,
 ) -> None:
-    """Draw the rows of a dataset, as :class:`CameraTransform` would have while it was collected.
+    """Render the rows of a dataset, as :class:`CameraTransform` would have while it was collected.
 
     Each episode is run again with its actions, and must give the stored observations bit for bit. The pictures are
-    saved beside the rows as PNGs. A call that was killed carries on when it is repeated.
+    saved beside the rows as PNGs. Repeat a call that was killed to resume it.
 
     Args:
         root: the dataset's folder, of :func:`collect_demonstrations`.
         cameras, height, width, every: as for :class:`CameraTransform`.
-        progress: show a progress bar when it takes longer than a second.
+        progress: show a progress bar if it takes longer than a second.
 
     Raises:
-        DatasetError: (a ValueError) there is no dataset, or MuJoCo or Meta-World lets its episodes go otherwise today.
-        ImportError: there is no OpenGL; it names what to install.
-        OSError: there is no room; nothing is lost.
+        DatasetError: (a ValueError) there is no dataset, or the installed simulator gives other observations.
+        ImportError: there is no OpenGL; the message names what to install.
 
     Example:
         >>> import tempfile, lw_torchrl as lw
@@ -120,45 +104,47 @@ def add_pictures(
         ...     replay.sample()["pixels"].shape
         torch.Size([8, 64, 64, 3])
     """
-    wanted, found = Pictures.of(cameras, height, width, every), read_metadata(Path(root))
-    verify(found, found.episodes)
-    rows = load_rows(found)
-    missing = [one for one in found.episodes if wanted.missing(found.root, one)]
-    with Progress("taking pictures", sum(map(wanted.count, missing)), "picture", show=progress) as bar:
-        for task in found.config.tasks:
-            own = [one for one in missing if one.task == task]
-            for some in (own[first : first + _TOGETHER] for first in range(0, len(own), _TOGETHER)):
-                for episode, taken in zip(some, _taken(found, rows, some, wanted), strict=True):
-                    _write(wanted.file(found.root, episode), taken)
-                    bar.update(len(taken))
+    pictures, dataset = Pictures.of(cameras, height, width, every), read_metadata(Path(root))
+    verify(dataset, dataset.episodes)
+    rows = load_rows(dataset)
+    missing = [episode for episode in dataset.episodes if not pictures.file(dataset.root, episode).is_file()]
+    with Progress("rendering", sum(map(pictures.count, missing)), "picture", show=progress) as bar:
+        for task in dataset.config.tasks:
+            episodes = [episode for episode in missing if episode.task == task]
+            for start in range(0, len(episodes), _TOGETHER):
+                some = episodes[start : start + _TOGETHER]
+                for episode, images in zip(some, _render(dataset, rows, some, pictures), strict=True):
+                    _write(pictures.file(dataset.root, episode), images)
+                    bar.update(len(images))
 
 
-def _taken(
-    found: Demonstrations, rows: TensorDictBase, episodes: Sequence[EpisodeInfo], wanted: Pictures
+def _render(
+    dataset: Demonstrations, rows: TensorDictBase, episodes: Sequence[EpisodeInfo], pictures: Pictures
 ) -> list[list[np.ndarray[Any, Any]]]:
-    task, seed, steps = episodes[0].task, found.config.seed, found.config.max_steps
+    """The pictures of some episodes of one task, which are run again together."""
+    task, seed, steps = episodes[0].task, dataset.config.seed, dataset.config.max_steps
     base = LanguageWorldEnv(task, num_envs=len(episodes), seed=seed, max_steps=steps)
-    camera = CameraTransform(wanted.cameras, height=wanted.height, width=wanted.width, every=wanted.every)
-    taken: list[list[np.ndarray[Any, Any]]] = [[] for _ in episodes]
-    starts = torch.tensor([one.start for one in episodes])
-    lengths = torch.tensor([one.length for one in episodes])
+    camera = CameraTransform(pictures.cameras, height=pictures.height, width=pictures.width, every=pictures.every)
+    images: list[list[np.ndarray[Any, Any]]] = [[] for _ in episodes]
+    starts = torch.tensor([episode.start for episode in episodes])
+    lengths = torch.tensor([episode.length for episode in episodes])
     with closing(TransformedEnv(base, camera)) as env:
-        state = env.reset(episode=torch.tensor([one.episode for one in episodes]))
+        state = env.reset(episode=torch.tensor([episode.episode for episode in episodes]))
         for step in range(int(lengths.max())):
-            going = step < lengths
-            here = rows[starts + torch.minimum(torch.tensor(step), lengths - 1)]
-            if not torch.equal(state.get("observation")[going], here.get("observation")[going]):
-                versions = ", ".join(f"{name} {version}" for name, version in found.versions.items())
+            active = step < lengths
+            stored = rows[starts + torch.minimum(torch.tensor(step), lengths - 1)]
+            if not torch.equal(state.get("observation")[active], stored.get("observation")[active]):
+                versions = ", ".join(f"{name} {version}" for name, version in dataset.versions.items())
                 raise DatasetError(
-                    f"root: episodes of {episodes[0].task!r} in {str(found.root)!r} go otherwise when they are run "
-                    f"again, from step {step} on: they were made by {versions}"
+                    f"root: episodes of {task!r} in {str(dataset.root)!r} differ from step {step} on when they are run "
+                    f"again; they were collected with {versions}"
                 )
-            if step % wanted.every == 0:
-                for place in going.nonzero().flatten().tolist():
-                    taken[place].append(state.get("pixels")[place].numpy())
-            state.set("action", here.get("action")).set("_step", going)
+            if step % pictures.every == 0:
+                for place in active.nonzero().flatten().tolist():
+                    images[place].append(state.get("pixels")[place].numpy())
+            state.set("action", stored.get("action")).set("_step", active)
             state = step_mdp(env.step(state), exclude_action=True).exclude("_step")
-    return taken
+    return images
 
 
 def _write(path: Path, pictures: Sequence[np.ndarray[Any, Any]]) -> None:
@@ -180,22 +166,21 @@ def load_pictures(
     width: int = 64,
     every: int = 1,
 ) -> Tensor:
-    """The pictures of a buffer's rows, in memory, for ``replay.add_column("pixels", ...)``: (R, height, width·C, 3)
-    uint8. They are those of ``observation``, in the order of ``replay[:]``; between two of an episode, the earlier one.
+    """The pictures of a buffer's rows, for ``replay.add_column("pixels", ...)``: (R, height, width·C, 3) uint8.
 
-    ``cameras``, ``height``, ``width`` and ``every`` are as given to :func:`add_pictures`. Without such pictures, or if
-    they are damaged, a :class:`DatasetError`, which is a ValueError, is raised.
+    They belong to ``observation``, in the order of ``replay[:]``; rows between two pictures show the earlier one.
+    ``cameras``, ``height``, ``width`` and ``every`` are as given to :func:`add_pictures`. A :class:`DatasetError` (a
+    ValueError) is raised if they are missing or damaged.
     """
-    wanted = Pictures.of(cameras, height, width, every)
+    pictures = Pictures.of(cameras, height, width, every)
     _, lengths = torch.unique_consecutive(replay.storage.column(("collector", "traj_ids")), return_counts=True)
-    listed = [(part.root, episode) for part in replay.parts for episode in part.episodes]
-    found = torch.empty((int(lengths.sum()), *wanted.shape), dtype=torch.uint8)
+    episodes = [(part.root, episode) for part in replay.parts for episode in part.episodes]
+    images = torch.empty((int(lengths.sum()), *pictures.shape), dtype=torch.uint8)
     row = 0
-    for (root, episode), length in zip(listed, lengths.tolist(), strict=True):
-        if not wanted.file(root, episode).is_file():
-            by = f"by {', '.join(wanted.cameras)}, {height} times {width} pixels, every {every}"
-            what = f"root: {str(root)!r} has no pictures of {episode.task}, episode {episode.episode}, {by}"
-            raise DatasetError(f"{what}; lw.data.add_pictures({str(root)!r}, ...) takes them")
-        found[row : row + length] = wanted.read(root, episode)[torch.arange(length) // every]
+    for (root, episode), length in zip(episodes, lengths.tolist(), strict=True):
+        if not pictures.file(root, episode).is_file():
+            missing = f"root: {str(root)!r} has no such pictures of {episode.task}, episode {episode.episode}"
+            raise DatasetError(f"{missing}; render them with lw.data.add_pictures({str(root)!r}, ...)")
+        images[row : row + length] = pictures.read(root, episode)[torch.arange(length) // every]
         row += length
-    return found
+    return images

@@ -1,4 +1,4 @@
-"""The rewards that rows are shown with, and their discounted sums over n steps."""
+"""The rewards of a replay buffer's rows, and options of their discounted sums over n steps."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -44,42 +44,36 @@ REWARDS: Mapping[RewardName, Reward] = MappingProxyType(
         "dense_cost": Reward("dense", shift=-_MOST, scale=0.01, at_success=0.0),
     }
 )
-"""By name: the success as 0 and 1; Meta-World's own, at most 10; a cost of 0.01 a step, none at success; what the dense
-reward lacks of 10, as a cost of at most about 0.1 a step, none at success. Costs need episodes that end at success
-(``terminate_on_success``): then the best return is 0, and staying short of the goal earns nothing."""
+"""By name: the success as 0 and 1; Meta-World's own, at most 10; a cost of 0.01 a step, none at success; the difference
+of the dense reward to 10, as a cost of at most about 0.1 a step, none at success. Costs need episodes that end at
+success (``terminate_on_success``): then the best return is 0, and staying short of the goal earns nothing."""
 
 
-def check_reward(name: RewardName, reward: Tensor, success: Tensor) -> None:
-    """Raise :class:`ValueError` if rows (R, 1) plainly have another reward; that of several steps shows over 10."""
-    stated = REWARDS[name]
+def check_reward(source: Literal["sparse", "dense"], reward: Tensor, success: Tensor) -> None:
+    """Raise :class:`ValueError` if the rewards of an environment's steps (R, 1) are plainly not those of ``source``."""
     sparse = success.to(torch.float32)
-    if stated.source == "sparse":
-        if not torch.equal(reward, stated.of(sparse, success)):
-            instead = "give reward='dense' or 'dense_cost' for a dense one, make the environment with frame_skip=1"
-            raise ValueError(f"batch: the reward is not the success, of which {name!r} is made; {instead}")
-        return
-    if stated.is_source and torch.equal(reward, sparse) and success.any():
-        raise ValueError("batch: the reward is the success, but the demonstrations' is dense; give reward='sparse'")
-    most = stated.of(reward.new_tensor([[_MOST]]), success.new_zeros(1, 1))
-    if len(reward) and float(reward.max()) > float(most) + 1e-3:
-        more = f"{float(reward.max()):.4g} is more than {name!r} gives in a step, {float(most):.4g}"
+    if source == "sparse" and not torch.equal(reward, sparse):
+        instead = "use reward='dense' or 'dense_cost', or make the environment with reward='sparse', frame_skip=1"
+        raise ValueError(f"batch: the reward is not the success, as the demonstrations' is; {instead}")
+    if source == "dense" and torch.equal(reward, sparse) and success.any():
+        raise ValueError("batch: the reward is the success, but the demonstrations' is dense; use reward='sparse'")
+    if len(reward) and float(reward.max()) > _MOST + 1e-3:
+        more = f"{float(reward.max()):.4g} is more than a step's, {_MOST:g}"
         raise ValueError(f"batch: a reward of {more}; make the environment with frame_skip=1")
-    if stated.at_success is not None and (reward[success] != stated.at_success).any():
-        raise ValueError(f"batch: the reward of a success must be {stated.at_success} for {name!r}")
 
 
 STEPS = "steps_to_next_obs"  # TorchRL's name of the column with the steps from an observation to its "next"
 
 
 def check_n_steps(n_steps: Any, gamma: Any) -> tuple[int, float]:
-    """Both, if they go together: more than one step needs the discount."""
+    """Return both; ValueError unless more than one step comes with the discount."""
     number = check_int("n_steps", n_steps, minimum=1)
     if number == 1:
         if gamma is not None:
-            raise ValueError(f"gamma belongs to n_steps of 2 or more, got gamma={gamma!r} with n_steps=1")
+            raise ValueError(f"gamma needs n_steps of 2 or more, got gamma={gamma!r} with n_steps=1")
         return 1, 1.0
     if gamma is None:
-        raise ValueError(f"n_steps={number} needs gamma, the discount that the loss has too")
+        raise ValueError(f"n_steps={number} needs gamma, the loss's discount")
     if not (discount := check_probability("gamma", gamma)):
         raise ValueError("gamma must be above 0, got 0")
     return number, discount

@@ -1,8 +1,8 @@
-"""Which episodes of which datasets a replay buffer shows, and which of their rows."""
+"""Selection of the episodes and rows that a replay buffer shows."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -10,25 +10,25 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._checks import check_fields, check_int, check_probability, check_text, shown, unknown_name
-from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo
-from lw_torchrl.data.memory_map import damaged, load_rows
-from lw_torchrl.data.passes import spans
+from lw_torchrl._checks import check_fields, check_int, check_probability, shown, unknown_name
+from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations, EpisodeInfo
+from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.data.rewards import REWARDS, RewardName
+from lw_torchrl.data.samplers import spans
 from lw_torchrl.language.value_checks import finite
 
 
 @dataclass(frozen=True)
 class EpisodeFilter:
-    """Which episodes to keep: those that meet every condition given.
+    """Keeps the episodes that meet every given condition.
 
-    An episode's return is the sum of the requested ``("next", "reward")`` over the rows that are shown of it.
+    An episode's return is the sum of the buffer's ``("next", "reward")`` over the rows that are shown of it.
 
     Attributes:
-        success: keep those that succeeded at some step, or, if False, those that did not.
-        least_return, behaviours: keep those with at least this return; those of these labels, "spoilt-30" say.
-        best: of those that meet the other conditions, the fraction of each task's episodes to keep, at least one, those
-            of the highest return, the shorter at a tie.
+        success: keep episodes that succeeded at some step, or, if False, those that did not.
+        least_return, behaviours: keep episodes of at least this return; of these labels, "spoilt-30" for example.
+        best: the fraction of each task's remaining episodes to keep, at least one: those of the highest return, the
+            shorter at a tie.
         else_best: for a task without an episode that meets the conditions, the fraction of all its episodes to keep,
             chosen as for ``best``; None for an error.
 
@@ -48,15 +48,8 @@ class EpisodeFilter:
         for name in ("best", "else_best"):
             if (part := getattr(self, name)) is not None and not check_probability(f"keep: {name}", part):
                 raise ValueError(f"keep: {name} must be above 0, got 0")
-        if self.behaviours is None:
-            return
-        if isinstance(self.behaviours, str) or not isinstance(self.behaviours, Iterable):
-            raise TypeError(f"keep: behaviours must be a tuple of labels, got {self.behaviours!r}")
-        object.__setattr__(self, "behaviours", tuple(self.behaviours))
-        for label in self.behaviours:
-            check_text("keep: behaviours", label)
-        if not self.behaviours:
-            raise ValueError("keep: behaviours must hold at least one label, got none")
+        if self.behaviours is not None:
+            object.__setattr__(self, "behaviours", tuple(self.behaviours))
 
     def choose(self, parts: Sequence[Demonstrations], returns: Sequence[Tensor]) -> list[Demonstrations]:
         """The parts with the episodes that are kept, by the return and the rows of each, (E, 2) float64 a part."""
@@ -106,41 +99,35 @@ def episode_returns(reward: Tensor, lengths: Sequence[int] | Tensor) -> Tensor:
 
 Label = Literal["expert", "unclipped", "executed"]
 EpisodeChoice = int | Mapping[str, int | Sequence[int]] | None
-"""All episodes; the first so many of each task; or, for each task to take, the first so many or these."""
+"""None for all; the number of first episodes of each task; or, for each task to use, such a number or the indices."""
 
 
-def choose_episodes(found: Demonstrations, chosen: EpisodeChoice, argument: str = "episodes") -> Demonstrations:
+def choose_episodes(dataset: Demonstrations, chosen: EpisodeChoice, argument: str = "episodes") -> Demonstrations:
     """A dataset's description with only the chosen episodes, in the dataset's order."""
     if chosen is None:
-        return found
-    there: dict[str, list[int]] = {}
-    for episode in found.episodes:
-        there.setdefault(episode.task, []).append(episode.episode)
-    if not isinstance(chosen, Mapping) and not hasattr(chosen, "__index__"):
-        raise TypeError(f"{argument} must be None, a number, or a mapping of task names, got {chosen!r}")
-    wanted = chosen if isinstance(chosen, Mapping) else dict.fromkeys(there, chosen)
-    if not wanted:
-        raise ValueError(f"{argument} must name at least one task, got an empty mapping")
+        return dataset
+    existing: dict[str, list[int]] = {}
+    for episode in dataset.episodes:
+        existing.setdefault(episode.task, []).append(episode.episode)
+    choices = chosen if isinstance(chosen, Mapping) else dict.fromkeys(existing, chosen)
     keep: set[tuple[str, int]] = set()
-    for task, some in wanted.items():
-        if task not in there:
-            raise unknown_name(f"{argument}: task", task, there)
+    for task, choice in choices.items():
+        if task not in existing:
+            raise unknown_name(f"{argument}: task", task, existing)
         place = f"{argument}[{task!r}]"
-        if hasattr(some, "__index__"):
-            if (number := check_int(place, some, minimum=1)) > len(there[task]):
-                raise ValueError(f"{place}: the dataset has {len(there[task])} episodes of {task!r}, got {number}")
-            numbers = there[task][:number]
-        elif isinstance(some, Sequence) and not isinstance(some, str):
-            numbers = [check_int(place, number) for number in some]
+        if isinstance(choice, Sequence) and not isinstance(choice, str):
+            numbers = list(choice)
+        elif check_int(place, choice, minimum=1) > len(existing[task]):
+            raise ValueError(f"{place}: the dataset has {len(existing[task])} episodes of {task!r}, got {choice}")
         else:
-            raise TypeError(f"{place} must be a number or a list of episodes, got {some!r}")
-        if odd := sorted(set(numbers) - set(there[task])):
-            held, asked = shown(there[task])[1:-1], shown(odd)[1:-1]
-            raise ValueError(f"{place}: the dataset holds the episodes {held}, got {asked}")
-        if not numbers or len(set(numbers)) != len(numbers):
-            raise ValueError(f"{place} must name at least one episode, each once, got {list(numbers)}")
+            numbers = existing[task][:choice]
+        if odd := sorted(set(numbers) - set(existing[task])):
+            episodes, missing = shown(existing[task])[1:-1], shown(odd)[1:-1]
+            raise ValueError(f"{place}: the dataset holds the episodes {episodes}, got {missing}")
+        if not numbers:
+            raise ValueError(f"{place} must name at least one episode")
         keep |= {(task, number) for number in numbers}
-    return replace(found, episodes=tuple(e for e in found.episodes if (e.task, e.episode) in keep))
+    return replace(dataset, episodes=tuple(e for e in dataset.episodes if (e.task, e.episode) in keep))
 
 
 def _kept(episodes: Sequence[EpisodeInfo], after: int | None) -> tuple[Tensor, Tensor]:
@@ -161,8 +148,8 @@ def returns_of(whole: Demonstrations, chosen: Demonstrations, reward: RewardName
 def read_part(
     whole: Demonstrations, chosen: Demonstrations, label: Label, reward: RewardName, after: int | None, terminate: bool
 ) -> tuple[TensorDictBase, Tensor | None]:
-    """All rows of a dataset, memory-mapped, and which of them to show: (n,) int64, None for all. Columns that differ
-    from the files are in memory: rewards, and ends of episodes that are cut short."""
+    """All rows of a dataset, memory-mapped, and the indices of the rows to show, (n,) int64, or None for all. Rewards
+    and the ends of shortened episodes, which differ from the files, are in memory."""
     rows = load_rows(whole)
     if label == "executed":
         rows = rows.clone(recurse=False)
@@ -173,7 +160,7 @@ def read_part(
         taken, other = ("expert_action", "unclipped_action")[:: 1 if label == "expert" else -1]
         rows = rows.exclude("next", "action", other).rename_key_(taken, "action")
     if not finite(rows.get("action")):
-        raise damaged(f"an action in {str(whole.root)!r} is no finite number, for label={label!r}")
+        raise DatasetError(f"root: {str(whole.root)!r} holds an action that is NaN or infinite, for label={label!r}")
     if chosen.episodes == whole.episodes and after is None:
         return rows, None
     kept, lengths = _kept(chosen.episodes, after)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from reprlib import repr as short
@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
 from lw_torchrl._devices import CPU
-from lw_torchrl._files import read_json, reading, write_json
+from lw_torchrl._files import read_json, write_json
 from lw_torchrl.data.rewards import STEPS, check_n_steps
 
 TRAJECTORY, REWARD, DONE = ("collector", "traj_ids"), ("next", "reward"), ("next", "done")
@@ -26,36 +26,44 @@ def column_name(key: NestedKey) -> str:
     return key if isinstance(key, str) else "/".join(key)
 
 
+def flat_columns(rows: TensorDictBase) -> dict[str, Any]:
+    """The columns by their names joined by dots."""
+    keys = rows.keys(True, True)
+    return {key if isinstance(key, str) else ".".join(key): rows.get(key) for key in keys}
+
+
+def row_dictionaries(columns: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """A dictionary for each row of columns, tensors (n, ...) or lists of n."""
+    parts = [column if isinstance(column, list) else column.unbind(0) for column in columns.values()]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*parts, strict=True)]
+
+
 def _columns(parts: Sequence[TensorDictBase]) -> dict[NestedKey, list[Tensor]]:
     """The leaves of each column, which must agree in all parts."""
     columns: dict[NestedKey, list[Tensor]] = {}
     for number, part in enumerate(parts):
-        if part.batch_dims != 1:
-            raise ValueError(f"parts[{number}] must have one batch dimension, got {tuple(part.batch_size)}")
-        found = {key: part.get(key) for key in part.keys(True, True, is_leaf=is_leaf_nontensor)}
-        if number and (odd := sorted(map(column_name, found.keys() ^ columns.keys()))):
+        leaves = {key: part.get(key) for key in part.keys(True, True, is_leaf=is_leaf_nontensor)}
+        if number and (odd := sorted(map(column_name, leaves.keys() ^ columns.keys()))):
             raise ValueError(f"parts[{number}] must have the columns of parts[0], they differ in {', '.join(odd)}")
-        for key, leaf in found.items():
-            where = f"parts[{number}]: column {column_name(key)} must be"
-            if not isinstance(leaf, Tensor):
-                raise TypeError(f"{where} a tensor, got {type(leaf).__name__}")
+        for key, leaf in leaves.items():
             before = columns.setdefault(key, [leaf])[0]
             if (leaf.shape[1:], leaf.dtype) != (before.shape[1:], before.dtype):
-                wanted, got = (f"{one.dtype} of shape {tuple(one.shape[1:])}" for one in (before, leaf))
-                raise ValueError(f"{where} {wanted} a row as in parts[0], got {got}")
+                expected, actual = (f"{one.dtype} of shape {tuple(one.shape[1:])}" for one in (before, leaf))
+                where = f"parts[{number}]: column {column_name(key)}"
+                raise ValueError(f"{where} must be {expected} a row as in parts[0], got {actual}")
             if number:
                 columns[key].append(leaf)
     return columns
 
 
 class JoinedStorage(Storage):
-    """Rows of several tensordicts, memory-mapped ones say, behind one index; only the batch that is read is copied.
+    """Rows of several tensordicts, memory-mapped for example, behind one index. Only the requested batch is copied.
 
     The rows come in the order of the parts, and within a part in the order of ``rows``. The storage is read-only, and
     its state is its length. A replay buffer over it needs ``collate_fn=lambda batch: batch``.
 
-    With ``n_steps``, the entries under ``"next"`` are those of the row so many steps ahead, or of the trajectory's last
-    row if that comes before. ``("next", "reward")`` is the discounted sum on the way, and ``steps_to_next_obs``, (B,)
+    With ``n_steps``, the entries under ``"next"`` are those of the row N steps ahead, or of the trajectory's last row
+    if that comes before. ``("next", "reward")`` is the discounted sum on the way, and ``steps_to_next_obs``, (B,)
     int64, the number of steps, which TorchRL's value estimators read.
 
     Args:
@@ -91,19 +99,16 @@ class JoinedStorage(Storage):
         self.n_steps, self.gamma = check_n_steps(n_steps, gamma)
         if not parts:
             raise ValueError("parts must hold at least one tensordict, got none")
-        chosen = [None] * len(parts) if rows is None else list(rows)
-        if len(chosen) != len(parts):
-            raise ValueError(f"rows must be one for each of the {len(parts)} parts, got {len(chosen)}")
         self._columns = _columns(parts)
         self._ends = torch.tensor([len(part) for part in parts]).cumsum(0)  # of the parts, all rows counted
-        taken = []
+        places = []
+        chosen = [None] * len(parts) if rows is None else rows
         for number, (one, (start, end)) in enumerate(zip(chosen, pairwise(self._bounds()), strict=True)):
             local = torch.arange(end - start) if one is None else one.to(torch.int64)
             if len(local) and not 0 <= int(local.min()) <= int(local.max()) < end - start:
-                got = f"{int(local.min())}..{int(local.max())}"
-                raise IndexError(f"rows[{number}] must be in [0, {end - start}), got {got}")
-            taken.append(local + start)
-        self._rows = torch.cat(taken)
+                raise IndexError(f"rows[{number}] must be in [0, {end - start})")
+            places.append(local + start)
+        self._rows = torch.cat(places)
         self.num_joined, self.num_parts = len(self._rows), len(parts)
         self._batch_device = parts[0].device
         self._places: Tensor | None = None  # of all rows, where rows have more columns than the parts
@@ -229,12 +234,7 @@ class JoinedStorage(Storage):
         write_json(Path(path) / "joined.json", self.state_dict())
 
     def loads(self, path: Any) -> None:
-        with reading(path, "storage's state"):
-            self.load_state_dict(read_json(Path(path) / "joined.json", "the file"))
-
-    def __repr__(self) -> str:
-        columns = ", ".join(map(column_name, self.keys()))
-        return f"{type(self).__name__}({len(self)} rows of {self.num_parts} parts, columns {columns})"
+        self.load_state_dict(read_json(Path(path) / "joined.json", "path: the storage's state"))
 
 
 class WholeStorage(JoinedStorage):

@@ -1,4 +1,4 @@
-"""The rows that a growing buffer stores: checked, and linked to trajectories."""
+"""Checks of the rows that a growing buffer stores, and their links to trajectories."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
@@ -7,7 +7,6 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._tensor_archive import check_like
 from lw_torchrl.data.rewards import STEPS
 from lw_torchrl.data.storage import DONE, TRAJECTORY, column_name
 from lw_torchrl.language.value_checks import finite
@@ -17,40 +16,38 @@ MASK = ("collector", "mask")
 
 
 def collected_rows(batch: TensorDictBase, columns: Mapping[NestedKey, Tensor]) -> dict[NestedKey, Tensor]:
-    """The ``columns`` of a collector's batch (n, ...), flattened to one dimension; ``action`` is what was executed.
-    Other columns, dtypes or shapes, NaN, actions outside [-1, 1], and rows of n steps or of padding are refused."""
+    """The ``columns`` of a collector's batch (n, ...), flattened to one dimension; ``action`` is the executed one.
+    ValueError for other columns, dtypes or shapes, NaN, actions outside [-1, 1], and rows of n steps or of padding."""
     names = set(batch.keys(True, True))
     if STEPS in names:
-        why = "so MultiStep or MultiStepTransform was here: leave it out and give the buffer n_steps= and gamma="
-        raise ValueError(f"batch holds {STEPS}, {why}")
+        raise ValueError(f"batch holds {STEPS} of MultiStep; leave that out and give the buffer n_steps= and gamma=")
     if MASK in names and not batch.get(MASK).all():
-        instead = "leave it out, or give batch[batch['collector', 'mask']]"
-        raise ValueError(f"batch holds rows that are no steps: split_trajs=True fills trajectories up; {instead}")
+        raise ValueError("batch holds padding of split_trajs=True; leave that out, or index by ('collector', 'mask')")
     sources = {key: EXECUTED if key == "action" and EXECUTED in names else key for key in columns}
     if absent := [column_name(key) for key, source in sources.items() if source not in names]:
         raise ValueError(f"batch lacks the columns {', '.join(absent)}, which the demonstrations have")
-    found = {}
+    rows = {}
     for key, like in columns.items():
         leaf = batch.get(sources[key])
         tail = leaf.shape[batch.ndim :]
         if leaf.dtype != like.dtype or tail != like.shape[1:]:
-            wanted = f"{like.dtype} of shape {tuple(like.shape[1:])} a row as in the demonstrations"
-            got = f"{leaf.dtype} of shape {tuple(tail)}"
-            raise ValueError(f"batch: column {column_name(sources[key])} must be {wanted}, got {got}")
+            expected = f"{like.dtype} of shape {tuple(like.shape[1:])} a row as in the demonstrations"
+            actual = f"{leaf.dtype} of shape {tuple(tail)}"
+            raise ValueError(f"batch: column {column_name(sources[key])} must be {expected}, got {actual}")
         if leaf.dtype.is_floating_point and not leaf.isfinite().all():
             raise ValueError(f"batch: column {column_name(sources[key])} holds NaN or an infinite number")
-        found[key] = leaf.detach().reshape(-1, *tail)
-    if sources.get("action") == "action" and (most := float(found["action"].abs().max())) > 1.0:
+        rows[key] = leaf.detach().reshape(-1, *tail)
+    if sources.get("action") == "action" and (largest := float(rows["action"].abs().max())) > 1.0:
         instead = "LanguageWorldEnv gives it as ('next', 'executed_action')"
-        raise ValueError(f"batch: action must be what was done, in [-1, 1], got one of {most:.3g}; {instead}")
-    return found
+        raise ValueError(f"batch: action must be the executed action, in [-1, 1], got {largest:.3g}; {instead}")
+    return rows
 
 
 Columns = Mapping[NestedKey, Tensor]
 
 
 class OpenTrajectories(NamedTuple):
-    """Of trajectories that have not ended, the collector's id, our number, and the last row's serial, (K,) int64."""
+    """The trajectories that have not ended: the collector's id, our number, and the last row's serial, (K,) int64."""
 
     key: Tensor
     number: Tensor
@@ -118,34 +115,15 @@ def link_rows(
 
 def check_grown_state(state: Mapping[str, Any], ring: Columns) -> tuple[int, int, Columns, OpenTrajectories]:
     """Count, next number, rows and open trajectories of a growing storage's state, if they fit the ring."""
-
-    def require(holds: bool, name: str, wanted: str) -> None:
-        if not holds:
-            raise ValueError(f"state_dict: {name} must be {wanted}")
-
-    grow = len(ring[TRAJECTORY])
-    require(state.get("grow") == grow, "grow", f"{grow}, as this buffer's")
-    for name, wanted in (("count", "a number of rows"), ("number", "a trajectory's number")):
-        require(type(state.get(name)) is int and 0 <= state[name] < 2**62, name, wanted)
-    count, number, names = state["count"], state["number"], {column_name(key): key for key in ring}
-    there = min(count, grow)
-    given = state.get("rows")
-    require(isinstance(given, Mapping) and set(given) == set(names), "rows", f"the columns {', '.join(names)}")
-    check_like(given, {name: ring[key][:there] for name, key in names.items()}, "state_dict: rows")
-    rows = {key: state["rows"][name] for name, key in names.items()}
-    for key, leaf in rows.items():
-        require(finite(leaf), f"rows[{column_name(key)!r}]", "finite numbers")
-    if "action" in rows:
-        require(bool((rows["action"].abs() <= 1).all()), "rows['action']", "in [-1, 1]")
-    require(bool((rows[TRAJECTORY] < number).all()), f"rows[{column_name(TRAJECTORY)!r}]", f"below {number}")
-    given, fields = state.get("open"), OpenTrajectories._fields
-    require(isinstance(given, Mapping) and set(given) == set(fields), "open", "key, number and last")
-    parts = [state["open"][name] for name in fields]
-    fits = (isinstance(part, Tensor) and part.dtype == torch.int64 and part.dim() == 1 for part in parts)
-    require(all(fits) and len({len(part) for part in parts}) == 1, "open", "(K,) int64 each")
-    opened = OpenTrajectories(*(part.clone() for part in parts))
-    inside = (opened.last >= count - there) & (opened.last < count)
-    require(bool(inside.all()) and len(opened.last.unique()) == len(opened.last), "open", "of rows that are there")
-    numbers = rows[TRAJECTORY].reshape(-1)[opened.last - (count - there)]
-    require(torch.equal(opened.number, numbers), "open", "of these rows' trajectories")
-    return count, number, rows, opened
+    grow, names = len(ring[TRAJECTORY]), {column_name(key): key for key in ring}
+    if state.get("grow") != grow:
+        raise ValueError(f"state_dict must be of a buffer with grow={grow}, got {state.get('grow')}")
+    count, number, rows = state["count"], state["number"], state["rows"]
+    if set(rows) != set(names):
+        raise ValueError(f"state_dict: rows must hold the columns {', '.join(names)}, got {', '.join(rows)}")
+    for name, key in names.items():
+        expected, actual = ring[key][: min(count, grow)], rows[name]
+        if (actual.dtype, actual.shape) != (expected.dtype, expected.shape) or not finite(actual):
+            raise ValueError(f"state_dict: {name} must be finite {expected.dtype} of shape {tuple(expected.shape)}")
+    opened = OpenTrajectories(*(state["open"][name].clone() for name in OpenTrajectories._fields))
+    return count, number, {key: rows[name] for name, key in names.items()}, opened

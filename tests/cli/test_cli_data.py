@@ -131,7 +131,7 @@ def test_check_reads_every_row(capsys, made, tmp_path):
         run(capsys, "data", "show", root, "--check")
     assert caught.value.code == 2
     error = capsys.readouterr().err
-    assert "is damaged: 1 of 6 episodes differ from their checksums; the same `lw-torchrl collect` runs these" in error
+    assert "is damaged: 1 of 6 episodes differ from their checksums; delete the folder" in error
 
 
 def test_a_long_check_writes_lines_into_a_pipe(capsys, made, monkeypatch):
@@ -158,7 +158,7 @@ def test_what_is_no_dataset_is_one_line(capsys, made, tmp_path):
     third = shutil.copytree(other, tmp_path / "third")
     stated["config"]["policy"].update(right=0.4)
     (third / "metadata.json").write_text(json.dumps(stated))
-    assert "'twice' stands for two behaviours" in fails(capsys, "data", "show", other, third)
+    assert "'twice' names different behaviours" in fails(capsys, "data", "show", other, third)
 
 
 # ---- collect

@@ -129,7 +129,7 @@ def test_data(capsys, folder):
     assert (found["all"]["episodes"], found["all"]["steps"], found["all"]["success"]) == (2, 1000, 1.0)
     assert found["datasets"][0]["config"]["seed"] == 0
     assert document(capsys, "data", "show", "demos", "--check")["damaged"] == []
-    check_documented("data export", document(capsys, "data", "export", "demos", "--to", "parquet", "--out", "others"))
+    check_documented("data export", document(capsys, "data", "export", "demos", "--to", "lerobot", "--out", "others"))
     found = document(capsys, "data", "import", "others", "--out", "back")
     check_documented("data import", found)
     assert (found["steps"], found["lacking"], found["tasks"][0]["success"]) == (1000, [], 1.0)

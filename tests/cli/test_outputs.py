@@ -14,7 +14,7 @@ FOLDERS = {
     "demo": ["--quick", "--out"],
     "collect": ["reach", "--out"],
     "train-evaluator": ["reach", "--out"],
-    "data export": ["demos", "--to", "parquet", "--out"],
+    "data export": ["demos", "--to", "lerobot", "--out"],
     "data import": ["demos", "--out"],
     "evaluate": ["expert", "--out"],
     "scripted": ["reach", "--out"],

@@ -66,9 +66,9 @@ WRONG = {
     "collect reach --out o --policy expret": "--policy must be one of 'expert', 'scripted', ",
     "collect reach --out o --policy nowhere.zip": "--policy: no file 'nowhere.zip'; `lw-torchrl train` writes one",
     "collect reach --out o --policy demos": "--policy: 'demos' is a folder; a policy is one file",
-    "data export nowhere --to parquet --out o": "FOLDER: no dataset folder 'nowhere'",
-    "data export demos --to lerobt --out o": "--to must be one of 'parquet', 'lerobot', 'hdf5', 'minari', got 'lerobt'",
-    "data export demos --to parquet --out .": "--out must be a new folder, or an empty one, '.' holds files",
+    "data export nowhere --to lerobot --out o": "FOLDER: no dataset folder 'nowhere'",
+    "data export demos --to lerobt --out o": "--to must be one of 'lerobot', 'minari', got 'lerobt'",
+    "data export demos --to lerobot --out .": "--out must be a new folder, or an empty one, '.' holds files",
     "data import nowhere --out o": "SOURCE: there is no file or folder 'nowhere'",
     "data import demos --out o --episodes 0": "--episodes must be at least 1, got 0",
     "data show nowhere": "FOLDERS: no dataset folder 'nowhere'; make one with `lw-torchrl collect`",
@@ -235,5 +235,5 @@ def test_the_words_of_the_command_line_are_those_of_the_library():
     from lw_torchrl.modules import METHODS
 
     assert tuple(BEHAVIOURS) == options.ACTORS
-    assert get_args(exchange.ExchangeFormat) == FORMATS
+    assert get_args(exchange.ExportFormat) == FORMATS
     assert tuple(METHODS) == options.CONDITIONS

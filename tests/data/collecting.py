@@ -9,7 +9,7 @@ import torch
 import lw_torchrl as lw
 from lw_torchrl.data import collect_demonstrations
 from lw_torchrl.data.dataset import read_metadata
-from lw_torchrl.data.memory_map import describe_episode, load_rows, map_rows
+from lw_torchrl.data.memory_map import describe_episode, load_rows
 from lw_torchrl.data.missing_episodes import EpisodeFiles
 
 TASKS = ("push", "reach")
@@ -31,7 +31,7 @@ def tree(root):
 def restate_checksums(root):
     """Make the rows of a dataset, whatever was done to them, the ones that its metadata speak of."""
     found = read_metadata(root)
-    rows = map_rows(found)
+    rows = load_rows(found)
     parts = [(one, rows[one.start : one.start + one.length]) for one in found.episodes]
     stated = json.loads((root / "metadata.json").read_text())
     stated["episodes"]["checksum"] = [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import warnings
 
 import pytest
@@ -11,13 +10,12 @@ import torch
 from collecting import PLANS, SEED, collect, interrupt_after, same_rows, trained, tree
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mutations import mutated
 
 import lw_torchrl as lw
 from lw_torchrl._seeding import episode_generator
 from lw_torchrl.data import BEHAVIOURS, Behaviour, CollectConfig, DatasetError, missing_episodes
-from lw_torchrl.data.behaviours import SegmentActor, behaviour_of, segment_plans
-from lw_torchrl.data.dataset import parse_config, read_metadata
+from lw_torchrl.data.behaviours import SegmentActor, segment_plans
+from lw_torchrl.data.dataset import read_metadata
 from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.envs.episodes import run_episodes
 from lw_torchrl.language.tasks import task_id
@@ -57,40 +55,13 @@ def test_nor_on_interruptions(made, name, tmp_path, monkeypatch):
     assert tree(collect(root, policy=name, num_envs=3).root) == tree(made[name].root)
 
 
-def test_behaviours_differ_in_what_they_do_and_not_in_where_they_begin(made):
-    first = [load_rows(one)[:1] for one in made.values()]
-    assert all(torch.equal(rows["observation"], first[0]["observation"]) for rows in first)
-    actions = [load_rows(one)["expert_action"] for one in made.values()]
-    assert not any(torch.equal(one, other) for n, one in enumerate(actions) for other in actions[:n])
-
-
 def test_the_metadata_say_who_acted(made):
     for name, one in made.items():
         found = read_metadata(one.root).config
         assert found.behaviour == name
         assert found.policy.acts == BEHAVIOURS[name]
         assert found.policy.fingerprint == segment_plans(("push", "reach")).fingerprint
-        assert parse_config(json.loads(json.dumps(found.to_json()))) == found
-
-
-def test_the_experts_metadata_say_what_they_said_before_there_were_others(tmp_path):
-    one = collect(tmp_path / "demos")
-    text = (one.root / "metadata.json").read_text()
-    assert list(json.loads(text)["config"]) == [
-        "tasks",
-        "episodes_per_task",
-        "seed",
-        "noise_scale",
-        "noise_hold",
-        "gripper_noise_factor",
-        "redraw_failures",
-        "max_steps",
-    ]
-    assert one.config.policy == BEHAVIOURS["expert"]
-    assert collect(one.root, policy="expert") == one
-    assert (one.root / "metadata.json").read_text() == text
-    assert one.config.behaviour == "noisy"
-    assert CollectConfig(("reach",), 1, 0).behaviour == "expert"
+        assert CollectConfig.from_json(json.loads(json.dumps(found.to_json()))) == found
 
 
 def pieces(flags):
@@ -227,17 +198,11 @@ def test_redrawing_with_others_than_the_expert(tmp_path, monkeypatch):
         collect(tmp_path / "c", tasks="push", policy="random", redraw_failures=True, episodes_per_task=1)
 
 
-def test_an_expert_of_another_name_is_one(tmp_path):
-    made = collect(tmp_path / "demos", behaviour="night shift")
-    assert made.config.behaviour == "night shift"
-    replay = lw.LanguageWorldExperienceReplay(made.root, label="expert")
-    assert replay.behaviours == ("night shift",)
-    assert torch.equal(replay[:]["action"], load_rows(made)["expert_action"])
-
-
 @pytest.mark.parametrize("label", ["expert", "unclipped"])
 def test_the_experts_label_is_refused_where_another_acted(made, label):
-    with pytest.raises(ValueError, match=f"label='{label}' is what the expert wanted, and random acted here"):
+    with pytest.raises(
+        ValueError, match=f"label='{label}' needs an expert's actions, but this dataset was collected by 'random'"
+    ):
         lw.LanguageWorldExperienceReplay(made["random"].root, label=label)
 
 
@@ -252,7 +217,7 @@ def test_rows_say_who_acted(made):
 def test_one_label_of_two_behaviours_is_refused(tmp_path, made):
     one = collect(tmp_path / "one", policy=trained(), behaviour="tiny")
     other = collect(tmp_path / "other", policy=trained(seed=1), behaviour="tiny")
-    with pytest.raises(ValueError, match=r"'tiny' stands for two behaviours.*metadata\.json"):
+    with pytest.raises(ValueError, match="'tiny' names different behaviours"):
         lw.LanguageWorldExperienceReplay([one.root, other.root], label="executed")
     stated = json.loads((other.root / "metadata.json").read_text())
     stated["config"]["policy"]["name"] = "second"
@@ -283,68 +248,9 @@ def test_a_policy_trained_on_such_data_says_which_seeds_it_saw(tmp_path, made, c
             assert "--seed must differ from the demonstrations' seed" in fails(capsys, "evaluate", path, "--seed", seed)
 
 
-# ---- JSON
-
-
-STATED = CollectConfig(("reach",), 1, 0, policy=behaviour_of("spoilt-30", ["reach"])).to_json()
-
-
-@given(st.data())
-@settings(max_examples=150, deadline=None)
-def test_json_of_any_shape_is_refused_by_name_or_a_behaviour(data):
-    stated = json.loads(json.dumps(STATED))
-    stated["policy"] = data.draw(mutated(stated["policy"]))
-    said = None
-    try:
-        found = parse_config(stated)
-    except (ValueError, TypeError, OverflowError) as error:
-        said = str(error)
-    if said is not None:
-        assert "policy" in said or "behaviour" in said
-        return
-    assert isinstance(found.policy, Behaviour)
-    assert parse_config(json.loads(json.dumps(found.to_json()))) == found
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (dict(kind="evil"), "behaviour: kind must be one of"),
-        (dict(kind="expert"), "right is of kind 'segments'"),
-        (dict(name="expert"), "label of its own, 'expert' is another's"),
-        (dict(longest=10**30), "behaviour: longest must be from shortest, 8, to 100000"),
-        (dict(longest=7), "behaviour: longest must be from shortest, 8"),
-        (dict(shortest=0), "behaviour: shortest must be at least 1"),
-        (dict(right=float("nan")), "it holds NaN, which is no JSON"),
-        (dict(right=1.5), "behaviour: right must be from 0 to 1"),
-        (dict(right=True), "behaviour: right must be a number"),
-        (dict(right="0.3"), "behaviour: right must be a number"),
-        (dict(otherwise="sleep"), "behaviour: otherwise must be one of"),
-        (dict(fingerprint=3), "behaviour: fingerprint must be a string"),
-        (dict(more=1), "policy must be an object of name, kind"),
-        (dict(name="x" * 101), "name must be a label"),
-    ],
-)
-def test_hostile_metadata_are_refused_by_name(made, tmp_path, change, message):
-    root = shutil.copytree(made["spoilt-30"].root, tmp_path / "demos")
-    stated = json.loads((root / "metadata.json").read_text())
-    stated["config"]["policy"].update(change)
-    (root / "metadata.json").write_text(json.dumps(stated))
-    with pytest.raises(DatasetError, match=message):
-        lw.LanguageWorldExperienceReplay(root, label="executed")
-
-
-@given(
-    right=st.floats(0.0, 1.0),
-    otherwise=st.sampled_from(["skill", "action"]),
-    shortest=st.integers(1, 100_000),
-    data=st.data(),
-)
-@settings(max_examples=50, deadline=None)
-def test_a_behaviour_comes_back_from_its_json(right, otherwise, shortest, data):
-    longest = data.draw(st.integers(shortest, 100_000))
-    one = Behaviour("mine", right=right, otherwise=otherwise, shortest=shortest, longest=longest)
-    assert Behaviour.from_json(json.loads(json.dumps(one.to_json()))) == one
+def test_a_behaviour_comes_back_from_its_json():
+    behaviour = Behaviour("mine", right=0.3, otherwise="action", shortest=3, longest=70)
+    assert Behaviour.from_json(json.loads(json.dumps(behaviour.to_json()))) == behaviour
 
 
 def test_a_behaviour_of_ones_own(tmp_path):

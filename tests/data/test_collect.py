@@ -185,28 +185,14 @@ def test_a_single_number_is_the_same_as_a_sequence_of_one(tmp_path):
     ("changed", "message"),
     [
         (dict(tasks="raech"), "reach"),
-        (dict(tasks=[]), "tasks"),
         (dict(episodes_per_task=0), "episodes_per_task must be at least 1, got 0"),
-        (dict(max_steps=0), "max_steps must be at least 1, got 0"),
         (dict(noise_scale=-0.1), "noise_scale must be finite and at least 0, got -0.1"),
-        (dict(noise_scale=float("nan")), "noise_scale"),
-        (dict(noise_hold=0), "noise_hold must be at least 1, got 0"),
-        (dict(noise_scale=()), "noise_scale must hold at least one number"),
-        (dict(gripper_noise_factor=-1), "gripper_noise_factor"),
         (dict(num_envs=1), "num_envs must be at least the number of tasks, 2, got 1"),
-        (dict(num_envs=0), "num_envs must be at least 1, got 0"),
     ],
 )
 def test_wrong_arguments_are_named(tmp_path, changed, message):
     with pytest.raises(ValueError, match=message):
         collect(tmp_path / "demos", **changed)
-
-
-@pytest.mark.parametrize("changed", [dict(episodes_per_task=2.0), dict(seed="0"), dict(noise_scale=["0.1"])])
-def test_wrong_types_are_named(tmp_path, changed):
-    with pytest.raises(TypeError, match=next(iter(changed))):
-        collect(tmp_path / "demos", **changed)
-    assert not (tmp_path / "demos").exists()
 
 
 def test_a_task_of_ones_own_is_sent_where_it_can_be_shown(tmp_path):

@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import textwrap
-import zipfile
 
 import numpy as np
 import pytest
@@ -65,9 +64,9 @@ KILLER = """
                     die()
                 os.replace = replace
             kills += wait(attempt(prepare))
-        for through in range(40):
+        for through in range(20):
             def prepare(through=through):
-                left = [through // 3]
+                left = [through]
                 def replace(*args):
                     if not left[0]:
                         die()
@@ -113,7 +112,7 @@ def half_made(tmp_path, monkeypatch):
 
 
 def test_an_interrupted_dataset_carries_on_without_doing_episodes_twice(half_made, made, monkeypatch):
-    with pytest.raises(DatasetError, match="half-written"):
+    with pytest.raises(DatasetError, match="unfinished"):
         read_metadata(half_made)
     shards = list((half_made / ".partial").glob("*.npz"))
     assert len(shards) == 4
@@ -127,90 +126,26 @@ def test_an_interrupted_dataset_carries_on_without_doing_episodes_twice(half_mad
     assert tree(half_made) == tree(made.root)
 
 
-def truncate(path):
+def test_a_damaged_episode_file_is_named(half_made, made):
+    path = sorted((half_made / ".partial").glob("*.npz"))[0]
     path.write_bytes(path.read_bytes()[:-100])
-
-
-def empty(path):
-    path.write_bytes(b"")
-
-
-def scribble(path):
-    content = bytearray(path.read_bytes())
-    middle = len(content) // 2
-    content[middle : middle + 8] = bytes(byte ^ 0xFF for byte in content[middle : middle + 8])
-    path.write_bytes(bytes(content))
-
-
-def foreign(path):
-    with replaced_zip(path) as archive:
-        archive.writestr("hello.txt", "nothing of ours")
-
-
-def replaced_zip(path):
+    with pytest.raises(DatasetError, match=rf"{path.name}' is damaged .*; delete this file to run it again"):
+        collect(half_made)
     path.unlink()
-    return zipfile.ZipFile(path, "w")
-
-
-def compress(path):
-    with np.load(path) as found:
-        arrays = dict(found)
-    np.savez_compressed(path, **arrays)
-
-
-def swell(path):
-    with zipfile.ZipFile(path, "a") as archive:
-        archive.writestr("more", bytes(100_000))
-
-
-def link(path):
-    path.symlink_to(path.rename(path.with_suffix(".elsewhere")))
-
-
-def fifo(path):
-    path.unlink()
-    os.mkfifo(path)
-
-
-@pytest.mark.parametrize("damage", [truncate, empty, scribble, foreign, compress, swell, link, fifo])
-@pytest.mark.slow
-def test_a_damaged_episode_is_done_again(half_made, made, damage, monkeypatch):
-    damage(sorted((half_made / ".partial").glob("*.npz"))[0])
-    done, put = [], EpisodeFiles.put
-    monkeypatch.setattr(EpisodeFiles, "put", lambda self, *args: (done.append(args), put(self, *args)))
     collect(half_made)
-    assert len(done) == 3
     assert tree(half_made) == tree(made.root)
 
 
-def test_a_folder_in_the_place_of_an_episode_is_named_and_left_alone(half_made):
-    (half_made / ".partial" / "reach.7.npz").mkdir()
-    (half_made / ".partial" / "reach.7.npz" / "thesis.tex").write_text("years of work")
-    before = tree(half_made)
-    with pytest.raises(DatasetError, match=r"root: .*reach\.7\.npz' is a folder"):
-        collect(half_made)
-    assert tree(half_made) == before
-
-
-def test_no_pickle_in_an_episodes_file_is_ever_executed(half_made, made, tmp_path):
+def test_no_pickle_in_an_episodes_file_is_ever_executed(half_made, tmp_path):
     class Evil:
         def __reduce__(self):
             return (os.mkdir, (str(tmp_path / "executed"),))
 
-    shard = sorted((half_made / ".partial").glob("*.npz"))[0]
-    with np.load(shard) as found:
-        arrays = {key: found[key] for key in found.files}
+    path = sorted((half_made / ".partial").glob("*.npz"))[0]
+    with np.load(path) as file:
+        arrays = {key: file[key] for key in file.files}
     arrays["observation"] = np.array([Evil()] * STEPS, dtype=object)
-    np.savez(shard, allow_pickle=True, **arrays)
-    collect(half_made)
-    assert not (tmp_path / "executed").exists()
-    assert tree(half_made) == tree(made.root)
-
-
-def test_a_damaged_configuration_of_a_half_made_dataset_is_named(half_made):
-    stated = half_made / ".partial" / "config.json"
-    stated.write_text(stated.read_text()[:20])
-    before = tree(half_made)
-    with pytest.raises(DatasetError, match=r"root: .*half.*damaged"):
+    np.savez(path, allow_pickle=True, **arrays)
+    with pytest.raises(DatasetError, match="is damaged"):
         collect(half_made)
-    assert tree(half_made) == before
+    assert not (tmp_path / "executed").exists()

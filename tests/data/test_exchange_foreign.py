@@ -1,51 +1,62 @@
-"""What others hold becomes a dataset: columns by their names, tasks by theirs, and what lacks is named."""
+"""Other people's demonstrations as datasets: columns by their usual names, and warnings for what is missing."""
 
 from __future__ import annotations
 
+import json
 import warnings
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from collecting import tree
 
 import lw_torchrl as lw
 from lw_torchrl.data import ExchangeError
-from lw_torchrl.data.memory_map import map_rows
+from lw_torchrl.data.memory_map import load_rows
 
 DRAWS = np.random.default_rng(0)
 STATES = DRAWS.standard_normal((9, 39))
 ACTIONS = DRAWS.uniform(-1, 1, (9, 4)).astype(np.float32)
 LENGTHS = (4, 2, 3)
-ODD = (float("nan"), 0.3, -1.0)  # which are no booleans
-EPISODE = np.repeat(np.arange(3), LENGTHS)
-TASKS = np.repeat(["push-v3", "reach-v2-goal-observable", lw.TASKS["push"].description], LENGTHS)
+WORDS = ("push-v3", "reach-v2-goal-observable", lw.TASKS["push"].description)
 
 
-def theirs(path, **changed):
-    """A file of three episodes: push, reach, push."""
-    rows = {
-        "observation.environment_state": list(STATES),
-        "observation.state": list(STATES[:, :4]),
-        "action": list(ACTIONS),
-    }
-    rows |= {"next.success": [False] * 8 + [True], "episode_index": EPISODE.tolist(), "task": TASKS.tolist(), **changed}
-    pq.write_table(pa.table({name: value for name, value in rows.items() if value is not None}), path)
-    return path
+def lerobot(folder, words=WORDS, version="v2.1", **changed):
+    """A LeRobot dataset of three episodes: push, reach, push; version 2 has a file for each."""
+    columns = {"observation.environment_state": list(STATES), "observation.state": list(STATES[:, :4])}
+    columns |= {"action": list(ACTIONS), "next.success": [False] * 8 + [True]}
+    columns |= {"episode_index": np.repeat(np.arange(3), LENGTHS).tolist(), "frame_index": [0, 1, 2, 3, 0, 1, 0, 1, 2]}
+    columns |= {"task_index": np.repeat(np.arange(3), LENGTHS).tolist(), **changed}
+    table = pa.table({name: column for name, column in columns.items() if column is not None})
+    (folder / "meta").mkdir(parents=True)
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    info = {"codebase_version": version, "total_frames": 9, "features": {}}
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    tasks = [{"task_index": number, "task": text} for number, text in enumerate(words)]
+    if version.startswith("v2"):
+        (folder / "meta" / "tasks.jsonl").write_text("\n".join(map(json.dumps, tasks)))
+        for number, start in enumerate((0, 4, 6)):
+            part = table.slice(start, LENGTHS[number])
+            pq.write_table(part, folder / "data" / "chunk-000" / f"episode_{number:06d}.parquet")
+    else:
+        pq.write_table(pa.Table.from_pylist(tasks), folder / "meta" / "tasks.parquet")
+        pq.write_table(table, folder / "data" / "chunk-000" / "file-000.parquet")
+    return folder
 
 
-def taken(source, out, warned, **options):
+def imported(source, out, warned, **options):
     with pytest.warns(UserWarning, match=warned):
         return lw.import_dataset(source, out, **{"episodes_per_task": 1, **options})
 
 
-def test_theirs_is_shown_by_a_buffer(tmp_path):
-    made = taken(
-        theirs(tmp_path / "a.parquet"), tmp_path / "out", r"lacks the observation after the last.*; a dense reward"
-    )
+@pytest.mark.parametrize("version", ["v2.0", "v2.1", "v3.0"])
+def test_lerobots_datasets(tmp_path, version):
+    lacks = r"lacks the observation after the last.*; a dense reward"
+    made = imported(lerobot(tmp_path / "theirs", version=version), tmp_path / "out", lacks)
     assert [(one.task, one.length, one.success) for one in made.episodes] == [("push", 4, False), ("reach", 2, False)]
     assert (made.config.behaviour, made.config.seed, made.config.max_steps) == ("imported", -1, 4)
-    rows = map_rows(made)
+    rows = load_rows(made)
     np.testing.assert_array_equal(rows["observation"], STATES[:6].astype(np.float32))
     np.testing.assert_array_equal(rows["next", "observation"][:3], STATES[1:4].astype(np.float32))
     np.testing.assert_array_equal(rows["next", "observation"][3], STATES[3].astype(np.float32))
@@ -55,158 +66,123 @@ def test_theirs_is_shown_by_a_buffer(tmp_path):
     assert (rows["next", "done"] == rows["next", "truncated"]).all()
     replay = lw.LanguageWorldExperienceReplay(made.root, label="executed", batch_size=3)
     assert replay.sample()["next", "reward"].shape == (3, 1)
-    with pytest.raises(ValueError, match="imported acted here: take label='executed'"):
+    with pytest.raises(ValueError, match="collected by 'imported'; use label='executed'"):
         lw.LanguageWorldExperienceReplay(made.root, batch_size=3)
+    out = lw.export_dataset(made.root, "lerobot", tmp_path / "again")
+    assert "NaN" not in (out / "meta" / "stats.json").read_text()
 
 
-def test_tasks_in_their_words_and_episodes_to_choose(tmp_path):
-    file = theirs(tmp_path / "a.parquet", task=np.repeat(["shove", "reach", "shove"], LENGTHS).tolist())
-    with pytest.raises(ValueError, match=r"task must be one of .*, got 'shove'.*task= may map it"):
-        lw.import_dataset(file, tmp_path / "out")
+def test_tasks_in_their_words_and_numbers_of_episodes(tmp_path):
+    source = lerobot(tmp_path / "theirs", words=("shove", "reach", "shove"))
+    with pytest.raises(ValueError, match=r"task must be one of .*, got 'shove'.*; or map it with task="):
+        lw.import_dataset(source, tmp_path / "out")
     words = {"shove": "push"}
-    with pytest.raises(ValueError, match=r"episodes_per_task must be given, 1 for example: .* 2 of push, 1 of reach"):
-        lw.import_dataset(file, tmp_path / "out", task=words)
-    with pytest.raises(ValueError, match="episodes_per_task must be at most 1, the episodes of 'reach', got 2"):
-        lw.import_dataset(file, tmp_path / "out", task=words, episodes_per_task=2)
-    made = taken(file, tmp_path / "out", "lacks", task="push", episodes_per_task=3, behaviour="friend")
+    with pytest.raises(ValueError, match=r"give episodes_per_task, 1 for example: it holds 2 of push, 1 of reach"):
+        lw.import_dataset(source, tmp_path / "out", task=words)
+    with pytest.raises(ValueError, match="episodes_per_task must be at most 1, as 'reach' has, got 2"):
+        lw.import_dataset(source, tmp_path / "out", task=words, episodes_per_task=2)
+    with pytest.raises(ValueError, match="task must be one task, 'MT10' is a set of 10"):
+        lw.import_dataset(source, tmp_path / "out", task="MT10")
+    made = imported(source, tmp_path / "out", "lacks", task="push", episodes_per_task=3, behaviour="friend")
     assert [one.length for one in made.episodes] == [*LENGTHS]
     assert (made.success_rate, made.config.behaviour) == ({"push": 1 / 3}, "friend")
 
 
-def test_episodes_by_their_ends_and_actions_beyond(tmp_path):
-    done = np.zeros(9, dtype=np.int64)
-    done[[3, 8]] = 1
-    file = theirs(tmp_path / "a.parquet", episode_index=None, task=None, dones=done.tolist(), action=list(ACTIONS * 2))
-    with pytest.raises(ExchangeError, match="lacks the task of its episodes; give task='reach'"):
-        lw.import_dataset(file, tmp_path / "out")
-    made = taken(file, tmp_path / "out", "those beyond are clipped", task="push", episodes_per_task=2)
-    assert [one.length for one in made.episodes] == [4, 5]
-    rows = map_rows(made)
+def test_actions_beyond_one_are_clipped(tmp_path):
+    source = lerobot(tmp_path / "theirs", action=list(ACTIONS * 2))
+    rows = load_rows(imported(source, tmp_path / "out", "larger ones are clipped", task="push", episodes_per_task=3))
     np.testing.assert_array_equal(rows["unclipped_action"], ACTIONS * 2)
     np.testing.assert_array_equal(rows["action"], (ACTIONS * 2).clip(-1, 1))
 
 
 @pytest.mark.parametrize(
-    ("changed", "told"),
+    ("changed", "message"),
     [
-        ({"action": None}, "lacks action, a column of 4 numbers as in 'metaworld': it has none of action, actions"),
-        (
-            {"observation.environment_state": None},
-            "lacks observation, a column of 39 numbers as in 'metaworld': observation.state has 4",
-        ),
-        ({"episode_index": None}, "lacks episodes: it has none of the columns episode_index, "),
-        ({"episode_index": [0, 1] * 4 + [2]}, "the rows of an episode must come one after another"),
+        ({"action": None}, "needs a column action of 4 numbers, as 'metaworld' has; observation.*state has 4"),
+        ({"observation.environment_state": None}, "needs a column observation of 39 .*observation.state has 4"),
         ({"action": [[0.0] * 4] * 8 + [[float("nan")] * 4]}, "action must hold finite numbers"),
-        ({"action": [[0.0] * 4] * 8 + [None]}, "action must hold numbers, 1 of them are absent"),
-        ({"action": [[0.0] * 4] * 8 + [[0.0] * 3]}, "action must hold as many numbers in each row"),
-        *(({"next.success": [0.0] * 8 + [odd]}, f"next.success must hold .* 0 and 1, it holds {odd}") for odd in ODD),
-        ({"next.done": [True] + [False] * 8}, "next.done must be true only where .* in row 0, episode_index 0 goes on"),
-        ({"frame_index": [0, 1, 3, 2, *range(5)]}, "frame_index must count up by 1 .* row 2 has 3 after 1"),
-        ({"task": ["reach"] * 3 + ["push"] * 6}, "task must be the same .* episode 0 has 'reach' and 'push'"),
-        ({"task": ["reach"] * 5 + [None] * 4}, "task must be the same .* episode 1 has 'reach' and None"),
-        ({"task": [["reach"]] * 9}, "task must hold texts, it holds list"),
-        ({"episode_index": [[0, 0]] * 9}, "episode_index must hold one number in each row, it holds 2"),
+        ({"action": [[0.0] * 4] * 8 + [None]}, "action must hold equally many numbers in each row"),
+        ({"action": [[0.0] * 4] * 8 + [[0.0] * 3]}, "action must hold equally many numbers in each row"),
+        ({"next.success": [0.0] * 8 + [0.3]}, "next.success must hold booleans, or 0 and 1, found 0.3"),
+        ({"task_index": [0, 0, 0, 1, 1, 1, 2, 2, 2]}, "task_index must be the same in all rows of an episode"),
     ],
 )
-def test_what_lacks_is_named(tmp_path, changed, told):
-    file = theirs(tmp_path / "a.parquet", **changed)
-    with pytest.raises(ExchangeError, match=f"a.parquet'.*{told}"):
-        lw.import_dataset(file, tmp_path / "out", episodes_per_task=1)
-    assert [one.name for one in tmp_path.iterdir()] == ["a.parquet"]
+def test_what_cannot_be_imported_is_named(tmp_path, changed, message):
+    source = lerobot(tmp_path / "theirs", version="v3.0", **changed)
+    with pytest.raises(ExchangeError, match=f"theirs': .*{message}"):
+        lw.import_dataset(source, tmp_path / "out", episodes_per_task=1)
+    assert [one.name for one in tmp_path.iterdir()] == ["theirs"]
 
 
-@pytest.mark.parametrize(
-    ("frames", "told"), [(None, "a.parquet' must hold whole"), ([*range(9)], "row 9 has 0 after 8")]
-)
-def test_two_files_with_the_same_episode_are_not_one(tmp_path, frames, told):
-    for name in "ab":
-        theirs(tmp_path / f"{name}.parquet", episode_index=[0] * 9, task=None, frame_index=frames)
-    with pytest.raises(ExchangeError, match=told):
-        lw.import_dataset(tmp_path, tmp_path / "out", task="push")
+def test_unused_columns_and_the_order_of_rows_do_not_matter(tmp_path):
+    more = {"subtask_index": [None, *range(8)], "tags": [[1], []] * 4 + [[2]], "comment": ["a"] * 8 + [None]}
+    made = imported(lerobot(tmp_path / "a", version="v3.0", **more), tmp_path / "out", "lacks")
+    shuffled = lerobot(tmp_path / "b", version="v3.0")
+    path = shuffled / "data" / "chunk-000" / "file-000.parquet"
+    table = pq.read_table(path)
+    pq.write_table(table.take([8, 3, 1, 4, 0, 7, 6, 2, 5]).select(table.column_names[::-1]), path)
+    again = imported(shuffled, tmp_path / "again", "lacks")
+    assert tree(again.root) == tree(made.root)
 
 
-@pytest.mark.parametrize("task", ["MT10", {"shove": "MT10"}])
-def test_a_set_of_tasks_is_no_task(tmp_path, task):
-    with pytest.raises(ValueError, match="task must be one task, 'MT10' is a set of 10"):
-        lw.import_dataset(theirs(tmp_path / "a.parquet"), tmp_path / "out", task=task)
-
-
-def test_places_that_are_none(tmp_path):
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "link").symlink_to(tmp_path / "empty")
-    file = theirs(tmp_path / "a.parquet")
-    for out, told in ((tmp_path / "link", "is a link"), (tmp_path / "no" / "..", "has no name of its own")):
-        with pytest.raises(ValueError, match=f"out must be a new folder, or an empty one, .* {told}"):
-            lw.import_dataset(file, out)
-    with pytest.raises(ExchangeError, match="source must be a file or a folder, '/dev/null' is neither"):
-        lw.import_dataset("/dev/null", tmp_path / "out")
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["a.parquet", "empty", "link"]
-
-
-def robomimics(path, change=None):
-    """A file of one episode of reach; ``change`` is given its group."""
+def robomimic(path, names=("demo_0",), rows=9, attributes=(), group_attributes=()):
+    """A file in robomimic's layout, of the same episode under each name, numbered by its reward."""
     h5py = pytest.importorskip("h5py")
     with h5py.File(path, "w") as file:
-        group = file.create_group("data/demo_0")
-        group.attrs["task"] = np.bytes_(b"reach")
-        group["obs/state"], group["actions"] = STATES, ACTIONS
-        if change:
-            change(h5py, group)
+        file.create_group("data").attrs.update(dict(attributes))
+        for number, name in enumerate(names):
+            group = file["data"].create_group(name)
+            group.attrs.update(dict(group_attributes))
+            group["obs/state"] = np.resize(STATES, (rows, 39))
+            group["actions"], group["rewards"] = ACTIONS, np.full(9, 2.0 + number)
+            group.create_dataset("obs/agentview_rgb", shape=(9, 10**9), dtype="f8", chunks=(1, 1000))
     return path
 
 
-def test_hdf5_reads_what_it_needs(tmp_path):
-    def huge(h5py, group):
-        group.create_dataset("pictures", shape=(9, 10**12), dtype="f8", chunks=(1, 1000))
-
-    made = taken(robomimics(tmp_path / "a.hdf5", huge), tmp_path / "out", "lacks success|lacks the observation")
-    assert (made.num_steps, *made.config.tasks) == (9, "reach")
-
-
-def test_groups_end_where_they_end(tmp_path):
-    def early(h5py, group):
-        group["dones"] = group["timeouts"] = [0, 1, 0, 0, 0, 0, 0, 0, 1]
-
-    with pytest.raises(ExchangeError, match="truncated must be true only where an episode ends, it is true in row 1"):
-        lw.import_dataset(robomimics(tmp_path / "a.hdf5", early), tmp_path / "out")
-
-
-def linked(h5py, group):
-    group["rewards"] = h5py.ExternalLink("other.hdf5", "/data/demo_0/actions")
+@pytest.mark.parametrize("name", ["demo_0", "traj_0"])
+@pytest.mark.parametrize(
+    "attributes",
+    [
+        {"task": np.bytes_(b"push")},
+        {"env_args": json.dumps({"env_name": "push-v3"})},
+        {"problem_info": json.dumps({"language_instruction": "push"}), "env_args": json.dumps({"env_name": "Libero"})},
+    ],
+)
+def test_robomimics_and_liberos_hdf5(tmp_path, name, attributes):
+    source = robomimic(tmp_path / "a.hdf5", [name], attributes=attributes)
+    made = imported(source, tmp_path / "out", "lacks the observation after the last .*; success")
+    rows = load_rows(made)
+    assert (made.num_steps, *made.config.tasks) == (9, "push")
+    np.testing.assert_array_equal(rows["observation"], STATES.astype(np.float32))
+    np.testing.assert_array_equal(rows["action"], ACTIONS)
 
 
-def virtual(h5py, group):
-    layout = h5py.VirtualLayout((9,), "f4")
-    layout[:] = h5py.VirtualSource("other.hdf5", "rewards", shape=(9,))
-    group.create_virtual_dataset("rewards", layout)
+def test_robomimics_observation_after_the_last_action(tmp_path):
+    made = imported(robomimic(tmp_path / "a.hdf5", rows=10), tmp_path / "out", "lacks success", task="push")
+    after = np.resize(STATES, (10, 39))[1:]
+    np.testing.assert_array_equal(load_rows(made)["next", "observation"], after.astype(np.float32))
 
 
-def outside(h5py, group):
-    group.create_dataset("rewards", shape=(9,), dtype="u1", external=[("/etc/hostname", 0, 9)])
+def test_robomimics_episodes_are_in_the_order_of_their_numbers(tmp_path):
+    for file, first in (("part-10.hdf5", 11), ("part-2.hdf5", 0)):
+        robomimic(tmp_path / file, [f"demo_{number}" for number in range(first, first + 11)])
+    made = imported(tmp_path, tmp_path / "out", "lacks", task="push", episodes_per_task=12)
+    rewards = load_rows(made)["next", "reward_dense"].reshape(12, 9)[:, 0].tolist()
+    assert rewards == [*range(2, 13), 2]
 
 
-@pytest.mark.parametrize("change", [linked, virtual, outside])
-def test_hdf5_reads_no_other_file(tmp_path, change):
-    with pytest.raises(ExchangeError, match=r"must hold all of its rows itself, data/demo_0/rewards .* another file"):
-        lw.import_dataset(robomimics(tmp_path / "a.hdf5", change), tmp_path / "out")
-
-
-def test_d4rls_flat_arrays(tmp_path):
+def test_other_hdf5_is_named(tmp_path):
     h5py = pytest.importorskip("h5py")
-    ends = np.zeros(9, dtype=bool)
-    ends[[3, 5, 8]] = True
     with h5py.File(tmp_path / "flat.hdf5", "w") as file:
-        told = {"observations": STATES, "actions": ACTIONS, "rewards": np.arange(9.0), "terminals": ends & False}
-        for name, values in {**told, "timeouts": ends, "infos/success": ends}.items():
-            file[name] = values
-    made = taken(tmp_path / "flat.hdf5", tmp_path / "out", "lacks the observation", task="reach", episodes_per_task=3)
-    rows = map_rows(made)
-    assert [one.length for one in made.episodes] == [*LENGTHS]
-    assert rows["next", "reward_dense"].flatten().tolist() == [*range(9)]
-    assert (rows["next", "success"].flatten().numpy() == ends).all()
+        file["observations"] = STATES
+    with pytest.raises(ExchangeError, match=r"flat.hdf5 has no group data/demo_0"):
+        lw.import_dataset(tmp_path / "flat.hdf5", tmp_path / "out")
+    (tmp_path / "broken.hdf5").write_bytes(b"no rows at all")
+    with pytest.raises(ExchangeError, match=r"broken.hdf5' is damaged"):
+        lw.import_dataset(tmp_path / "broken.hdf5", tmp_path / "out")
 
 
-def test_minaris_datasets_of_others(tmp_path, monkeypatch):
+def test_minaris_datasets(tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
     from gymnasium.spaces import Box
     from minari.data_collector import EpisodeBuffer
@@ -217,10 +193,9 @@ def test_minaris_datasets_of_others(tmp_path, monkeypatch):
         truncations=[False] * 7 + [True], infos={"success": np.array([0.0] * 8 + [1.0])},
     )  # fmt: skip
     spaces = {"observation_space": Box(-9, 9, (39,)), "action_space": Box(-1, 1, (4,))}
-    told = {name: "us" for name in ("algorithm_name", "author", "author_email", "code_permalink", "description")}
-    with warnings.catch_warnings(action="ignore"):  # of what else Minari would like to be told
-        minari.create_dataset_from_buffers("reach/theirs-v0", [buffer], **spaces, **told)
+    metadata = {name: "us" for name in ("algorithm_name", "author", "author_email", "code_permalink", "description")}
+    with warnings.catch_warnings(action="ignore"):  # Minari asks for more metadata
+        minari.create_dataset_from_buffers("reach/theirs-v0", [buffer], **spaces, **metadata)
     made = lw.import_dataset(tmp_path / "minari" / "reach" / "theirs-v0", tmp_path / "out", task="reach")
-    rows = map_rows(made)
     assert (made.num_steps, made.success_rate) == (8, {"reach": 1.0})
-    np.testing.assert_array_equal(rows["next", "observation"], STATES[1:].astype(np.float32))
+    np.testing.assert_array_equal(load_rows(made)["next", "observation"], STATES[1:].astype(np.float32))

@@ -113,27 +113,6 @@ def test_of_equal_returns_the_shorter_and_then_the_earlier_are_best():
     assert [[e.episode for e in one] for one in kept] == [[2], [1, 2], [0, 1, 2], [0, 1, 2, 3]]
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        (dict(success="yes"), TypeError, "success must be True or False, got 'yes'"),
-        (dict(success=1), TypeError, "success must be True or False"),
-        (dict(success=[]), TypeError, "success must be True or False"),
-        (dict(best=0), ValueError, "keep: best must be above 0"),
-        (dict(best=1.2), ValueError, "keep: best must be from 0 to 1"),
-        (dict(best=True), TypeError, "best must be a number"),
-        (dict(least_return=float("nan")), ValueError, "least_return must be finite, got nan"),
-        (dict(least_return="3"), TypeError, "least_return must be a number, got '3'"),
-        (dict(behaviours="expert"), TypeError, "behaviours must be a tuple of labels, got 'expert'"),
-        (dict(behaviours=3), TypeError, "behaviours must be a tuple of labels, got 3"),
-        (dict(behaviours=()), ValueError, "behaviours must hold at least one label"),
-    ],
-)
-def test_a_wrong_condition_is_refused_by_name(options, error, message):
-    with pytest.raises(error, match=message):
-        EpisodeFilter(**options)
-
-
 # ---- of datasets
 
 
@@ -233,7 +212,6 @@ EMPTY = dict(keep=EpisodeFilter(behaviours=("scripted",)))  # leaves nothing of 
         RandomSampler,
         TaskBalancedSampler,
         lambda: CoLearningSampler("reach"),
-        lambda: CoLearningSampler([True, *[False] * 9]),
         lambda: SliceSampler(slice_len=4, traj_key=("collector", "traj_ids")),
     ],
 )

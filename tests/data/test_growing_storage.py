@@ -9,7 +9,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from streams import Stream, own_rows
-from tensordict import TensorDict
 from torchrl.data import (
     LazyTensorStorage,
     RandomSampler,
@@ -160,7 +159,7 @@ def test_slices_never_join_what_does_not_follow(cached):
 
 
 def test_rows_with_gaps_are_told():
-    with pytest.warns(UserWarning, match="19 of 20 rows are not the .* of the rows before them"):
+    with pytest.warns(UserWarning, match="19 of 20 rows differ from .* of the row before"):
         buffer().extend(own_rows([40], first=0.0)[::2])
     assert len(buffer().storage) == 12
 
@@ -176,7 +175,7 @@ def test_one_trajectory_longer_than_the_ring_is_not_joined_at_the_edge():
 
 def test_nothing_has_come_yet():
     replay = buffer()
-    with pytest.raises(ValueError, match="target 'grown': nothing has come yet"):
+    with pytest.raises(ValueError, match="target 'grown': extend the buffer before the first sample"):
         replay.sample()
     replay.extend(Stream(0, 2, 0).batch(3))
     assert replay.sample()["is_target"].sum() == 4
@@ -184,21 +183,20 @@ def test_nothing_has_come_yet():
     numbers = replay.storage[12:][IDS]
     replay.empty()
     assert len(replay) == 12
-    with pytest.raises(ValueError, match="nothing has come yet"):
+    with pytest.raises(ValueError, match="extend the buffer before the first sample"):
         replay.sample()
     replay.extend(Stream(0, 2, 0).batch(3))
     assert replay.storage[12:][IDS].min() > numbers.max()
 
 
 def test_targets_and_storages_that_do_not_belong_together_are_refused():
-    for sampler in (CoLearningSampler("reach"), CoLearningSampler([True, False, False])):
-        replay = buffer(sampler=sampler)
-        replay.extend(Stream(0, 2, 0).batch(3))
-        with pytest.raises(ValueError, match="target must be 'grown', since the buffer grows, got"):
-            replay.sample()
+    replay = buffer(sampler=CoLearningSampler("reach"))
+    replay.extend(Stream(0, 2, 0).batch(3))
+    with pytest.raises(ValueError, match="target must be 'grown', since the buffer grows, got 'reach'"):
+        replay.sample()
     plain = TensorDictReplayBuffer(storage=LazyTensorStorage(20), sampler=CoLearningSampler("grown"), batch_size=8)
     plain.extend(own_rows([4, 4]))
-    with pytest.raises(ValueError, match="target 'grown' needs a buffer that grows"):
+    with pytest.raises(ValueError, match="target 'grown' needs a growing buffer"):
         plain.sample()
     replay = buffer(batch_size=6)
     replay.extend(Stream(0, 2, 0).batch(3))
@@ -220,9 +218,9 @@ BAD = [
     (changed("observation", torch.zeros(2, 3, 3)), r"column observation must be torch.float32 of shape \(2,\) a row"),
     (changed("task_id", torch.zeros(2, 3)), "column task_id must be torch.int64 .* got torch.float32"),
     (changed(("next", "reward"), torch.full((2, 3, 1), torch.nan)), "column next/reward holds NaN"),
-    (changed("action", torch.full((2, 3, 2), 1.5)), r"action must be what was done, in \[-1, 1\], got one of 1.5"),
-    (changed("steps_to_next_obs", torch.ones(2, 3)), "so MultiStep or MultiStepTransform was here: leave it out"),
-    (changed(("collector", "mask"), torch.ones(2, 3).tril().bool()), "rows that are no steps: split_trajs=True"),
+    (changed("action", torch.full((2, 3, 2), 1.5)), r"action must be the executed action, in \[-1, 1\], got 1.5"),
+    (changed("steps_to_next_obs", torch.ones(2, 3)), "of MultiStep; leave that out"),
+    (changed(("collector", "mask"), torch.ones(2, 3).tril().bool()), "padding of split_trajs=True"),
     (Stream(0, 2, 0).batch(16), "batch must have 1 to 30 rows, as many as grow says, got 32"),
 ]
 
@@ -238,26 +236,6 @@ def test_rows_that_do_not_fit_are_refused_and_nothing_is_written(batch, message)
     assert all(torch.equal(before["rows"][key], leaf) for key, leaf in replay.storage.state_dict()["rows"].items())
 
 
-def test_trajectories_that_were_split_are_stored_without_what_fills_them_up():
-    replay = buffer()
-    batch = changed(("collector", "mask"), torch.ones(2, 3).tril().bool())
-    replay.extend(batch[batch["collector", "mask"]])
-    assert torch.equal(replay[12:]["observation"], batch["observation"][batch["collector", "mask"]])
-
-
-def test_a_sampler_that_keeps_something_of_each_row_is_told_of_rows_one_by_one():
-    class Marked(RandomSampler):
-        marks = ()
-
-        def mark_update(self, index, *, storage=None):
-            self.marks += (index,)
-
-    replay = buffer(sampler=(sampler := Marked()))
-    for shape in ((2, 3), (6,)):
-        replay.extend(Stream(0, 2, 0).batch(3).reshape(shape))
-    assert [mark.tolist() for mark in sampler.marks] == [list(range(12, 18)), list(range(18, 24))]
-
-
 def test_what_was_done_is_the_action_and_other_columns_are_left_out():
     replay = buffer()
     batch = changed("action", torch.full((2, 3, 2), 7.0))
@@ -267,24 +245,12 @@ def test_what_was_done_is_the_action_and_other_columns_are_left_out():
     assert "loc" not in replay.sample().keys()
 
 
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [
-        (own_rows([3]).exclude(IDS), "grow=5 needs the columns collector/traj_ids"),
-        (own_rows([3]).exclude(("next", "observation"), ("next", "task_id")), "a column and its"),
-    ],
-)
-def test_parts_that_cannot_grow_are_refused(parts, message):
-    with pytest.raises(ValueError, match=message):
-        GrowingStorage([parts], grow=5)
-
-
 def test_it_is_of_one_process():
     storage = GrowingStorage([own_rows([3])], grow=9)
     storage.extend(Stream(0, 2, 0).batch(3))
     assert (pickle.loads(pickle.dumps(storage))[:] == storage[:]).all()
     torch_spawn = torch.multiprocessing.get_context("spawn")
-    with pytest.raises(RuntimeError, match="a buffer that grows is of one process"):
+    with pytest.raises(RuntimeError, match="a growing buffer cannot be shared between processes"):
         torch_spawn.Process(target=print, args=(storage,)).start()
 
 
@@ -295,36 +261,21 @@ def test_another_writer_is_refused():
         replay.extend(own_rows([2]))
 
 
-def damaged(name, value):
-    def change(state):
-        state[name] = value(state[name]) if callable(value) else value
-
-    return change
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (damaged("length", 13), "must be of 12 rows, got one of 13"),
-        (damaged("grow", 31), "grow must be 30"),
-        (damaged("count", -1), "count must be"),
-        (damaged("count", 7), r"rows\['observation'\] must be"),
-        (damaged("number", 3), "collector/traj_ids'] must be below 3"),
-        (damaged("rows", lambda rows: rows | {"more": torch.zeros(6)}), "rows must be the columns"),
-        (damaged("rows", lambda rows: rows | {"task_id": torch.zeros(6)}), r"rows\['task_id'\] must be torch.int64"),
-        (damaged("open", lambda opened: opened | {"last": opened["last"] + 6}), "open must be of rows that are there"),
-        (damaged("open", lambda opened: opened | {"key": opened["key"][:0]}), r"open must be \(K,\) int64 each"),
-        (damaged("open", None), "open must be key, number and last"),
+        ({"length": 13}, "must be of 12 rows, got one of 13"),
+        ({"grow": 31}, "of a buffer with grow=30, got 31"),
+        ({"count": 7}, "observation must be finite"),
+        ({"rows": {}}, "rows must hold the columns"),
     ],
 )
-def test_a_state_that_is_none_is_refused_and_nothing_changes(change, message):
+def test_a_state_of_another_buffer_is_refused_and_nothing_changes(change, message):
     storage, other = buffer().storage, buffer().storage
     for one in (storage, other):
         one.extend(Stream(0, 2, 0).batch(3))
-    state = other.state_dict()
-    change(state)
     with pytest.raises(ValueError, match=message):
-        storage.load_state_dict(state)
+        storage.load_state_dict(other.state_dict() | change)
     assert (storage[:] == other[:]).all()
 
 
@@ -334,15 +285,6 @@ def test_the_storage_alone_goes_through_a_folder(tmp_path):
     storage.dumps(tmp_path)
     other.loads(tmp_path)
     assert (storage[:] == other[:]).all()
-    assert [path.name for path in tmp_path.iterdir()] == ["grown.zip"]
-
-
-def test_own_columns_keep_their_nesting():
-    rows = own_rows([3])
-    found = TensorDict({"a": {"b": torch.zeros(3, 2)}}, [3])
-    storage = GrowingStorage([rows.update(found)], grow=4)
-    storage.extend(own_rows([2], first=5.0).update(TensorDict({"a": {"b": torch.ones(2, 2)}}, [2])))
-    assert storage[3:]["a", "b"].tolist() == [[1, 1], [1, 1]]
 
 
 @pytest.mark.parametrize("options", [{}, {"n_steps": 3, "gamma": 0.9}])

@@ -143,16 +143,6 @@ def test_one_demonstration_beside_the_base_tasks(base, target):
     assert torch.equal(seen["observation"].unique(dim=0), demonstration["observation"].unique(dim=0))
 
 
-def test_a_mask_chooses_the_demonstration_too(base, target):
-    shown = (*base.episodes, *target.episodes)
-    mask = [episode is target.episodes[2] for episode in shown]
-    replay = LanguageWorldExperienceReplay([base.root, target.root], batch_size=8, sampler=CoLearningSampler(mask))
-    assert replay.demonstrations.episodes == shown
-    batch = replay.sample()
-    assert batch["collector", "traj_ids"][batch["is_target"]].unique().tolist() == [6 + 2]
-    assert not (batch["task_id"][~batch["is_target"]] == task_id("reach")).any()
-
-
 @pytest.mark.parametrize("label", ["expert", "unclipped", "executed"])
 def test_no_column_of_numbers_is_copied(base, target, label, monkeypatch):
     loaded = []
@@ -167,15 +157,6 @@ def test_no_column_of_numbers_is_copied(base, target, label, monkeypatch):
             if key == "action" and label != "executed":
                 source = f"{label}_action"
             assert [leaf.data_ptr() for leaf in leaves] == [rows[source].data_ptr() for rows in loaded]
-
-
-def test_joining_leaves_the_datasets_alone(base, target):
-    before = {p: p.read_bytes() for one in (base, target) for p in one.root.rglob("*") if p.is_file()}
-    replay = LanguageWorldExperienceReplay([base.root, target.root], label="executed", after_success=0, batch_size=8)
-    replay.sample().zero_()
-    with pytest.raises(RuntimeError):
-        replay.empty()
-    assert before == {path: path.read_bytes() for path in before}
 
 
 def test_the_same_dataset_can_be_base_and_target(base):
@@ -243,49 +224,27 @@ def test_it_describes_its_parts(base, target):
     assert found.config.episodes == ({"button-press-topdown": [0], "push": [0], "reach": [0]}, {"reach": [0, 2]})
     assert json.loads(json.dumps(found.config.to_json()))["parts"][0] == base.config.to_json()
     for path in ("data_path_root", "data_path"):
-        with pytest.raises(ValueError, match="joins 2 datasets, so it has no one folder; see its roots"):
+        with pytest.raises(ValueError, match="joins 2 datasets; see its roots"):
             getattr(replay, path)
 
 
 @pytest.mark.parametrize(
-    ("choice", "error", "message"),
+    ("choice", "message"),
     [
-        ({"pusj": 1}, ValueError, "episodes: task must be one of .* got 'pusj'; did you mean 'push'"),
-        (3, ValueError, r"episodes\['button-press-topdown'\]: the dataset has 2 episodes of .* got 3"),
-        ({"push": 3}, ValueError, r"episodes\['push'\]: the dataset has 2 episodes of 'push', got 3"),
-        ({"push": 0}, ValueError, r"episodes\['push'\] must be at least 1, got 0"),
-        ({"push": [0, 7]}, ValueError, r"episodes\['push'\]: the dataset holds the episodes 0, 1, got 7"),
-        ({"push": [0, 0]}, ValueError, r"episodes\['push'\] must name at least one episode, each once, got \[0, 0\]"),
-        ({"push": []}, ValueError, r"episodes\['push'\] must name at least one episode"),
-        ({"push": "0"}, TypeError, r"episodes\['push'\] must be a number or a list of episodes, got '0'"),
-        ({"push": [0.5]}, TypeError, r"episodes\['push'\] must be an integer, got 0.5"),
-        ({}, ValueError, "episodes must name at least one task, got an empty mapping"),
-        (True, TypeError, "episodes.* must be an integer, got True"),
-        ("push", TypeError, "episodes must be None, a number, or a mapping of task names, got 'push'"),
-        ([None], TypeError, "episodes must be None, a number, or a mapping"),
+        ({"pusj": 1}, "episodes: task must be one of .* got 'pusj'; did you mean 'push'"),
+        ({"push": 3}, r"episodes\['push'\]: the dataset has 2 episodes of 'push', got 3"),
+        ({"push": [0, 7]}, r"episodes\['push'\]: the dataset holds the episodes 0, 1, got 7"),
+        ({"push": []}, r"episodes\['push'\] must name at least one episode"),
     ],
 )
-def test_wrong_choices_are_named(base, choice, error, message):
-    with pytest.raises(error, match=message):
+def test_wrong_choices_are_named(base, choice, message):
+    with pytest.raises(ValueError, match=message):
         LanguageWorldExperienceReplay(base.root, episodes=choice)
 
 
-@pytest.mark.parametrize(
-    ("episodes", "error", "message"),
-    [
-        ([None], ValueError, "episodes must be as many as the folders in root, 2, got 1"),
-        ({"push": 1}, TypeError, "episodes must be a list of choices, one for each of the 2 folders"),
-        (1, TypeError, "episodes must be a list of choices, one for each of the 2 folders, got 1"),
-        ([None, {"push": 1}], ValueError, r"episodes\[1\]: task must be one of 'reach', got 'push'"),
-    ],
-)
-def test_choices_for_several_folders_are_a_list(base, target, episodes, error, message):
-    with pytest.raises(error, match=message):
-        LanguageWorldExperienceReplay([base.root, target.root], episodes=episodes)
-
-
-def test_a_list_of_folders_is_not_empty_and_each_is_there(base, tmp_path):
-    with pytest.raises(ValueError, match="root must hold at least one folder"):
-        LanguageWorldExperienceReplay([])
-    with pytest.raises(FileNotFoundError, match=r"no dataset folder .*nowhere"):
-        LanguageWorldExperienceReplay([base.root, tmp_path / "nowhere"])
+def test_choices_for_several_folders_are_a_list(base, target):
+    for episodes in ([None], {"push": 1}, 1):
+        with pytest.raises(ValueError, match="episodes must be a list of a choice for each of the 2 folders"):
+            LanguageWorldExperienceReplay([base.root, target.root], episodes=episodes)
+    with pytest.raises(ValueError, match=r"episodes\[1\]: task must be one of 'reach', got 'push'"):
+        LanguageWorldExperienceReplay([base.root, target.root], episodes=[None, {"push": 1}])

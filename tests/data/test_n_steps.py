@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from streams import Stream, own_rows
 from tensordict import TensorDict
 from torchrl.data import MultiStep
-from torchrl.envs import Compose, MultiStepTransform, RewardScaling
+from torchrl.envs import MultiStepTransform
 from torchrl.modules import ValueOperator
 from torchrl.objectives.value import TD0Estimator
 
@@ -132,35 +132,11 @@ def test_of_a_dataset_they_end_with_the_episode_and_where_it_is_cut(root, after)
     assert torch.equal(found["task_id"], found["next", "task_id"])
 
 
-def test_torchrls_transform_is_refused_where_it_would_do_nothing(root):
-    transform = MultiStepTransform(n_steps=3, gamma=0.9)
-    replay = LanguageWorldExperienceReplay(root, label="executed")
-    for attach in (
-        lambda: LanguageWorldExperienceReplay(root, transform=transform),
-        lambda: LanguageWorldExperienceReplay(root, transform=Compose(RewardScaling(0.0, 1.0), transform)),
-        lambda: LanguageWorldExperienceReplay(root, label="executed", grow=9, transform=transform),
-        lambda: replay.append_transform(transform),
-        lambda: replay.insert_transform(0, transform),
-    ):
-        with pytest.raises(ValueError, match=r"leave it out and give n_steps=3, gamma=0\.9"):
-            attach()
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        (dict(n_steps=3), ValueError, "n_steps=3 needs gamma"),
-        (dict(gamma=0.9), ValueError, "gamma belongs to n_steps of 2 or more"),
-        (dict(n_steps=0, gamma=0.9), ValueError, "n_steps must be at least 1, got 0"),
-        (dict(n_steps=2, gamma=1.5), ValueError, "gamma must be from 0 to 1, got 1.5"),
-        (dict(n_steps=2, gamma=0.0), ValueError, "gamma must be above 0, got 0"),
-        (dict(n_steps=2.0, gamma=0.9), TypeError, "n_steps must be an integer"),
-        (dict(n_steps=2, gamma=0.9, label="expert"), ValueError, "need label='executed'.*got 'expert'"),
-    ],
-)
-def test_wrong_options_are_named(root, options, error, message):
-    with pytest.raises(error, match=message):
-        LanguageWorldExperienceReplay(root, **{"label": "executed", **options})
+def test_n_steps_need_a_discount_and_executed_actions(root):
+    with pytest.raises(ValueError, match="n_steps=3 needs gamma"):
+        LanguageWorldExperienceReplay(root, label="executed", n_steps=3)
+    with pytest.raises(ValueError, match="n_steps, grow and terminate_on_success need label='executed', got 'expert'"):
+        LanguageWorldExperienceReplay(root, n_steps=3, gamma=0.9)
 
 
 def test_columns_that_it_needs_are_named():

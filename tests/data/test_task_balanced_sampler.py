@@ -13,7 +13,6 @@ from torchrl.data import (
     LazyStackStorage,
     LazyTensorStorage,
     ListStorage,
-    RandomSampler,
     TensorDictReplayBuffer,
 )
 
@@ -80,14 +79,6 @@ def test_the_generator_fixes_the_batches(sizes, count, seed):
     assert drawn(one, 4) == drawn(two, 4)
 
 
-def test_another_seed_gives_other_batches_and_a_pass_another_order():
-    rows = make_rows([40, 40])
-    assert drawn(make_replay(rows, 20, 0), 1) != drawn(make_replay(rows, 20, 1), 1)
-    passes = drawn(make_replay(rows, 80), 2)
-    assert passes[0] != passes[1]
-    assert sorted(passes[0]) == sorted(passes[1])
-
-
 @settings(max_examples=20, deadline=None)
 @given(sizes, counts, seeds, st.integers(0, 5))
 def test_a_state_saved_anywhere_gives_the_same_batches_again(sizes, count, seed, before):
@@ -103,15 +94,6 @@ def test_a_state_saved_anywhere_gives_the_same_batches_again(sizes, count, seed,
     other.sampler.load_state_dict(state)
     other.set_rng(generator)
     assert drawn(other, 5) == expected
-
-
-def test_a_saved_state_does_not_change_with_the_sampler():
-    replay = make_replay(make_rows([7, 5]), 4)
-    drawn(replay, 1)
-    state = replay.sampler.state_dict()
-    before = {key: value.clone() for key, value in state.items()}
-    drawn(replay, 9)
-    assert all(torch.equal(state[key], before[key]) for key in before)
 
 
 @pytest.mark.parametrize("before", [0, 2])
@@ -131,19 +113,6 @@ def test_the_state_goes_through_a_folder(tmp_path, before):
     other.sampler.load_state_dict(other.sampler.state_dict())
 
 
-def test_the_state_is_part_of_the_replay_buffers():
-    rows = make_rows([7, 5, 9])
-    replay = make_replay(rows, 12)
-    drawn(replay, 2)
-    state = replay.state_dict()
-    rng = replay._rng.get_state()
-    expected = drawn(replay, 4)
-    other = make_replay(rows, 12, seed=9)
-    other.load_state_dict(state)
-    other._rng.set_state(rng)
-    assert drawn(other, 4) == expected
-
-
 @pytest.mark.parametrize(
     ("tasks", "batch_size", "nearest"), [(3, 100, "99 and 102"), (3, 2, "3"), (10, 512, "510 and 520"), (7, 1, "7")]
 )
@@ -151,15 +120,6 @@ def test_a_batch_that_the_tasks_do_not_divide_is_refused_with_the_nearest(tasks,
     replay = make_replay(make_rows([4] * tasks), batch_size)
     with pytest.raises(ValueError, match=f"number of tasks, {tasks}, got {batch_size}; the nearest are {nearest}$"):
         replay.sample()
-
-
-def test_after_a_refused_batch_size_sampling_goes_on():
-    replay = make_replay(make_rows([4, 4]), 4)
-    drawn(replay, 1)
-    with pytest.raises(ValueError, match="batch_size"):
-        replay.sampler.sample(replay.storage, 3)
-    tasks = replay.sample()["task_id"].bincount().tolist()
-    assert tasks == [0, 0, 0, 2, 0, 2]
 
 
 def test_an_empty_storage_is_refused():
@@ -179,13 +139,6 @@ def test_it_ran_out_whenever_a_batch_ends_a_pass_over_the_largest_task(sizes, co
         replay.sample()
         ended = batch * count // largest > (batch - 1) * count // largest
         assert replay.sampler.ran_out == ended
-
-
-def test_ran_out_can_be_set():
-    sampler = TaskBalancedSampler()
-    assert sampler.ran_out is False
-    sampler.ran_out = True
-    assert sampler.ran_out is True
 
 
 def test_a_buffer_that_grows_is_grouped_again():
@@ -219,12 +172,6 @@ def test_the_task_key_can_be_another():
     rows = make_rows([4, 4]).rename_key_("task_id", "kind")
     replay = make_replay(rows, 4, sampler=TaskBalancedSampler(task_key="kind"))
     assert replay.sample()["kind"].bincount().tolist() == [0, 0, 0, 2, 0, 2]
-
-
-def test_the_counts_of_torchrls_random_sampler_are_not_exact():
-    """Why there is a sampler of our own."""
-    replay = make_replay(make_rows([50, 50]), 10, sampler=RandomSampler())
-    assert len({int((replay.sample()["task_id"] == 3).sum()) for _ in range(20)}) > 1
 
 
 def make_grid(steps, *tasks):
@@ -289,17 +236,3 @@ def test_other_storages_are_drawn_from_as_well(storage):
     replay = TensorDictReplayBuffer(storage=storage(20), sampler=TaskBalancedSampler(), batch_size=4)
     replay.extend(make_rows([7, 3]))
     assert replay.sample()["task_id"].bincount().tolist() == [0, 0, 0, 2, 0, 2]
-
-
-@pytest.mark.parametrize(
-    ("size", "error", "message"),
-    [
-        (0, ValueError, "batch_size must be at least 1, got 0"),
-        (-4, ValueError, "batch_size must be at least 1, got -4"),
-        (2.0, TypeError, "batch_size must be an integer, got 2.0"),
-        ("4", TypeError, "batch_size must be an integer, got '4'"),
-    ],
-)
-def test_a_batch_size_that_is_none_is_named(size, error, message):
-    with pytest.raises(error, match=message):
-        make_replay(make_rows([4, 4]), None).sample(size)

@@ -55,12 +55,6 @@ def test_it_is_bootstrapped_from_nothing_n_steps_ahead(root):
     assert (rows["next", "reward"][rows["next", "terminated"]] > 0).all()
 
 
-@pytest.mark.parametrize("options", [{"label": "expert"}, {"after_success": 20}, {"after_success": 0}])
-def test_what_ends_in_two_ways_is_refused(root, options):
-    with pytest.raises(ValueError, match="terminate_on_success ends an episode at its first success"):
-        opened(root, **options)
-
-
 @pytest.mark.parametrize("env_ends", [True, False])
 @pytest.mark.parametrize("buffer_ends", [True, False])
 def test_rows_that_end_otherwise_are_refused(root, env_ends, buffer_ends):

@@ -86,5 +86,5 @@ def test_what_is_refused(replay):
     with pytest.raises(IndexError, match="rows are 0 to 20, got 21"):
         RowDataset(replay)[21]
     growing = lw.LanguageWorldExperienceReplay(replay.roots, label="executed", grow=4)
-    with pytest.raises(ValueError, match="rows come and go in a buffer that grows"):
+    with pytest.raises(ValueError, match="replay must not grow"):
         RowDataset(growing)

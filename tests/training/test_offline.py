@@ -370,7 +370,7 @@ def test_losses_that_cannot_be_summed_are_refused(demos):
 def test_priorities_that_nothing_would_change_are_refused(demos):
     replay = make_replay(demos)
     replay._sampler = PrioritizedSampler.__new__(PrioritizedSampler)  # made as users do, it needs compiled code
-    with pytest.raises(ValueError, match="a PrioritizedSampler draws them all alike"):
+    with pytest.raises(ValueError, match="a PrioritizedSampler draws uniformly"):
         check_minibatches([], replay, 8)
 
 

@@ -8,8 +8,11 @@ data/metadata.json     Minari's description, and the metadata of a dataset of ou
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
+import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,8 +21,7 @@ import numpy as np
 
 from lw_torchrl._files import parse_json
 from lw_torchrl._progress import Progress
-from lw_torchrl.data.exchange.hdf5 import check_whole
-from lw_torchrl.data.exchange.table import ABOUT, EPISODES, HOLDS, NAMES, Array, ExchangeError, Table, check_rows
+from lw_torchrl.data.exchange.table import ABOUT, HOLDS, NAMES, TASK_NAMES, Array, Table
 
 _AFTER = ("success", "reward_sparse")
 _BEFORE = ("expert_action", "unclipped_action", HOLDS, "next_observation")
@@ -41,6 +43,9 @@ def _infos(table: Table, start: int, end: int) -> dict[str, Array]:
 
 def write(table: Table, folder: Path, bar: Progress) -> None:
     """Write a table as a dataset; its id is the name of its folder, and -v0 where that has no version."""
+    if shutil.disk_usage(folder).free < 2 * sum(column.nbytes for column in table.columns.values()):
+        # A write that fails inside HDF5 leaves the file open, and the process crashes when it ends.
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
     import minari
     from gymnasium.spaces import Box
     from minari.data_collector import EpisodeBuffer
@@ -101,27 +106,15 @@ def _columns(episode: Mapping[str, Any]) -> dict[str, Array]:
 
 
 def read(source: Path) -> Table:
-    """Read a dataset with Minari; ExchangeError if it is damaged, or none."""
-    import h5py
-    import minari  # noqa: F401
+    """Read a dataset with Minari."""
     from minari.dataset.minari_storage import MinariStorage
 
-    where = f"source: {str(source)!r}"
-    place = source / "data" if (source / "data").is_dir() else source
-    try:
-        if (file := place / "main_data.hdf5").is_file():
-            with h5py.File(file, "r") as opened:
-                check_whole(source, opened)
-        storage = MinariStorage.read(place)
-        every = range(storage.total_episodes)
-        parts = [_columns(episode) for episode in storage.get_episodes(every)]
-        told = [*storage.get_episode_metadata(every)]
-        about = parse_json(str(stated).encode()) if (stated := storage.metadata.get(ABOUT)) else None
-        columns = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
-    except (ImportError, ExchangeError):
-        raise
-    except Exception as error:  # a damaged file may raise anything
-        raise ExchangeError(f"{where} is no dataset of Minari, or damaged ({type(error).__name__}: {error})") from error
-    check_rows(source, columns, storage.total_steps)
-    tasks = (next((str(one[name]) for name in EPISODES["task"] if name in one), "") for one in told)
-    return Table(columns, tuple(len(part["rewards"]) for part in parts), tuple(tasks), about=about)
+    storage = MinariStorage.read(source / "data" if (source / "data").is_dir() else source)
+    numbers = range(storage.total_episodes)
+    parts = [_columns(episode) for episode in storage.get_episodes(numbers)]
+    metadata = [*storage.get_episode_metadata(numbers)]
+    text = storage.metadata.get(ABOUT)
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    tasks = (next((str(one[name]) for name in TASK_NAMES if name in one), "") for one in metadata)
+    lengths = tuple(len(part["rewards"]) for part in parts)
+    return Table(columns, lengths, tuple(tasks), about=parse_json(str(text).encode()) if text else None)

@@ -1,0 +1,77 @@
+"""HDF5 in the layout of robomimic and LIBERO, which is read, not written.
+
+data                        attributes: env_args, JSON with env_name; task or another name of it; LIBERO's problem_info
+data/demo_0                 a group for each episode; attributes: task or another name of it
+data/demo_0/obs/...         (T, n), or (T + 1, n) where the last row is the observation after the last action
+data/demo_0/actions         (T, n); also rewards, dones, next_obs/..., success
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lw_torchrl.data.exchange.table import KNOWN, TASK_NAMES, Array, ExchangeError, Table
+
+
+def _files(source: Path) -> list[Path]:
+    """The HDF5 files at a path, sorted by name, numbers by their value."""
+    if source.is_file():
+        return [source]
+    paths = [path for path in source.iterdir() if path.suffix in (".hdf5", ".h5") and path.name[0] != "."]
+    return sorted(
+        paths, key=lambda path: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
+    )
+
+
+def _episode(group: Any) -> dict[str, Array]:
+    """The known columns of an episode's group."""
+    columns: dict[str, Array] = {}
+
+    def note(path: str, item: Any) -> None:
+        name = path.replace("/", ".")
+        if name in KNOWN and getattr(item, "dtype", np.dtype("O")).kind in "biuf" and item.ndim:
+            columns[name] = item[()]
+
+    group.visititems(note)
+    if "actions" not in columns:
+        raise ExchangeError(f"{group.name} has no actions")
+    steps = len(columns["actions"])
+    for name in [name for name, column in columns.items() if len(column) == steps + 1]:
+        columns.setdefault(f"next_{name}", columns[name][1:])
+        columns[name] = columns[name][:-1]
+    if odd := [name for name, column in columns.items() if len(column) != steps]:
+        raise ExchangeError(f"{group.name} has {steps} actions and {len(columns[odd[0]])} rows of {odd[0]}")
+    return columns
+
+
+def _task(attributes: Any) -> str:
+    """The task that attributes name; "" if they do not."""
+    stated = {name: attributes[name] for name in TASK_NAMES if name in attributes}
+    for name, keys in {"problem_info": TASK_NAMES, "env_args": ("env_name",)}.items():
+        stated |= {key: value for key, value in json.loads(attributes.get(name, "{}")).items() if key in keys}
+    text = next(iter(stated.values()), "")
+    return text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
+
+
+def read(source: Path) -> Table:
+    """Read a file in robomimic's layout, or all files of a folder."""
+    import h5py
+
+    parts, tasks = [], []
+    for path in _files(source):
+        with h5py.File(path, "r") as file:
+            if "data" not in file:
+                raise ExchangeError(f"{path.name} has no group data/demo_0")
+            groups = {name: group for name, group in file["data"].items() if re.fullmatch(r"\D+_\d+", name)}
+            for name in sorted(groups, key=lambda name: int(name.rpartition("_")[2])):
+                parts.append(_episode(groups[name]))
+                tasks.append(_task(groups[name].attrs) or _task(file["data"].attrs))
+    if not parts or any(part.keys() != parts[0].keys() for part in parts):
+        raise ExchangeError("it must hold at least one episode, and the same columns in each")
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return Table(columns, tuple(len(part["actions"]) for part in parts), tuple(tasks))
