@@ -16,8 +16,9 @@ from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import Task
+from lw_torchrl.record.entities import STEP_TIME, time_columns
 from lw_torchrl.record.meshes import Motion
-from lw_torchrl.suites.suite import known_suite
+from lw_torchrl.suites.suite import Suite
 
 APART = 0.01  # metres between two episodes that have parted
 NOBODY = -1  # in the place of a step's number: no step is in force alone
@@ -65,6 +66,15 @@ class RecordedEpisode:
     layout: Layout = METAWORLD
     reasons: tuple[str, ...] = ()  # what the plan says of each step, how it was written for one
     pixels: NDArray[np.uint8] | None = None  # T×H×W×3, what the policy or its evaluator saw
+    step_time: float = STEP_TIME  # seconds between two actions
+
+    def times(self, steps: NDArray[np.int64]) -> list[Any]:
+        """Return the timelines of these steps."""
+        return time_columns(steps, self.step_time)
+
+    def at(self, step: int) -> str:
+        """Return the words for a time step, "t = 80 (1.00 s)", which differ from those for a plan's step."""
+        return f"t = {step} ({step * self.step_time:.2f} s)"
 
     @property
     def answers(self) -> NDArray[np.bool_] | None:
@@ -103,9 +113,8 @@ class RecordedEpisode:
                 found[rows] = pose.distance[rows]
         return None if np.isnan(found).all() else found
 
-    def with_target_poses(self, task: Task) -> RecordedEpisode:
-        """The episode with the target poses of its plan's skills in ``task``."""
-        suite = known_suite(task.name)
+    def with_target_poses(self, task: Task, suite: Suite | None) -> RecordedEpisode:
+        """Return the episode with the target poses of its plan's skills in ``task``."""
         scripted = load_skills() if suite is None or suite.skills is None else suite.skills
         positions = task.positions(torch.from_numpy(self.observation))
         poses: list[TargetPose | None] = [None] * len(self.steps)
@@ -128,6 +137,7 @@ class RecordedEpisode:
         objects: Mapping[str, Any],
         plan: PlanLike | None = None,
         layout: Layout = METAWORLD,
+        step_time: float = STEP_TIME,
     ) -> RecordedEpisode:
         """Check a rollout; see :meth:`lw_torchrl.RerunLogger.log_episode` for the keys and the errors."""
         if not isinstance(rollout, TensorDictBase):
@@ -181,6 +191,7 @@ class RecordedEpisode:
             corrected=optional("action_corrected", flat=True),
             steps=steps,
             layout=layout,
+            step_time=step_time,
             reasons=tuple(getattr(step, "reason", "") for step in plan.steps) if plan is not None else (),
             pixels=None if pixels is None else pixels.numpy(force=True),
         )

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,7 +20,7 @@ from torch import Tensor
 
 from lw_torchrl._checks import checked, missing_keys, shown
 from lw_torchrl._devices import device_of
-from lw_torchrl._files import AnyPath, replacing
+from lw_torchrl._files import AnyPath
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import episode_seed
@@ -29,9 +32,10 @@ from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
+from lw_torchrl.record.entities import STEP_TIME
 from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
-from lw_torchrl.record.rerun_logger import RerunLogger
+from lw_torchrl.record.rerun_logger import RerunLogger, is_complete
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.suites.suite import Suite, known_suite, load_suite
 from lw_torchrl.transforms.qaf import QAFTransform
@@ -106,7 +110,7 @@ def log_rollout(
     if suite is not None:
         suite = load_suite(suite)
         tasks = [*tasks, *suite.tasks.values()]
-    heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
+    heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks, suite=suite)
     suite = suite or known_suite(heading.task)
     motion, ghost = _motion(heading, episode, suite), None
     if failure is not None and failure.mended is not None:
@@ -114,7 +118,7 @@ def log_rollout(
         for key in ("task_id", "episode"):
             if (got := _single(steps, key, required=False)) != (own := _single(rollout, key, required=False)):
                 raise ValueError(f"failure.mended must be of the rollout's episode, {key} {own}, got {got}")
-        other, mended = read_rollout(steps, Plans([plan]), seed=seed, tasks=tasks)
+        other, mended = read_rollout(steps, Plans([plan]), seed=seed, tasks=tasks, suite=suite)
         ghost = MendedRecording(by, mended, None if motion is None else _motion(other, mended, suite))
     return logger.add_page(heading, episode, motion=motion, ghost=ghost, name=name)
 
@@ -127,6 +131,7 @@ def read_rollout(
     policy: str | None = None,
     failure: Failure | None = None,
     tasks: Iterable[Task] = (),
+    suite: Suite | None = None,
 ) -> tuple[Heading, RecordedEpisode]:
     """What a page shows of a rollout (T,), checked, as :func:`log_rollout` has it."""
     plans = None if plans is None else as_plans(plans)
@@ -159,9 +164,11 @@ def read_rollout(
         for name, position in task.positions(observation).items():
             if plan is None or name == GRIPPER or any(name in words for words in told_of):
                 objects[name] = position
-    episode = RecordedEpisode.from_rollout(rollout, objects, plan, METAWORLD if task is None else task.layout)
+    layout, suite = METAWORLD if task is None else task.layout, suite or known_suite(label)
+    step_time = STEP_TIME if suite is None else suite.step_time
+    episode = RecordedEpisode.from_rollout(rollout, objects, plan, layout, step_time)
     if task is not None and plan is not None:
-        episode = episode.with_target_poses(task)
+        episode = episode.with_target_poses(task, suite)
     return Heading(label, index, seed, policy, failure), episode
 
 
@@ -291,22 +298,30 @@ def run_recorded(
     return [found[task, episode] for task in chosen for episode in episodes]
 
 
-def write_recording(
-    path: AnyPath,
-    episodes: Iterable[FinishedEpisode],
-    plans: Plans | None = None,
-    *,
-    tasks: Iterable[Task] = (),
-    **said: Any,
-) -> None:
-    """Write episodes of :func:`run_recorded` to a rerun file, which is replaced whole.
+@contextmanager
+def new_recording(path: AnyPath) -> Iterator[RerunLogger]:
+    """Yield a logger whose file replaces ``path`` at the end; an error or a full disk leaves the old file."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=target.parent, prefix=".") as folder:
+        file = Path(folder) / target.name
+        with RerunLogger(file) as logger:
+            yield logger
+        if not is_complete(file):
+            raise OSError(f"recording {str(target)!r} could not be written: is the disk full?")
+        os.replace(file, target)
 
-    The other arguments, ``seed`` and ``suite`` among them, are as for :func:`lw_torchrl.log_rollout`.
+
+def write_recording(
+    path: AnyPath, episodes: Iterable[FinishedEpisode], plans: Plans | None = None, **options: Any
+) -> None:
+    """Write episodes of :func:`run_recorded` to a rerun file, which is replaced if it exists.
+
+    The options are those of :func:`lw_torchrl.log_rollout`.
     """
-    tasks = list(tasks)
-    with replacing(path) as file, RerunLogger(file, exp_name=Path(path).stem) as logger:
-        for one in episodes:
-            log_rollout(logger, one.steps, plans, tasks=tasks, **said)
+    with new_recording(path) as logger:
+        for episode in episodes:
+            log_rollout(logger, episode.steps, plans, **options)
 
 
 def active_skills(episode: FinishedEpisode, plan: ConditionalPlan) -> list[tuple[str, int]]:
