@@ -50,7 +50,7 @@ class TargetPose(NamedTuple):
 
 @dataclass(frozen=True)
 class RecordedEpisode:
-    """T rows of one episode, checked, on the CPU; S is the number of steps of its plan."""
+    """One episode of T rows as checked arrays on the CPU; S is the number of steps of its plan."""
 
     observation: NDArray[np.float32]  # T×D, as the layout says; metres, gripper opening in [0,1]
     action: NDArray[np.float32]  # T×A, of Meta-World displacement xyz and gripper effort, in [-1,1]
@@ -78,7 +78,7 @@ class RecordedEpisode:
 
     @property
     def answers(self) -> NDArray[np.bool_] | None:
-        """The truth that the policy went by: the learned evaluator's, where there is one."""
+        """The truth that the policy used: the learned evaluator's if there is one."""
         return self.qaf if self.believed is None else self.believed
 
     @cached_property
@@ -96,7 +96,7 @@ class RecordedEpisode:
 
     @property
     def first_success(self) -> int | None:
-        """The step at which the task was first seen done: one more than the row whose action did it."""
+        """The step at which the task was first seen as done: one after the row whose action did it."""
         if self.success is None or not self.success.any():
             return None
         return int(self.success.argmax()) + 1
@@ -140,8 +140,6 @@ class RecordedEpisode:
         step_time: float = STEP_TIME,
     ) -> RecordedEpisode:
         """Check a rollout; see :meth:`lw_torchrl.RerunLogger.log_episode` for the keys and the errors."""
-        if not isinstance(rollout, TensorDictBase):
-            raise TypeError(f"rollout must be a TensorDict, got {type(rollout).__name__}")
         if len(rollout.batch_size) != 1 or not rollout.batch_size[0]:
             hint = "; take one episode, rollout[i]" if len(rollout.batch_size) > 1 else ""
             raise ValueError(f"rollout must have batch size (T,) with T >= 1, got {tuple(rollout.batch_size)}{hint}")
@@ -151,8 +149,7 @@ class RecordedEpisode:
         def column(key: Any, size: int | None) -> NDArray[Any]:
             value = rollout.get(key, None)
             if value is None:
-                found = ", ".join(sorted(map(str, rollout.keys())))
-                raise ValueError(f"rollout must have the key {key!r} ({length}×{size}), got {found or 'no keys'}")
+                raise ValueError(f"rollout must have the key {key!r} ({length}×{size}), got {sorted(rollout.keys())}")
             return _array(value, f"rollout[{key!r}]", (length, size))
 
         def optional(key: Any, *, flat: bool = False, truth: bool = False) -> NDArray[Any] | None:
@@ -168,16 +165,9 @@ class RecordedEpisode:
             return array[:, 0] if flat else array[:, : needed or None]
 
         logits, observation = optional("qaf_logits"), column("observation", layout.size)
-        if not isinstance(objects, Mapping):
-            raise TypeError(f"objects must map names to T×3 positions, got {type(objects).__name__}")
-        if unnamed := [name for name in objects if not isinstance(name, str) or not name]:
-            raise TypeError(f"objects must be named by non-empty strings, got {unnamed[0]!r}")
         places = {name: _array(value, f"objects[{name!r}]", (length, 3)) for name, value in objects.items()}
         places.setdefault(GRIPPER, observation[:, layout.positions[0]])
         pixels = rollout.get("pixels", None)
-        if pixels is not None and (pixels.ndim != 4 or pixels.shape[-1] != 3 or pixels.dtype != torch.uint8):
-            got = f"{str(pixels.dtype).removeprefix('torch.')} of shape {'×'.join(map(str, pixels.shape))}"
-            raise ValueError(f"rollout['pixels'] must be uint8 of shape T×H×W×3, got {got}")
         executed = ("next", "executed_action")
         return cls(
             observation=observation,

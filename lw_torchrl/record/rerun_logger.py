@@ -226,7 +226,7 @@ class RerunLogger(Logger):
     def flush(self, timeout: float | None = None) -> None:
         """Send everything to the file and the viewer, and wait for it, at most ``timeout`` seconds (5)."""
         if not self._service_shutdown:
-            self._send(now=True)
+            self._send(now=True, layout=self.connect is not None)
             with suppress(RuntimeError):  # a full disk or a lost viewer, about which rerun has printed an error
                 self.experiment.flush(timeout_sec=FLUSH_SECONDS if timeout is None else timeout)
 
@@ -234,6 +234,7 @@ class RerunLogger(Logger):
         """Send the rest, waiting as :meth:`flush` does, and close the file; a second call does nothing."""
         if self._service_shutdown:
             return
+        self._send(now=True, layout=True)
         self.flush(timeout)
         self._service_shutdown = True
         atexit.unregister(self.shutdown)
@@ -252,10 +253,10 @@ class RerunLogger(Logger):
         self._counters[path] = now + 1
         return now
 
-    def _send(self, *, now: bool = False) -> None:
-        """Save new tabs, and send buffered numbers if it is time for it.
+    def _send(self, *, now: bool = False, layout: bool = False) -> None:
+        """Save new tabs, and send buffered numbers if it is time for it or ``now``.
 
-        The blueprint, which rerun accepts only whole, is sent to a live viewer and with the rest of a file.
+        Rerun accepts a layout only whole, 0.1 MB a page, so a file gets it at its end and a live viewer now and then.
         """
         with self._lock:
             stream, time_now = self.experiment, time.monotonic()
@@ -269,7 +270,7 @@ class RerunLogger(Logger):
                 columns = rr.Scalars.columns(scalars=[number for row in values for number in row])
                 path = entity_path("metrics", *name.split("/"))
                 stream.send_columns(path, index, columns.partition([len(row) for row in values]))
-            if now or self.connect is not None:
+            if layout or (self.connect is not None and self._tabs.has_grown):
                 self._tabs.send(stream)
 
     @property

@@ -18,13 +18,13 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._checks import checked, missing_keys, shown
+from lw_torchrl._checks import checked, missing_keys
 from lw_torchrl._devices import device_of
 from lw_torchrl._files import AnyPath
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import episode_seed
-from lw_torchrl.evaluation.failure_records import Failure, MendedEpisode
+from lw_torchrl.evaluation.failure_records import Failure
 from lw_torchrl.evaluation.protocol import actor_plans, tasks_of
 from lw_torchrl.evaluation.running import answered_by, make_env, running
 from lw_torchrl.language.layout import METAWORLD
@@ -59,28 +59,30 @@ def log_rollout(
 ) -> Any:
     """Add a rollout to a recording: the robot in 3-D, a verdict, the plan at the cursor, the timeline and curves.
 
-    Where the environment's seed is given, the episode is simulated again, from its task, ``seed``, ``episode`` and
-    actions, and the robot is shown as it moved. The observations must come out the same, bit for bit; where they do
-    not, a warning says so, and a hand over a table stands for the robot, as it does without a seed.
+    If the environment's seed is given, the episode is simulated again from its task, ``seed``, ``episode`` and actions,
+    and the robot is shown as it moved. Its observations must be equal bit for bit; otherwise a warning says so, and a
+    simple hand over a table stands for the robot, as without a seed.
 
     Args:
         logger: the recording.
         rollout: batch size (T,), one episode from its first state on: "observation" T×39 float32 (metres), "task_id" T
             int64, "action" T×4 float32 in [-1, 1], as executed, and ("next", "success") T×1 bool. Optional are
-            ("next", "executed_action") T×4, which is taken in the place of the action, "episode" T int64, "qaf" T×S
-            bool, "qaf_plan" T int64, "qaf_logits" T×S float32 (positive: true), "skill_weights" T×S float32,
-            "action_corrected" T×1, ("next", "reward") T×1 float32 and "pixels" T×H×W×3 uint8, what the policy saw. Or
-            batch size (N, T), an episode in each row.
-        plans: what ``qaf`` answers; None for no plan.
-        seed: of the environment; with ``episode`` it says how the episode began.
-        name: of the episode in the recording; None takes "push-7", of task and episode, or else "push".
-        policy: who acted, in a word, for the tab.
-        failure: why it failed, for the verdict; of N rows one for each, None where there is none.
-        tasks: of your own, where the plans do not say what they are.
-        suite: whose simulator runs it again; None for the one in :data:`~lw_torchrl.suites.SUITES` that has the task.
+            ("next", "executed_action") T×4, which replaces the action, "episode" T int64, "qaf" T×S bool, "qaf_plan" T
+            int64, "qaf_logits" T×S float32 (positive: true), "skill_weights" T×S float32, "action_corrected" T×1,
+            ("next", "reward") T×1 float32 and "pixels" T×H×W×3 uint8, the policy's input. Or batch size (N, T), an
+            episode in each row.
+        plans: the plans that ``qaf`` answers; None without plans.
+        seed: the environment's seed; with ``episode`` it determines how the episode began.
+        name: the episode's name in the recording, for batch size (T,); None takes "push-7", of task and episode, or
+            "push".
+        policy: the policy's name, for the tab.
+        failure: why the episode failed, for the verdict; for N rows a list with one entry each, or None.
+        tasks: custom tasks that the plans do not define.
+        suite: the suite that simulates the episode again; None for the one in :data:`~lw_torchrl.suites.SUITES` that
+            has the task.
 
     Returns:
-        The name; of N rows a list of names.
+        The episode's name; for N rows a list of names.
 
     Raises:
         ValueError: the rows are of several episodes; ``qaf`` answers other plans; the failure is another episode's.
@@ -97,16 +99,11 @@ def log_rollout(
         >>> env.close()
     """
     if len(rollout.batch_size) == 2:
-        if name is not None:
-            raise ValueError(f"name is of one episode, but rollout holds {len(rollout)}; got {name!r}")
         failures = failure if isinstance(failure, Sequence) else [failure] * len(rollout)
-        if len(failures) != len(rollout):
-            raise ValueError(f"failure must be one for each of {len(rollout)} rows, got {len(failures)}")
         same: dict[str, Any] = {"seed": seed, "policy": policy, "tasks": list(tasks), "suite": suite}
         rows = zip(rollout, failures, strict=True)
         return [log_rollout(logger, row, plans, failure=why, **same) for row, why in rows]
-    if isinstance(failure, Sequence):
-        raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
+    assert not isinstance(failure, Sequence), "one episode has one failure"
     if suite is not None:
         suite = load_suite(suite)
         tasks = [*tasks, *suite.tasks.values()]
@@ -115,9 +112,6 @@ def log_rollout(
     motion, ghost = _motion(heading, episode, suite), None
     if failure is not None and failure.mended is not None:
         by, plan, steps = failure.mended
-        for key in ("task_id", "episode"):
-            if (got := _single(steps, key, required=False)) != (own := _single(rollout, key, required=False)):
-                raise ValueError(f"failure.mended must be of the rollout's episode, {key} {own}, got {got}")
         other, mended = read_rollout(steps, Plans([plan]), seed=seed, tasks=tasks, suite=suite)
         ghost = MendedRecording(by, mended, None if motion is None else _motion(other, mended, suite))
     return logger.add_page(heading, episode, motion=motion, ghost=ghost, name=name)
@@ -150,10 +144,6 @@ def read_rollout(
         answered = rollout.get("qaf_plan", None)
         if answered is not None and not bool((answered == Plans([plan]).numbers[label]).all()):
             raise ValueError(f"rollout['qaf'] answers another plan of {label!r} than was given, as 'qaf_plan' tells")
-    if not isinstance(failure, Failure | None):
-        raise TypeError(f"failure must be a Failure, got {shown(failure)} ({type(failure).__name__})")
-    if failure is not None and not isinstance(failure.mended, MendedEpisode | None):
-        raise TypeError(f"failure.mended must be a MendedEpisode, got {shown(failure.mended)}")
     if failure is not None and (failure.task, failure.episode) != (label, failure.episode if index is None else index):
         got = f"{failure.task} {failure.episode}"
         raise ValueError(f"failure must be of the rollout's episode, {label} {index}, got that of {got}")

@@ -93,6 +93,11 @@ class Tabs:
             stream.log(f"__properties/{_PROPERTY}/{number}", entry, static=True)
         self._saved = len(self._entries)
 
+    @property
+    def has_grown(self) -> bool:
+        """Whether a quarter of the tabs that a viewer shows, or more, have been added since :meth:`send`."""
+        return 4 * (len(self._entries) - self._sent) >= self._sent
+
     def send(self, stream: Any) -> None:
         """Send the blueprint and the table of the overview if there are new tabs."""
         if self._sent == len(self._entries):
@@ -104,12 +109,8 @@ class Tabs:
             stream.log(entity_path(OVERVIEW, "table"), document, static=True)
         stream.send_blueprint(self.blueprint())
 
-    def blueprint(self, tab: str | None = None, *, alone: bool = False) -> rrb.Blueprint:
-        """Return rerun's layout with ``tab`` in front, or ``alone``; None is the first one.
-
-        Raises:
-            ValueError: unknown tab.
-        """
+    def blueprint(self, only: str | None = None) -> rrb.Blueprint:
+        """Return rerun's layout, of all tabs or of ``only`` one."""
         tabs: list[Any] = []
         if self._has_overview():
             views: list[Any] = [rrb.TextDocumentView(origin=entity_path(OVERVIEW, "table"), name="Episodes")]
@@ -130,12 +131,10 @@ class Tabs:
         tabs += of_training + of_episodes if self._has_overview() else of_episodes + of_training
         closed = {"state": "collapsed"}
         fps = 1 / next((page.step_time for page in self.pages.values()), STEP_TIME)
-        time = {"timeline": self.tab(tab).timeline, "fps": fps, "play_state": "paused", "loop_mode": "all"}
+        time = {"timeline": self.tab(only).timeline, "fps": fps, "play_state": "paused", "loop_mode": "all"}
         panels = rrb.BlueprintPanel(**closed), rrb.SelectionPanel(**closed), rrb.TimePanel(**closed, **time)
-        if alone and tabs:
-            return rrb.Blueprint(tabs[self._find(tab)], *panels, auto_views=False)
-        front = None if tab is None else self._find(tab)
-        return rrb.Blueprint(rrb.Tabs(*tabs, active_tab=front), *panels, auto_views=False)
+        shown = rrb.Tabs(*tabs) if only is None else tabs[self.index(only)]
+        return rrb.Blueprint(shown, *panels, auto_views=False)
 
     def tabs(self) -> list[Tab]:
         """Return the tabs from left to right. Training comes before many episodes, else nobody would find it."""
@@ -154,7 +153,7 @@ class Tabs:
     def tab(self, name: str | None = None) -> Tab:
         """Return the tab of a name, or the first one."""
         tabs = self.tabs()
-        return tabs[self._find(name)] if tabs or name is not None else Tab("", "", [], METRIC_TIMELINE)
+        return tabs[self.index(name)] if tabs or name is not None else Tab("", "", [], METRIC_TIMELINE)
 
     def front(self) -> str | None:
         """Return the name of the first tab; for an overview, of the episode that it begins with."""
@@ -165,8 +164,12 @@ class Tabs:
         """Return the step to open a tab at: the earliest decisive one of its episodes; None without episodes."""
         return min((self.pages[name].decisive for name in self.tab(tab).episodes), default=None)
 
-    def _find(self, name: str | None) -> int:
-        """Return the index of the tab with this name or title, or of the only one whose title contains it."""
+    def index(self, name: str | None) -> int:
+        """Return the index of the tab with this name or title, or of the only one whose title contains it.
+
+        Raises:
+            ValueError: there is no such tab.
+        """
         tabs = self.tabs()
         exact = [i for i, tab in enumerate(tabs) if name in (tab.name, tab.title, None)]
         containing = [i for i, tab in enumerate(tabs) if str(name).lower() in tab.title.lower()]

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 from lw_torchrl._checks import checked
 from lw_torchrl._files import AnyPath, replacing
@@ -53,11 +53,12 @@ def open_viewer(
         screenshot: a PNG file to write instead of opening a window.
         window_size: of the picture or the window, "1400x900" points.
         step: the step to open at; None for an episode's first success or failure, and a training's last step.
-        episode: the tab to open at, by its title ("Metrics") or its episode's name; None opens the first one.
+        episode: the tab to open at, by its title ("Metrics") or its episode's name, in the recordings that have it;
+            None opens the first one.
 
     Raises:
         FileNotFoundError: there is no such file, or rerun's viewer is not installed.
-        ValueError: the recording has no such tab.
+        ValueError: no recording has such a tab.
         RuntimeError: the viewer ended with an error; the message says what to do about it.
 
     Example:
@@ -69,26 +70,32 @@ def open_viewer(
         raise ValueError(f"screenshot must end in '.png', got {str(screenshot)!r}")
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        files: list[Path] = []
-        steps: dict[str, int | None] = {}
-        for number, recording in enumerate(recordings, 1):
-            file, shown = stack.enter_context(readable(recording)), number == len(recordings)
-            opened, recording_id, at = _opening(file, folder, episode if shown else None, step if shown else None)
-            files, steps[recording_id] = [*files, *opened], at
+        files = [stack.enter_context(readable(recording)) for recording in recordings]
+        layouts = [layout for file in files if (layout := _missing_layout(file, folder)) is not None]
+        openings: dict[str, Opening] = {}
+        unknown: list[ValueError] = []
+        for file in files:
+            try:
+                openings |= _opening(file, episode, step)
+            except ValueError as error:
+                unknown.append(error)
+                openings |= _opening(file, None, None)
+        if len(unknown) == len(files):
+            raise unknown[-1]
         port = str(free_port())
-        arguments: list[str | Path] = [*files, "--port", port, "--window-size", window_size]
+        arguments: list[str | Path] = [*files, *layouts, "--port", port, "--window-size", window_size]
         if screenshot is None:
             process, output = stack.enter_context(rerun_process(*arguments))
             with suppress(ConnectionError, TimeoutError):  # the window may have been closed at once
-                _go_to(_connect(process, port, len(steps)), steps)
+                _go_to(_connect(process, port, len(openings)), openings)
             if process.wait():
                 raise failure(output)
             return
         process, output = stack.enter_context(rerun_process(*arguments, "--headless"))
         picture = stack.enter_context(replacing(screenshot))
         try:
-            client = _connect(process, port, len(steps))
-            _go_to(client, steps)
+            client = _connect(process, port, len(openings))
+            _go_to(client, openings)
             _take_picture(client, picture.absolute())
         except (ConnectionError, TimeoutError) as error:
             time.sleep(0.5)  # the viewer takes a moment to print its error
@@ -126,22 +133,38 @@ def readable(recording: Path) -> Iterator[Path]:
         yield copy
 
 
-def _opening(
-    recording: Path, folder: Path, episode: str | None, step: int | None
-) -> tuple[list[Path], str, int | None]:
-    """Return the files that open a recording at a tab, its id, and its step; a blueprint file chooses the tab."""
+class Opening(NamedTuple):
+    """Where to open a recording: the index of a tab, a timeline and a step; None leaves what the viewer chose."""
+
+    tab: int | None
+    timeline: str | None
+    step: int | None
+
+
+def _opening(recording: Path, episode: str | None, step: int | None) -> dict[str, Opening]:
+    """Return where to open a recording, by its id."""
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(recording)
+    recording_id, tabs = reader.recordings()[0].recording_id, Tabs.read(reader)
+    if tabs is None:  # another program's, which has its own layout
+        return {recording_id: Opening(None, None, step)}
+    number = None if episode is None else tabs.index(episode)
+    step = tabs.opening_step(episode) if step is None else step
+    return {recording_id: Opening(number, tabs.tab(episode).timeline, step)}
+
+
+def _missing_layout(recording: Path, folder: Path) -> Path | None:
+    """Write the layout of a recording that was never closed, and so has none, into ``folder``."""
     from rerun.chunk import RrdReader
 
     reader = RrdReader(recording)
     known, tabs = reader.recordings()[0], Tabs.read(reader)
-    if tabs is None:  # another program's, which has its own layout
-        return [recording], known.recording_id, step
-    step = tabs.opening_step(episode) if step is None else step
-    if episode is None and reader.blueprints():
-        return [recording], known.recording_id, step
-    blueprint = folder / f"{known.recording_id}.rbl"
-    tabs.blueprint(episode).save(known.application_id, str(blueprint))
-    return [recording, blueprint], known.recording_id, step
+    if reader.blueprints() or tabs is None:
+        return None
+    file = folder / f"{known.recording_id}.rbl"
+    tabs.blueprint().save(known.application_id, str(file))
+    return file
 
 
 def _connect(process: subprocess.Popen[bytes], port: str, recordings: int) -> Any:
@@ -160,17 +183,26 @@ def _connect(process: subprocess.Popen[bytes], port: str, recordings: int) -> An
     raise TimeoutError(f"the recording was not loaded within {START_SECONDS:g} seconds")
 
 
-def _go_to(client: Any, steps: dict[str, int | None]) -> None:
-    """Set the cursor of each recording, by its id, to its step, or to the last one of its timeline."""
-    for recording in client.get_state().recordings:
-        name = recording.current_timeline or EPISODE_TIMELINE
+def _go_to(client: Any, openings: dict[str, Opening]) -> None:
+    """Bring tabs to the front, set cursors, and show the last recording. The default step is a timeline's last one."""
+    recordings = {recording.store_id.rpartition(":")[2]: recording for recording in client.get_state().recordings}
+    for recording_id, (tab, name, step) in openings.items():
+        recording = recordings[recording_id]
+        if tab is not None:
+            layout = client.get_blueprint(store_id=recording.store_id).blueprint
+            root = f"/container/{layout['/viewport']['ViewportBlueprint']['root_container']}"
+            container = layout[root]["ContainerBlueprint"]
+            container["active_tab"] = container["contents"][tab]
+            client.set_blueprint(layout, store_id=recording.store_id)
+        name = name or recording.current_timeline
         timeline = next((timeline for timeline in recording.timelines if timeline.name == name), None)
-        if timeline is None or timeline.end is None:
-            continue
-        step = steps.get(recording.store_id.rpartition(":")[2])
-        if step is None:  # an episode's success and reward stand one step after its last row
-            step = max(timeline.end - 1 if name == EPISODE_TIMELINE else timeline.end, timeline.start)
-        client.set_time(name, sequence=step, play_state="paused", recording=recording.store_id)
+        if timeline is not None and timeline.end is not None:
+            if step is None:  # an episode's success and reward stand one step after its last row
+                step = max(timeline.end - 1 if name == EPISODE_TIMELINE else timeline.end, timeline.start)
+            client.set_time(name, sequence=step, play_state="paused", recording=recording.store_id)
+    if len(openings) > 1:
+        client.set_location(recording.location)
+        client.run_command("ui.expand_blueprint_panel")  # it lists the recordings
 
 
 def _take_picture(client: Any, picture: Path) -> None:

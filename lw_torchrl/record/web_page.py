@@ -147,7 +147,7 @@ def _page(recording: Path, episode: str | None, step: int | None) -> tuple[bytes
             for tab in layout.tabs():
                 if tab.name != OVERVIEW:  # the page has a table instead
                     piece = Path(folder) / "layout.rbl"
-                    layout.blueprint(tab.name, alone=True).save(known.application_id, str(piece))
+                    layout.blueprint(tab.name).save(known.application_id, str(piece))
                     place = len(layouts), len(layouts) + piece.stat().st_size
                     layouts += piece.read_bytes()
                     row = layout.pages[tab.name].row if tab.name in layout.pages else None
