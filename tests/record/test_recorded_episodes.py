@@ -196,7 +196,7 @@ def test_the_layout_is_in_the_file(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda r: r.exclude("observation"), r"must have the key 'observation' \(20×39\), got action"),
+        (lambda r: r.exclude("observation"), r"must have the key 'observation' \(20×39\), got \['action'"),
         (lambda r: r[None], r"batch size \(T,\) with T >= 1, got \(1, 20\); take one episode"),
         (lambda r: r.set("observation", torch.rand(20, 38)), r"'observation'\] must have shape 20×39, got 20×38"),
         (lambda r: r.set("action", torch.full((20, 4), float("nan"))), r"'action'\] must be finite, .* row 0"),

@@ -203,7 +203,7 @@ def test_a_step_takes_its_suites_time(tmp_path):
     rollout = env.rollout(3)[0]
     env.close()
     with RerunLogger(tmp_path / "a.rrd") as logger:
-        lw.log_rollout(logger, rollout, seed=1)
+        lw.log_rollout(logger, rollout, seed=1, suite="fetch")
     found = Recording(tmp_path / "a.rrd")
     seconds = found.times("/fetch\\/reach-0/action", "Scalars:scalars", "time")
     assert [int(second) for second in seconds] == [0, 40_000_000, 80_000_000]

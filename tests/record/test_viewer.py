@@ -57,8 +57,8 @@ def test_wrong_arguments_of_the_viewer(tmp_path):
         open_viewer(tmp_path / "c.rrd")
     with pytest.raises(FileNotFoundError, match="holds no recording"):
         open_viewer(tmp_path / "empty")
-    with pytest.raises(ValueError, match="episode must be one of 'reach', 'Metrics', got 'rea'"):
-        open_viewer(tmp_path / "a.rrd", episode="rea")
+    with pytest.raises(ValueError, match="episode must be one of 'reach', 'Metrics', got 'push'"):
+        open_viewer(tmp_path / "a.rrd", episode="push")
 
 
 def test_a_folder_stands_for_its_recordings(tmp_path):
