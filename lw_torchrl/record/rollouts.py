@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._checks import checked, missing_keys
+from lw_torchrl._checks import checked, missing_keys, shown
 from lw_torchrl._devices import device_of
 from lw_torchrl._files import AnyPath
 from lw_torchrl.envs.episodes import FinishedEpisode
@@ -103,7 +103,8 @@ def log_rollout(
         same: dict[str, Any] = {"seed": seed, "policy": policy, "tasks": list(tasks), "suite": suite}
         rows = zip(rollout, failures, strict=True)
         return [log_rollout(logger, row, plans, failure=why, **same) for row, why in rows]
-    assert not isinstance(failure, Sequence), "one episode has one failure"
+    if not isinstance(failure, Failure | None):
+        raise TypeError(f"failure must be one Failure for one episode, got {shown(failure)}")
     if suite is not None:
         suite = load_suite(suite)
         tasks = [*tasks, *suite.tasks.values()]
