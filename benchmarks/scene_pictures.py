@@ -27,6 +27,7 @@ from rerun.experimental import ViewerClient
 
 import lw_torchrl as lw
 from lw_torchrl.envs.seeding import episode_seed
+from lw_torchrl.record.entities import STEP_TIME
 from lw_torchrl.record.meshes import Motion, log_motion
 from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
 
@@ -79,7 +80,7 @@ def _our_picture(client: Any, task: str, motion: Motion, folder: str) -> Any:
     stream = rr.RecordingStream(f"scene-of-{task}")  # an application has one layout
     stream.save(file)
     stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    frames = log_motion(stream, "/bodies", motion, {})
+    frames = log_motion(stream, "/bodies", motion, {}, STEP_TIME)
     eye = rrb.EyeControls3D(position=EYE, look_target=TARGET, eye_up=(0.0, 0.0, 1.0))
     view = rrb.Spatial3DView(
         origin="/",

@@ -10,6 +10,7 @@ import argparse
 import tempfile
 import time
 import warnings
+from pathlib import Path
 
 import torch
 from torchrl.envs import TransformedEnv
@@ -71,7 +72,7 @@ def main() -> None:
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, args.steps)
         env = TransformedEnv(lw.LanguageWorldEnv(TASKS, seed=SEED), lw.QAFTransform(plans))
 
-        with lw.RerunLogger(args.out, connect=args.connect) as logger:
+        with lw.RerunLogger(args.out, connect=args.connect, exp_name=Path(args.out).parent.name) as logger:
             logger.log_hparams(vars(args) | {"optimizer": {"name": "AdamW", "lr": 1e-3}})
             began = time.perf_counter()
             for step in range(args.steps):
@@ -88,7 +89,7 @@ def main() -> None:
                     show(logger, env, actor, plans, step + 1, args.length)
                     print(f"step {step + 1:5}  loss {value.item():.4f}")
         env.close()
-    print(f"lw-torchrl view {args.out}")
+    print(f"lw-torchrl view {logger.path}")
 
 
 if __name__ == "__main__":

@@ -121,7 +121,9 @@ class Engine:
 def make_suite(arm: str = "Panda") -> Suite:
     """The tasks with one of robosuite's arms, and a Panda's gripper."""
     words = {"plans": lw.load_plans(WORDS, tasks=TASKS), "skills": lw.load_skills(WORDS / "skills.toml", tasks=TASKS)}
-    return Suite("robosuite", LAYOUT, TASKS, lambda rows, **how: Engine(rows, arm, **how), max_steps=300, **words)
+    return Suite(
+        "robosuite", LAYOUT, TASKS, lambda rows, **how: Engine(rows, arm, **how), max_steps=300, step_time=0.05, **words
+    )
 
 
 def main() -> None:

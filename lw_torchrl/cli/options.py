@@ -313,10 +313,9 @@ Logs = Literal["csv", "tensorboard", "wandb", "rerun"]
 
 
 def make_logger(kind: Logs, out: Path) -> Any:
-    """The TorchRL logger of --logger, in a folder beside ``out``; rerun's goes on in its recording if training does."""
+    """The TorchRL logger of --logger, in a folder beside ``out``; rerun writes a new recording for each run."""
     if kind == "rerun":
-        resume = out.exists() or out.with_name("checkpoint.zip").exists()
-        return lw.RerunLogger(out.parent / "logs" / f"{out.stem}.rrd", resume=resume)
+        return lw.RerunLogger(out.parent / "logs" / f"{out.stem}.rrd", exp_name=f"{out.parent.name}/{out.stem}")
     from torchrl.record.loggers import get_logger
 
     try:

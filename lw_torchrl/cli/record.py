@@ -1,17 +1,14 @@
 """``lw-torchrl record`` and ``view``: episodes of any policy, recorded and looked at in rerun."""
 
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._files import replacing
 from lw_torchrl.cli import objects, options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.language.plans import Plans
@@ -63,7 +60,7 @@ def record(
     out = out or Path("runs/recordings") / f"{label}-{objects.name_of(policy)}.rrd"
     options.check_file("--out", out, ".rrd")
     from lw_torchrl._devices import check_device
-    from lw_torchrl.record.rollouts import run_recorded
+    from lw_torchrl.record.rollouts import new_recording, run_recorded
 
     options.use_one_thread()
     acting: dict[str, Any] = {"device": check_device("device", device)}
@@ -82,7 +79,7 @@ def record(
         cast.append((actor, shown, called, asked))
     rows: list[dict[str, Any]] = []
     recorded: list[list[str]] = []
-    with replacing(out) as file, lw.RerunLogger(file, exp_name=out.stem) as logger:
+    with new_recording(out) as logger:
         for actor, shown, who, asked in cast:
             how = episode_options | acting | {"evaluator": asked}
             run = how | {"stop_at_success": stop_at_success, "progress": True}
@@ -173,9 +170,7 @@ def view(
     web: bool = False,  # serve a page on this machine and print its address, until Ctrl-C
     port: int = 0,  # of the page; 0 takes a free one
 ) -> None:
-    """Open a recording in the rerun viewer; or take a picture of it, write it as one page, or serve it as one.
-
-    Of several runs, up to four, curves lie over one another, and an episode that they share stands side by side.
+    """Open recordings in rerun's viewer; or take a picture, or write or serve one as a web page.
 
     Example: lw-torchrl view runs/demo --episode drawer-open --screenshot picture.png --step 80
     Example: lw-torchrl view runs/small/logs/policy.rrd runs/large/logs/policy.rrd
@@ -186,29 +181,18 @@ def view(
     for option, file, ending in (("--screenshot", screenshot, ".png"), ("--html", html, ".html")):
         if file is not None:
             options.check_file(option, file, ending)
-    if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", window_size):
-        raise ValueError(f"window_size must be like '1400x900', got {window_size!r}")
-    if not 1 <= len(recordings) <= 4:
-        raise ValueError(f"recordings must be 1 to 4 files or folders, got {len(recordings)}")
-    for recording in recordings:
-        if not recording.exists():
-            raise FileNotFoundError(f"recordings: there is no file or folder {str(recording)!r}")
-        if recording.is_dir() and not any(recording.glob("*.rrd")):
-            raise FileNotFoundError(f"recordings: the folder {str(recording)!r} holds no recording (*.rrd)")
-    from lw_torchrl.record import WebPage, join_recordings, open_viewer, write_html
+    from lw_torchrl.record import WebPage, open_viewer, write_html
 
-    with TemporaryDirectory() as folder:
-        shown = recordings[0]
-        if len(recordings) > 1:
-            shown = join_recordings(recordings, Path(folder) / "runs.rrd")
-        if web:
-            with WebPage(shown, episode=episode, step=step, port=port) as page:
-                print(f"{page.address}  (Ctrl-C ends it)", flush=True)
-                with suppress(KeyboardInterrupt):
-                    page.serve()
-        elif html is not None:
-            write_html(shown, html, episode=episode, step=step)
-        else:
-            open_viewer(shown, screenshot, window_size, step=step, episode=episode)
+    if (web or html is not None) and len(recordings) > 1:
+        raise ValueError(f"--web and --html show one recording, got {len(recordings)}")
+    if web:
+        with WebPage(recordings[0], episode=episode, step=step, port=port) as page:
+            print(f"{page.address}  (Ctrl-C ends it)", flush=True)
+            with suppress(KeyboardInterrupt):
+                page.serve()
+    elif html is not None:
+        write_html(recordings[0], html, episode=episode, step=step)
+    else:
+        open_viewer(recordings, screenshot, window_size, step=step, episode=episode)
     if written := html or screenshot:
         print(f"written to {written}")

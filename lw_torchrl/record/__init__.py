@@ -1,14 +1,13 @@
-"""Recordings to look at: a torchrl Logger that writes rerun files, and viewers for them.
+"""Recordings in rerun: a TorchRL logger that writes them, and viewers that show them.
 
-Importing this package loads no rerun; constructing a :class:`RerunLogger` does.
+Importing this package does not import rerun; making a :class:`RerunLogger` does.
 """
 
 import lw_torchrl._torchrl  # noqa: F401
-from lw_torchrl.record.joining import join_recordings
 from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.rollout_recorder import RolloutRecorder
 from lw_torchrl.record.rollouts import log_rollout
 from lw_torchrl.record.viewer import open_viewer
 from lw_torchrl.record.web_page import WebPage, write_html
 
-__all__ = ["RerunLogger", "RolloutRecorder", "WebPage", "join_recordings", "log_rollout", "open_viewer", "write_html"]
+__all__ = ["RerunLogger", "RolloutRecorder", "WebPage", "log_rollout", "open_viewer", "write_html"]

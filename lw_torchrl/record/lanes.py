@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.language.relations import PREDICATES, STATES
-from lw_torchrl.record.conventions import (
+from lw_torchrl.record.entities import (
     FALSE,
     GOLD,
     STEEL,
@@ -40,6 +40,7 @@ class Lanes:
     """
 
     root: str
+    step_time: float
     states: dict[str, tuple[str, Color]] = field(default_factory=dict)
     paths: list[str] = field(default_factory=list)
 
@@ -49,7 +50,7 @@ class Lanes:
             self.states[state] = look if isinstance(look[0], str) else (state, look)
         rows = changes(states[:, None])
         entries = [*states[rows].tolist(), ""]
-        times = time_columns(np.array([*rows, len(states)]) + first)
+        times = time_columns(np.array([*rows, len(states)]) + first, self.step_time)
         # This apostrophe counts as a letter.
         path = self.root + entity_path(name.replace("'", "\u02bc").replace(" ", "_"))
         stream.send_columns(path, times, rr.StateChange.columns(state=entries))
@@ -65,7 +66,7 @@ def log_lanes(
     ghost: MendedRecording | None,
 ) -> Lanes:
     """The lanes of an episode below ``root``; ``ended`` is its verdict, ``touched`` what its fingers touched."""
-    lanes = Lanes(root)
+    lanes = Lanes(root, episode.step_time)
     found = [a.shape[1] for a in (episode.qaf, episode.believed, episode.skill_weights) if a is not None]
     columns = max([len(episode.steps), *found])
     width = len(str(columns))

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.record.conventions import entity_path, rr, time_columns
+from lw_torchrl.record.entities import entity_path, rr, time_columns
 from lw_torchrl.suites.engine import RowModel
 
 SHOWN_GROUPS = (0, 1, 2)  # Meta-World keeps what only collides in group 4
@@ -85,6 +85,7 @@ def log_motion(
     root: str,
     motion: Motion,
     known: Known,
+    step_time: float,
     drawn: NDArray[np.int64] | None = None,
     *,
     ghost: bool = False,
@@ -93,6 +94,7 @@ def log_motion(
 
     Args:
         known: the recording's meshes; new ones are added.
+        step_time: seconds per row.
         drawn: the rows to draw, the first one among them; None for all.
         ghost: draw translucent meshes, below /ghosts, and only of what moves.
 
@@ -132,7 +134,7 @@ def log_motion(
         names = np.repeat([*placed], [len(own) for own, _ in placed.values()])[order].tolist()
         every = every[order]
         columns = rr.Transform3D.columns(translation=every[:, :3], quaternion=every[:, 3:], child_frame=names)
-        stream.send_columns(root, time_columns(rows[order]), columns)
+        stream.send_columns(root, time_columns(rows[order], step_time), columns)
     return frames
 
 

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lw_torchrl.record.conventions import rr
+from lw_torchrl.record.entities import rr
 
 MOST_CURVES = 64
 JPEG_QUALITY = 90

@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from lw_torchrl.record.conventions import EPISODE_TIMELINE, SECONDS_TIMELINE, Color, entity_path, rr, rrb
+from lw_torchrl.record.entities import EPISODE_TIMELINE, SECONDS_TIMELINE, Color, entity_path, rr, rrb
 from lw_torchrl.record.lanes import log_lanes
 from lw_torchrl.record.meshes import Known, Motion
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
@@ -57,6 +57,7 @@ class Page:
     row: dict[str, Any]  # in the overview
     frames: dict[str, str]  # as log_motion gives them
     pictures: float  # what the policy saw: width over height, 0 where it saw none
+    step_time: float  # seconds between two actions
 
     def title(self, policy: bool = True) -> str:
         """The tab's: the episode's name, who acted if that is to be said, and how it ended, if that is known."""
@@ -64,18 +65,6 @@ class Page:
         if self.row["cause"]:
             ended = f"failed: {self.row['cause']}"
         return " · ".join(filter(None, [self.row["name"], self.row["policy"] if policy else None, ended]))
-
-    def below(self, run: str) -> Page:
-        """The page where all entities of its recording lie below that of a ``run``, whose name it takes too."""
-        root, row = entity_path(run), self.row
-        return replace(
-            self,
-            root=root + self.root,
-            trails=[root + path for path in self.trails],
-            lanes=[root + path for path in self.lanes],
-            frames={root + mesh: frame for mesh, frame in self.frames.items()},
-            row=row | {"name": f"{run}/{row['name']}", "title": f"{run}: {row['title']}"},
-        )
 
     def tab(self, title: str) -> rrb.Horizontal:
         """Scene and curves on the left, words and lanes on the right."""
@@ -191,6 +180,7 @@ def send_page(
         row=heading.row(episode, name),
         frames=frames,
         pictures=log_pictures(stream, root, episode, drawn),
+        step_time=episode.step_time,
     )
 
 

@@ -16,8 +16,9 @@ from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import Task
+from lw_torchrl.record.entities import STEP_TIME, time_columns
 from lw_torchrl.record.meshes import Motion
-from lw_torchrl.suites.suite import known_suite
+from lw_torchrl.suites.suite import Suite
 
 APART = 0.01  # metres between two episodes that have parted
 NOBODY = -1  # in the place of a step's number: no step is in force alone
@@ -49,7 +50,7 @@ class TargetPose(NamedTuple):
 
 @dataclass(frozen=True)
 class RecordedEpisode:
-    """T rows of one episode, checked, on the CPU; S is the number of steps of its plan."""
+    """One episode of T rows as checked arrays on the CPU; S is the number of steps of its plan."""
 
     observation: NDArray[np.float32]  # T×D, as the layout says; metres, gripper opening in [0,1]
     action: NDArray[np.float32]  # T×A, of Meta-World displacement xyz and gripper effort, in [-1,1]
@@ -65,10 +66,19 @@ class RecordedEpisode:
     layout: Layout = METAWORLD
     reasons: tuple[str, ...] = ()  # what the plan says of each step, how it was written for one
     pixels: NDArray[np.uint8] | None = None  # T×H×W×3, what the policy or its evaluator saw
+    step_time: float = STEP_TIME  # seconds between two actions
+
+    def times(self, steps: NDArray[np.int64]) -> list[Any]:
+        """Return the timelines of these steps."""
+        return time_columns(steps, self.step_time)
+
+    def at(self, step: int) -> str:
+        """Return the words for a time step, "t = 80 (1.00 s)", which differ from those for a plan's step."""
+        return f"t = {step} ({step * self.step_time:.2f} s)"
 
     @property
     def answers(self) -> NDArray[np.bool_] | None:
-        """The truth that the policy went by: the learned evaluator's, where there is one."""
+        """The truth that the policy used: the learned evaluator's if there is one."""
         return self.qaf if self.believed is None else self.believed
 
     @cached_property
@@ -86,7 +96,7 @@ class RecordedEpisode:
 
     @property
     def first_success(self) -> int | None:
-        """The step at which the task was first seen done: one more than the row whose action did it."""
+        """The step at which the task was first seen as done: one after the row whose action did it."""
         if self.success is None or not self.success.any():
             return None
         return int(self.success.argmax()) + 1
@@ -103,9 +113,8 @@ class RecordedEpisode:
                 found[rows] = pose.distance[rows]
         return None if np.isnan(found).all() else found
 
-    def with_target_poses(self, task: Task) -> RecordedEpisode:
-        """The episode with the target poses of its plan's skills in ``task``."""
-        suite = known_suite(task.name)
+    def with_target_poses(self, task: Task, suite: Suite | None) -> RecordedEpisode:
+        """Return the episode with the target poses of its plan's skills in ``task``."""
         scripted = load_skills() if suite is None or suite.skills is None else suite.skills
         positions = task.positions(torch.from_numpy(self.observation))
         poses: list[TargetPose | None] = [None] * len(self.steps)
@@ -128,10 +137,9 @@ class RecordedEpisode:
         objects: Mapping[str, Any],
         plan: PlanLike | None = None,
         layout: Layout = METAWORLD,
+        step_time: float = STEP_TIME,
     ) -> RecordedEpisode:
         """Check a rollout; see :meth:`lw_torchrl.RerunLogger.log_episode` for the keys and the errors."""
-        if not isinstance(rollout, TensorDictBase):
-            raise TypeError(f"rollout must be a TensorDict, got {type(rollout).__name__}")
         if len(rollout.batch_size) != 1 or not rollout.batch_size[0]:
             hint = "; take one episode, rollout[i]" if len(rollout.batch_size) > 1 else ""
             raise ValueError(f"rollout must have batch size (T,) with T >= 1, got {tuple(rollout.batch_size)}{hint}")
@@ -141,8 +149,7 @@ class RecordedEpisode:
         def column(key: Any, size: int | None) -> NDArray[Any]:
             value = rollout.get(key, None)
             if value is None:
-                found = ", ".join(sorted(map(str, rollout.keys())))
-                raise ValueError(f"rollout must have the key {key!r} ({length}×{size}), got {found or 'no keys'}")
+                raise ValueError(f"rollout must have the key {key!r} ({length}×{size}), got {sorted(rollout.keys())}")
             return _array(value, f"rollout[{key!r}]", (length, size))
 
         def optional(key: Any, *, flat: bool = False, truth: bool = False) -> NDArray[Any] | None:
@@ -158,16 +165,9 @@ class RecordedEpisode:
             return array[:, 0] if flat else array[:, : needed or None]
 
         logits, observation = optional("qaf_logits"), column("observation", layout.size)
-        if not isinstance(objects, Mapping):
-            raise TypeError(f"objects must map names to T×3 positions, got {type(objects).__name__}")
-        if unnamed := [name for name in objects if not isinstance(name, str) or not name]:
-            raise TypeError(f"objects must be named by non-empty strings, got {unnamed[0]!r}")
         places = {name: _array(value, f"objects[{name!r}]", (length, 3)) for name, value in objects.items()}
         places.setdefault(GRIPPER, observation[:, layout.positions[0]])
         pixels = rollout.get("pixels", None)
-        if pixels is not None and (pixels.ndim != 4 or pixels.shape[-1] != 3 or pixels.dtype != torch.uint8):
-            got = f"{str(pixels.dtype).removeprefix('torch.')} of shape {'×'.join(map(str, pixels.shape))}"
-            raise ValueError(f"rollout['pixels'] must be uint8 of shape T×H×W×3, got {got}")
         executed = ("next", "executed_action")
         return cls(
             observation=observation,
@@ -181,6 +181,7 @@ class RecordedEpisode:
             corrected=optional("action_corrected", flat=True),
             steps=steps,
             layout=layout,
+            step_time=step_time,
             reasons=tuple(getattr(step, "reason", "") for step in plan.steps) if plan is not None else (),
             pixels=None if pixels is None else pixels.numpy(force=True),
         )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,18 +27,19 @@ _AFTER = ("executed_action", "success", "reward")
 
 
 class RolloutRecorder(Transform):
-    """Records episodes of chosen rows of a :class:`~lw_torchrl.LanguageWorldEnv` as they run, and changes no entry.
+    """Record episodes of chosen rows of a :class:`~lw_torchrl.LanguageWorldEnv` while they run.
 
-    It adds a page like :func:`lw_torchrl.log_rollout`'s at an episode's end; one that is cut off, by a reset or by
-    closing the environment, is recorded as far as it came. Put it after :class:`~lw_torchrl.QAFTransform` and before
-    what changes the observation, and close the environment before the logger. It sees no worker of another process.
+    At the end of an episode it adds a page like :func:`lw_torchrl.log_rollout`'s; an episode that is cut by a reset or
+    by closing the environment is recorded as far as it went. Put it after :class:`~lw_torchrl.QAFTransform` and before
+    transforms of the observation, and close the environment before the logger. It cannot record an environment that
+    runs in another process.
 
     Args:
         logger: the recording.
-        rows: which rows of the environment.
-        plans: what ``qaf`` answers, with a plan for the task of each of the rows; None for no plan.
-        every: record the first episode of a row, and then every so manieth.
-        policy: who acts, in a word, for the tab.
+        rows: indices of the environment's rows.
+        plans: the plans that ``qaf`` answers, one for the task of each row; None without plans.
+        every: record the first and then every N-th episode of a row.
+        policy: the policy's name, for the tab.
 
     Example:
         >>> import tempfile
@@ -118,16 +119,13 @@ class RolloutRecorder(Transform):
             self._end(running)
 
     def _end(self, running: _Row) -> None:
-        """Add the page of a row's episode, if it is one to record and has begun."""
+        """Add the page of a row's episode if it has begun and is to be recorded."""
         rollout, motion = running.finish()
         if rollout is None:
             return
-        if not self.logger.is_alive:
-            dropped = f"{len(rollout)} steps of an episode of {running.task.name!r} are dropped"
-            warnings.warn(f"{dropped}: the logger was closed before the environment", stacklevel=4)
-            return
-        known: dict[str, Any] = {"tasks": [running.task], "seed": running.seed, "policy": self.policy}
-        heading, episode = read_rollout(rollout, self.plans, **known)
+        about: dict[str, Any] = {"tasks": [running.task], "seed": running.seed, "policy": self.policy}
+        heading, episode = read_rollout(rollout, self.plans, suite=running.suite, **about)
+        episode = replace(episode, step_time=running.suite.step_time * running.frame_skip)
         self.logger.add_page(heading, episode, motion=motion)
 
 
@@ -135,7 +133,7 @@ class _Row:
     def __init__(self, env: LanguageWorldEnv, row: int, logger: RerunLogger) -> None:
         self.task = env.task_of_row[row]
         self.ended = 0
-        self.seed = env.seed
+        self.seed, self.suite, self.frame_skip = env.seed, env.suite, env.frame_skip
         self._env, self._row = env, row
         self._part: Any = row if env.batch_size else ...
         # An engine of one's own may have no bodies.

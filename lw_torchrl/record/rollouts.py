@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,11 +20,11 @@ from torch import Tensor
 
 from lw_torchrl._checks import checked, missing_keys, shown
 from lw_torchrl._devices import device_of
-from lw_torchrl._files import AnyPath, replacing
+from lw_torchrl._files import AnyPath
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import episode_seed
-from lw_torchrl.evaluation.failure_records import Failure, MendedEpisode
+from lw_torchrl.evaluation.failure_records import Failure
 from lw_torchrl.evaluation.protocol import actor_plans, tasks_of
 from lw_torchrl.evaluation.running import answered_by, make_env, running
 from lw_torchrl.language.layout import METAWORLD
@@ -29,9 +32,10 @@ from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
+from lw_torchrl.record.entities import STEP_TIME
 from lw_torchrl.record.meshes import Motion
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
-from lw_torchrl.record.rerun_logger import RerunLogger
+from lw_torchrl.record.rerun_logger import RerunLogger, is_complete
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.suites.suite import Suite, known_suite, load_suite
 from lw_torchrl.transforms.qaf import QAFTransform
@@ -55,28 +59,30 @@ def log_rollout(
 ) -> Any:
     """Add a rollout to a recording: the robot in 3-D, a verdict, the plan at the cursor, the timeline and curves.
 
-    Where the environment's seed is given, the episode is simulated again, from its task, ``seed``, ``episode`` and
-    actions, and the robot is shown as it moved. The observations must come out the same, bit for bit; where they do
-    not, a warning says so, and a hand over a table stands for the robot, as it does without a seed.
+    If the environment's seed is given, the episode is simulated again from its task, ``seed``, ``episode`` and actions,
+    and the robot is shown as it moved. Its observations must be equal bit for bit; otherwise a warning says so, and a
+    simple hand over a table stands for the robot, as without a seed.
 
     Args:
         logger: the recording.
         rollout: batch size (T,), one episode from its first state on: "observation" T×39 float32 (metres), "task_id" T
             int64, "action" T×4 float32 in [-1, 1], as executed, and ("next", "success") T×1 bool. Optional are
-            ("next", "executed_action") T×4, which is taken in the place of the action, "episode" T int64, "qaf" T×S
-            bool, "qaf_plan" T int64, "qaf_logits" T×S float32 (positive: true), "skill_weights" T×S float32,
-            "action_corrected" T×1, ("next", "reward") T×1 float32 and "pixels" T×H×W×3 uint8, what the policy saw. Or
-            batch size (N, T), an episode in each row.
-        plans: what ``qaf`` answers; None for no plan.
-        seed: of the environment; with ``episode`` it says how the episode began.
-        name: of the episode in the recording; None takes "push-7", of task and episode, or else "push".
-        policy: who acted, in a word, for the tab.
-        failure: why it failed, for the verdict; of N rows one for each, None where there is none.
-        tasks: of your own, where the plans do not say what they are.
-        suite: whose simulator runs it again; None for the one in :data:`~lw_torchrl.suites.SUITES` that has the task.
+            ("next", "executed_action") T×4, which replaces the action, "episode" T int64, "qaf" T×S bool, "qaf_plan" T
+            int64, "qaf_logits" T×S float32 (positive: true), "skill_weights" T×S float32, "action_corrected" T×1,
+            ("next", "reward") T×1 float32 and "pixels" T×H×W×3 uint8, the policy's input. Or batch size (N, T), an
+            episode in each row.
+        plans: the plans that ``qaf`` answers; None without plans.
+        seed: the environment's seed; with ``episode`` it determines how the episode began.
+        name: the episode's name in the recording, for batch size (T,); None takes "push-7", of task and episode, or
+            "push".
+        policy: the policy's name, for the tab.
+        failure: why the episode failed, for the verdict; for N rows a list with one entry each, or None.
+        tasks: custom tasks that the plans do not define.
+        suite: the suite that simulates the episode again; None for the one in :data:`~lw_torchrl.suites.SUITES` that
+            has the task.
 
     Returns:
-        The name; of N rows a list of names.
+        The episode's name; for N rows a list of names.
 
     Raises:
         ValueError: the rows are of several episodes; ``qaf`` answers other plans; the failure is another episode's.
@@ -93,28 +99,21 @@ def log_rollout(
         >>> env.close()
     """
     if len(rollout.batch_size) == 2:
-        if name is not None:
-            raise ValueError(f"name is of one episode, but rollout holds {len(rollout)}; got {name!r}")
         failures = failure if isinstance(failure, Sequence) else [failure] * len(rollout)
-        if len(failures) != len(rollout):
-            raise ValueError(f"failure must be one for each of {len(rollout)} rows, got {len(failures)}")
         same: dict[str, Any] = {"seed": seed, "policy": policy, "tasks": list(tasks), "suite": suite}
         rows = zip(rollout, failures, strict=True)
         return [log_rollout(logger, row, plans, failure=why, **same) for row, why in rows]
-    if isinstance(failure, Sequence):
-        raise ValueError(f"failure must be one Failure for one episode, got {len(failure)}")
+    if not isinstance(failure, Failure | None):
+        raise TypeError(f"failure must be one Failure for one episode, got {shown(failure)}")
     if suite is not None:
         suite = load_suite(suite)
         tasks = [*tasks, *suite.tasks.values()]
-    heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks)
+    heading, episode = read_rollout(rollout, plans, seed=seed, policy=policy, failure=failure, tasks=tasks, suite=suite)
     suite = suite or known_suite(heading.task)
     motion, ghost = _motion(heading, episode, suite), None
     if failure is not None and failure.mended is not None:
         by, plan, steps = failure.mended
-        for key in ("task_id", "episode"):
-            if (got := _single(steps, key, required=False)) != (own := _single(rollout, key, required=False)):
-                raise ValueError(f"failure.mended must be of the rollout's episode, {key} {own}, got {got}")
-        other, mended = read_rollout(steps, Plans([plan]), seed=seed, tasks=tasks)
+        other, mended = read_rollout(steps, Plans([plan]), seed=seed, tasks=tasks, suite=suite)
         ghost = MendedRecording(by, mended, None if motion is None else _motion(other, mended, suite))
     return logger.add_page(heading, episode, motion=motion, ghost=ghost, name=name)
 
@@ -127,6 +126,7 @@ def read_rollout(
     policy: str | None = None,
     failure: Failure | None = None,
     tasks: Iterable[Task] = (),
+    suite: Suite | None = None,
 ) -> tuple[Heading, RecordedEpisode]:
     """What a page shows of a rollout (T,), checked, as :func:`log_rollout` has it."""
     plans = None if plans is None else as_plans(plans)
@@ -145,10 +145,6 @@ def read_rollout(
         answered = rollout.get("qaf_plan", None)
         if answered is not None and not bool((answered == Plans([plan]).numbers[label]).all()):
             raise ValueError(f"rollout['qaf'] answers another plan of {label!r} than was given, as 'qaf_plan' tells")
-    if not isinstance(failure, Failure | None):
-        raise TypeError(f"failure must be a Failure, got {shown(failure)} ({type(failure).__name__})")
-    if failure is not None and not isinstance(failure.mended, MendedEpisode | None):
-        raise TypeError(f"failure.mended must be a MendedEpisode, got {shown(failure.mended)}")
     if failure is not None and (failure.task, failure.episode) != (label, failure.episode if index is None else index):
         got = f"{failure.task} {failure.episode}"
         raise ValueError(f"failure must be of the rollout's episode, {label} {index}, got that of {got}")
@@ -159,9 +155,11 @@ def read_rollout(
         for name, position in task.positions(observation).items():
             if plan is None or name == GRIPPER or any(name in words for words in told_of):
                 objects[name] = position
-    episode = RecordedEpisode.from_rollout(rollout, objects, plan, METAWORLD if task is None else task.layout)
+    layout, suite = METAWORLD if task is None else task.layout, suite or known_suite(label)
+    step_time = STEP_TIME if suite is None else suite.step_time
+    episode = RecordedEpisode.from_rollout(rollout, objects, plan, layout, step_time)
     if task is not None and plan is not None:
-        episode = episode.with_target_poses(task)
+        episode = episode.with_target_poses(task, suite)
     return Heading(label, index, seed, policy, failure), episode
 
 
@@ -291,22 +289,30 @@ def run_recorded(
     return [found[task, episode] for task in chosen for episode in episodes]
 
 
-def write_recording(
-    path: AnyPath,
-    episodes: Iterable[FinishedEpisode],
-    plans: Plans | None = None,
-    *,
-    tasks: Iterable[Task] = (),
-    **said: Any,
-) -> None:
-    """Write episodes of :func:`run_recorded` to a rerun file, which is replaced whole.
+@contextmanager
+def new_recording(path: AnyPath) -> Iterator[RerunLogger]:
+    """Yield a logger whose file replaces ``path`` at the end; an error or a full disk leaves the old file."""
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=target.parent, prefix=".") as folder:
+        file = Path(folder) / target.name
+        with RerunLogger(file) as logger:
+            yield logger
+        if not is_complete(file):
+            raise OSError(f"recording {str(target)!r} could not be written: is the disk full?")
+        os.replace(file, target)
 
-    The other arguments, ``seed`` and ``suite`` among them, are as for :func:`lw_torchrl.log_rollout`.
+
+def write_recording(
+    path: AnyPath, episodes: Iterable[FinishedEpisode], plans: Plans | None = None, **options: Any
+) -> None:
+    """Write episodes of :func:`run_recorded` to a rerun file, which is replaced if it exists.
+
+    The options are those of :func:`lw_torchrl.log_rollout`.
     """
-    tasks = list(tasks)
-    with replacing(path) as file, RerunLogger(file, exp_name=Path(path).stem) as logger:
-        for one in episodes:
-            log_rollout(logger, one.steps, plans, tasks=tasks, **said)
+    with new_recording(path) as logger:
+        for episode in episodes:
+            log_rollout(logger, episode.steps, plans, **options)
 
 
 def active_skills(episode: FinishedEpisode, plan: ConditionalPlan) -> list[tuple[str, int]]:

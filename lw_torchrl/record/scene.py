@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.record.conventions import GOLD, GREEN, STEEL, Color, changes, entity_path, rr, step_color, time_columns
+from lw_torchrl.record.entities import GOLD, GREEN, STEEL, Color, changes, entity_path, rr, step_color
 from lw_torchrl.record.meshes import GHOST, Known, Motion, log_motion
 from lw_torchrl.record.metrics import send_images
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
@@ -54,7 +54,7 @@ def log_scene(
     if motion is None:
         _log_simple_robot(stream, scene, episode, drawn)
     else:
-        frames = log_motion(stream, f"{scene}/bodies", motion, known, drawn)
+        frames = log_motion(stream, f"{scene}/bodies", motion, known, episode.step_time, drawn)
 
     def point(path: str, position: NDArray[np.float32], label: str | None, radius: float, color: Color) -> None:
         labels = None if label is None else [label]
@@ -63,7 +63,7 @@ def log_scene(
         style = rr.Points3D.from_fields(positions=still, radii=[radius], colors=[color], labels=labels)
         stream.log(f"{scene}/{path}", style, static=True)
         if still is None:
-            stream.send_columns(f"{scene}/{path}", time_columns(rows), rr.Points3D.columns(positions=position[rows]))
+            stream.send_columns(f"{scene}/{path}", episode.times(rows), rr.Points3D.columns(positions=position[rows]))
 
     def named(path: str, label: str, radius: float, color: Color) -> None:
         """A point with its name, which stands beside it if it would cover another there."""
@@ -74,7 +74,7 @@ def log_scene(
 
     def lines(path: str, strips: NDArray[np.float32], radius: float, color: Color) -> None:
         look = {"colors": np.tile(np.array(color, np.uint8), (len(drawn), 1)), "radii": np.full(len(drawn), radius)}
-        stream.send_columns(f"{scene}/{path}", time_columns(drawn), rr.LineStrips3D.columns(strips=strips, **look))
+        stream.send_columns(f"{scene}/{path}", episode.times(drawn), rr.LineStrips3D.columns(strips=strips, **look))
 
     goal = np.ascontiguousarray(episode.observation[:, episode.layout.positions[-1]])
     # Objects that stand for the goal, like "target location", have its colour, and their own label.
@@ -107,7 +107,7 @@ def log_scene(
         way = ghost.episode.objects[GRIPPER]
         stream.log(f"{scene}/ghost", rr.LineStrips3D([way], colors=[GHOST], radii=[0.002]), static=True)
         if motion is not None and ghost.motion is not None:
-            frames |= log_motion(stream, f"{scene}/ghost", ghost.motion, known, drawn, ghost=True)
+            frames |= log_motion(stream, f"{scene}/ghost", ghost.motion, known, episode.step_time, drawn, ghost=True)
     return trails, frames
 
 
@@ -138,7 +138,7 @@ def log_pictures(stream: Any, root: str, episode: RecordedEpisode, drawn: NDArra
     if episode.pixels is None:
         return 0.0
     rows = drawn[changes(episode.pixels[drawn].reshape(len(drawn), -1))]
-    send_images(stream, f"{root}/seen", time_columns(rows), episode.pixels[rows])
+    send_images(stream, f"{root}/seen", episode.times(rows), episode.pixels[rows])
     _, height, width, _ = episode.pixels.shape
     return width / height
 
@@ -172,7 +172,7 @@ def beside(things: dict[str, NDArray[np.float32]], eye: tuple[Point, Point]) -> 
 
 
 def _log_simple_robot(stream: Any, scene: str, episode: RecordedEpisode, drawn: NDArray[np.int64]) -> None:
-    times = time_columns(drawn)
+    times = episode.times(drawn)
 
     def box(path: str, centers: Any, half_sizes: Any, color: Color, labels: list[str] | None = None) -> None:
         size = {"centers": centers, "half_sizes": half_sizes}
@@ -211,7 +211,7 @@ def _log_target(stream: Any, scene: str, episode: RecordedEpisode, drawn: NDArra
             start[rows], end[rows] = pose.moved[rows], pose.position[rows]
             colors[rows], shown[rows] = (*step_color(step), 255), True
     rows = drawn[changes(np.concatenate([start, end, colors, shown[:, None]], axis=1)[drawn])]
-    start, end, colors, shown, times = start[rows], end[rows], colors[rows], shown[rows], time_columns(rows)
+    start, end, colors, shown, times = start[rows], end[rows], colors[rows], shown[rows], episode.times(rows)
     look = {"colors": colors[shown], "radii": np.full(shown.sum(), 0.004)}
     arrows = rr.Arrows3D.columns(origins=start[shown], vectors=(end - start)[shown], **look)
     stream.send_columns(f"{scene}/target", times, arrows.partition(shown.astype(int)))

@@ -1,4 +1,4 @@
-// LZMA as Python's lzma.FORMAT_ALONE writes it: a header of 13 bytes, then a range coder's.
+// Decompress LZMA as Python's lzma.FORMAT_ALONE writes it: a header of 13 bytes, then the range coder's output.
 function unlzma(input, size) {
   const lc = input[0] % 9, rest = (input[0] / 9) | 0, lp = rest % 5, pb = (rest / 5) | 0;
   const out = new Uint8Array(size), chances = (count) => new Uint16Array(count).fill(1024);

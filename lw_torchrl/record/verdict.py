@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lw_torchrl.evaluation.failure_records import CAUSES, Failure, part_words
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plan_text import one_line
-from lw_torchrl.record.conventions import CONTROL_PERIOD, FALSE, STEEL, Color, changes, rr, step_color, time_columns
+from lw_torchrl.record.entities import FALSE, STEEL, Color, changes, rr, step_color
 from lw_torchrl.record.lanes import short
 from lw_torchrl.record.recorded_episode import NOBODY, MendedRecording, RecordedEpisode
 
@@ -50,20 +50,15 @@ class Heading:
         cause = self.failure.cause if self.failure is not None and ended == "failed" else None
         title = " · ".join([name if name != self.name else self.task, *self.parts()[1:2]])
         known = {"name": name, "title": title, "task": self.task, "episode": self.episode, "policy": self.policy}
-        return known | {"ended": ended, "cause": cause, "at": at, "seconds": at * CONTROL_PERIOD}
+        return known | {"ended": ended, "cause": cause, "at": at, "seconds": at * episode.step_time}
 
     def ended(self, episode: RecordedEpisode) -> str:
         """How it ended, in a few words."""
         if episode.first_success is not None:
-            return f"SUCCESS at {at(episode.first_success)} of {len(episode)}"
+            return f"SUCCESS at {episode.at(episode.first_success)} of {len(episode)}"
         if self.failure is None:
-            return f"FAILED in {len(episode)} steps ({len(episode) * CONTROL_PERIOD:.2f} s)"
+            return f"FAILED in {len(episode)} steps ({len(episode) * episode.step_time:.2f} s)"
         return f"FAILED: {self.failure.cause}, {CAUSES[self.failure.cause]}"
-
-
-def at(step: int) -> str:
-    """A step of an episode, told apart from a plan's: "t = 80 (1.00 s)"."""
-    return f"t = {step} ({step * CONTROL_PERIOD:.2f} s)"
 
 
 def decisive_step(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None) -> int:
@@ -129,7 +124,7 @@ def verdict(
         lines += _facts(episode)
     if ghost is not None:
         end, parting = ghost.episode.first_success, ghost.parts_at(episode)
-        ended = "does not succeed" if end is None else f"succeeds at {at(end)}"
+        ended = "does not succeed" if end is None else f"succeeds at {episode.at(end)}"
         lines.insert(1, f"**The blue ghost**, with {ghost.by}, {ended}; they part at **t = {parting}**.")
     # Line after line: in a small window, paragraphs would not fit.
     head = f"**{lines[0]}**  \n" if small else f"#### {lines[0]}\n\n"
@@ -140,7 +135,7 @@ def _why(failure: Failure, episode: RecordedEpisode) -> list[str]:
     lines = [failure.why] if failure.why else []
     if failure.also is not None:
         lines.append(f"Also: {failure.also}, {CAUSES[failure.also]}.")
-    seen = f"Seen at {at(failure.at)} of {len(episode)}"
+    seen = f"Seen at {episode.at(failure.at)} of {len(episode)}"
     if failure.step is not None and failure.step < len(episode.steps):
         seen += f", in {_step(episode, failure.step)}"
     useless = [part_words(part) for part, worked in failure.counterfactuals.items() if not worked]
@@ -163,8 +158,8 @@ def _facts(episode: RecordedEpisode) -> list[str]:
             distance = np.where(episode.in_force == last, pose.distance, np.inf)
             nearest = int(distance.argmin())
             facts.append(
-                f"What it moves came within **{distance[nearest] * 100:.1f} cm** of where it goes, at {at(nearest)}; "
-                f"at the end it was {pose.distance[-1] * 100:.1f} cm away."
+                f"What it moves came within **{distance[nearest] * 100:.1f} cm** of where it goes, at "
+                f"{episode.at(nearest)}; at the end it was {pose.distance[-1] * 100:.1f} cm away."
             )
     answers = episode.answers
     never = [] if answers is None else [i for i in range(len(episode.steps)) if not answers[:, i].any()]
@@ -217,7 +212,7 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
             )
         texts.append("  \n".join(parts))
     documents = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
-    stream.send_columns(f"{root}/plan", time_columns(changed), documents)
+    stream.send_columns(f"{root}/plan", episode.times(changed), documents)
     return _lines(told, episode)
 
 
@@ -239,27 +234,33 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
     """``root``/action, and, where there is any, /distance (cm), /reward, /skill_weights, /corrected; returns which."""
     rows = np.arange(len(episode))
     sent = ["action"]
-    _send(stream, f"{root}/action", rows, episode.action, action_names(episode.layout))
+    _send(stream, f"{root}/action", episode.times(rows), episode.action, action_names(episode.layout))
     if (distance := episode.distance) is not None:
         # One line in centimetres, in the colour of the step in force.
         assert episode.in_force is not None
         steps = range(int(episode.in_force.max()) + 1)
         colors = np.array([*map(step_color, steps), FALSE], np.uint8)[episode.in_force]  # NOBODY, -1, takes the last
         columns = [*rr.Scalars.columns(scalars=distance * 100), *rr.SeriesLines.columns(colors=colors)]
-        stream.send_columns(f"{root}/distance", time_columns(rows), columns)
+        stream.send_columns(f"{root}/distance", episode.times(rows), columns)
         sent.append("distance")
     # A sparse reward is the success, which has a row in the timeline.
     reward: Any = episode.reward
     if reward is not None and not (episode.success is not None and np.array_equal(reward, episode.success)):
-        _send(stream, f"{root}/reward", rows + 1, reward[:, None], ["reward"], STEEL)
+        _send(stream, f"{root}/reward", episode.times(rows + 1), reward[:, None], ["reward"], STEEL)
         sent.append("reward")
     weights = episode.skill_weights
     if weights is not None and bool(((weights > 1e-3) & (weights < 1 - 1e-3)).any()):  # else the timeline has them
         texts = [f" {skill}" for _, skill in episode.steps] or [""] * weights.shape[1]
-        _send(stream, f"{root}/skill_weights", rows, weights, [f"{i}{text}" for i, text in enumerate(texts, 1)])
+        _send(
+            stream,
+            f"{root}/skill_weights",
+            episode.times(rows),
+            weights,
+            [f"{i}{text}" for i, text in enumerate(texts, 1)],
+        )
         sent.append("skill_weights")
     if episode.corrected is not None:
-        _send(stream, f"{root}/corrected", rows, episode.corrected[:, None], ["of the correction"])
+        _send(stream, f"{root}/corrected", episode.times(rows), episode.corrected[:, None], ["of the correction"])
         sent.append("corrected")
     return sent
 
@@ -273,8 +274,8 @@ def action_names(layout: Layout) -> list[str]:
     return names
 
 
-def _send(stream: Any, path: str, steps: Any, values: Any, names: Sequence[str], *color: Color) -> None:
+def _send(stream: Any, path: str, times: Any, values: Any, names: Sequence[str], *color: Color) -> None:
     colors = list(color) or [step_color(i) for i in range(len(names))]
     stream.log(path, rr.SeriesLines(names=names, colors=colors), static=True)
     columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
-    stream.send_columns(path, time_columns(steps), columns)
+    stream.send_columns(path, times, columns)

@@ -1,147 +1,270 @@
-"""Opens a recording in rerun's viewer, or takes a picture of it without a screen."""
+"""Opens recordings in rerun's viewer, or takes a picture of one without a screen."""
 
 from __future__ import annotations
 
+import os
 import re
+import socket
 import subprocess
-import threading
+import sys
+import tempfile
 import time
 import warnings
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from typing import Any
+from typing import IO, Any, NamedTuple
 
 from lw_torchrl._checks import checked
 from lw_torchrl._files import AnyPath, replacing
-from lw_torchrl.record.conventions import EPISODE_TIMELINE
-from lw_torchrl.record.recording_file import LOCAL, failure, find_recording, free_port, opened, opening_step, running
+from lw_torchrl.record.entities import EPISODE_TIMELINE
+from lw_torchrl.record.rerun_logger import is_complete
+from lw_torchrl.record.tabs import Tabs
 
+LOCAL = "127.0.0.1"
 START_SECONDS = 60.0
-PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 PAINT_SECONDS, SETTLE_SECONDS = 0.7, 15.0
+REASONS = {
+    r"render context|[Nn]o (graphics|wgpu) adapter|libvulkan": "no graphics driver was found. Without a GPU, install "
+    "Vulkan's loader and Mesa's software driver (Debian: apt-get install libvulkan1 mesa-vulkan-drivers)",
+    r"DISPLAY is set|EventLoopError|failed to open display": "there is no screen. Take a picture with --screenshot, "
+    "serve a page with --web, or write one with --html",
+}
+"""What rerun's viewer prints when it fails, and what to do about it."""
 
 
 @checked
 def open_viewer(
-    path: AnyPath,
+    path: AnyPath | Sequence[AnyPath],
     screenshot: AnyPath | None = None,
     window_size: str = "1400x900",
     *,
     step: int | None = None,
     episode: str | None = None,
 ) -> None:
-    """Open a recording in rerun's viewer and wait until it is closed; or save a picture of it.
+    """Open recordings in rerun's viewer and wait until it is closed; or save a picture of the viewer.
 
-    A recording whose writer was killed, or still writes, is shown as far as it goes, with a warning.
+    A recording that was not closed, since its run was killed or still writes, is shown as far as it was written, with
+    a warning.
 
     Args:
-        path: the .rrd file, or a folder that holds one.
-        screenshot: a PNG file to write instead of opening a window; it is replaced whole or not at all.
+        path: a .rrd file, a folder of such files, or several of these; the viewer shows the last one and lists all.
+        screenshot: a PNG file to write instead of opening a window.
         window_size: of the picture or the window, "1400x900" points.
-        step: where the time cursor stands; None for an episode's first success or failure, and a training's last step.
-        episode: the tab to open at, by its title ("Metrics") or its episode's name; None takes the layout's.
+        step: the step to open at; None for an episode's first success or failure, and a training's last step.
+        episode: the tab to open at, by its title ("Metrics") or its episode's name, in the recordings that have it;
+            None opens the first one.
 
     Raises:
         FileNotFoundError: there is no such file, or rerun's viewer is not installed.
-        ValueError: the file is no recording, or a damaged one, or it has no such step or tab.
+        ValueError: no recording has such a tab.
         RuntimeError: the viewer ended with an error; the message says what to do about it.
 
     Example:
         >>> open_viewer("runs/demo", screenshot="rollout.png", episode="drawer-open", step=75)  # doctest: +SKIP
     """
-    recording = find_recording(path)
-    if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", window_size):
-        raise ValueError(f"window_size must be like '1400x900', got {window_size!r}")
+    paths = [path] if isinstance(path, (str, os.PathLike)) else path
+    recordings = [file for one in paths for file in find_recordings(one)]
     if screenshot is not None and Path(screenshot).suffix != ".png":
         raise ValueError(f"screenshot must end in '.png', got {str(screenshot)!r}")
-    with opened(recording, episode) as file:
-        at = opening_step(file, episode, step)
-        if screenshot is not None:
-            with replacing(screenshot) as picture:
-                _take_picture(file, picture.absolute(), window_size, at)
-            return
-        port = free_port()
-        with running(file, "--port", str(port), "--window-size", window_size) as (process, output):
-            with suppress(ConnectionError, TimeoutError):  # it may have been closed at once
-                go_to(*connect(process, port), at)
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        files = [stack.enter_context(readable(recording)) for recording in recordings]
+        layouts = [layout for file in files if (layout := _missing_layout(file, folder)) is not None]
+        openings: dict[str, Opening] = {}
+        unknown: list[ValueError] = []
+        for file in files:
+            try:
+                openings |= _opening(file, episode, step)
+            except ValueError as error:
+                unknown.append(error)
+                openings |= _opening(file, None, None)
+        if len(unknown) == len(files):
+            raise unknown[-1]
+        port = str(free_port())
+        arguments: list[str | Path] = [*files, *layouts, "--port", port, "--window-size", window_size]
+        if screenshot is None:
+            process, output = stack.enter_context(rerun_process(*arguments))
+            with suppress(ConnectionError, TimeoutError):  # the window may have been closed at once
+                _go_to(_connect(process, port, len(openings)), openings)
             if process.wait():
                 raise failure(output)
-
-
-def _take_picture(recording: Path, picture: Path, window_size: str, step: int | None) -> None:
-    port = free_port()
-    arguments = (recording, "--headless", "--port", str(port), "--window-size", window_size)
-    with running(*arguments) as (process, output):
+            return
+        process, output = stack.enter_context(rerun_process(*arguments, "--headless"))
+        picture = stack.enter_context(replacing(screenshot))
         try:
-            client, shown = connect(process, port)
-            go_to(client, shown, step)
-            # Its messages lie over the views.
-            client.run_command("ui.toggle_top_panel")
-            _settle(client, picture)
-            for view in client.get_state().views:
-                for report in view.reports:
-                    warnings.warn(f"view {view.name!r} reports: {report.summary}", stacklevel=4)
+            client = _connect(process, port, len(openings))
+            _go_to(client, openings)
+            _take_picture(client, picture.absolute())
         except (ConnectionError, TimeoutError) as error:
-            # The viewer takes a moment to print why it dies.
-            time.sleep(0.5)
+            time.sleep(0.5)  # the viewer takes a moment to print its error
             if process.poll() is None:
                 raise RuntimeError(f"rerun's viewer did not answer: {error}") from error
             raise failure(output) from error
 
 
-def _settle(client: Any, picture: Path) -> None:
-    """Take pictures until two in a row are the same: then nothing is loading or moving any more."""
+def find_recordings(path: AnyPath) -> list[Path]:
+    """Return the recording ``path``, or all recordings in the folder ``path``, oldest first."""
+    recording = Path(path)
+    if not recording.is_dir():
+        if not recording.is_file():
+            raise FileNotFoundError(f"there is no recording {str(recording)!r}; give a .rrd file or a folder of some")
+        return [recording]
+    recordings = [file for file in recording.glob("*.rrd") if not file.name.startswith(".")]
+    if not recordings:
+        raise FileNotFoundError(f"folder {str(recording)!r} holds no recording (*.rrd)")
+    return sorted(recordings, key=lambda file: (file.stat().st_mtime, file.name))
+
+
+@contextmanager
+def readable(recording: Path) -> Iterator[Path]:
+    """Yield the recording, or if it was not closed a complete copy: rerun waits for the rest of an incomplete file."""
+    if is_complete(recording):
+        yield recording
+        return
+    warnings.warn(f"recording {str(recording)!r} was not closed; it is shown as far as it was written", stacklevel=4)
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / recording.name
+        command = [rerun_program(), "rrd", "merge", str(recording), "-o", str(copy)]
+        merge = subprocess.run(command, capture_output=True, text=True, check=False)
+        if merge.returncode:
+            raise ValueError(f"rerun cannot read recording {str(recording)!r}: {merge.stderr.strip()}")
+        yield copy
+
+
+class Opening(NamedTuple):
+    """Where to open a recording: the index of a tab, a timeline and a step; None leaves what the viewer chose."""
+
+    tab: int | None
+    timeline: str | None
+    step: int | None
+
+
+def _opening(recording: Path, episode: str | None, step: int | None) -> dict[str, Opening]:
+    """Return where to open a recording, by its id."""
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(recording)
+    recording_id, tabs = reader.recordings()[0].recording_id, Tabs.read(reader)
+    if tabs is None:  # another program's, which has its own layout
+        return {recording_id: Opening(None, None, step)}
+    number = None if episode is None else tabs.index(episode)
+    step = tabs.opening_step(episode) if step is None else step
+    return {recording_id: Opening(number, tabs.tab(episode).timeline, step)}
+
+
+def _missing_layout(recording: Path, folder: Path) -> Path | None:
+    """Write the layout of a recording that was never closed, and so has none, into ``folder``."""
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(recording)
+    known, tabs = reader.recordings()[0], Tabs.read(reader)
+    if reader.blueprints() or tabs is None:
+        return None
+    file = folder / f"{known.recording_id}.rbl"
+    tabs.blueprint().save(known.application_id, str(file))
+    return file
+
+
+def _connect(process: subprocess.Popen[bytes], port: str, recordings: int) -> Any:
+    """Return a client of the viewer once it has loaded the recordings."""
+    from rerun.experimental import ViewerClient
+
+    client: Any = None
+    deadline = time.monotonic() + START_SECONDS
+    while time.monotonic() < deadline and process.poll() is None:
+        with suppress(ConnectionError):
+            client = client or ViewerClient.connect(f"rerun+http://{LOCAL}:{port}/proxy")
+            state = client.get_state()
+            if len(state.recordings) >= recordings and state.active_recording and not state.loading:
+                return client
+        time.sleep(0.1)
+    raise TimeoutError(f"the recording was not loaded within {START_SECONDS:g} seconds")
+
+
+def _go_to(client: Any, openings: dict[str, Opening]) -> None:
+    """Bring tabs to the front, set cursors, and show the last recording. The default step is a timeline's last one."""
+    recordings = {recording.store_id.rpartition(":")[2]: recording for recording in client.get_state().recordings}
+    for recording_id, (tab, name, step) in openings.items():
+        recording = recordings[recording_id]
+        if tab is not None:
+            layout = client.get_blueprint(store_id=recording.store_id).blueprint
+            root = f"/container/{layout['/viewport']['ViewportBlueprint']['root_container']}"
+            container = layout[root]["ContainerBlueprint"]
+            container["active_tab"] = container["contents"][tab]
+            client.set_blueprint(layout, store_id=recording.store_id)
+        name = name or recording.current_timeline
+        timeline = next((timeline for timeline in recording.timelines if timeline.name == name), None)
+        if timeline is not None and timeline.end is not None:
+            if step is None:  # an episode's success and reward stand one step after its last row
+                step = max(timeline.end - 1 if name == EPISODE_TIMELINE else timeline.end, timeline.start)
+            client.set_time(name, sequence=step, play_state="paused", recording=recording.store_id)
+    if len(openings) > 1:
+        client.set_location(recording.location)
+        client.run_command("ui.expand_blueprint_panel")  # it lists the recordings
+
+
+def _take_picture(client: Any, picture: Path) -> None:
+    """Save pictures until two in a row are the same: then everything is loaded and nothing moves."""
+    client.run_command("ui.toggle_top_panel")  # its messages lie over the views
     before, deadline = b"", time.monotonic() + SETTLE_SECONDS
     while True:
         time.sleep(PAINT_SECONDS)
         client.save_screenshot(str(picture))
-        now = picture.read_bytes() if picture.is_file() else b""
+        now = picture.read_bytes()
         if (now == before and now) or time.monotonic() > deadline:
             break
         before = now
-    if now[: len(PNG_MAGIC)] != PNG_MAGIC:
-        raise RuntimeError("rerun's viewer wrote no picture")
+    for view in client.get_state().views:
+        for report in view.reports:
+            warnings.warn(f"view {view.name!r} reports: {report.summary}", stacklevel=4)
 
 
-def connect(process: subprocess.Popen[bytes], port: int) -> tuple[Any, Any]:
-    """A client of the viewer and what it says of the recording, once it has loaded it; else a TimeoutError."""
-    from rerun.experimental import ViewerClient
+def rerun_program() -> str:
+    """Return the path of rerun's program."""
+    if override := os.environ.get("RERUN_CLI_PATH"):
+        return override
+    package = find_spec("rerun_cli")  # a folder with the program; the module only starts it as a process of its own
+    if package is None or package.origin is None:
+        raise FileNotFoundError("rerun's viewer is not installed; pip install 'rerun-sdk>=0.41,<0.42'")
+    name = {"win32": "rerun.exe", "darwin": "Rerun.app/Contents/MacOS/Rerun"}.get(sys.platform, "rerun")
+    return str(Path(package.origin).parent / name)
 
-    deadline = time.monotonic() + START_SECONDS
-    found: SimpleQueue[tuple[Any, Any] | Exception | None] = SimpleQueue()
 
-    def ask() -> None:
-        client: Any = None
-        while time.monotonic() < deadline and process.poll() is None:
+def free_port() -> int:
+    """Return a free port of this machine."""
+    with socket.socket() as free:
+        free.bind((LOCAL, 0))
+        return int(free.getsockname()[1])
+
+
+@contextmanager
+def rerun_process(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[bytes], IO[bytes]]]:
+    """Run rerun's program until the end of the block; yield the process and the file with its output."""
+    with tempfile.TemporaryFile() as output:
+        command = [rerun_program(), *map(str, arguments), "--bind", LOCAL]
+        # Its notes about software drawing would cover the picture.
+        quiet = {"RUST_LOG": "error"} if "--headless" in command else {}
+        process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=quiet | dict(os.environ))
+        try:
+            yield process, output
+        finally:
+            process.terminate()
             try:
-                client = client or ViewerClient.connect(f"rerun+http://{LOCAL}:{port}/proxy")
-                state = client.get_state()
-                if state.recordings and state.active_recording and not state.loading:
-                    return found.put((client, state.recordings[0]))
-            except ConnectionError:
-                client = None
-            except Exception as error:
-                return found.put(error)
-            time.sleep(0.1)
-        found.put(None)
-
-    # A call waits for ever where something listens and says nothing.
-    threading.Thread(target=ask, name="a viewer that starts", daemon=True).start()
-    with suppress(Empty):
-        came = found.get(timeout=START_SECONDS)
-        if isinstance(came, Exception):
-            raise came
-        if came is not None:
-            return came
-    raise TimeoutError(f"no answer within {START_SECONDS:g} seconds")
+                process.wait(10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
-def go_to(client: Any, recording: Any, step: int | None) -> None:
-    """Set the time cursor to ``step``, or to the last one, of the timeline that the layout chose."""
-    timeline = next((one for one in recording.timelines if one.name == recording.current_timeline), None)
-    if timeline is None or timeline.end is None:
-        return
-    if step is None:  # an episode's success and reward stand one step after its last row
-        step = max(timeline.end - 1 if timeline.name == EPISODE_TIMELINE else timeline.end, timeline.start)
-    client.set_time(timeline.name, sequence=step, play_state="paused")
+def failure(output: IO[bytes]) -> RuntimeError:
+    """Return the error that says why rerun's program ended, from its output."""
+    output.seek(0)
+    text = re.sub(r"\x1b\[[0-9;]*m", "", output.read().decode("utf-8", "replace"))  # without colours
+    for pattern, reason in REASONS.items():
+        if re.search(pattern, text):
+            return RuntimeError(f"rerun's viewer stopped: {reason}.")
+    # Neither the stack nor the routine lines.
+    lines = [line for line in text.splitlines() if line.strip() and not re.match(r"\s+(\d+:|at )|.* INFO ", line)]
+    return RuntimeError("rerun's viewer ended with an error:\n" + "\n".join(lines[-12:]))

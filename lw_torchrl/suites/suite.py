@@ -34,6 +34,7 @@ class Suite:
         make_expert: ``(tasks) -> actor``, a demonstrator that writes ``action`` (N, A) float32 in [-1, 1] and
             ``unclipped_action``, the same before it is cut off; None for the plans with their scripted skills.
         max_steps: how many steps an episode has, unless the user says another number.
+        step_time: seconds between two actions; recordings show it. The default is Meta-World's, 80 Hz.
 
     Raises:
         ValueError: a task of another layout, or whose name does not begin with the suite's.
@@ -54,6 +55,7 @@ class Suite:
     plans: Plans | None = None
     make_expert: Callable[..., Any] | None = None
     max_steps: int = 500
+    step_time: float = 0.0125
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -14,7 +14,7 @@ from torchrl.envs import TransformedEnv
 import lw_torchrl as lw
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.record.recorded_episode import GRIPPER
-from lw_torchrl.record.tabs import Layout
+from lw_torchrl.record.tabs import Tabs
 
 STEPS = (
     ("the robot's gripper is not near the puck", "place the gripper above the puck"),
@@ -121,9 +121,13 @@ class Recording:
         at = np.searchsorted(steps, np.arange(length) + first, side="right") - 1
         return [states[i] for i in at]
 
+    def saved_tabs(self):
+        """The names of the tabs that the recording lists."""
+        return [tab.name for tab in Tabs.read(self.reader).tabs()]
+
     def tabs(self):
-        """What the tabs are asked for by, which are as many as rerun's own layout has."""
-        names = [tab.name for tab in Layout.read(self.reader).tabs()]
+        """The names of the tabs, which are as many as rerun's layout has."""
+        names = self.saved_tabs()
         assert len(names) == len(self.shown_tabs())
         return names
 
@@ -137,13 +141,6 @@ class Recording:
             inside = values.get((path.strip("/"), "contents"), [])
             titles[self._title(values, path)] = [self._title(values, child) for child in inside]
         return titles
-
-    def front(self):
-        """The title of the tab in front, and the timeline in force."""
-        values = self.blueprint()
-        (root,) = values["viewport", "root_container"]
-        (path,) = values[f"container/{uuid.UUID(bytes=bytes(root))}", "active_tab"]
-        return self._title(values, path), values["time_panel", "timeline"][0]
 
     def _title(self, values, path):
         return values.get((path.strip("/"), "display_name"), [""])[0]

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import io
-import socket
 import threading
-import time
 import urllib.request
-from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -169,38 +166,11 @@ def test_a_page_shows_itself_in_a_notebook(recording):
         page.close()
 
 
-@pytest.mark.parametrize("begun", [b"", b"G", b"GET / HTTP/1.1\r\nX: ", b"GET /wasm.gz HTTP/1.0\r\n\r\n"])
-def test_who_asks_or_takes_too_slowly_holds_no_thread(monkeypatch, recording, begun):
-    monkeypatch.setattr("lw_torchrl.record.web_page.ASKING_SECONDS", 0.5)
-    monkeypatch.setattr("lw_torchrl.record.web_page.STALLED_SECONDS", 0.5)
-    page = WebPage(recording)
-    server = threading.Thread(target=page.serve)
-    server.start()
-    before = threading.active_count()
-    try:
-        with socket.create_connection(("127.0.0.1", int(page.address.rstrip("/").rpartition(":")[2]))) as slow:
-            slow.sendall(begun)
-            for _ in range(100):
-                time.sleep(0.05)
-                with suppress(ConnectionError):
-                    slow.sendall(b"x")
-                if threading.active_count() <= before:
-                    break
-            assert threading.active_count() <= before
-        with urllib.request.urlopen(page.address, timeout=20) as answer:
-            assert answer.status == 200
-    finally:
-        page.close()
-        server.join(20)
-
-
 def test_wrong_pages_are_named(tmp_path, recording):
     with pytest.raises(ValueError, match=r"page must end in '\.html', got "):
         write_html(recording, tmp_path / "page.htmx")
     with pytest.raises(ValueError, match="episode must be one of 'push', 'Metrics', got 'pusch'; did you mean 'push'"):
         write_html(recording, tmp_path / "page.html", episode="pusch")
-    with pytest.raises(FileNotFoundError, match="does not exist"):
+    with pytest.raises(FileNotFoundError, match="there is no recording"):
         WebPage(tmp_path / "none.rrd")
-    with pytest.raises(ValueError, match="step must be at most 21, the recording's last, got 22"):
-        write_html(recording, tmp_path / "page.html", step=22)
     assert not list(Path(tmp_path).iterdir())

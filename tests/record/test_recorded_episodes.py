@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import time
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from lw_torchrl.record.lanes import EVENLY, NONE_HOLDS, short
 from lw_torchrl.record.page import ROBOT_EYE
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
 from lw_torchrl.record.scene import beside
-from lw_torchrl.record.tabs import Layout
+from lw_torchrl.record.tabs import Tabs
 
 ROWS = [f"/e1/{i}_" + short(c).replace(" ", "_") for i, (c, _) in enumerate(STEPS, 1)]
 
@@ -72,7 +71,7 @@ def test_the_step_in_force_has_a_timeline(tmp_path):
     found = record(tmp_path / "a.rrd", rollout)
     names = [f"{i} {skill}" for i, (_, skill) in enumerate(STEPS, 1)]
     assert found.values("/push/skill_weights", "SeriesLines:names") == [names]
-    states = Layout.read(found.reader).pages["push"].states
+    states = Tabs.read(found.reader).pages["push"].states
     assert [states[state][0] for state in ("0", "1", NONE_HOLDS, EVENLY)] == [*names, NONE_HOLDS, EVENLY]
     for row, state in enumerate(found.states("/e1/0b_plan_step", 20)):
         weights, truth = rollout["skill_weights"][row, :2], rollout["qaf"][row, :2]
@@ -108,16 +107,6 @@ def test_timelines(tmp_path):
     assert found.times("/push/reward", "Scalars:scalars") == [1, 2, 3, 4, 5]
     seconds = found.times("/push/action", "Scalars:scalars", "time")
     assert [int(second) for second in seconds] == [0, 12_500_000, 25_000_000, 37_500_000, 50_000_000]
-
-
-def test_control_period_is_metaworlds():
-    from lw_torchrl.record.conventions import CONTROL_PERIOD
-    from lw_torchrl.suites.metaworld.plain_engine import make_metaworld_env
-
-    env = make_metaworld_env("reach")
-    period = env.frame_skip * env.model.opt.timestep
-    assert period == pytest.approx(CONTROL_PERIOD)
-    env.close()
 
 
 def test_fingers_follow_the_opening(tmp_path):
@@ -177,9 +166,9 @@ def test_several_episodes_and_their_names(tmp_path):
             logger.log_episode(rollout, task="push", objects=make_objects(rollout), name=name)
             for rollout, name in ((first, None), (second, None), (first, "best so far"))
         ]
-        with pytest.raises(ValueError, match="name must be another"):
+        with pytest.raises(ValueError, match="is empty or reserved"):
             logger.log_episode(first, task="push", objects={}, name="push-2")
-        with pytest.raises(ValueError, match="name must be another"):
+        with pytest.raises(ValueError, match="is empty or reserved"):
             logger.log_episode(first, task="push", objects={}, name="metrics")
     assert names == ["push", "push-2", "best so far"]
     found = Recording(tmp_path / "a.rrd")
@@ -204,64 +193,21 @@ def test_the_layout_is_in_the_file(tmp_path):
         assert expected in text
 
 
-def test_speed(tmp_path):
-    rollout = make_rollout(500, columns=8)
-    objects = make_objects(rollout)
-    with RerunLogger(tmp_path / "a.rrd") as logger:
-        logger.log_episode(rollout, task="push", objects=objects, plan=PLAN)
-        start = time.process_time()  # other processes may be busy
-        logger.log_episode(rollout, task="push", objects=objects, plan=PLAN)
-        assert time.process_time() - start < 0.3
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda r: r.exclude("observation"), r"must have the key 'observation' \(20×39\), got action"),
-        (lambda r: r.exclude("action"), "must have the key 'action'"),
+        (lambda r: r.exclude("observation"), r"must have the key 'observation' \(20×39\), got \['action'"),
         (lambda r: r[None], r"batch size \(T,\) with T >= 1, got \(1, 20\); take one episode"),
-        (lambda r: r[:0], r"got \(0,\)"),
-        (
-            lambda r: r.set("observation", torch.rand(20, 38)),
-            r"'observation'\] must have shape 20×39, got 20×38",
-        ),
-        (
-            lambda r: r.set("action", torch.full((20, 4), float("nan"))),
-            r"'action'\] must be finite, .* row 0",
-        ),
-        (
-            lambda r: r.set(("next", "executed_action"), torch.rand(20, 3)),
-            r"rollout\[\('next', 'executed_action'\)\] must have shape 20×4, got 20×3",
-        ),
+        (lambda r: r.set("observation", torch.rand(20, 38)), r"'observation'\] must have shape 20×39, got 20×38"),
+        (lambda r: r.set("action", torch.full((20, 4), float("nan"))), r"'action'\] must be finite, .* row 0"),
         (lambda r: r.set("qaf_logits", torch.rand(20, 1)), r"'qaf_logits'.* each of 2 plan steps, got 1"),
         (lambda r: r.set("qaf", torch.rand(20, 3)), r"'qaf'\] must be bool, got torch.float32"),
-        (lambda r: r.set("qaf", torch.ones(20, 1, dtype=torch.bool)), "each of 2 plan steps, got 1"),
-        (
-            lambda r: r.set("skill_weights", torch.full((20, 3), torch.inf)),
-            "'skill_weights'.* must be finite",
-        ),
     ],
 )
 def test_wrong_rollouts_are_named(tmp_path, change, message):
     rollout = make_rollout()
     with RerunLogger(tmp_path / "a.rrd") as logger, pytest.raises(ValueError, match=message):
         logger.log_episode(change(rollout.clone()), task="push", objects=make_objects(rollout), plan=PLAN)
-
-
-def test_wrong_objects_are_named(tmp_path):
-    rollout = make_rollout()
-    with RerunLogger(tmp_path / "a.rrd") as logger:
-        with pytest.raises(ValueError, match=r"objects\['puck'\] must have shape 20×3, got 19×3"):
-            logger.log_episode(rollout, task="push", objects={"puck": torch.rand(19, 3)})
-        with pytest.raises(ValueError, match=r"objects\['puck'\] must be finite"):
-            logger.log_episode(rollout, task="push", objects={"puck": torch.full((20, 3), float("nan"))})
-        with pytest.raises(TypeError, match="objects must map names"):
-            logger.log_episode(rollout, task="push", objects=[torch.rand(20, 3)])
-        with pytest.raises(TypeError, match="rollout must be a TensorDict"):
-            logger.log_episode({"observation": torch.rand(20, 39)}, task="push", objects={})
-        with pytest.raises(ValueError, match="task must be"):
-            logger.log_episode(rollout, task="", objects={})
-    assert Recording(tmp_path / "a.rrd").entities() == {"/__properties"}
 
 
 @pytest.mark.parametrize(
@@ -303,5 +249,3 @@ def test_pictures_that_the_policy_saw_stand_beside_the_scene(tmp_path):
     assert [round(float(picture.mean()), -1) for picture in pictures] == [0, 60, 120, 180]
     views = [value for (_, field), value in found.blueprint().items() if field == "display_name"]
     assert ["What it saw"] in views
-    with pytest.raises(ValueError, match=r"rollout\['pixels'\] must be uint8 of shape T×H×W×3, got float32"):
-        record(tmp_path / "b.rrd", make_rollout(3).set("pixels", torch.zeros(3, 4, 4, 3)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -12,14 +11,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from recordings import PLAN, Recording, make_objects, make_rollout
+from recordings import Recording
 from tensordict import TensorDict
 from torchrl.record import VideoRecorder
 from torchrl.record.loggers import Logger
 
 from lw_torchrl.record import RerunLogger
-from lw_torchrl.record.tabs import Layout
-from lw_torchrl.record.writer import END, MESSAGE
 
 
 def test_it_is_a_torchrl_logger(tmp_path):
@@ -37,7 +34,7 @@ def test_it_is_a_torchrl_logger(tmp_path):
     assert "closed" in repr(logger)
     with pytest.raises(RuntimeError, match="cannot be restarted"):
         logger.start()
-    with pytest.raises(RuntimeError, match="takes nothing more"):
+    with pytest.raises(RuntimeError, match="accepts nothing more"):
         logger.log_scalar("loss", 1.0)
 
 
@@ -89,33 +86,6 @@ def test_each_group_of_metrics_has_a_view(tmp_path):
     }
 
 
-def test_many_tabs_do_not_make_the_layout_dear():
-    layout, sent = Layout(), []
-    for number in range(1000):
-        layout.add_view("metrics", f"group {number}")
-        if layout.is_due(seconds=1.0):
-            sent.append(number + 1)
-            layout._shown = number + 1
-    assert sent[:5] == [1, 2, 3, 4, 5], "the first are shown at once"
-    assert sum(sent) < 6 * 1000
-    assert layout.is_due(seconds=5000.0)
-
-
-def test_a_tab_that_comes_while_others_are_saved_is_saved_too():
-    layout, saved = Layout(), []
-
-    class Stream:
-        def log(self, path, *_, **__):
-            saved.append(path)
-            if len(saved) == 1:  # as another thread would
-                layout.add_view("metrics", "late")
-
-    layout.add_view("metrics", "early")
-    layout.save(Stream())
-    layout.save(Stream())
-    assert saved == ["__properties/layout/0", "__properties/layout/1"]
-
-
 def test_counters_are_saved_and_restored(tmp_path):
     with RerunLogger(tmp_path / "a.rrd") as logger:
         logger.log_scalar("loss", 1.0)
@@ -125,57 +95,6 @@ def test_counters_are_saved_and_restored(tmp_path):
         logger.load_state_dict(state)
         logger.log_scalar("loss", 1.0)
     assert Recording(tmp_path / "b.rrd").times("/metrics/loss", "Scalars:scalars", "global_step") == [2]
-
-
-def begin(path):
-    """A recording of a training with an episode; its logger is not closed."""
-    logger = RerunLogger(path)
-    logger.log_hparams({"lr": 0.1, "odd | name": "a | b"})
-    for value in (1.0, 2.0):
-        logger.log_scalar("loss/bc", value)
-    rollout = make_rollout()
-    logger.log_episode(rollout, task="push", objects=make_objects(rollout), plan=PLAN)
-    logger.flush()
-    return logger
-
-
-@pytest.mark.parametrize("end", ["closed", "killed", "cut"])
-def test_a_resumed_training_goes_on_in_its_recording(tmp_path, end):
-    path = tmp_path / "a.rrd"
-    first = begin(path)
-    content = path.read_bytes()
-    first.shutdown()
-    if end != "closed":
-        half = MESSAGE.pack(2, 1000) + b"x" * 50  # of what was being written
-        path.write_bytes(content if end == "killed" else content[: -len(END)] + half)
-    rollout = make_rollout(seed=1)
-    with RerunLogger(path, resume=True) as logger:
-        assert logger.episodes == ["push"]
-        logger.log_scalar("loss/bc", 3.0)
-        logger.log_hparams({"seed": 7})
-        second = logger.log_episode(rollout, task="push", objects=make_objects(rollout), plan=PLAN)
-    assert second == "push-2"
-    assert os.listdir(tmp_path) == ["a.rrd"]
-    found = Recording(path)
-    (after,) = found.reader.recordings()
-    assert (after.recording_id, after.application_id) == (first.experiment.get_recording_id(), first.application_id)
-    assert found.times("/metrics/loss/bc", "Scalars:scalars", "global_step") == [0, 1, 2]
-    assert found.values("/metrics/loss/bc", "Scalars:scalars") == [[1.0], [2.0], [3.0]]
-    assert {"push", "push-2", "Metrics", "Hyperparameters"} <= set(found.tabs())
-    assert {"/e1/gripper", "/e2/gripper"} <= found.entities()
-    table = found.values("/hparams", "TextDocument:text")[-1][0].splitlines()
-    assert table[2:] == ["| lr | 0.1 |", r"| odd \| name | a \| b |", "| seed | 7 |"]
-
-
-def test_resuming_begins_where_there_is_nothing_and_refuses_what_it_cannot_read(tmp_path):
-    with RerunLogger(tmp_path / "new.rrd", resume=True) as logger:
-        logger.log_scalar("loss", 1.0)
-    (tmp_path / "bad.rrd").write_bytes(b"no recording at all, but long enough")
-    with pytest.raises(ValueError, match=r"bad\.rrd.* is no rerun recording"):
-        RerunLogger(tmp_path / "bad.rrd", resume=True)
-    assert (tmp_path / "bad.rrd").read_bytes().startswith(b"no recording")
-    with pytest.raises(ValueError, match="resume=True needs path"):
-        RerunLogger(connect="127.0.0.1:1", resume=True)
 
 
 def pixels(found, entity):
@@ -197,9 +116,6 @@ def test_videos(tmp_path, channels):
         logger.log_video("plain", video)
         logger.log_video("batched", video[None], step=100, fps=10)
         logger.log_video("two", torch.stack([video, video]))
-        for wrong in (video.float(), video[0], video[:0], video[:, :1].repeat(1, 2, 1, 1)):
-            with pytest.raises(ValueError, match="video 'wrong' must be uint8 of shape T×C×H×W"):
-                logger.log_video("wrong", wrong)
     found = Recording(tmp_path / "a.rrd")
     for entity in ("/videos/plain", "/videos/batched/step\\ 100", "/videos/two/0", "/videos/two/1"):
         shown = pixels(found, entity).reshape(4, 24, 32, channels).astype(int)
@@ -254,9 +170,6 @@ def test_histograms(tmp_path):
     with RerunLogger(tmp_path / "a.rrd") as logger:
         logger.log_histogram("actor/action", data, step=5, bins=7)
         logger.log_histogram("list", [1, 2, 2])
-        for wrong in ([], [1.0, float("nan")]):
-            with pytest.raises(ValueError, match="data of histogram 'wrong' must be finite and not empty"):
-                logger.log_histogram("wrong", wrong)
     found = Recording(tmp_path / "a.rrd")
     counts, edges = np.histogram(data.double().numpy(), bins=7)
     entity = "/histograms/actor/action"

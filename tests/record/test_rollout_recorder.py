@@ -49,7 +49,7 @@ def test_live_is_what_is_logged_afterwards(tmp_path):
         assert str(value) == str(second[key]), key
 
 
-def test_every_so_manieth_episode(tmp_path):
+def test_every_nth_episode(tmp_path):
     with lw.RerunLogger(tmp_path / "a.rrd") as logger:
         env = make(logger, ["reach"], num_envs=1, length=3, every=2)
         for _ in range(5):
@@ -58,7 +58,7 @@ def test_every_so_manieth_episode(tmp_path):
         assert logger.episodes == ["reach-0", "reach-2", "reach-4"]
 
 
-def test_a_reset_alone_is_no_episode(tmp_path):
+def test_a_reset_without_a_step_is_not_an_episode(tmp_path):
     with lw.RerunLogger(tmp_path / "a.rrd") as logger:
         env = make(logger, ["reach"], num_envs=1, length=3, every=2)
         env.reset()
@@ -122,15 +122,6 @@ def test_a_single_environment_without_rows(tmp_path):
         env.rollout(3)
         env.close()
         assert logger.episodes == ["reach-0"]
-
-
-def test_a_logger_closed_first_loses_what_is_unfinished(tmp_path):
-    logger = lw.RerunLogger(tmp_path / "a.rrd")
-    env = make(logger)
-    env.step(env.rand_action(env.reset()))
-    logger.shutdown()
-    with pytest.warns(UserWarning, match="1 steps of an episode of 'push' are dropped"):
-        env.close()
 
 
 def test_wrong_places_for_a_recorder(tmp_path):

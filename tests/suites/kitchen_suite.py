@@ -147,4 +147,4 @@ class Pusher(lw.Policy):
 
 def make_suite() -> Suite:
     tasks = {task.name: task for task in (CABINET, MICROWAVE)}
-    return Suite("kitchen", KITCHEN, tasks, KitchenEngine, plans=PLANS, max_steps=160)
+    return Suite("kitchen", KITCHEN, tasks, KitchenEngine, plans=PLANS, max_steps=160, step_time=0.08)

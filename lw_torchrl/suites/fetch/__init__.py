@@ -55,7 +55,8 @@ def load_plans() -> Plans:
 
 def make_suite() -> Suite:
     """The four tasks, with their scripted skills and plans. Episodes have 50 steps, as gymnasium-robotics has it."""
-    return Suite("fetch", FETCH, TASKS, _make_engine, skills=load_skills(), plans=load_plans(), max_steps=50)
+    step_time = 0.04  # 20 simulation steps of 2 ms
+    return Suite("fetch", FETCH, TASKS, _make_engine, load_skills(), load_plans(), max_steps=50, step_time=step_time)
 
 
 def _make_engine(row_tasks: list[str], **options: Any) -> Any:
