@@ -158,7 +158,5 @@ def check(
     return output.show("success", None if found.own is None else found.success)
 
 
-
-
 def plan() -> None:
     """Plans from language models: the prompt, asking a model, and checking and repairing what it wrote."""
