@@ -11,7 +11,6 @@ import tyro
 import lw_torchrl as lw
 from lw_torchrl._files import read_json, write_json
 from lw_torchrl._progress import Progress
-from lw_torchrl.planners.model_server import SMALL_MODEL
 
 ASKED = "Say the command to a robot in other words. Keep what it means. Answer with one short command and nothing else."
 SHOWN = (
@@ -23,11 +22,11 @@ SHOWN = (
 
 @dataclass(frozen=True)
 class Arguments:
-    """Ask a model for each skill in other words, ten times. `lw-torchrl plan serve` serves the small one."""
+    """Ask a model for ten paraphrases of each skill. Ours are by SmolLM2, a model of 135 million weights."""
 
     base_url: str = "http://127.0.0.1:8000/v1"
     """Of a server that speaks OpenAI's protocol."""
-    model: str = SMALL_MODEL
+    model: str = "smollm2-135m"
     """As the server calls it."""
     number: int = 10
     """Of paraphrases of each skill."""

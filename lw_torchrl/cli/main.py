@@ -58,7 +58,7 @@ COMMANDS = Commands(
         "check": "check",
     }
 )
-_OF_PLAN = dict(prompt="plan", generate="plan_models", serve="plan", read="plan", check="plan")
+_OF_PLAN = dict(prompt="plan", generate="plan_models", read="plan", check="plan")
 _OF_PLAN |= dict(repair="plan_models")
 _OF_DATA = {"show": "data", "export": "exchange", "import": "exchange"}
 GROUPS = {"plan": Commands(_OF_PLAN), "data": Commands(_OF_DATA)}

@@ -141,7 +141,7 @@ def check(
     """
     text, task, format, known = _answer(file, task, format, task_file)
     skills = options.read_skills(skill_file, known) if skill_file else None
-    from lw_torchrl.planners.checking import check_plan
+    from lw_torchrl.planners.repairing import check_plan
 
     options.use_one_thread()
     found = check_plan(text, task, format, episodes=episodes, seed=seed, skills=skills, tasks=known)
@@ -156,37 +156,6 @@ def check(
     output = Output(json).show("task", found.task, str(found)).show("reason", found.decoded.reason or None)
     output.show("notes", [*map(str, found.decoded.notes)]).show("steps", rows)
     return output.show("success", None if found.own is None else found.success)
-
-
-def serve(
-    model: Positional[Annotated[Path | None, arg(metavar="[MODEL.gguf]")]] = None,
-    /,
-    host: str = "127.0.0.1",  # the address to listen at; by default only this machine can ask. There is no key
-    port: int = 8000,  # where; 0 takes a free one
-    context: int = 8192,  # tokens of a question and its answer, at most
-    threads: int | None = None,  # of the processor; half of its cores if none is given
-) -> None:
-    """Serve a language model on this machine, as OpenAI's servers do, until Ctrl-C. It wants the extra [serve].
-
-    The extra brings a small model, so that everything can be tried without a key. Held to a schema, it writes plans
-    that run, but few that succeed. https://huggingface.co has larger models as GGUF files.
-
-    Example: lw-torchrl plan serve Llama-3.2-3B-Instruct-Q4_K_M.gguf --port 8001
-
-    Args:
-        model: a GGUF file; the small model of the extra if none is given.
-    """
-    from lw_torchrl.planners.model_server import model_file, serve_model
-
-    file = model_file(model)
-    print(f"loading {file}", flush=True)
-
-    def ready(name: str, address: str) -> None:
-        asked = f"--model {name} --base-url {address} --constrain --format basic_py"
-        print(f"{name} is served at {address}; Ctrl-C ends it. In another terminal:")
-        print(f"lw-torchrl plan generate MT10 {asked}", flush=True)
-
-    serve_model(file, host=host, port=port, context=context, threads=threads, ready=ready)
 
 
 def plan() -> None:

@@ -12,7 +12,7 @@ from rapidfuzz import fuzz, process
 
 from lw_torchrl._checks import check_choice, checked, shown
 from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, check_length, parse_query, read_query
-from lw_torchrl.language.relations import PREDICATES, PUBLISHED, UNARY
+from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.skills import WORDS, ScriptedSkill, SkillError, Skills, load_skills, skills_for
 from lw_torchrl.language.tasks import Task, get_task
 
@@ -25,6 +25,7 @@ _EMPTY = frozenset(("the", "a", "an", "is", "are", "be", "does", "do", "did", "h
 _LONGEST = 400  # characters of a text that is compared
 _MOST_CLAUSES = 8  # of a condition outside the language
 _MOST_COMPARED = 64  # conditions and goals of an answer outside the language, a limit to its time
+LIMIT, SKILL_LIMIT = 0.4, 0.7  # distances beyond which no condition and no skill is near; see docs/planners.md
 _TARGETS = ("target location", "reach target")
 _TARGET = re.compile(
     r"\b(?:the\s)?(?:reach\s)?(?:goal|target)(?:\s(?:location|position|area|place|point|destination))?\b"
@@ -49,9 +50,7 @@ class QueryMatch:
 
 
 @checked
-def nearest_query(
-    text: str, task: str | Task, by: Literal["edit", "embedding"] = "edit", published_only: bool = False
-) -> QueryMatch:
+def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] = "edit") -> QueryMatch:
     """The query of a task that is nearest to a text.
 
     A text that is a query is found as it is. Otherwise it is split at "and" and "but", and each part is taken for the
@@ -62,7 +61,6 @@ def nearest_query(
         text: any words, of at most 64 parts.
         task: a task or its name, whose objects the query may name.
         by: "edit", closest in spelling; "embedding", closest in meaning (an ImportError without the extra ``[text]``).
-        published_only: leave out the points that we named, and relations that were added.
 
     Example:
         >>> match = nearest_query("the gripper isn't touching the puck", "push")
@@ -73,9 +71,8 @@ def nearest_query(
 
     Source: paper section 'Query Answering Function': the nearest by sentence embedding or by edit distance.
     """
-    owner = get_task(task).published if published_only else get_task(task)
-    relations = PUBLISHED if published_only else tuple(PREDICATES)
-    if (query := _parse(text, owner, relations)) is not None:
+    owner = get_task(task)
+    if (query := read_query(text, owner)) is not None:
         return QueryMatch(query, 1.0, tuple(QueryPart(str(clause), str(clause), 1.0) for clause in query.clauses))
     split = [" ".join(part.split()) for part in re.split(r"\b(?:and|but)\b", text, flags=re.IGNORECASE)]
     split = [part for part in split if _content(_affirmed(part)[0])] or [" ".join(text.split())]
@@ -85,9 +82,9 @@ def nearest_query(
     subject = ""
     for part in split:
         if (part, subject) not in known:
-            found = _nearest_part(part, owner, relations, by)
+            found = _nearest_part(part, owner, by)
             if subject and found.score < 1.0:
-                joined = _nearest_part(f"the {subject} {part}", owner, relations, by)
+                joined = _nearest_part(f"the {subject} {part}", owner, by)
                 found = joined._replace(text=part) if joined.score > found.score else found
             known[part, subject] = found
         parts.append(known[part, subject])
@@ -96,17 +93,11 @@ def nearest_query(
     return QueryMatch(query, sum(part.score for part in parts) / len(parts), tuple(parts))
 
 
-def _parse(text: str, task: Task, relations: tuple[str, ...]) -> Query | None:
-    """The query that a text is, if it has no other relations."""
-    query = read_query(text, task)
-    return query if query and all(clause.predicate in (*relations, *UNARY) for clause in query.clauses) else None
-
-
-def _nearest_part(part: str, task: Task, relations: tuple[str, ...], by: str) -> QueryPart:
-    if (query := _parse(part, task, relations)) is not None:
+def _nearest_part(part: str, task: Task, by: str) -> QueryPart:
+    if (query := read_query(part, task)) is not None:
         return QueryPart(part, str(query), 1.0)
     words, negated = _affirmed(part)
-    clauses, contents = _choices(task, relations)
+    clauses, contents = _choices(task, tuple(PREDICATES))
     if by == "edit":
         _, similarity, at = process.extractOne(_content(words), contents, scorer=fuzz.ratio)
         score = similarity / 100
@@ -152,15 +143,13 @@ def nearest_skill(
     text: str,
     task: str | Task | None = None,
     skills: Skills | Iterable[str] | None = None,
-    by: Literal["edit", "embedding"] = "edit",
 ) -> tuple[ScriptedSkill, float]:
-    """The scripted skill whose text is closest, and how close it is, in [0, 1].
+    """Return the scripted skill with the closest text, by edit distance, and how close it is, in [0, 1].
 
     Args:
         text: what to do, in any words.
         task: consider only skills whose objects this task has; with none it is a :class:`SkillError`.
         skills: to choose from; None for the shipped ones.
-        by: as for :func:`nearest_query`.
 
     Example:
         >>> nearest_skill("put gripper above puck", task="push")[0].text
@@ -179,11 +168,6 @@ def nearest_skill(
     if not allowed:
         raise SkillError(f"no scripted skill suits task {task!r}")
     words = " ".join(text.lower().replace("_", " ").split())
-    if by == "embedding":
-        from lw_torchrl.language.text import encode_texts
-
-        at, score = _nearest_meaning(words, allowed, encode_texts)
-        return table[allowed[at]], score
     found = process.extractOne(words, allowed, scorer=fuzz.ratio)
     return table[found[0]], found[1] / 100
 
@@ -194,11 +178,8 @@ class StepMapper:
     Source: paper section 'LLM Experiments', which takes the nearest by string edit distance.
     """
 
-    def __init__(
-        self, task: Task, skills: Skills | None, by: Literal["edit", "embedding"], limit: float, skill_limit: float
-    ) -> None:
-        self.task, self.by, self.limit, self.skill_limit = task, by, limit, skill_limit
-        self.skills = skills_for(task, skills)
+    def __init__(self, task: Task, skills: Skills | None) -> None:
+        self.task, self.skills = task, skills_for(task, skills)
         self.compared = 0
 
     def query(self, text: str) -> tuple[Query | None, float]:
@@ -208,8 +189,8 @@ class StepMapper:
         self.compared += 1
         if self.compared > _MOST_COMPARED or len(text) > _LONGEST:
             return None, 1.0
-        found, distance = _nearest_condition(text, self.task, self.by)
-        return (found if distance <= self.limit else None), distance
+        found, distance = _nearest_condition(text, self.task)
+        return (found if distance <= LIMIT else None), distance
 
     def skill(self, text: str) -> tuple[str | None, float]:
         """The text of the nearest scripted skill and its distance; no text if that is beyond the limit."""
@@ -220,15 +201,15 @@ class StepMapper:
         words = _with_target(text, self.task)
         if found := _phrases("skills").match(words):
             words = WORDS["skills"][found[0]] + words[found.end() :]
-        skill, score = nearest_skill(words, None, self.skills, by=self.by)
-        return (skill.text if 1.0 - score <= self.skill_limit else None), 1.0 - score
+        skill, score = nearest_skill(words, None, self.skills)
+        return (skill.text if 1.0 - score <= SKILL_LIMIT else None), 1.0 - score
 
 
 @lru_cache(maxsize=4096)
-def _nearest_condition(text: str, task: Task, by: Literal["edit", "embedding"]) -> tuple[Query | None, float]:
+def _nearest_condition(text: str, task: Task) -> tuple[Query | None, float]:
     words = _phrases("conditions").sub(lambda found: WORDS["conditions"][found[0]], _with_target(text, task))
     try:
-        match = nearest_query(words, task, by=by)
+        match = nearest_query(words, task)
     except QueryError:
         return None, 1.0
     if len(match.parts) > _MOST_CLAUSES:

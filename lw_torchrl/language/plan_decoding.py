@@ -5,9 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
-from lw_torchrl._checks import check_choice, check_probability, checked, counted, shown
+from lw_torchrl._checks import check_choice, checked, counted, shown
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.base import Clause, Note, Reading, Section, listed_steps
 from lw_torchrl.language.formats.prose import ProseReading
@@ -61,9 +60,6 @@ class DecodedPlan:
         return self.plan is not None and self.scripted is not None and len(self.scripted.steps) == len(self.plan.steps)
 
 
-LIMIT, SKILL_LIMIT = 0.4, 0.7
-"""Distances beyond which a condition and a skill are taken for nothing; docs/planners.md shows the effect."""
-
 _LONGEST = 65_536  # characters of a text that are read
 
 
@@ -73,9 +69,6 @@ def decode_plan(
     task: str | Task,
     format: str,
     *,
-    by: Literal["edit", "embedding"] = "edit",
-    limit: float = LIMIT,
-    skill_limit: float = SKILL_LIMIT,
     skills: Skills | None = None,
     tasks: Tasks = TASKS,
 ) -> DecodedPlan:
@@ -85,15 +78,14 @@ def decode_plan(
     on where the prompt ended. Thoughts, up to ``</think>`` or as other models mark them, are left out. Of several
     versions the longest counts, of equals the first. Python where prose was asked for, or the reverse, is read too.
 
-    A condition outside the query language is taken for the nearest query, clause by clause; one beyond ``limit`` is
-    dropped with its step. Skills stay as they are written in ``plan``; ``scripted`` has the nearest scripted ones.
+    A condition outside the query language is replaced by the nearest query by edit distance, clause by clause, or
+    dropped with its step if none is near. Skills stay as written in ``plan``; ``scripted`` has the nearest scripted
+    ones.
 
     Args:
         text: the answer; what follows 65,536 characters or 1,000 steps is left out.
         task: the task that was asked for, or its name.
         format: the format that was asked for, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
-        by: nearest in spelling ("edit"), or in meaning ("embedding"; an ImportError without the extra ``[text]``).
-        limit, skill_limit: the largest distance, from 0 to 1, of a condition or a goal, and of a skill, from ours.
         skills: the scripted skills to choose from; None for the shipped ones.
         tasks: where a task's name is looked up, as from :func:`~lw_torchrl.load_tasks`.
 
@@ -113,8 +105,7 @@ def decode_plan(
     """
     owner = get_task(task, tasks)
     read = PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].read
-    limits = check_probability("limit", limit), check_probability("skill_limit", skill_limit)
-    return decode_as(text, read, StepMapper(owner, skills, by, *limits))
+    return decode_as(text, read, StepMapper(owner, skills))
 
 
 def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> DecodedPlan:

@@ -1,10 +1,18 @@
-"""Plans from language models: how they are asked for, and who answers.
+"""Plans from language models: prompts, questions to a server, and answers.
 
-How answers fare needs the simulator: :mod:`~lw_torchrl.planners.checking`.
+:mod:`~lw_torchrl.planners.repairing` checks plans in the simulator, and asks for better ones.
 """
 
-from lw_torchrl.planners.answer_files import FilePlanner, Planner, answer_path, folder_name, write_answer
-from lw_torchrl.planners.answers import Answer, Answers, PlannerError, Tokens
+from lw_torchrl.planners.answer_files import (
+    Answer,
+    Answers,
+    FilePlanner,
+    Planner,
+    answer_path,
+    folder_name,
+    write_answer,
+)
+from lw_torchrl.planners.chat import PlannerError, Tokens
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
 from lw_torchrl.planners.prompts import plan_prompt, plan_schema, prompt_examples
 

@@ -1,45 +1,113 @@
-"""Answers on disk, ``DIR/<model>/<format>/<task>-<attempt>.<ext>``, a planner that reads them, and the cache."""
+"""Answers of language models: the plans in them, their files, the planner that reads these, and the cache."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
-from dataclasses import asdict, replace
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from lw_torchrl._checks import check_choice, check_int, checked, counted, differences, shown, unknown_name
-from lw_torchrl._files import JSON_LIMIT, AnyPath, parse_json, read_bytes, read_json, read_text, write_json, write_text
-from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.plan_decoding import decode_plan
+from lw_torchrl._files import AnyPath, read_json, read_text, write_json, write_text
+from lw_torchrl.language.formats import PLAN_FORMATS, encode_plan
+from lw_torchrl.language.formats.structured import read_structured
+from lw_torchrl.language.nearest import StepMapper
+from lw_torchrl.language.plan_decoding import DecodedPlan, decode_as, decode_plan
 from lw_torchrl.language.skills import Skills
-from lw_torchrl.language.tasks import TaskList, named_tasks
-from lw_torchrl.planners.answers import Answer, Answers, PlannerError, Reply, Tokens, is_count, read_reply, storable
-from lw_torchrl.planners.prompts import Question
+from lw_torchrl.language.tasks import Task, TaskList, named_tasks
+from lw_torchrl.planners.chat import PlannerError, Reply, Tokens
+from lw_torchrl.planners.prompts import passes
 
-_VERSION = 1  # of the cache
-_SETTINGS = "settings.json"
-_FIELDS = {"llm": str, "format": str, "task": str, "attempt": int, "completion": str}
+CUT_OFF = "it was cut off at max_tokens"
+_CACHE_VERSION = 1
+_ROW = {"llm": str, "format": str, "task": str, "attempt": int, "completion": str}  # of a .jsonl file
 _Place = tuple[str, str, int]  # format, task, attempt
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A planner's answer to one question."""
+
+    task: str
+    format: str  # the requested format
+    attempt: int  # the index of this answer among several to the same question
+    text: str  # the answer in the format, for :func:`~lw_torchrl.decode_plan`
+    raw: str  # the answer as the server sent it: JSON if the model was constrained, otherwise equal to ``text``
+    decoded: DecodedPlan  # the plan that was read from it
+    tokens: Tokens = field(default_factory=Tokens)
+    cached: bool = False  # read from a file, without a request
+    notes: tuple[str, ...] = ()  # remarks, such as that the answer was cut off
+
+
+class Answers(tuple[Answer, ...]):
+    """Answers, sorted by format, task and attempt."""
+
+    def __new__(cls, answers: Iterable[Answer]) -> Answers:
+        return super().__new__(cls, sorted(answers, key=lambda answer: (answer.format, answer.task, answer.attempt)))
+
+    @property
+    def tokens(self) -> Tokens:
+        """The tokens of all answers, including cached ones."""
+        return sum((answer.tokens for answer in self), Tokens())
+
+    def __repr__(self) -> str:
+        plans = sum(answer.decoded.plan is not None for answer in self)
+        return f"Answers({len(self)} answers, {plans} plans, {self.tokens.total} tokens)"
+
+
+def read_reply(
+    reply: Reply,
+    task: Task,
+    format: str,
+    attempt: int = 0,
+    skills: Skills | None = None,
+    schema: Mapping[str, Any] | None = None,
+) -> Answer:
+    """Read the plan in a reply. With a ``schema`` the reply should be JSON, which is rewritten in the format."""
+    read = PLAN_FORMATS[format].read if schema is None else read_structured
+    raw = storable(reply.text)
+    decoded = decode_as(raw, read, StepMapper(task, skills))
+    text = encode_plan(decoded.plan, format) if schema and decoded.plan is not None else raw
+    reasons = {"length": CUT_OFF, "content_filter": "the server's content filter cut it off"}
+    notes = [reasons[reply.finish]] if reply.finish in reasons else []
+    if reply.refusal:
+        notes.append(f"the model refused: {shown(reply.refusal)}")
+    elif not raw.strip():
+        notes.append("it is empty")
+    elif schema and reply.finish != "length":
+        valid = False
+        with suppress(ValueError, RecursionError):
+            valid = passes(json.loads(raw), schema)
+        notes += [] if valid else ["the server did not keep to the schema"]
+    notes += reply.notes
+    return Answer(task.name, format, attempt, storable(text), raw, decoded, reply.tokens, notes=tuple(notes))
+
+
+def storable(text: str) -> str:
+    r"""Return a text as a file gives it back: no lone surrogates or byte order mark, and "\n" as line end."""
+    text = text.encode("utf-8", "replace").decode()
+    return text.replace("\r\n", "\n").replace("\r", "\n").lstrip("\ufeff")
 
 
 @checked
 def folder_name(model: str) -> str:
-    """A model's name as that of a folder: "meta-llama_Llama-3.1-8B"."""
+    """Turn a model's name into a folder's: "meta-llama_Llama-3.1-8B"."""
     return re.sub(r"[^\w .+-]+", "_", model).strip(" ._")[:100].rstrip(" .") or "model"
 
 
 @checked
 def answer_path(folder: AnyPath, model: str, format: str, task: str, attempt: int) -> Path:
-    """Where the answer of a model is kept."""
+    """Return the path of a model's answer."""
     return Path(folder) / folder_name(model) / format / f"{task}-{attempt}.{PLAN_FORMATS[format].extension}"
 
 
 @checked
 def write_answer(folder: AnyPath, model: str, answer: Answer) -> Path:
-    """Write an answer to its place, whole or not at all; one that came in another form beside it, as .json."""
+    """Write an answer to its path; if the server sent JSON, also write that, as .json."""
     path = answer_path(folder, model, answer.format, answer.task, answer.attempt)
     if answer.raw != answer.text:
         write_text(path.with_suffix(".json"), answer.raw)
@@ -47,70 +115,55 @@ def write_answer(folder: AnyPath, model: str, answer: Answer) -> Path:
     return path
 
 
-def settle_folder(folder: Path, settings: Mapping[str, Any], *, reading: bool = False) -> None:
-    """Write what determines a model's answers to ``folder/settings.json``, unless it is there.
+def write_settings(folder: Path, settings: Mapping[str, Any], *, reading: bool = False) -> None:
+    """Write the settings that determine a model's answers to ``folder/settings.json``, unless they are there.
 
-    A ValueError if the folder has answers of others; with ``reading``, only the model has to be the same.
+    Raises:
+        ValueError: the folder has answers of other settings; with ``reading``, of another model.
     """
-    file = folder / _SETTINGS
-    there = read_json(file, "out: the settings") if file.is_file() else {}
-    if there == settings:
+    file = folder / "settings.json"
+    before = read_json(file, "out: the settings") if file.is_file() else {}
+    if before == settings:
         return
-    if any(path for format, known in PLAN_FORMATS.items() for path in folder.glob(f"{format}/*.{known.extension}")):
-        if reading and there.get("model", settings["model"]) == settings["model"]:
+    if any(path for name, format in PLAN_FORMATS.items() for path in folder.glob(f"{name}/*.{format.extension}")):
+        if reading and before.get("model", settings["model"]) == settings["model"]:
             return
-        differ = ", ".join(differences(there, settings)) if there else f"it has no {_SETTINGS} that says which"
-        how = "give these again, or the new answers another name (--name) or out"
-        raise ValueError(f"out: {str(folder)!r} holds answers of other settings: {differ}; {how}")
+        difference = ", ".join(differences(before, settings)) if before else "it has no settings.json to compare with"
+        advice = "use these settings again, or give the new answers another name (--name) or out"
+        raise ValueError(f"out: {str(folder)!r} holds answers of other settings: {difference}; {advice}")
     if not reading:
         write_json(file, dict(settings))
 
 
-def recorded_answer(
-    out: AnyPath, model: str, question: Question, format: str, kept: Reply | None, skills: Skills | None
-) -> Answer | None:
-    """The answer recorded in ``out/<model>``, if any; ``kept`` is the reply in the cache, which knows more of it."""
-    path = answer_path(out, model, format, question.task.name, question.attempt)
-    if not path.is_file():
-        return None
-    text, raw, schema = read_text(path, ValueError), path.with_suffix(".json"), question.request["schema"]
-    replies = [(kept, schema)] if kept else []
-    replies += [(Reply(read_text(raw, ValueError)), schema)] if schema and raw.is_file() else []
-    for reply, held_to in [*replies, (Reply(text), None)]:
-        answer = read_reply(reply, question.task, format, question.attempt, skills, held_to)
-        if answer.text == text:
-            break  # else the file was changed since
-    return replace(answer, cached=True)
-
-
 def recorded_answers(source: AnyPath) -> dict[str, dict[_Place, str | Path]]:
-    """Models to their answers, or files of these, by format, task and attempt; errors as of :class:`FilePlanner`."""
+    """Return each model's answers, or their files, by format, task and attempt; see :class:`FilePlanner`."""
     path = Path(source)
     if not path.exists():
         raise FileNotFoundError(f"source: there is no file or folder {str(path)!r}")
-    if not (found := _of_folder(path) if path.is_dir() else _of_lines(path)):
+    answers = _answers_in_folder(path) if path.is_dir() else _answers_in_lines(path)
+    if not answers:
         raise ValueError(f"source: {str(path)!r} holds no answers, <model>/<format>/<task>-<attempt>.<ext>")
-    return found
+    return answers
 
 
-def answer_text(found: str | Path) -> str:
-    """The text of an answer that :func:`recorded_answers` gives."""
-    return storable(read_text(found, ValueError) if isinstance(found, Path) else found)
+def answer_text(answer: str | Path) -> str:
+    """Return the text of an answer that :func:`recorded_answers` gives."""
+    return storable(read_text(answer, ValueError) if isinstance(answer, Path) else answer)
 
 
-def _of_folder(root: Path) -> dict[str, dict[_Place, str | Path]]:
-    found: dict[str, dict[_Place, str | Path]] = {}
-    for format, known in PLAN_FORMATS.items():
-        for path in root.glob(f"*/{format}/*.{known.extension}"):
-            named = re.fullmatch(r"([a-z][a-z0-9-]*)-(\d{1,9})", path.stem)
-            if named and path.parts[-3][0] != ".":
-                found.setdefault(path.parts[-3], {})[format, named[1], int(named[2])] = path
-    return found
+def _answers_in_folder(root: Path) -> dict[str, dict[_Place, str | Path]]:
+    answers: dict[str, dict[_Place, str | Path]] = {}
+    for name, format in PLAN_FORMATS.items():
+        for path in root.glob(f"*/{name}/*.{format.extension}"):
+            match = re.fullmatch(r"([a-z][a-z0-9-]*)-(\d{1,9})", path.stem)
+            if match and path.parts[-3][0] != ".":
+                answers.setdefault(path.parts[-3], {})[name, match[1], int(match[2])] = path
+    return answers
 
 
-def _of_lines(file: Path) -> dict[str, dict[_Place, str | Path]]:
-    found: dict[str, dict[_Place, str | Path]] = {}
-    named: dict[str, str] = {}
+def _answers_in_lines(file: Path) -> dict[str, dict[_Place, str | Path]]:
+    answers: dict[str, dict[_Place, str | Path]] = {}
+    models: dict[str, str] = {}
     for number, line in enumerate(read_text(file, ValueError).split("\n"), 1):
         if not line.strip():
             continue
@@ -118,94 +171,65 @@ def _of_lines(file: Path) -> dict[str, dict[_Place, str | Path]]:
         try:
             row = json.loads(line)
         except (ValueError, RecursionError) as error:
-            raise ValueError(f"{where}: it is no JSON: {error}") from error
-        if not isinstance(row, dict) or any(type(row.get(name)) is not kind for name, kind in _FIELDS.items()):
-            raise ValueError(f"{where}: an answer has {', '.join(_FIELDS)}, got {shown(row)}")
+            raise ValueError(f"{where}: it is not JSON: {error}") from error
+        if not isinstance(row, dict) or any(type(row.get(name)) is not kind for name, kind in _ROW.items()):
+            raise ValueError(f"{where}: an answer needs {', '.join(_ROW)}, got {shown(row)}")
         check_choice(f"{where}: format", row["format"], PLAN_FORMATS)
-        if not 0 <= row["attempt"] < 10**9:
-            raise ValueError(f"{where}: attempt must be from 0 to 999999999, got {shown(row['attempt'])}")
         name = folder_name(row["llm"])
-        if named.setdefault(name, row["llm"]) != row["llm"]:
-            both = f"the models {named[name]!r} and {row['llm']!r} would both be {name!r}"
+        if models.setdefault(name, row["llm"]) != row["llm"]:
+            both = f"the models {models[name]!r} and {row['llm']!r} would both be {name!r}"
             raise ValueError(f"{where}: {both}; give one of them another name")
-        found.setdefault(name, {})[row["format"], row["task"], row["attempt"]] = row["completion"]
-    return found
-
-
-def answer_key(request: dict[str, Any]) -> str:
-    """The name of an answer in the cache: 64 hex digits of all that determines it, in any order."""
-    return sha256(json.dumps([_VERSION, request], sort_keys=True).encode()).hexdigest()
+        answers.setdefault(name, {})[row["format"], row["task"], row["attempt"]] = row["completion"]
+    return answers
 
 
 class AnswerCache:
-    """Answers in a folder, each a JSON file with its question, so that nothing is asked twice."""
+    """Replies in a folder, one JSON file each, under a hash of the request."""
 
     def __init__(self, folder: AnyPath) -> None:
         self.folder = Path(folder)
 
-    def path(self, request: dict[str, Any]) -> Path:
-        return self.folder / (key := answer_key(request))[:2] / f"{key}.json"
+    def path(self, request: Mapping[str, Any]) -> Path:
+        """Return the file of the reply to a request, which is named by everything that determines the reply."""
+        key = sha256(json.dumps([_CACHE_VERSION, request], sort_keys=True).encode()).hexdigest()
+        return self.folder / key[:2] / f"{key}.json"
 
-    def read(self, request: dict[str, Any]) -> Reply | None:
-        """The answer to a request, None if there is none yet; a file without it is a :class:`ValueError`."""
-        path = self.path(request)
+    def read(self, request: Mapping[str, Any]) -> Reply | None:
+        """Return the reply to a request; None if there is none, or if its file is damaged."""
         try:
-            return _reply(parse_json(read_bytes(path, JSON_LIMIT)), request)
-        except FileNotFoundError:
+            answer = read_json(self.path(request), "the cached answer")["answer"]
+            reply = Reply(**{**answer, "tokens": Tokens(**answer["tokens"]), "notes": tuple(answer["notes"])})
+        except (FileNotFoundError, ValueError, KeyError, TypeError):  # the question can be asked again
             return None
-        except ValueError as error:
-            raise ValueError(f"the kept answer {str(path)!r} cannot be read: {error}") from error
+        texts = (reply.text, reply.finish, reply.refusal, *reply.notes)
+        return reply if all(isinstance(text, str) for text in texts) else None
 
-    def write(self, request: dict[str, Any], reply: Reply) -> None:
-        """Keep an answer, whole or not at all; one that could not be read back is a :class:`ValueError`."""
-        try:
-            text = json.dumps({"request": request, "answer": asdict(reply)}, indent=2, allow_nan=False) + "\n"
-            if len(text) > JSON_LIMIT:
-                raise ValueError(f"it is larger than {JSON_LIMIT} bytes")
-            if _reply(parse_json(text.encode()), request) != reply:
-                raise ValueError("it would be read back as another")
-        except (TypeError, ValueError, RecursionError) as error:
-            raise ValueError(f"the answer cannot be kept: {error}") from error
-        write_text(self.path(request), text)
-
-
-def _reply(found: dict[str, Any], request: dict[str, Any]) -> Reply:
-    try:
-        if answer_key(found["request"]) != answer_key(request):
-            raise ValueError("it answers another request")
-        said = found["answer"]
-        reply = Reply(said["text"], said["finish"], said["refusal"], Tokens(**said["tokens"]), tuple(said["notes"]))
-        texts = "".join((reply.text, reply.finish, reply.refusal, *reply.notes))
-    except (KeyError, TypeError, RecursionError) as error:
-        raise ValueError(repr(error)) from error
-    texts.encode()  # a lone surrogate goes into no file of an answer
-    if not (is_count(reply.tokens.prompt) and is_count(reply.tokens.completion)):
-        raise ValueError("its tokens must be integers from 0 to 2**53")
-    return reply
+    def write(self, request: Mapping[str, Any], reply: Reply) -> None:
+        write_json(self.path(request), {"request": request, "answer": asdict(reply)})
 
 
 @runtime_checkable
 class Planner(Protocol):
-    """Whatever writes plans: :class:`~lw_torchrl.OpenAIPlanner`, :class:`~lw_torchrl.FilePlanner`, or one of yours."""
+    """The interface of everything that writes plans, such as :class:`~lw_torchrl.OpenAIPlanner`."""
 
     @property
     def name(self) -> str:
-        """The model's name, fit for a folder's."""
+        """The model's name, as a folder's name."""
         ...
 
     def plans(
         self, tasks: TaskList, *, format: str = "chain_py", attempts: int = 1, out: AnyPath | None = None
     ) -> Answers:
-        """Plans of tasks, an answer for each task and attempt.
+        """Write plans of tasks: one answer for each task and attempt.
 
         Args:
             tasks: "MT10", "MT50", a task's name, a :class:`~lw_torchrl.Task`, or a list of names and tasks.
             format: a name in :data:`~lw_torchrl.PLAN_FORMATS`.
             attempts: answers to each question.
-            out: a folder; each answer is written to ``out/<name>/<format>/<task>-<attempt>.<ext>`` as it comes.
+            out: a folder; each answer is written to ``out/<name>/<format>/<task>-<attempt>.<ext>`` as it arrives.
 
         Raises:
-            PlannerError: an answer is missing. Those that came before it are kept.
+            PlannerError: an answer is missing. Earlier answers are kept.
         """
         ...
 
@@ -214,13 +238,13 @@ class FilePlanner:
     """The recorded answers of one model.
 
     Args:
-        source: a folder ``<model>/<format>/<task>-<attempt>.<ext>``, as planners write it; or a .jsonl file, on each
-            line an object with "llm", "format", "task", "attempt" and "completion".
-        model: whose answers; None where there is only one.
+        source: a folder ``<model>/<format>/<task>-<attempt>.<ext>``, as planners write it; or a .jsonl file with an
+            object of "llm", "format", "task", "attempt" and "completion" on each line.
+        model: the model whose answers to read; None if there is only one.
 
     Attributes:
-        name: the model's name, fit for a folder's.
-        recorded: (format, task, attempt) of each answer there is, sorted.
+        name: the model's name, as a folder's name.
+        recorded: (format, task, attempt) of each answer, sorted.
 
     Example:
         >>> import json, pathlib, lw_torchrl as lw
@@ -236,14 +260,14 @@ class FilePlanner:
 
     @checked
     def __init__(self, source: AnyPath, model: str | None = None) -> None:
-        found = recorded_answers(source)
-        if model is None and len(found) > 1:
-            raise ValueError(f"model must be given, since {str(source)!r} has answers of {', '.join(sorted(found))}")
-        name = next(iter(found)) if model is None else folder_name(model)
-        if name not in found:
-            raise unknown_name("model", model, sorted(found))
-        self.name, self._found = name, found[name]
-        self.recorded = tuple(sorted(self._found))
+        answers = recorded_answers(source)
+        if model is None and len(answers) > 1:
+            raise ValueError(f"model must be given, since {str(source)!r} has answers of {', '.join(sorted(answers))}")
+        name = next(iter(answers)) if model is None else folder_name(model)
+        if name not in answers:
+            raise unknown_name("model", model, sorted(answers))
+        self.name, self._answers = name, answers[name]
+        self.recorded = tuple(sorted(self._answers))
 
     def __repr__(self) -> str:
         return f"FilePlanner({self.name!r}, {counted(len(self.recorded), 'answer')})"
@@ -251,20 +275,20 @@ class FilePlanner:
     def plans(
         self, tasks: TaskList, *, format: str = "chain_py", attempts: int = 1, out: AnyPath | None = None
     ) -> Answers:
-        """The recorded answers, see :meth:`Planner.plans`; one that is not recorded is a :class:`PlannerError`."""
+        """Return the recorded answers; see :meth:`Planner.plans`."""
         check_choice("format", format, PLAN_FORMATS)
-        wanted = range(check_int("attempts", attempts, minimum=1))
-        found = []
+        count = check_int("attempts", attempts, minimum=1)
+        answers = []
         for name, task in named_tasks(tasks).items():
-            for attempt in wanted:
-                text = self._found.get((format, name, attempt))
-                if text is None:
-                    there = [str(number) for style, other, number in self.recorded if (style, other) == (format, name)]
-                    known = f"attempts {', '.join(there)}" if there else f"none in {format}"
+            for attempt in range(count):
+                if (format, name, attempt) not in self._answers:
+                    recorded = [str(place[2]) for place in self.recorded if place[:2] == (format, name)]
+                    available = f"attempts {', '.join(recorded)}" if recorded else f"none in {format}"
                     what = f"no answer of {self.name!r} is recorded for {name} in {format}, attempt {attempt}"
-                    raise PlannerError(f"{what}; of {name} there are {known}")
-                said = answer_text(text)
-                found.append(Answer(name, format, attempt, said, said, decode_plan(said, task, format), cached=True))
+                    raise PlannerError(f"{what}; of {name} there are {available}")
+                text = answer_text(self._answers[format, name, attempt])
+                decoded = decode_plan(text, task, format)
+                answers.append(Answer(name, format, attempt, text, text, decoded, cached=True))
                 if out is not None:
-                    write_answer(out, self.name, found[-1])
-        return Answers(found)
+                    write_answer(out, self.name, answers[-1])
+        return Answers(answers)

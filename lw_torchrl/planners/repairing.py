@@ -1,4 +1,4 @@
-"""repair_plans: the model that wrote a plan is told what became of it, and writes another."""
+"""check_plan runs a plan in the simulator; repair_plans reports its failures to the model that wrote it."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -10,39 +10,148 @@ from torch import Tensor
 from lw_torchrl._checks import check_int
 from lw_torchrl._files import AnyPath
 from lw_torchrl._progress import Progress
+from lw_torchrl.envs.episodes import FinishedEpisode
+from lw_torchrl.evaluation.plan_use import PlanUse, TaskUse, expert_use
+from lw_torchrl.evaluation.protocol import evaluate
 from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.plan_decoding import DecodedPlan, decode_plan
+from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
-from lw_torchrl.planners.answers import CUT_OFF, Answer
-from lw_torchrl.planners.checking import PlanCheck, check_decoded
+from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
+from lw_torchrl.planners.answer_files import CUT_OFF, Answer
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
+
+_GAPS = 3  # at most so many gaps are printed, the longest
+
+
+@dataclass(frozen=True)
+class PlanCheck:
+    """How a plan was read, and how it fares in the simulator."""
+
+    task: str
+    decoded: DecodedPlan
+    expert: TaskUse | None = None  # how its conditions fare in the states of Meta-World's expert; None without a plan
+    own: TaskUse | None = None  # how its steps fare under scripted skills; None if these cannot carry it out
+    success: float = 0.0  # the success rate under scripted skills
+    failed: tuple[Tensor, ...] = ()  # the observations of failed episodes, (T, 39) float32
+
+    @property
+    def never(self) -> tuple[int, ...]:
+        """The steps, from 0, whose condition held neither in the expert's states nor in the plan's own."""
+        if self.expert is None:
+            return ()
+        own = [0.0] * len(self.expert.true) if self.own is None else self.own.true
+        return tuple(k for k, (a, b) in enumerate(zip(self.expert.true, own, strict=True)) if a == 0.0 and b == 0.0)
+
+    def __str__(self) -> str:
+        if self.decoded.plan is None:
+            return "\n".join([f"{self.task}: no plan: {self.decoded.reason}", *map(str, self.decoded.notes)])
+        assert self.expert is not None
+        lines = [f"{self.task}, {len(self.decoded.plan.steps)} steps"]
+        for k, step in enumerate(step for step in self.decoded.steps if not step.dropped):
+            own = "" if self.own is None else f", {self.own.true[k]:.0%} of its own; acts in {self.own.chosen[k]:.0%}"
+            lines += [
+                f"{k + 1}  when {step.condition}{_written(step.written_condition, step.condition_distance)}",
+                f"   {step.scripted or 'no scripted skill'}{_written(step.written_skill, step.skill_distance)}",
+                f"   holds in {self.expert.true[k]:.0%} of the expert's states{own}",
+            ]
+        lines += [f"left out, {note}" for note in self.decoded.notes]
+        lines.append(f"Some condition holds in {self.expert.covered:.0%} of the states up to the expert's success.")
+        for episode, first, last in sorted(self.expert.gaps, key=lambda gap: gap[1] - gap[2])[:_GAPS]:
+            steps = f"step {first}" if first == last else f"steps {first} to {last}"
+            lines.append(f"No condition holds in {steps} of the expert's episode {episode}.")
+        lines += [f"Step {k + 1} never fires: its condition held in no state that was visited." for k in self.never]
+        if self.own is None:
+            lines.append("Scripted skills cannot carry it out: a step's skill is near none of them.")
+        else:
+            lines.append(f"Carried out by scripted skills it succeeds in {self.success:.0%} of episodes.")
+        return "\n".join(lines)
+
+
+def _written(text: str, distance: float) -> str:
+    return f"   <- {text!r} ({distance:.2f})" if distance else ""
+
+
+def check_plan(
+    text: str,
+    task: str | Task,
+    format: str,
+    *,
+    episodes: int = 5,
+    seed: int = 0,
+    skills: Skills | None = None,
+    tasks: Tasks = TASKS,
+) -> PlanCheck:
+    """Decode a text with :func:`~lw_torchrl.decode_plan`, and find the states in which its plan's conditions hold.
+
+    The task is one of Meta-World's. The expert and the plan, under scripted skills, run ``episodes`` each.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> check = check_plan(lw.encode_plan(lw.load_plans("MT10")["reach"], "basic_md"), "reach", "basic_md")
+        >>> check.never, check.expert.covered, check.success
+        ((), 1.0, 1.0)
+    """
+    task = get_task(task, tasks)
+    decoded = decode_plan(text, task, format, skills=skills, tasks=tasks)
+    return _check_decoded(decoded, task, episodes, seed, skills)
+
+
+def _check_decoded(
+    decoded: DecodedPlan, task: Task, episodes: int, seed: int, skills: Skills | None = None
+) -> PlanCheck:
+    if decoded.plan is None:
+        return PlanCheck(task.name, decoded)
+    expert = expert_use({task.name: decoded.plan}, task.name, episodes_per_task=episodes, seed=seed)[task.name]
+    if decoded.scripted is None or not decoded.all_scripted:
+        return PlanCheck(task.name, decoded, expert)
+    use, failed = PlanUse({task.name: decoded.scripted}), []
+
+    def on_episode(episode: FinishedEpisode) -> None:
+        use(episode)
+        if episode.first_success is None:
+            failed.append(episode.steps.get("observation"))
+
+    result = evaluate(
+        ScriptedSkillActor({task.name: decoded.scripted}, skills=skills),
+        tasks=task.name,
+        episodes_per_task=episodes,
+        seed=seed,
+        noise_scale=0.0,
+        stop_at_success=True,
+        also_record=["observation", "qaf", "skill_weights"],
+        on_episode=on_episode,
+        progress=False,
+    )
+    success = result.success_once[task.name] or 0.0
+    return PlanCheck(task.name, decoded, expert, use.tasks()[task.name], success, tuple(failed))
 
 
 @dataclass(frozen=True)
 class Repair:
-    """An answer and those that came in its place, one a round, with what became of each."""
+    """The first answer and its revisions, one for each round, with the check of each."""
 
     answers: tuple[Answer, ...]
     checks: tuple[PlanCheck, ...]
 
     @property
     def best(self) -> int:
-        """The round whose plan succeeds most, the earliest of equals; 0 is the first answer."""
+        """The round with the most successful plan, the earliest if several are equal; 0 is the first answer."""
         rates = [check.success for check in self.checks]
         return rates.index(max(rates))
 
 
 def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
-    """What became of a plan, in words for the model that wrote it; of the answer's ``notes``, that it was cut off.
+    """Report to a model how its plan fared; of the answer's ``notes``, only that it was cut off.
 
     Example:
         >>> from lw_torchrl.language.tasks import TASKS
-        >>> from lw_torchrl.planners.checking import check_plan
         >>> print(plan_facts(check_plan("I cannot.", "reach", "basic_py"), TASKS["reach"]))
         The answer was read, and no plan was found in it: it has no steps, neither for reach nor for another task.
         In the answer, line 1: is no part of a plan: 'I cannot.'
-        Write the plan for `reach` again, the whole of it, in the same form, with this mended.
+        Write the plan for `reach` again, the whole of it, in the same form, with this corrected.
     """
-    again = f"Write the plan for `{task.name}` again, the whole of it, in the same form, with this mended."
+    again = f"Write the plan for `{task.name}` again, the whole of it, in the same form, with this corrected."
     unread = [f"The answer is too long: {note}." for note in notes if note == CUT_OFF]
     unread += [f"In the answer, {note}" for note in check.decoded.notes]
     if check.decoded.plan is None:
@@ -64,7 +173,7 @@ def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
 
 
 def _distances(task: Task, failed: Iterable[Tensor]) -> list[str]:
-    """How near the gripper came to each thing, and things that move to those that stay: medians of failed episodes."""
+    """Report how near the gripper came to each object, and moved objects to still ones: medians of failed episodes."""
     episodes = [task.published.positions(observation) for observation in failed]
     if not episodes:
         return []
@@ -74,9 +183,9 @@ def _distances(task: Task, failed: Iterable[Tensor]) -> list[str]:
     pairs += [(a, b) for a in moved for b in names if GRIPPER not in (a, b) and b not in moved]
     lines = []
     for a, b in pairs:
-        far = [(one[a] - one[b]).norm(dim=-1) for one in episodes]
-        both = [distance.min() for distance in far], [distance[-1] for distance in far]
-        least, last = (100 * float(torch.stack(listed).median()) for listed in both)
+        distances = [(one[a] - one[b]).norm(dim=-1) for one in episodes]
+        both = [distance.min() for distance in distances], [distance[-1] for distance in distances]
+        least, last = (100 * float(torch.stack(values).median()) for values in both)
         lines.append(f"The {a} came within {least:.0f} cm of the {b}, and ended {last:.0f} cm from it.")
     return lines
 
@@ -93,46 +202,47 @@ def repair_plans(
     out: AnyPath | None = None,
     progress: bool = True,
 ) -> list[Repair]:
-    """Carry out plans, tell the model what became of those that fail, and ask for others, round by round.
-
-    Every answer is kept in ``out``, where each round counts as a model.
+    """Carry out plans, report the failures to the model, and ask for better plans, round by round.
 
     Args:
-        planner: who wrote the answers.
-        answers: its answers, of one format.
-        rounds: at most.
-        enough: the success rate from which a plan is left as it is.
-        episodes, seed: in which scripted skills carry out plans. Compare repaired plans on another seed.
+        planner: the planner that wrote the answers.
+        answers: its answers, in one format.
+        rounds: maximum number of rounds.
+        enough: the success rate from which a plan is not revised.
+        episodes, seed: the episodes in which scripted skills carry out each plan. Compare plans with another seed.
         tasks: where tasks' names are looked up.
-        out: as for :meth:`OpenAIPlanner.revise`.
+        out: see :meth:`OpenAIPlanner.revise`; each round is written like the answers of a model of its own.
         progress: show progress bars.
 
     Raises:
-        PlannerError: an answer did not come; those that came are kept.
+        PlannerError: an answer is missing; the others are cached.
     """
     check_int("rounds", rounds, minimum=1)
-    first = list(answers)
-    options: dict[str, Any] = {"episodes": episodes, "seed": seed, "skills": planner.skills}
 
-    def check(answers: Sequence[Answer]) -> list[PlanCheck]:
+    def run(answers: Sequence[Answer]) -> list[PlanCheck]:
         checks = []
         with Progress("carrying out", len(answers), "plan", show=progress) as bar:
             for answer in answers:
-                checks.append(check_decoded(answer.decoded, get_task(answer.task, tasks), **options))
+                task = get_task(answer.task, tasks)
+                checks.append(_check_decoded(answer.decoded, task, episodes, seed, planner.skills))
                 bar.update()
         return checks
 
-    found = [Repair((answer,), (checked,)) for answer, checked in zip(first, check(first), strict=True)]
+    first = list(answers)
+    repairs = [Repair((answer,), (checked,)) for answer, checked in zip(first, run(first), strict=True)]
     for number in range(1, rounds + 1):
-        open_ = [k for k, one in enumerate(found) if one.checks[-1].success < enough]
-        if not open_:
+        failing = [k for k, repair in enumerate(repairs) if repair.checks[-1].success < enough]
+        if not failing:
             break
-        before = [found[k].answers[-1] for k in open_]
-        checks = [found[k].checks[-1] for k in open_]
-        facts = [plan_facts(one, tasks[of.task], of.notes) for one, of in zip(checks, before, strict=True)]
-        came = planner.revise(before, facts, round=number, tasks=tasks, out=out, progress=progress)
-        of = {(answer.task, answer.attempt): answer for answer in came}
-        others = [of[answer.task, answer.attempt] for answer in before]
-        for k, other, checked in zip(open_, others, check(others), strict=True):
-            found[k] = Repair((*found[k].answers, other), (*found[k].checks, checked))
-    return found
+        before = [repairs[k].answers[-1] for k in failing]
+        checks = [repairs[k].checks[-1] for k in failing]
+        facts = [
+            plan_facts(check, get_task(answer.task, tasks), answer.notes)
+            for check, answer in zip(checks, before, strict=True)
+        ]
+        options: dict[str, Any] = {"round": number, "tasks": tasks, "out": out, "progress": progress}
+        revised = {(answer.task, answer.attempt): answer for answer in planner.revise(before, facts, **options)}
+        after = [revised[answer.task, answer.attempt] for answer in before]
+        for k, answer, checked in zip(failing, after, run(after), strict=True):
+            repairs[k] = Repair((*repairs[k].answers, answer), (*repairs[k].checks, checked))
+    return repairs

@@ -180,7 +180,7 @@ def test_a_plan_that_is_checked(capsys):
 def test_all_that_print_a_table_have_it():
     every = {**COMMANDS, **{f"{group} {name}": one for group, names in GROUPS.items() for name, one in names.items()}}
     without = {name for name, function in every.items() if "json" not in function.__annotations__}
-    assert without == {"view", "data", "plan", "plan prompt", "plan serve"}
+    assert without == {"view", "data", "plan", "plan prompt"}
 
 
 def test_what_json_cannot_hold_is_null_or_text():

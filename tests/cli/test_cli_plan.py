@@ -156,9 +156,7 @@ def test_generate_fails_in_one_line(capsys, tmp_path):
     with serving(FakeServer(lambda body: error(404, "no such model"))) as address:
         message = fails(capsys, *generate(address, tmp_path, "push"))
     assert f"'a/model' at {address}, push, attempt" in message
-    assert "--free-skills is for constrain" in fails(
-        capsys, *generate("http://x/v1", tmp_path, "push", "--free-skills")
-    )
+    assert "--free-skills needs constrain" in fails(capsys, *generate("http://x/v1", tmp_path, "push", "--free-skills"))
     message = fails(capsys, *generate("http://x/v1", tmp_path, "push", "--format", "all", "basic_py"))
     assert "--format must be one of 'all', 'basic_py'" in message
     assert "'all' alone" in message

@@ -130,7 +130,6 @@ WRONG = {
     f"plan generate psuh {MODEL}": "TASKS must be one of",
     f"plan generate push {MODEL} --format chain": "--format must be one of",
     f"plan generate push {MODEL} --out file": "--out must be a folder, 'file' is none",
-    "plan serve nowhere.gguf": "model 'nowhere.gguf' does not exist",
     "plan check nowhere.plan": "FILE: there is no file 'nowhere.plan'",
     "plan check push.plan --task pusch": "--task must be one of",
     "plan check push.plan --format chain": "--format must be one of",

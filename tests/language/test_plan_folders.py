@@ -159,9 +159,3 @@ def test_a_file_that_is_no_utf8_text_names_itself(tmp_path):
 def test_a_file_from_another_editor_loads(tmp_path, encode):
     (tmp_path / "push.plan").write_bytes(encode(HEAD))
     assert load_plans(tmp_path) == Plans([plan()])
-
-
-@pytest.mark.parametrize("source", [None, 3, ["MT10"]])
-def test_a_source_of_another_type_is_a_type_error(source):
-    with pytest.raises(TypeError):
-        load_plans(source)

@@ -154,16 +154,3 @@ def test_a_description_of_several_lines_stays_in_one(tmp_path):
     plan = ConditionalPlan.from_pairs(task, [("gripper open", "stack the brick")])
     for format in NINE:
         assert read_back(plan, format) == plan
-
-
-@pytest.mark.parametrize(
-    ("plan", "format", "error", "says"),
-    [
-        (None, "chain_py", TypeError, "plan must be a ConditionalPlan"),
-        (SHIPPED[0], "chain", ValueError, "format must be one of .* did you mean 'chain_py'"),
-        (SHIPPED[0], None, TypeError, "format must be a string"),
-    ],
-)
-def test_wrong_arguments_are_named(plan, format, error, says):
-    with pytest.raises(error, match=says):
-        lw.encode_plan(plan, format)

@@ -11,7 +11,7 @@ from lw_torchrl.language import plan_text
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plan_text import MOST_STEPS, PLAN_LIMIT
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, check_plan, parse_plan
-from lw_torchrl.language.queries import check_query, parse_query
+from lw_torchrl.language.queries import check_query
 
 
 def test_a_plan_is_read_line_by_line():
@@ -124,12 +124,6 @@ def test_an_error_names_the_source_and_the_line(text, line, says):
 def test_a_plan_for_another_task_is_refused():
     with pytest.raises(PlanError, match=r"line 2: this is a plan for 'drawer-open', expected one for 'push'"):
         parse_plan(DRAWER, "push")
-
-
-@pytest.mark.parametrize("text", [None, 3, DRAWER.encode(), DRAWER.splitlines(), parse_query("gripper open", "push")])
-def test_a_text_of_another_type_is_a_type_error(text):
-    with pytest.raises(TypeError, match="text must be a string"):
-        parse_plan(text)
 
 
 def test_a_text_is_never_executed(tmp_path):

@@ -113,19 +113,3 @@ def test_shipped_points_are_marked_and_named_apart():
         assert all(point.ours for point in task.objects[len(task.published.objects) :])
         assert all(not thing.ours for thing in task.published.objects)
         assert task.published.published == task.published
-
-
-@pytest.mark.parametrize(
-    "offset", [(0.0, 0.0), (0.0, 0.0, float("nan")), (0.0, float("inf"), 0.0), ("0", 0.0, 0.0), (True, 0.0, 0.0), ()]
-)
-def test_a_wrong_offset_is_refused(offset):
-    with pytest.raises(ValueError, match="offset of 'place' must be three numbers"):
-        NamedObject("place", (4, 5, 6), offset, ours=True)
-
-
-@pytest.mark.parametrize(
-    "position", [("obs", 1, 2), (True, 1, 2), (None, 1, 2), (float("nan"), 0.0, 0.0), (0.0, 0.0, float("inf"))]
-)
-def test_a_wrong_coordinate_is_refused(position):
-    with pytest.raises(ValueError, match="position of 'place' must hold"):
-        NamedObject("place", position)

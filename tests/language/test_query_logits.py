@@ -191,14 +191,6 @@ def test_any_leading_shape(shape):
     assert torch.equal(logits > 0, everything()(states, ids))
 
 
-@pytest.mark.parametrize("temperature", [0, -1.0, math.nan, math.inf, 1e-9, "warm", None])
-def test_a_wrong_temperature_is_named(temperature):
-    with pytest.raises(ValueError, match="temperature"):
-        QueryProgram({"push": ["gripper open"]}).logits(
-            torch.zeros(39), torch.tensor(task_id("push")), temperature=temperature
-        )
-
-
 def test_a_wrong_state_is_refused_as_by_the_hard_truth():
     program = QueryProgram({"push": ["gripper open"]})
     for states, ids, says in (

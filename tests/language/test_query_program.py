@@ -200,11 +200,3 @@ def test_one_row_of_a_task_without_queries_is_named_among_the_others():
     with pytest.raises(ValueError, match=r"without queries.*: reach$") as caught:
         QueryProgram({"push": ["gripper open"]})(torch.zeros(4, 39), ids)
     assert "push" not in str(caught.value)
-
-
-@pytest.mark.parametrize("name", ["observation", "task_id"])
-def test_an_array_that_is_no_tensor_is_named(name):
-    rows = {"observation": torch.zeros(1, 39), "task_id": torch.tensor([task_id("reach")])}
-    rows[name] = rows[name].numpy()
-    with pytest.raises(TypeError, match=f"{name} must be a tensor, got ndarray"):
-        QueryProgram({"reach": ["the gripper is open"]})(**rows)

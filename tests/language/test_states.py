@@ -122,21 +122,6 @@ def test_openings_are_written_and_read_again():
         Task.from_json("mine", {"description": "Mine.", "objects": {"door": {"openin": "obs[3]"}}})
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"opening": 15}, r"obs\[15\] is outside the 15 numbers"),
-        ({"opening": -1}, r"obs\[-1\] is outside"),
-        ({"opening": 0.5}, "opening of 'drawer' must be an index, of an object alone, got 0.5"),
-        ({"opening": True}, "must be an index"),
-        ({"opening": 3, "ours": True}, "of an object alone"),
-    ],
-)
-def test_an_opening_that_is_none_is_refused(options, says):
-    with pytest.raises(ValueError, match=says):
-        replace(HOUSE, objects=(*HOUSE.objects, NamedObject("drawer", (0, 1, 2), **options)))
-
-
 def test_an_action_may_have_no_displacement_and_no_gripper():
     joints = replace(LAYOUT, displacement=None, gripper=None, action_size=2)
     assert Layout.from_json(joints.to_json()) == joints

@@ -1,10 +1,10 @@
-"""Held to a schema: it fits every task and every shipped plan, what passes it decodes, and servers may ignore it."""
+"""The JSON Schema of plans: shipped plans satisfy it, what satisfies it is a plan that runs, servers may ignore it."""
 
 import json
 
 import jsonschema
 import pytest
-from fake_server import PLANS, FakeServer, completion, error, serving, shipped
+from fake_server import PLANS, FakeServer, completion, error, shipped
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,7 +12,8 @@ import lw_torchrl as lw
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.structured import read_structured, write_structured
 from lw_torchrl.planners import plan_schema
-from lw_torchrl.planners.answers import Reply, read_reply
+from lw_torchrl.planners.answer_files import read_reply
+from lw_torchrl.planners.chat import Reply
 from lw_torchrl.planners.prompts import passes
 
 OTHER_WORDS = lw.load_plans("MT50", skills="MT10")
@@ -20,24 +21,8 @@ PUSH = plan_schema("push")
 FORMATS = ("basic_py", "chain_md", "goal_py_md")
 
 
-@pytest.fixture
-def ask(monkeypatch, tmp_path):
-    monkeypatch.delenv("OPENAI_API_KEY", raising=False)
-    monkeypatch.setenv("NO_PROXY", "*")
-
-    def asked(server, tasks="MT10", format="basic_py", **options):
-        with serving(server) as address:
-            planner = lw.OpenAIPlanner(
-                "m", base_url=address, constrain=True, cache=tmp_path / "kept", retries=1, concurrency=1, **options
-            )
-            planner.address = "http://fake/v1"  # the port is another each time
-            return planner.plans(tasks, format=format, out=tmp_path / "out", progress=False)
-
-    return asked
-
-
 def parts(schema):
-    """The schema and all that are in it."""
+    """Yield a schema and all schemas inside it."""
     yield schema
     for inner in (*schema.get("properties", {}).values(), *schema.get("anyOf", ()), schema.get("items")):
         if inner:
@@ -48,27 +33,25 @@ def parts(schema):
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_the_schema_of_every_task_is_one_that_servers_know(format):
+def test_servers_know_every_word_of_the_schema(format):
     for task in lw.MT50 if PLAN_FORMATS[format].style.goals else lw.MT10:
         schema = plan_schema(task, format)
         jsonschema.Draft202012Validator.check_schema(schema)
-        found = list(parts(schema))
-        assert {name for part in found for name in part} <= {
+        inner = list(parts(schema))
+        assert {name for part in inner for name in part} <= {
             "type", "properties", "required", "additionalProperties", "items", "minItems", "maxItems", "anyOf", "enum",
             "pattern",
         }  # fmt: skip
-        for part in found:
+        for part in inner:
             if part.get("type") == "object":
                 assert part["additionalProperties"] is False
                 assert part["required"] == list(part["properties"]) == sorted(part["properties"])
-        words = [word for part in found for word in part.get("enum", ())]
-        assert len(words) <= 350
-        assert max(len(part.get("enum", ())) for part in found) <= 250
+        assert sum(len(part.get("enum", ())) for part in inner) <= 350
         assert len(json.dumps(schema)) < 16_000
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_every_shipped_plan_passes_and_comes_back(format):
+def test_every_shipped_plan_satisfies_the_schema_and_is_read_back(format):
     style = PLAN_FORMATS[format].style
     for task, plan in list(PLANS.items())[:: 1 if style.goals else 5]:
         text = write_structured(plan, style)
@@ -85,136 +68,122 @@ def test_every_shipped_plan_passes_and_comes_back(format):
         jsonschema.validate(json.loads(write_structured(OTHER_WORDS[task], style)), free)
 
 
-def test_it_takes_what_the_language_has_and_nothing_else():
-    schema = plan_schema("push", "basic_py")
-    (condition,) = [p["items"] for p in parts(schema) if "anyOf" in p.get("items", {})]
-    said = []
+def test_the_schema_has_all_supported_queries_and_no_others():
+    (condition,) = [part["items"] for part in parts(PUSH) if "anyOf" in part.get("items", {})]
+    sentences = []
     for clause in condition["anyOf"]:
         words = clause["properties"]
         for first in words["first"]["enum"]:
             for predicate in words["is"]["enum"]:
                 for second in words.get("second", {"enum": [""]})["enum"]:
-                    said.append(f"{first} is {predicate} {second}".strip())
-    assert sorted(said) == sorted(lw.supported_queries("push"))
+                    sentences.append(f"{first} is {predicate} {second}".strip())
+    assert sorted(sentences) == sorted(lw.supported_queries("push"))
 
 
 def test_a_task_without_scripted_skills(tmp_path):
     (tmp_path / "tasks.toml").write_text('[stack]\ndescription = "Stack it."\nobjects.brick = "obs[4:7]"\n')
     stack = lw.load_tasks(tmp_path / "tasks.toml")["stack"]
-    none = {"push": lw.load_skills()["place the gripper above the puck"]}
+    skills = {"push": lw.load_skills()["place the gripper above the puck"]}
     with pytest.raises(ValueError, match="no scripted skill suits task 'stack'; free_skills=True"):
-        plan_schema(stack, skills=none)
-    assert (
-        "pattern"
-        in plan_schema(stack, skills=none, free_skills=True)["properties"]["steps"]["items"]["properties"]["skill"]
-    )
+        plan_schema(stack, skills=skills)
+    step = plan_schema(stack, skills=skills, free_skills=True)["properties"]["steps"]["items"]
+    assert "pattern" in step["properties"]["skill"]
 
 
-# ---- what comes back
+# ---- answers
 
 
-def drawn(schema):
-    """Answers that pass a schema; free texts are plain words."""
+def instances(schema):
+    """Draw JSON that satisfies a schema."""
     if "anyOf" in schema:
-        return st.one_of([drawn(one) for one in schema["anyOf"]])
+        return st.one_of([instances(one) for one in schema["anyOf"]])
     if "enum" in schema:
         return st.sampled_from(schema["enum"])
     if schema["type"] == "object":
-        return st.fixed_dictionaries({name: drawn(one) for name, one in schema["properties"].items()})
+        return st.fixed_dictionaries({name: instances(one) for name, one in schema["properties"].items()})
     if schema["type"] == "array":
-        return st.lists(drawn(schema["items"]), min_size=schema["minItems"], max_size=schema["maxItems"])
+        return st.lists(instances(schema["items"]), min_size=schema["minItems"], max_size=schema["maxItems"])
     return st.from_regex(schema["pattern"], fullmatch=True)
 
 
-SHAPED = st.tuples(st.sampled_from(lw.MT50), st.sampled_from(FORMATS), st.booleans()).flatmap(
+ANSWERS = st.tuples(st.sampled_from(lw.MT50), st.sampled_from(FORMATS), st.booleans()).flatmap(
     lambda of: st.tuples(
-        st.just(of), drawn(plan_schema(of[0], of[1], free_skills=of[2])), st.none() | st.integers(0, 900)
+        st.just(of), instances(plan_schema(of[0], of[1], free_skills=of[2])), st.none() | st.integers(0, 900)
     )
 )
 
 
 @settings(max_examples=40, deadline=None)
-@given(SHAPED)
-def test_whatever_passes_the_schema_is_a_plan_that_runs(found):
-    (task, format, free), answer, cut = found
-    text = json.dumps(answer)[:cut]
-    read = read_reply(Reply(text), lw.TASKS[task], format, schema=plan_schema(task, format, free_skills=free))
-    assert (read.decoded.plan is None) == bool(read.decoded.reason)
-    if cut is not None and len(json.dumps(answer)) > cut:
+@given(ANSWERS)
+def test_what_satisfies_the_schema_is_a_plan_that_runs(drawn):
+    (task, format, free), value, cut = drawn
+    text = json.dumps(value)[:cut]
+    answer = read_reply(Reply(text), lw.TASKS[task], format, schema=plan_schema(task, format, free_skills=free))
+    assert (answer.decoded.plan is None) == bool(answer.decoded.reason)
+    if cut is not None and len(json.dumps(value)) > cut:
         return
-    assert read.notes == ()
-    assert len(read.decoded.plan.steps) == len(answer["steps"])
-    assert lw.decode_plan(read.text, task, format).plan == read.decoded.plan
+    assert answer.notes == ()
+    assert len(answer.decoded.plan.steps) == len(value["steps"])
+    assert lw.decode_plan(answer.text, task, format).plan == answer.decoded.plan
     if not free:
-        assert read.decoded.scripted == read.decoded.plan
+        assert answer.decoded.scripted == answer.decoded.plan
 
 
+KEYS = st.sampled_from(["steps", "condition", "skill", "goal", "because", "first", "is", "second"])
 ANY_JSON = st.recursive(
     st.none() | st.booleans() | st.floats(allow_nan=True) | st.text(max_size=8),
-    lambda inner: (
-        st.lists(inner, max_size=4)
-        | st.dictionaries(
-            st.sampled_from(["steps", "condition", "skill", "goal", "because", "first", "is", "second"]),
-            inner,
-            max_size=5,
-        )
-    ),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(KEYS, inner, max_size=5),
     max_leaves=20,
 )
 
 
 @settings(max_examples=40, deadline=None)
-@given(SHAPED, ANY_JSON, st.randoms(use_true_random=False))
-def test_answers_are_validated_as_the_standard_says(found, value, draw):
-    """An answer that passes, and the same with something in it exchanged."""
-    (task, format, free), answer, _ = found
+@given(ANSWERS, ANY_JSON, st.randoms(use_true_random=False))
+def test_answers_are_validated_as_json_schema_says(drawn, other, random):
+    (task, format, free), value, _ = drawn
     schema = plan_schema(task, format, free_skills=free)
-    validator = jsonschema.Draft202012Validator(schema)
-    assert passes(answer, schema)
-    place = [answer, answer["steps"], *answer["steps"], *(step["condition"] for step in answer["steps"])]
-    chosen = draw.choice(place)
-    at = draw.choice(list(chosen) if isinstance(chosen, dict) else range(len(chosen)))
-    if draw.random() < 0.3:
-        del chosen[at]
+    assert passes(value, schema)
+    part = random.choice([value, value["steps"], *value["steps"], *(step["condition"] for step in value["steps"])])
+    at = random.choice(list(part) if isinstance(part, dict) else range(len(part)))
+    if random.random() < 0.3:
+        del part[at]
     else:
-        chosen[at] = value
-    assert passes(answer, schema) == validator.is_valid(answer)
+        part[at] = other
+    assert passes(value, schema) == jsonschema.Draft202012Validator(schema).is_valid(value)
 
 
 @settings(max_examples=60, deadline=None)
 @given(ANY_JSON, st.text(max_size=10), st.none() | st.integers(0, 60))
 def test_any_other_text_is_a_plan_or_a_reason(value, before, cut):
     text = (before + json.dumps({"steps": value}))[:cut]
-    found = read_reply(Reply(text), lw.TASKS["push"], "basic_py", schema=PUSH)
-    assert (found.decoded.plan is None) == bool(found.decoded.reason)
-    found.text.encode()
+    answer = read_reply(Reply(text), lw.TASKS["push"], "basic_py", schema=PUSH)
+    assert (answer.decoded.plan is None) == bool(answer.decoded.reason)
+    answer.text.encode()
 
 
-@pytest.mark.parametrize(
-    "text", ['{"steps": [' + "[" * 50_000, '{"steps": [' + "9" * 50_000, '{"steps": [' + "{}," * 20_000]
-)
-def test_hostile_texts_end(text):
-    assert not read_structured(text).sections[0].clauses
+@pytest.mark.parametrize("text", ["[" * 50_000, "9" * 50_000, "{}," * 20_000], ids=range(3))
+def test_large_broken_json_is_read_in_time(text):
+    assert not read_structured('{"steps": [' + text).sections[0].clauses
 
 
-def test_what_was_whole_of_a_cut_off_answer_is_kept():
+def test_the_whole_steps_of_a_cut_off_answer_are_kept():
     text = write_structured(PLANS["push"], PLAN_FORMATS["basic_py"].style)
-    (answer,) = [read_reply(Reply(text[:-40], "length"), lw.TASKS["push"], "basic_py", schema=PUSH)]
+    answer = read_reply(Reply(text[:-40], "length"), lw.TASKS["push"], "basic_py", schema=PUSH)
     assert len(answer.decoded.plan.steps) == len(PLANS["push"].steps) - 1
     assert "it was cut off at max_tokens" in answer.notes
     assert "ends or is no JSON from here" in str(answer.decoded.notes[-1])
 
 
-def test_sentences_and_fences_are_understood():
+def test_json_in_a_fence_with_sentences_is_read():
     text = 'Sure!\n```json\n{"steps": [\n{"condition": "gripper open", "skill": "grab the puck"},\n'
     text += '{"skill": "wait"}\n]}\n```'
-    found = read_reply(Reply(text), lw.TASKS["push"], "basic_py", schema=PUSH)
-    assert [(str(s.condition), s.skill) for s in found.decoded.plan.steps] == [
+    answer = read_reply(Reply(text), lw.TASKS["push"], "basic_py", schema=PUSH)
+    assert [(str(step.condition), step.skill) for step in answer.decoded.plan.steps] == [
         ("the robot's gripper is open", "grab the puck")
     ]
-    assert found.decoded.scripted.steps[0].skill == "close the gripper around the puck"
-    assert found.notes == ("the server did not keep to the schema",)
-    assert any(str(note).startswith("line 5: a step without a condition") for note in found.decoded.notes)
+    assert answer.decoded.scripted.steps[0].skill == "close the gripper around the puck"
+    assert answer.notes == ("the server did not keep to the schema",)
+    assert any(str(note).startswith("line 5: a step without a condition") for note in answer.decoded.notes)
 
 
 # ---- servers
@@ -222,67 +191,52 @@ def test_sentences_and_fences_are_understood():
 
 def test_the_schema_is_sent_and_the_answer_is_written_in_the_format(ask, tmp_path):
     server = FakeServer()
-    found = ask(server, "MT10", "basic_md")
+    answers = ask(server, format="basic_md", constrain=True, concurrency=1, out=tmp_path / "out")
     sent = server.requests[0]["response_format"]
     assert (sent["type"], sent["json_schema"]["strict"]) == ("json_schema", True)
     assert sent["json_schema"]["schema"] == plan_schema(lw.MT10[0], "basic_md")
     assert '{"steps": [' in server.requests[0]["messages"][0]["content"]
-    assert all(answer.decoded.plan == answer.decoded.scripted == PLANS[answer.task] for answer in found)
-    folder = tmp_path / "out" / "m-constrained" / "basic_md"
+    assert all(answer.decoded.plan == answer.decoded.scripted == PLANS[answer.task] for answer in answers)
+    folder = tmp_path / "out" / "a_model-constrained" / "basic_md"
     assert (folder / "push-0.md").read_text() == lw.encode_plan(PLANS["push"], "basic_md")
-    assert [answer.raw for answer in found if answer.task == "push"] == [(folder / "push-0.json").read_text()]
+    assert [answer.raw for answer in answers if answer.task == "push"] == [(folder / "push-0.json").read_text()]
     assert len(list(folder.iterdir())) == 20
 
 
-def llama(body):
-    """As llama-cpp-python's server: another kind of response_format, and a status that says nothing."""
-    if body["response_format"]["type"] == "json_schema":
-        return error(500, "[{'loc': ('body', 'response_format', 'type'), 'msg': \"Input should be 'json_object'\"}]")
-    assert body["response_format"]["schema"]["required"] == ["steps"]
-    return shipped(body)
-
-
-@pytest.mark.parametrize("status", [400, 422, 500])
-def test_a_server_that_knows_another_kind_of_schema(ask, status):
+@pytest.mark.parametrize("status", [400, 500])
+def test_a_server_that_only_knows_json_object(ask, status):
     def respond(body):
-        found = llama(body)
-        if not isinstance(found, dict):
-            found.status = status
-        return found
+        if body["response_format"]["type"] == "json_schema":  # as llama-cpp-python's server says it
+            return error(status, "[{'loc': ('body', 'response_format', 'type'), 'msg': \"Input should be 'text'\"}]")
+        assert body["response_format"]["schema"]["required"] == ["steps"]
+        return shipped(body)
 
     server = FakeServer(respond)
-    found = ask(server)
-    assert all(answer.decoded.scripted == PLANS[answer.task] for answer in found)
-    assert {answer.notes for answer in found} == {
-        ("the schema was sent as json_object, since the server takes no json_schema",)
-    }
+    answers = ask(server, format="basic_py", constrain=True, concurrency=1)
+    assert all(answer.decoded.scripted == PLANS[answer.task] for answer in answers)
+    note = "the schema was sent as json_object, since the server takes no json_schema"
+    assert {answer.notes for answer in answers} == {(note,)}
     assert len(server.requests) == 11
 
 
-def test_a_server_that_takes_no_schema_says_so(ask):
+def test_a_server_that_takes_no_schema(ask):
     server = FakeServer(lambda body: error(400, f"response_format {body['response_format']['type']} is not supported"))
-    with pytest.raises(
-        lw.planners.PlannerError, match=r"json_object is not supported.*did not take .*json_schema is not supported"
-    ):
-        ask(server, "push")
+    with pytest.raises(lw.planners.PlannerError, match="json_object is not supported"):
+        ask(server, "push", constrain=True)
 
 
 def test_a_server_that_ignores_the_schema(ask, tmp_path):
+    options = {"constrain": True, "out": tmp_path / "out"}
     server = FakeServer(lambda body: completion(lw.encode_plan(PLANS["push"], "basic_py")))
-    (answer,) = ask(server, "push", "chain_py")
+    (answer,) = ask(server, "push", **options)
     assert answer.decoded.plan == PLANS["push"]
     assert answer.notes == ("the server did not keep to the schema",)
-    assert answer.text == lw.encode_plan(answer.decoded.plan, "chain_py")
     assert lw.decode_plan(answer.text, "push", "chain_py").plan == PLANS["push"]
-    (refusing,) = ask(FakeServer(lambda body: completion("I like turtles")), "reach", "chain_py")
-    assert refusing.decoded.plan is None
-    assert refusing.notes == ("the server did not keep to the schema",)
-    assert (tmp_path / "out/m-constrained/chain_py/reach-0.py").read_text() == "I like turtles"
-    assert [path.suffix for path in (tmp_path / "out/m-constrained/chain_py").glob("push*")] != [".py"]
-
-
-def test_an_answer_outside_the_enums_is_noted(ask):
-    text = write_structured(PLANS["push"], PLAN_FORMATS["basic_py"].style).replace("not above", "not really above")
-    (answer,) = ask(FakeServer(lambda body: completion(text)), "push", "basic_py")
+    (answer,) = ask(FakeServer(lambda body: completion("I like turtles")), "reach", **options)
+    assert answer.decoded.plan is None
     assert answer.notes == ("the server did not keep to the schema",)
+    assert (tmp_path / "out/a_model-constrained/chain_py/reach-0.py").read_text() == "I like turtles"
+    text = write_structured(PLANS["push"], PLAN_FORMATS["basic_py"].style).replace("not above", "not really above")
+    (answer,) = ask(FakeServer(lambda body: completion(text)), "push", format="basic_py", constrain=True)
     assert answer.decoded.plan is not None
+    assert answer.notes == ("the server did not keep to the schema",)

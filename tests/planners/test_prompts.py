@@ -77,17 +77,3 @@ def test_plans_and_tasks_of_ones_own(tmp_path):
     assert prompt.endswith("# stack: Stack it.\ndef stack(robot):\n")
     with pytest.raises(ValueError, match="plans must hold one of another task than 'hammer'"):
         lw.plan_prompt("hammer", "basic_py", plans=mine)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "options", "error", "says"),
-    [
-        (("drawer-opne", "chain_py"), {}, ValueError, "'drawer-open'"),
-        (("drawer-open", "chain"), {}, ValueError, "format must be one of"),
-        (("drawer-open", "chain_py"), {"vocabulary": "yes"}, TypeError, "vocabulary"),
-        (("drawer-open", "chain_py"), {"plans": 3}, TypeError, "plans"),
-    ],
-)
-def test_wrong_arguments_are_named(arguments, options, error, says):
-    with pytest.raises(error, match=says):
-        lw.plan_prompt(*arguments, **options)
