@@ -14,8 +14,6 @@ from reprlib import Repr
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from lw_torchrl._tables import Table
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -26,7 +24,7 @@ def nearest(given: str, allowed: Iterable[str], *, n: int = 3) -> list[str]:
 
 def unknown_name(argument: str, given: object, allowed: Iterable[str]) -> ValueError:
     """The error for a name outside a fixed set, with those close in spelling; the caller raises it."""
-    names = allowed.names() if isinstance(allowed, Table) else list(allowed)
+    names = list(allowed)
     listed = ", ".join(repr(name) for name in names[:12]) + (", ..." if len(names) > 12 else "")
     message = f"{argument} must be one of {listed}, got {shown(given)}"
     if isinstance(given, str) and (close := nearest(given, names)):
@@ -68,7 +66,7 @@ def missing_keys(found: Iterable[Any], *needed: str) -> ValueError:
 
 def check_choice(argument: str, given: Any, allowed: Iterable[str]) -> Any:
     """Return ``given`` if it is one of ``allowed``, else raise :class:`ValueError` with the nearest name."""
-    names = allowed if isinstance(allowed, Table) else list(allowed)
+    names = list(allowed)
     if given not in names:
         raise unknown_name(argument, given, names)
     return given

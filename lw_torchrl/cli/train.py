@@ -97,15 +97,15 @@ def train(
 
     from lw_torchrl._devices import check_device
     from lw_torchrl.data.dataset import read_metadata
-    from lw_torchrl.modules.tables import METHODS, make_policy
+    from lw_torchrl.modules.registry import find_method, make_policy
 
     options.use_one_thread()
     there, held = check_device("device", device), read_metadata(data).config
     encoder = options.read_encoder(text_encoder)
     asked: dict[str, Any] = {"features": features, "width": width, "depth": depth}
     actor_options = {name: value for name, value in asked.items() if value is not None}
-    reads_plans = METHODS[method].reads_plans
-    if mix is not None or METHODS[method].takes("mix"):
+    reads_plans = find_method(method).reads_plans
+    if mix is not None or find_method(method).takes("mix"):
         actor_options["mix"] = mix or "latents"
     for option, value in (("mix", mix), ("latent-consistency", latent_consistency), ("evaluator", evaluator)):
         if value and not reads_plans:

@@ -13,11 +13,11 @@ from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 from lw_torchrl.modules.policy import Encoder, Encoding, Policy
 from lw_torchrl.modules.query_evaluator import EVALUATORS, QueryEvaluator
+from lw_torchrl.modules.registry import ENCODERS, METHODS, POLICIES, Method, make_policy
 from lw_torchrl.modules.relative_positions import PlanFocus
 from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
-from lw_torchrl.modules.tables import ENCODERS, METHODS, POLICIES, Method, make_policy
 
 __all__ = [
     "ENCODERS", "EVALUATORS", "IMAGE_ENCODERS", "METHODS", "POLICIES", "ActorEnsemble", "ConditionedActor",

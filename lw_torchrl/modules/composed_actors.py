@@ -18,7 +18,7 @@ from lw_torchrl.language.tasks import task_id
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.held_evaluator import HeldEvaluator
 from lw_torchrl.modules.policy import Policy, decided
-from lw_torchrl.modules.tables import from_description
+from lw_torchrl.modules.registry import from_description
 
 
 class ActorEnsemble(Policy):

@@ -21,7 +21,7 @@ from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import DISTRIBUTIONS, ActionHead, DistributionName
 from lw_torchrl.modules.policy import Encoder, Encoding, Policy, decided, kind_of
-from lw_torchrl.modules.tables import ENCODERS, class_of
+from lw_torchrl.modules.registry import ENCODERS, class_of
 
 _OF_HEAD = ("width", "depth", "squash", "distribution", "init_std", "decided_gripper", "action_size", "out_keys")
 _ALTERING = ("jitter", "swap_unmentioned", "hide_opening")

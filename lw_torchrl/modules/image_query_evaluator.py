@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import check_choice, check_int, checked
+from lw_torchrl._registry import Registry, is_function
 from lw_torchrl._rendering import check_cameras
-from lw_torchrl._tables import Functions
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
@@ -113,7 +113,7 @@ class PointingNetwork(ClauseNetwork):
         return places, pointed.unflatten(0, (rows, self.cameras)).unflatten(-1, (height, width))
 
 
-IMAGE_ENCODERS = Functions("image encoder", "lw_torchrl.image_encoders", {"small": SmallImageEncoder})
+IMAGE_ENCODERS = Registry("image encoder", "lw_torchrl.image_encoders", {"small": SmallImageEncoder}, is_function)
 """What makes an encoder of pictures, by name: a module from (n, 3, H, W) float32 in [0, 1] to a map of features
 (n, F, h, w). Put yours here, one that is frozen with ``requires_grad_(False)`` too, to have it in files."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from inspect import signature
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from tensordict import TensorDictBase
@@ -22,9 +22,6 @@ from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import with_weights_of
 from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.transforms.qaf import QAFTransform
-
-if TYPE_CHECKING:
-    from lw_torchrl.modules.query_evaluator import QueryEvaluator
 
 
 class Encoding(NamedTuple):
@@ -250,7 +247,7 @@ class Policy(Prepared):
         """Make what :meth:`describe` described, with fresh weights."""
         return cls(**found["options"])
 
-    def with_evaluator(self, evaluator: QueryEvaluator) -> Policy:
+    def with_evaluator(self, evaluator: Any) -> Policy:
         """The same weights, with the conditions answered by an evaluator; :class:`TypeError` if it reads none."""
         what = f"with_evaluator is for PlanConditionedActor and ScriptedSkillActor, {type(self).__name__} has none"
         raise TypeError(f"{what}; evaluate(..., evaluator=) answers any policy's conditions")

@@ -13,12 +13,13 @@ from torchrl.envs import Transform
 
 from lw_torchrl._checks import checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, write
+from lw_torchrl._registry import Registry, is_class
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.language.value_checks import finite, readable
 from lw_torchrl.modules.networks import with_weights_of
 from lw_torchrl.modules.policy import Prepared, kind_of
-from lw_torchrl.modules.tables import Kinds, class_of
+from lw_torchrl.modules.registry import class_of
 from lw_torchrl.transforms.qaf import QAFTransform
 
 
@@ -99,15 +100,14 @@ class QueryEvaluator(Prepared):
         return {**kind_of(self), "options": self.config}
 
 
-EVALUATORS = Kinds(
+EVALUATORS = Registry(
     "evaluator",
-    QueryEvaluator,
     "lw_torchrl.evaluators",
     {
-        "HeldEvaluator": "lw_torchrl.modules.held_evaluator:HeldEvaluator",
         "ImageQueryEvaluator": "lw_torchrl.modules.image_query_evaluator:ImageQueryEvaluator",
         "StateQueryEvaluator": "lw_torchrl.modules.state_query_evaluator:StateQueryEvaluator",
     },
+    is_class("evaluator", QueryEvaluator),
 )
 """The classes of evaluators by name, as in policy files."""
 

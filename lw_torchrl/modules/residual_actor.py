@@ -19,7 +19,7 @@ from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.networks import head
 from lw_torchrl.modules.plan_encoder import IN_FORCE, PlanEncoder
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.modules.tables import from_description
+from lw_torchrl.modules.registry import from_description
 
 
 class ResidualActor(Policy):

@@ -19,8 +19,8 @@ from lw_torchrl.envs.episodes import FinishedEpisode, policy_of
 from lw_torchrl.evaluation import EvaluationResult, PlanUse, evaluate, stuck_steps, weakest_step
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.registry import find_method, make_policy
 from lw_torchrl.modules.residual_actor import ResidualActor
-from lw_torchrl.modules.tables import METHODS, make_policy
 from lw_torchrl.paper.imitation import ExpertDataset
 from lw_torchrl.paper.recipes import TARGET
 from lw_torchrl.paper.runs import Run, Work, execute_run, kept_policy, own_tasks, plain
@@ -70,14 +70,14 @@ class OnlineRun(Run):
 
     def __post_init__(self) -> None:
         if self.method != START and self.method not in LEARNERS:
-            raise unknown_name("method", self.method, [*LEARNERS.names(), START])
+            raise unknown_name("method", self.method, [*LEARNERS, START])
         if self.step is not None and self.method != "residual":
             raise ValueError(f"step is of the method 'residual', got it with {self.method!r}")
         if isinstance(self.step, str):
             check_choice("step", self.step, (WEAKEST,))
         elif self.step is not None:
             check_int("step", self.step, minimum=0)
-        check_choice("condition", self.condition, METHODS)
+        find_method(self.condition, "condition")
         if self.method != START:
             method_config(self.method, self.recipe.config)
 
@@ -167,7 +167,7 @@ class OnlineRun(Run):
         def train(checkpoint: Path) -> dict[str, Any]:
             torch.manual_seed(self.seed)
             noise: dict[str, Any] = {"feature_noise": self.recipe.feature_noise}
-            options = noise if METHODS[self.condition].takes("feature_noise") else {}
+            options = noise if find_method(self.condition).takes("feature_noise") else {}
             actor = make_policy(self.condition, self.own_plans(work.plans), **options)
             replay, config = self._replay(work, actor), replace(self.recipe.cloning, seed=self.seed)
             BehavioralCloningTrainer(actor, replay, config, checkpoint=checkpoint, progress=work.progress).train()

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from lw_torchrl._checks import check_choice, check_fields, shown, unknown_name
-from lw_torchrl._tables import Table
+from lw_torchrl._registry import Registry
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.relations import PREDICATES
@@ -93,19 +93,15 @@ class Suite:
         return f"{self.name}/{task}"
 
 
-class Suites(Table[Suite]):
-    """Suites by name; a function that makes one stands for what it makes."""
-
-    def check(self, name: str, thing: Any) -> Suite:
-        found = thing() if callable(thing) else thing
-        if not isinstance(found, Suite):
-            raise TypeError(f"suite {name!r} must be a Suite, or a function that makes one, got {shown(thing)}")
-        return found
+def _check_suite(name: str, entry: Any) -> Suite:
+    suite = entry() if callable(entry) else entry
+    if not isinstance(suite, Suite):
+        raise TypeError(f"suite {name!r} must be a Suite, or a function that makes one, got {shown(entry)}")
+    return suite
 
 
-SUITES = Suites(
-    "suite", "lw_torchrl.suites", {name: f"lw_torchrl.suites.{name}:make_suite" for name in ("metaworld", "fetch")}
-)
+_SHIPPED = {name: f"lw_torchrl.suites.{name}:make_suite" for name in ("metaworld", "fetch")}
+SUITES = Registry("suite", "lw_torchrl.suites", _SHIPPED, _check_suite)
 """The suites by name. Add yours to use it by name; nobody has to, since every ``suite=`` takes the object too."""
 
 

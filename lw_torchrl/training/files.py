@@ -14,7 +14,7 @@ from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
-from lw_torchrl.modules.tables import from_description
+from lw_torchrl.modules.registry import from_description
 from lw_torchrl.training.envelope import EVALUATOR, POLICY
 from lw_torchrl.training.file_checks import stand_in, text_vectors
 
