@@ -57,8 +57,6 @@ def missing_keys(found: Iterable[Any], *needed: str) -> ValueError:
     names = [str(key) for key in found]
     absent = [key for key in needed if key not in names]
     hint = ": QAFTransform(plans) in the environment, and in the buffer, writes it" if "qaf" in absent else ""
-    if "qaf_held_logits" in absent:
-        hint = ": HeldEvaluator.transform() writes it in an environment; rows without steps train what it holds"
     return ValueError(
         f"{' and '.join(needed)} are needed, got {', '.join(names)}; without {' and '.join(absent)}{hint}"
     )

@@ -15,6 +15,7 @@ import torch
 import lw_torchrl as lw
 from benchmarks import __main__ as cli
 from benchmarks import ablations, faults, latents, truth
+from benchmarks.finding_points import PADS, find_points
 from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
 from lw_torchrl.language.task_index import PlanTables
@@ -233,3 +234,11 @@ def test_outside_the_list_no_sound_part_is_right():
     ]
     missing = faults.FAULTS["missing step"]
     assert [faults.is_right(missing, {"cause": cause}) for cause in ("plan", "undecided")] == [True, False]
+
+
+def test_points_of_shapes_are_where_fingers_fit_or_where_a_hand_pushes():
+    tasks = find_points(["push", "plate-slide-side", "dial-turn"], episodes=1)
+    points = {name: {one.name: one.offset for one in task.objects if one.ours} for name, task in tasks.items()}
+    assert points["push"]["puck grip"] == pytest.approx((0.0, 0.0, PADS - 0.015), abs=2e-3)
+    assert points["plate-slide-side"]["plate side"][0] == pytest.approx(0.05 + 0.015, abs=5e-3)
+    assert not points["dial-turn"]

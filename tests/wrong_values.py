@@ -201,7 +201,6 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "EpisodeFilter": {},
         "ExpectileValueLoss": {"value_network": value},
         "ExpertActor": {"tasks": "reach"},
-        "HeldEvaluator": {"evaluator": evaluator},
         "ImageQueryEvaluator": {"plans": plans, "width": 8},
         "ImageQueryEvaluatorConfig": {},
         "ImageQueryEvaluatorTrainer": {"evaluator": images, "data": data},

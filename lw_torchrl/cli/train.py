@@ -134,12 +134,6 @@ def train(
         actor = make_policy(method, shown, text_encoder=encoder, **actor_options)
     loaded.require(replay.tasks)
     inside = getattr(actor, "evaluator", None)
-    if isinstance(inside, lw.HeldEvaluator):
-        which, mend = "--begin must have", "give the one to train by --evaluator"
-        if evaluator is not None:
-            which = "--evaluator must be"
-            mend = "train with the one inside it, lw.training.save_evaluator(held.evaluator, FILE)"
-        raise ValueError(f"{which} no HeldEvaluator, of whose steps a dataset's rows tell nothing: {mend}")
     if isinstance(inside, lw.modules.ImageQueryEvaluator):
         pictures: dict[str, Any] = {"cameras": inside.cameras, "height": inside.height, "width": inside.width}
         lw.data.add_pictures(data, **pictures)

@@ -1,8 +1,8 @@
-"""CorruptQAF: answers that are wrong on purpose, as a bad evaluator's are."""
+"""CorruptQAF: query answers that are taken rarely, come late, or are wrong."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -16,19 +16,20 @@ from lw_torchrl._seeding import episode_generator
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.queries import Query, read_query
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.transforms.environment import DelayedAnswers, EpisodeTransform, reset_rows
+from lw_torchrl.transforms.environment import EpisodeTransform, reset_rows
 from lw_torchrl.transforms.qaf import plan_number_key
 
 _BLOCK = 64  # steps of an episode whose draws are made at once
 
 
 class CorruptQAF(EpisodeTransform):
-    """Spoils ``qaf`` in an environment, behind a :class:`QAFTransform`, to measure what wrong answers cost.
+    """Corrupt ``qaf`` in an environment, after a :class:`QAFTransform`, to measure the cost of slow and wrong answers.
 
     Reads ``qaf`` (B, S) bool, ``task_id`` (B,) and ``episode`` (B,) int64, and ``qaf_plan`` (B,) int64 where it is;
-    writes ``qaf`` alone. What is asked for is done in this order:
+    writes only ``qaf``. The corruptions are applied in this order:
 
-    - **lag**: a row is shown the answers of ``lag`` steps ago, until then those of its reset;
+    - **every, delay**: in step t of its episode, 0 at the reset, a row is shown the answers of step
+      every · ⌊max(t - delay, 0) / every⌋;
     - **stick**: in each step each answer stays, with this probability, what it was the step before;
     - **flip**: in each step, the reset's state included, each answer is shown as its opposite, with this probability;
       what sticks is the answer itself, not its opposite;
@@ -40,7 +41,8 @@ class CorruptQAF(EpisodeTransform):
 
     Args:
         plans: whose conditions ``qaf`` answers.
-        flip, stick, lag: probabilities, from 0 to 1, and steps.
+        every, delay: steps between two updates of a row's answers, and steps until they are shown.
+        flip, stick: probabilities, from 0 to 1.
         drop: conditions of the plans in any spelling, each dropped in all plans that have it.
         seed: any integer, of what is drawn.
         in_keys: where qaf, task_id and episode are, in this order; qaf is written where it was.
@@ -53,9 +55,9 @@ class CorruptQAF(EpisodeTransform):
     Example:
         >>> import lw_torchrl as lw
         >>> plans = lw.load_plans("MT10")
-        >>> spoilt = lw.CorruptQAF(plans, flip=0.05, drop=["the gripper is near the reach target"])
+        >>> noisy = lw.CorruptQAF(plans, every=2, flip=0.05, drop=["the gripper is near the reach target"])
         >>> actor = lw.ScriptedSkillActor(plans)
-        >>> lw.evaluate(actor, tasks="reach", episodes_per_task=2, seed=1_000, evaluator=spoilt).success_once
+        >>> lw.evaluate(actor, tasks="reach", episodes_per_task=2, seed=1_000, evaluator=noisy).success_once
         {'reach': 1.0}
 
     Source: the paper names a visual question answering model as a query answering function; such a one errs.
@@ -66,9 +68,10 @@ class CorruptQAF(EpisodeTransform):
         self,
         plans: AnyPlans,
         *,
+        every: int = 1,
+        delay: int = 0,
         flip: float = 0.0,
         stick: float = 0.0,
-        lag: int = 0,
         drop: Iterable[str | Query] = (),
         seed: int = 0,
         in_keys: Sequence[NestedKey] | None = None,
@@ -77,7 +80,8 @@ class CorruptQAF(EpisodeTransform):
         super().__init__(in_keys=keys, out_keys=keys[:1])
         self.plans = as_plans(plans)
         self.flip, self.stick = check_probability("flip", flip), check_probability("stick", stick)
-        self.lag, self.seed = check_int("lag", lag, minimum=0), check_int("seed", seed)
+        self.every, self.delay = check_int("every", every, minimum=1), check_int("delay", delay, minimum=0)
+        self.seed = check_int("seed", seed)
         self.drop = _as_texts(drop)
         self._tables = PlanTables(self.plans)
         self._answered = self._tables.mask.clone()
@@ -92,14 +96,14 @@ class CorruptQAF(EpisodeTransform):
         self._forget_episodes()
 
     def _forget_episodes(self) -> None:
-        self._rows = DelayedAnswers(delay=self.lag)
+        self._rows = _DelayedAnswers(self.every, self.delay)
         self._draws = {purpose: _Draws(purpose, self.seed, self._tables, self.plans) for purpose in ("stick", "flip")}
 
     def with_plans(self, plans: AnyPlans) -> CorruptQAF:
-        """One that spoils the answers of other plans alike; queries that these lack are not dropped."""
+        """Return a transform that corrupts the answers of other plans alike; queries that they lack are not dropped."""
         other = as_plans(plans)
         dropped = [text for text in self.drop if _steps_with(text, PlanTables(other), other).any()]
-        same = {name: getattr(self, name) for name in ("flip", "stick", "lag", "seed", "in_keys")}
+        same = {name: getattr(self, name) for name in ("every", "delay", "flip", "stick", "seed", "in_keys")}
         return CorruptQAF(other, drop=dropped, **same)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -141,6 +145,52 @@ class CorruptQAF(EpisodeTransform):
         if any(key not in found for key in self.in_keys):
             raise missing_keys(found, *map(str, self.in_keys))
         return observation_spec
+
+
+class _DelayedAnswers:
+    """Counts the steps of each row's episode, and keeps the answers that have not been shown yet.
+
+    In step t of its episode, 0 at the reset, a row is shown the answers of step every · ⌊max(t - delay, 0) / every⌋.
+    """
+
+    def __init__(self, every: int, delay: int) -> None:
+        self.every, self.delay = every, delay
+        self._places = -(-delay // every) + 1  # as many answers are waiting to be shown, at most
+        self._step: Tensor | None = None  # B int64
+        self._taken: Tensor | None = None  # (B, places, S) bool; the n-th answers are in place n % places
+        self._shown: Tensor | None = None  # (B, S) bool
+
+    @property
+    def step(self) -> Tensor:
+        """B int64, the step of its episode that each row is at; :class:`RuntimeError` if no episode has begun."""
+        if self._step is None:
+            raise RuntimeError("rows have begun no episode, or not since load_state_dict: reset the environment")
+        return self._step
+
+    def begin(self, answers: Tensor, rows: Tensor | None) -> Tensor:
+        """Begin the episodes of rows (B bool, None for all) with answers (B, S); return the shown answers."""
+        shape = answers.shape[:-1]
+        self._step = reset_rows(self._step, torch.zeros(shape, dtype=torch.int64, device=answers.device), rows)
+        self._taken = reset_rows(self._taken, answers.unsqueeze(-2).repeat(*[1] * len(shape), self._places, 1), rows, 2)
+        self._shown = reset_rows(self._shown, answers.clone(), rows, 1)
+        return self._shown.clone()
+
+    def advance(self, answers: Tensor, rows: Tensor | None, stuck: Callable[[], Tensor] | None) -> Tensor:
+        """Return the shown answers (B, S) after a step; ``stuck`` (B, S) bool says which stay as they were shown."""
+        rows = torch.ones_like(self.step, dtype=torch.bool) if rows is None else rows.reshape(self.step.shape)
+        assert self._taken is not None
+        assert self._shown is not None
+        self._step = step = self.step + rows
+        place = torch.arange(self._places, device=step.device) == (step // self.every % self._places).unsqueeze(-1)
+        due = rows & (step % self.every == 0)
+        self._taken = torch.where((place & due.unsqueeze(-1)).unsqueeze(-1), answers.unsqueeze(-2), self._taken)
+        place = (step - self.delay).clamp(min=0) // self.every % self._places
+        place = place[..., None, None].expand(*place.shape, 1, self._taken.shape[-1])
+        shown = self._taken.gather(-2, place).squeeze(-2)
+        if stuck is not None:
+            shown = torch.where(stuck() | ~rows.unsqueeze(-1), self._shown, shown)
+        self._shown = shown
+        return shown.clone()
 
 
 class _Draws:

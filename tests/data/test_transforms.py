@@ -179,8 +179,7 @@ def test_what_is_not_made_for_samples_says_so(root, name):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: lw.QAFTransform(lw.load_plans("MT10"), every=2), "counts the steps of an environment's episodes"),
-        (lambda: lw.CorruptQAF(lw.load_plans("MT10"), lag=1), "counts the steps of an environment's episodes"),
+        (lambda: lw.CorruptQAF(lw.load_plans("MT10"), delay=1), "counts the steps of an environment's episodes"),
         (
             lambda: lw.transforms.CameraTransform("corner2", height=8, width=8),
             "a dataset's are drawn by lw.data.add_pictures",

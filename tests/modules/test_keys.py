@@ -142,7 +142,6 @@ MODULES = {
     "quantiles": lambda: QValue(PlanEncoder(PLANS), quantiles=5, **networks),
     "attention": lambda: PlanAttention(PLANS),
     "evaluator": lambda: lw.StateQueryEvaluator(PLANS, width=8),
-    "held evaluator": lambda: lw.HeldEvaluator(lw.StateQueryEvaluator(PLANS, width=8)),
 }
 each_module = pytest.mark.parametrize("name", MODULES)
 
@@ -151,7 +150,7 @@ def made(name):
     """A module, what it reads of some rows, and what it writes."""
     torch.manual_seed(0)
     module, rows = MODULES[name]().eval(), state()
-    rows["action"], rows["qaf_held_logits"] = torch.rand(3, 4), torch.randn(3, PLANS.num_steps)
+    rows["action"] = torch.rand(3, 4)
     read = rows.select(*module.in_keys)
     return module, read, module(read.copy()).select(*module.out_keys)
 
