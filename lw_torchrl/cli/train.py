@@ -30,7 +30,6 @@ def train(
     task_file: options.TaskFile = None,
     text_encoder: options.EncoderName = None,
     method: options.Condition = "pcbc",
-    mix: Literal["latents", "actions"] | None = None,
     features: Literal["raw", "differences", "relative", "both"] | None = None,
     width: int | None = None,  # of the action decoder's hidden layers; by default the method's, 256
     depth: int | None = None,  # number of them; by default the method's, 3
@@ -55,7 +54,6 @@ def train(
     Example: lw-torchrl train demos/mt10 --out runs/tuned.zip --begin runs/mt10.zip --evaluator runs/eyes/evaluator.zip
 
     Args:
-        mix: of a policy with plans, mix the skills' latents, as in the paper and by default, or their actions.
         features: what the policy sees: the raw observation; differences between hand, objects and goal, the default of
             our methods; relative, these without the hand's height and the gripper's opening; or both the first and the
             second.
@@ -84,7 +82,7 @@ def train(
     chosen = resolve_tasks(options.one_or_many(tasks), tasks=known) if tasks else ()
     if begin is not None:
         options.check_saved("--begin", begin)
-        given = {"method": method, "mix": mix, "features": features, "width": width, "depth": depth, "plans": plans}
+        given = {"method": method, "features": features, "width": width, "depth": depth, "plans": plans}
         for name, one in given.items():
             if one != signature(train).parameters[name].default:
                 raise ValueError(f"--{name} is that of the policy that --begin names; leave it out")
@@ -105,9 +103,7 @@ def train(
     asked: dict[str, Any] = {"features": features, "width": width, "depth": depth}
     actor_options = {name: value for name, value in asked.items() if value is not None}
     reads_plans = find_method(method).reads_plans
-    if mix is not None or find_method(method).takes("mix"):
-        actor_options["mix"] = mix or "latents"
-    for option, value in (("mix", mix), ("latent-consistency", latent_consistency), ("evaluator", evaluator)):
+    for option, value in (("latent-consistency", latent_consistency), ("evaluator", evaluator)):
         if value and not reads_plans:
             raise ValueError(f"--{option} is for a method that reads plans, --method {method} does not")
     numbers: dict[str, Any] = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed}

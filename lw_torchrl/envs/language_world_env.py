@@ -21,7 +21,7 @@ from lw_torchrl._checks import Count, check_int, checked
 from lw_torchrl._keys import row_mask
 from lw_torchrl._rendering import check_picture
 from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, done_spec, observation_spec
-from lw_torchrl.envs.seeding import EpisodeCounter, check_worker, stated_episode
+from lw_torchrl.envs.seeding import EpisodeCounter, check_worker
 from lw_torchrl.envs.workers import OneThread, one_thread_at_a_time, torchrl_worker
 from lw_torchrl.language.tasks import Task, one_layout
 from lw_torchrl.suites.engine import Engine, EngineStep
@@ -40,8 +40,7 @@ class LanguageWorldEnv(EnvBase):
 
     ``env.reset(episode=7)`` or ``env.reset(episode=tensor)``, int64 (N,), starts these episodes and counts as a reset.
     A SerialEnv or ParallelEnv takes ``reset(list_of_kwargs=[{"episode": ...}, ...])``. A reset ignores the ``episode``
-    in a tensordict, unless ``reset(tensordict, set_state=True)`` asks for its beginning; an ``observation`` that is not
-    the episode's first is refused, and a TransformedEnv hands down no outputs.
+    in a tensordict.
 
     TorchRL's SerialEnv, ParallelEnv, AsyncEnvPool and multi-process collectors are recognised when they call the
     function that makes the environment; elsewhere (Ray, RPC, your own processes) give ``worker=(w, W)``, or another
@@ -100,7 +99,6 @@ class LanguageWorldEnv(EnvBase):
     Source: paper section 'Task Formalism'; ``metaworld.sawyer_xyz_env.SawyerXYZEnv``.
     """
 
-    _supports_set_state = True
     _has_frame_skip = True  # else TorchRL puts a transform of its own around it, which knows nothing of rows that end
 
     @checked
@@ -212,18 +210,11 @@ class LanguageWorldEnv(EnvBase):
             )
 
     @one_thread_at_a_time
-    def _reset(
-        self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None, set_state: bool = False
-    ) -> TensorDict:
+    def _reset(self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None) -> TensorDict:
         rows = np.flatnonzero(row_mask(tensordict, "_reset", len(self.row_tasks)))
-        if set_state:
-            episode = stated_episode(tensordict, episode)
-            self._rows.refuse_other_tasks(tensordict, rows)
         episodes = self._counter.next(rows) if episode is None else self._counter.asked(episode, rows)
         self._rows.begin(rows, episodes, self._engine.reset(rows.tolist(), self._counter.seeds(rows, episodes)))
         self._counter.resets[rows] += 1
-        if set_state:
-            self._rows.refuse_later_steps(tensordict, rows)
         return self._shown(self._rows.as_tensordict())
 
     def _shown(self, rows: TensorDict) -> TensorDict:

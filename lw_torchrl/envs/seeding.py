@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from lw_torchrl._checks import check_int, shown
@@ -54,16 +53,6 @@ def check_worker(worker: Any) -> tuple[int, int]:
     if rank >= of:
         raise ValueError(f"worker's rank must be under the number of workers, {of}, got {rank}")
     return rank, of
-
-
-def stated_episode(tensordict: TensorDictBase | None, episode: int | Tensor | None) -> Tensor:
-    """The episode that ``reset(tensordict, set_state=True)`` goes to; ValueError without one, or with two."""
-    if episode is not None:
-        raise ValueError("episode and set_state=True each name an episode: give one of them")
-    if tensordict is None or (episode := tensordict.get("episode", None)) is None:
-        instead = "a TransformedEnv does not hand it down: reset(episode=tensordict['episode'])"
-        raise ValueError(f"set_state=True needs episode in the tensordict; {instead}")
-    return episode
 
 
 class EpisodeCounter:

@@ -24,7 +24,7 @@ from lw_torchrl.modules.policy import Encoder, Encoding, Policy, decided, kind_o
 from lw_torchrl.modules.registry import ENCODERS, class_of
 
 _OF_HEAD = ("width", "depth", "squash", "distribution", "init_std", "decided_gripper", "action_size", "out_keys")
-_ALTERING = ("jitter", "swap_unmentioned", "hide_opening")
+_ALTERING = ("jitter", "swap_unmentioned")
 
 
 class ConditionedActor(Policy):
@@ -102,7 +102,7 @@ class ConditionedActor(Policy):
             self.encoder = self.encoder_class(about, feature_noise=feature_noise, **options)
         if distribution is not None and any(self.encoder.config.get(name) for name in _ALTERING):
             raise ValueError(
-                f"{', '.join(_ALTERING[:-1])} and {_ALTERING[-1]} must be 0 with a distribution, whose likelihood they "
+                f"{' and '.join(_ALTERING)} must be 0 with a distribution, whose likelihood they "
                 "would change from call to call; train an actor without one, and take actor.stochastic()"
             )
         head: Any = dict(width=width, depth=depth, squash=squash, distribution=distribution, init_std=init_std)
@@ -231,8 +231,8 @@ class ConditionedActor(Policy):
         return self.head.loc_scale(self._encoding(*self.prepare(tensordict)).joined)
 
     def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> Self:
-        """A copy with a distribution, whose mode is what this actor does, to be trained by RL; its features have no
-        noise, jitter, swaps nor hidden opening.
+        """Return a copy with a distribution whose mode is this actor's action, for RL; its features have no noise, jitter
+        nor swaps.
 
         Args:
             distribution: "tanh_normal", or "normal", whose actions the environment clips.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Unpack
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -16,7 +16,6 @@ from lw_torchrl._checks import check_int, checked, passes_on
 from lw_torchrl._keys import as_keys, check_apart, check_key, dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans
 from lw_torchrl.modules.networks import DistributionName, check_width, head
-from lw_torchrl.modules.options import CriticOptions, PlanQValueOptions, PlanValueOptions
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 from lw_torchrl.modules.policy import Encoder
@@ -121,7 +120,7 @@ class QValue(Value):
         ensemble: int = 1,
         action_key: NestedKey = "action",
         quantiles: int = 1,
-        **options: Unpack[CriticOptions],
+        **options: Any,
     ) -> None:
         self._numbers = check_int("quantiles", quantiles, minimum=1)
         if quantiles > 1 and ensemble != 1:
@@ -153,10 +152,9 @@ class PlanConditionedValue(Value):
     """
 
     @passes_on(Value.__init__, PlanEncoder.__init__)
-    def __init__(self, plans: AnyPlans, **options: Unpack[PlanValueOptions]) -> None:
-        given: dict[str, Any] = {**options}
-        own = {name: given.pop(name) for name in _OWN if name in given}
-        super().__init__(PlanEncoder(plans, **given), **own)
+    def __init__(self, plans: AnyPlans, **options: Any) -> None:
+        own = {name: options.pop(name) for name in _OWN if name in options}
+        super().__init__(PlanEncoder(plans, **options), **own)
 
 
 class PlanConditionedQValue(QValue):
@@ -176,10 +174,9 @@ class PlanConditionedQValue(QValue):
     """
 
     @passes_on(QValue.__init__, PlanEncoder.__init__)
-    def __init__(self, plans: AnyPlans, **options: Unpack[PlanQValueOptions]) -> None:
-        given: dict[str, Any] = {**options}
-        own = {name: given.pop(name) for name in (*_OWN, "action_key", "quantiles") if name in given}
-        super().__init__(PlanEncoder(plans, **given), **own)
+    def __init__(self, plans: AnyPlans, **options: Any) -> None:
+        own = {name: options.pop(name) for name in (*_OWN, "action_key", "quantiles") if name in options}
+        super().__init__(PlanEncoder(plans, **options), **own)
 
 
 @passes_on(PlanConditionedActor.__init__)

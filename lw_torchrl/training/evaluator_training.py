@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Unpack
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import checked_but, passes_on
+from lw_torchrl._checks import checked, passes_on
 from lw_torchrl._tensor_archive import check_like, check_optimizer_state
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
@@ -171,7 +171,7 @@ class QueryEvaluatorTrainer(Training):
     minibatches: ClassVar[Callable[..., _StateMinibatches | _PictureMinibatches]] = _StateMinibatches
 
     @passes_on(Training.__init__)
-    @checked_but("evaluator")
+    @checked
     def __init__(
         self,
         evaluator: ClauseEvaluator,

@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor, nn
 from torchrl.envs import Compose, Transform
 
-from lw_torchrl._checks import checked, checked_but
+from lw_torchrl._checks import checked
 from lw_torchrl._files import AnyPath, shipped_policy
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.text import TextEncoder, encoded
@@ -89,7 +89,7 @@ def policy_file(path: AnyPath) -> Path:
     return shipped_policy(path) or Path(path)
 
 
-@checked_but("evaluator")
+@checked
 def save_evaluator(evaluator: QueryEvaluator, path: AnyPath, **about: Any) -> None:
     """Write an evaluator, for :func:`load_evaluator`; an earlier file is replaced whole. It holds the network alone.
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import io
 import warnings
-from itertools import product
 from typing import Any, Self
 
 import torch
 from tensordict import unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.envs import Compose, EnvBase, RenameTransform, SerialEnv, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, RenameTransform, Transform, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 
@@ -26,33 +25,21 @@ def base_env(transform: Transform) -> EnvBase | None:
     return env
 
 
-def refuse_changed(transform: Transform, key: NestedKey, beside: int = -1) -> int:
-    """Raise :class:`ValueError` where a transform before this one says that it writes what this one is to read; return
-    how many its Compose has, 0 without one. As many as ``beside`` say that none was put there since: none is asked."""
-    container = _container(transform)
-    now = len(container.transforms) if isinstance(container, Compose) else 0
-    if now == beside:
-        return now
-    for entry, chain in product((key, unravel_key(("next", key))), _before(transform)):
-        for earlier in reversed(chain):
-            written = [unravel_key(out) for out in earlier.__dict__.get("_out_keys") or ()]
-            if entry not in written:
-                continue
-            if getattr(earlier, "makes_observation", False):
-                break  # it is the observation as it was, and what stands before it does not matter
-            if isinstance(earlier, RenameTransform):
-                entry = unravel_key(earlier.in_keys[written.index(entry)])
-                continue
+def refuse_changed(transform: Transform, key: NestedKey) -> None:
+    """Raise :class:`ValueError` if a transform before this one in its Composes or environments writes ``key``."""
+    for earlier in reversed(_before(transform)):
+        written = [unravel_key(out) for out in earlier.__dict__.get("_out_keys") or ()]
+        if getattr(earlier, "makes_observation", False):
+            return  # it writes the original observation, so the transforms before it do not matter
+        if isinstance(earlier, RenameTransform) and key in written:
+            key = unravel_key(earlier.in_keys[written.index(key)])
+        elif key in written or unravel_key(("next", key)) in written:
             name, other = type(transform).__name__, type(earlier).__name__
-            raise ValueError(
-                f"{other} changes {entry!r} before {name} reads it, which is made for the observation as it was: put "
-                f"{name} before {other}"
-            )
-    return now
+            raise ValueError(f"{other} changes {key!r} before {name} reads it: put {name} before {other}")
 
 
-def _before(transform: Transform) -> list[list[Transform]]:
-    """What runs before a transform; of several workers, a list for each."""
+def _before(transform: Transform) -> list[Transform]:
+    """Return the transforms that run before one, in order."""
     found: list[Transform] = []
     inner, container = transform, _container(transform)
     while isinstance(container, Compose):
@@ -61,15 +48,7 @@ def _before(transform: Transform) -> list[list[Transform]]:
         inner, container = container, _container(container)
     while isinstance(container, TransformedEnv) and isinstance(container := container.base_env, TransformedEnv):
         found = _flat(container.transform) + found
-    return [inner + found for inner in _inside(container)]
-
-
-def _inside(env: Compose | EnvBase | None) -> list[list[Transform]]:
-    """The transforms in an environment, a list for each worker of a SerialEnv that runs."""
-    if isinstance(env, TransformedEnv):
-        return [inner + _flat(env.transform) for inner in _inside(env.base_env)]
-    workers = env.__dict__.get("_envs", ()) if isinstance(env, SerialEnv) else ()
-    return [chain for worker in workers for chain in _inside(worker)] or [[]]
+    return found
 
 
 def _container(transform: Transform) -> Compose | EnvBase | None:

@@ -47,8 +47,8 @@ class QAFTransform(KeepsEnvState):
     the environment's, as :class:`EnvState` does.
 
     Conditions speak of metres, so it comes before whatever changes the observation: a normaliser, :class:`RandomYaw`.
-    A transform that comes first and names the observation in its ``out_keys`` is refused. It cannot see one that does
-    not name it or is in a ParallelEnv's processes: put it into each worker, before them.
+    A transform that comes first and names the observation in its ``out_keys`` is refused; those in the workers of a
+    SerialEnv or ParallelEnv cannot be seen.
 
     Args:
         plans: a plan for each task that will be seen.
@@ -88,8 +88,6 @@ class QAFTransform(KeepsEnvState):
         tables = PlanTables(self.plans)
         self._number = TaskTables(tables.index, _Number(tables.number), f"tasks without a plan in {self.plans!r}")
         self._task: Tensor | None = None  # of each row, since its last reset
-        self._beside = 0
-        self._saw_workers = False
 
     def with_plans(self, plans: AnyPlans) -> QAFTransform:
         """Return a transform that answers the conditions of other plans."""
@@ -111,9 +109,6 @@ class QAFTransform(KeepsEnvState):
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if not self._saw_workers:  # which a SerialEnv has since its first reset
-            refuse_changed(self, self.in_keys[0])
-            self._saw_workers = True
         begun, task = tensordict.get("_reset", None), tensordict_reset.get(self.in_keys[1], None)
         self._task = task if task is None else reset_rows(self._task, task, begun)
         self._write(tensordict_reset, self._task)
@@ -121,7 +116,6 @@ class QAFTransform(KeepsEnvState):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observation, task = self.in_keys
-        self._beside = refuse_changed(self, observation, self._beside)  # something may be put there later
         task_id = tensordict.get(task, None)
         self._write(tensordict, task_id)
         following = tensordict.get("next", None)
@@ -131,7 +125,6 @@ class QAFTransform(KeepsEnvState):
 
     def set_container(self, container: Transform | EnvBase) -> None:
         super().set_container(container)
-        self._saw_workers = False
         refuse_changed(self, self.in_keys[0])
         env = base_env(self)
         if not isinstance(env, BatchedEnvBase):  # whose workers may not be there yet
@@ -139,7 +132,7 @@ class QAFTransform(KeepsEnvState):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         assert isinstance(observation_spec, Composite)
-        refuse_changed(self, self.in_keys[0])  # it may have been put there later
+        refuse_changed(self, self.in_keys[0])  # a transform may have been inserted before it
         steps, shape, device = self.program.num_queries, observation_spec.shape, observation_spec.device
         observation_spec[self.out_keys[0]] = Binary(steps, shape=(*shape, steps), dtype=torch.bool, device=device)
         observation_spec[self.out_keys[1]] = Unbounded(shape, dtype=torch.int64, device=device)

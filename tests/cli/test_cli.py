@@ -81,7 +81,7 @@ def test_every_command_explains_itself(capsys, command):
         (["query"], "TASK must be given; `lw-torchrl query --help` says what there is"),
         (["collect", "reach"], "--out must be given; "),
         (["collect", "reach", "--out"], "--out must be given a value"),
-        (["train", "x", "--out", "y", "--mix", "z"], "--mix must be one of 'latents', 'actions', got 'z'"),
+        (["train", "x", "--out", "y", "--features", "z"], "--features must be one of 'raw', 'differences', "),
     ],
 )
 def test_a_wrong_command_line_is_refused_with_code_2(capsys, monkeypatch, args, message):
@@ -288,9 +288,7 @@ def test_evaluate_runs_the_tasks_of_the_training(capsys, demos, checkpoint, tmp_
 
 
 def test_an_option_for_plans_is_refused_without_them(capsys, demos, tmp_path):
-    given = ("train", demos, "--out", tmp_path / "p.zip", "--mix", "actions", "--method")
     for method in ("dc", "one-hot"):
-        assert f"--mix is for a method that reads plans, --method {method} does not" in fails(capsys, *given, method)
         near = ("train", demos, "--out", tmp_path / "p.zip", "--latent-consistency", 0.1, "--method", method)
         assert "--latent-consistency is for a method that reads plans" in fails(capsys, *near)
 

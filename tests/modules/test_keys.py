@@ -125,7 +125,6 @@ def plan_actor(**more):
 networks = dict(width=8, depth=1)
 MODULES = {
     "plan": plan_actor,
-    "actions": lambda: plan_actor(mix="actions"),
     "tanh_normal": lambda: plan_actor(distribution="tanh_normal"),
     "normal": lambda: lw.DescriptorConditionedActor("MT10", distribution="normal", **SMALL),
     "description": lambda: lw.DescriptorConditionedActor("MT10", **SMALL),

@@ -283,37 +283,22 @@ def test_training_without_statistics_wants_contacts_first():
     lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()
 
 
-def test_the_opening_is_hidden_but_where_a_step_closes():
-    actor = lw.PlanConditionedActor(MT10, hide_opening=1.0, **OPTIONS)
-    row, number = lw.task_id("push"), 200
-    for step, hidden in ((0, True), (2, False), (3, False)):  # place above; close around; carry
-        qaf = torch.zeros(number, actor.plans.num_steps, dtype=torch.bool)
-        qaf[:, step] = True
-        observation = torch.rand(number, 39)
-        state = TensorDict(observation=observation, task_id=torch.full((number,), row), qaf=qaf, batch_size=[number])
-        seen = actor.train().prepare(state)[2][:, 0]
-        assert torch.equal(seen, observation[:, 3]) is not hidden
-        assert set(seen.tolist()) <= set(observation[:, 3].tolist())
-        assert torch.equal(actor.eval().prepare(state)[2][:, 0], observation[:, 3])
-        assert torch.equal(state["observation"], observation)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"jitter": 0.1}, "jitter moves the way of the roles, and roles is False; got jitter=0.1"),
         ({"roles": True, "jitter": -1.0}, "jitter must be finite and at least 0"),
-        ({"hide_opening": 1.5}, "hide_opening must be"),
-        ({"hide_opening": 0.5, "features": "relative"}, "hide_opening: features='relative' do not show the opening"),
-        ({"hide_opening": 0.5, "features": "none", "roles": True}, "hide_opening: features='none' do not show"),
         ({"roles": True, "canonical": False}, "canonical must be true with roles=True, which are those of canonical"),
         *(
             ({"features": features}, f"features='{features}' shows nothing of where things are; it needs roles=True or")
             for features in ("opening", "none")
         ),
         *(
-            ({"roles": True, "distribution": "tanh_normal", name: 0.1}, "jitter, .* must be 0 with a distribution")
-            for name in ("jitter", "swap_unmentioned", "hide_opening")
+            (
+                {"roles": True, "distribution": "tanh_normal", name: 0.1},
+                "jitter and swap_unmentioned must be 0 with a distribution",
+            )
+            for name in ("jitter", "swap_unmentioned")
         ),
         ({"roles": True, "evaluator": lw.StateQueryEvaluator(MT10)}, "focus, roles, .* an evaluator takes away"),
     ],

@@ -147,10 +147,10 @@ def test_with_plans_shares_the_network_alone(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_saved_and_loaded_with_the_policy_to_the_bit(kind, tmp_path):
-    actor = make_actor(kind, answers="tanh", answer_scale=0.7)
+    actor = make_actor(kind, answers="tanh")
     lw.save_actor(actor, tmp_path / "policy.zip")
     loaded = lw.load_actor(tmp_path / "policy.zip", text_encoder=letters)
-    assert loaded.config["answer_scale"] == 0.7
+    assert loaded.config["answers"] == "tanh"
     for key in actor.out_keys:
         assert torch.equal(loaded(states())[key], actor(states())[key]), key
 
@@ -215,7 +215,7 @@ def test_what_cannot_be_is_named():
         make("structure").logits(torch.rand(1, 39), torch.tensor([lw.task_id("hammer")]))
     with pytest.raises(ValueError, match="answers must be one of"):
         make_actor("structure", answers="soft")
-    with pytest.raises(ValueError, match="answers and answer_scale are of an evaluator's logits"):
+    with pytest.raises(ValueError, match="answers='tanh' needs an evaluator"):
         lw.PlanConditionedActor(PLANS, answers="tanh")
     with pytest.raises(TypeError, match="structure must be True or False, got 'no'"):
         lw.StateQueryEvaluator(PLANS, structure="no")

@@ -144,7 +144,6 @@ def test_keys_of_ones_own():
         ({"squash": False}, ValueError, "squash must be true for the distribution 'tanh_normal'"),
         ({"init_std": 0.0}, ValueError, r"init_std must be over 0\.001, got 0\.0"),
         ({"init_std": "wide"}, TypeError, "init_std must be a number"),
-        ({"mix": "actions"}, ValueError, "mix must be 'latents' with a distribution"),
     ],
 )
 def test_wrong_options_are_named(options, error, message):
@@ -172,7 +171,7 @@ def test_a_trained_one_is_evaluated_and_collects(tmp_path):
 
 
 def test_nothing_random_is_left_in_the_likelihoods_of_one_made_of_a_trained_one():
-    trained = make("plan", None, roles=True, focus=True, jitter=0.03, swap_unmentioned=0.5, hide_opening=1.0)
+    trained = make("plan", None, roles=True, focus=True, jitter=0.03, swap_unmentioned=0.5)
     actor, state = trained.stochastic().train(), make_state(50, plans=trained.plans)
     first, second = (actor.get_dist(state).log_prob(torch.zeros(50, 4)) for _ in range(2))
     assert torch.equal(first, second)

@@ -47,7 +47,7 @@ def by_hand(encoder, kind):
     return total / len(skills)
 
 
-@pytest.mark.parametrize("options", [{}, {"mix": "actions"}, {"distribution": "normal"}, {"encoder_depth": 0}])
+@pytest.mark.parametrize("options", [{}, {"distribution": "normal"}, {"encoder_depth": 0}])
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_is_what_is_written_by_hand(kind, options):
     actor = make_actor(**options)

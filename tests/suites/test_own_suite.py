@@ -90,7 +90,7 @@ def test_every_feature_has_the_layout_s_width(features, demos):
 
 def test_a_policy_is_trained_saved_evaluated_and_recorded(demos, tmp_path):
     plans = lw.Plans([pressing(task) for task in TASKS.values()])
-    actor = lw.PlanConditionedActor(plans, features="opening", roles=True, hide_opening=0.5, **SMALL)
+    actor = lw.PlanConditionedActor(plans, features="opening", roles=True, **SMALL)
     replay = lw.LanguageWorldExperienceReplay(
         demos.root,
         sampler=lw.TaskBalancedSampler(),

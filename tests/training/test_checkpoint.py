@@ -84,8 +84,8 @@ def saved(tmp_path_factory):
 @pytest.mark.parametrize(
     "options",
     [
-        dict(mix="actions", features="raw"),
-        dict(mix="latents", features="both", feature_noise=0.5),
+        dict(features="raw"),
+        dict(features="both", feature_noise=0.5),
         dict(latent_size=7, width=9, depth=2, encoder_width=5, encoder_depth=2),
     ],
 )

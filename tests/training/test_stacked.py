@@ -30,12 +30,10 @@ def make(kind, seed):
         return lw.PlanConditionedActor(PLANS, width=32)
     if kind == "focused plan":
         return lw.PlanConditionedActor(PLANS, width=32, focus=True, swap_unmentioned=0.5)
-    if kind == "mixed actions":
-        return lw.PlanConditionedActor(PLANS, width=32, mix="actions")
     return lw.DescriptorConditionedActor(TASKS, width=32, condition=kind)
 
 
-@pytest.mark.parametrize("kind", first_fast(["plan", "focused plan", "mixed actions", "description", "one-hot"]))
+@pytest.mark.parametrize("kind", first_fast(["plan", "focused plan", "description", "one-hot"]))
 def test_every_loss_is_the_one_it_has_alone(demos, kind):
     together = lw.training.StackedBehavioralCloning(
         [make(kind, seed) for seed in range(3)], [replay(demos) for _ in range(3)], CONFIG, progress=False
@@ -80,7 +78,7 @@ def test_what_it_refuses(demos):
 
 
 @pytest.mark.parametrize(
-    ("options", "different"), [(dict(squash=False), "squash"), (dict(mix="actions", features="both"), "features, mix")]
+    ("options", "different"), [(dict(squash=False), "squash"), (dict(features="both"), "features")]
 )
 def test_actors_of_other_options_are_refused(demos, options, different):
     """Of the same shapes, they would be trained as the first one is."""
