@@ -14,7 +14,7 @@ import torch
 
 import lw_torchrl as lw
 from benchmarks import __main__ as cli
-from benchmarks import ablations, faults, latents, truth
+from benchmarks import ablations, faults, truth
 from benchmarks.finding_points import PADS, find_points
 from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
@@ -147,24 +147,6 @@ def test_ablations_write_a_table_of_what_was_run(setting, monkeypatch, tmp_path,
     assert [line.split("|")[1].strip() for line in table.splitlines()[2:]] == list(ablations.ABLATIONS[setting])
     assert "0.750, 1.000" in table
     assert table in capsys.readouterr().out
-
-
-def test_latents_writes_a_table_of_what_was_run(monkeypatch, tmp_path):
-    seen = []
-
-    def run(unit, plans, out):
-        training = unit.preset.training
-        seen.append((str(unit.folder), training.latent_consistency, training.latent_contrast))
-        return SimpleNamespace(success_once={"reach": 1.0, "push": 0.5}, mean_success=0.75)
-
-    monkeypatch.setattr(latents, "execute_run", run)
-    latents.main(latents.Arguments(setting="one-shot", consistency=(0.0, 0.5), contrast=(2.0,), out=tmp_path))
-    assert seen == [
-        ("one-shot/strong/pcbc/seed0", 0.0, 0.0),
-        ("one-shot/strong-latent-consistency-0.5/pcbc/seed0", 0.5, 0.0),
-        ("one-shot/strong-latent-contrast-2/pcbc/seed0", 0.0, 2.0),
-    ]
-    assert "latent_contrast 2" in (tmp_path / "one-shot" / "latents.md").read_text("utf-8")
 
 
 def test_truth_writes_a_table_and_a_figure_and_carries_on(tmp_path, monkeypatch, capsys):

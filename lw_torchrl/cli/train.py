@@ -37,7 +37,6 @@ def train(
     batch_size: int = 500,  # rows of a minibatch, equally many of each task
     learning_rate: float = 1e-3,  # at the start; a cosine brings it to 0
     after_success: int | None = 20,  # leave out steps so long after an episode's first success; None keeps all
-    latent_consistency: float = 0.0,  # weight of a term that keeps skills with similar texts similar; with plans
     begin: Path | None = None,  # a trained policy to start from: its weights, plans, options and statistics
     evaluator: str | None = None,
     answers: Literal["logit", "tanh", "hard"] | None = None,
@@ -103,11 +102,10 @@ def train(
     asked: dict[str, Any] = {"features": features, "width": width, "depth": depth}
     actor_options = {name: value for name, value in asked.items() if value is not None}
     reads_plans = find_method(method).reads_plans
-    for option, value in (("latent-consistency", latent_consistency), ("evaluator", evaluator)):
-        if value and not reads_plans:
-            raise ValueError(f"--{option} is for a method that reads plans, --method {method} does not")
+    if evaluator and not reads_plans:
+        raise ValueError(f"--evaluator is for a method that reads plans, --method {method} does not")
     numbers: dict[str, Any] = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed}
-    numbers |= {"latent_consistency": latent_consistency, "qaf_anchor": qaf_anchor}
+    numbers["qaf_anchor"] = qaf_anchor
     config = lw.BehavioralCloningConfig(normalize=begin is None, **numbers)
     wanted = {check_choice("tasks", task, held.tasks): held.episodes_per_task for task in chosen}
     rows: dict[str, Any] = {"episodes": wanted or None, "after_success": after_success}
@@ -183,8 +181,6 @@ def train_evaluator(
     held_out_tasks: tuple[str, ...] = (),  # names, or a number of tasks to draw: none of their queries is trained
     held_out_pairs: float = 0.1,  # the share of pairs of objects none of whose queries is trained
     held_out_states: float = 0.2,  # the share of episodes that are not trained on
-    structure: bool = True,  # read parsed clauses, and objects' positions where the tasks' table says; else only texts
-    text_encoder: str | None = None,  # with --no-structure, your function from texts to vectors, as my_texts:encode
     width: int = 128,  # of the hidden layers
     depth: int = 3,  # number of them
     steps: int | None = None,  # minibatches; by default 6000, with --cameras 4000
@@ -208,8 +204,6 @@ def train_evaluator(
             topview, behindGripper, gripperPOV.
     """
     options.check_folder("--out", out)
-    if text_encoder is not None and structure:
-        raise ValueError("--text-encoder is for --no-structure; with structure no text is read")
     known = options.read_tasks(None, tasks)
     names = options.simulated("tasks", options.one_or_many(tasks), known)
     drawn = len(held_out_tasks) == 1 and held_out_tasks[0].isdigit()
@@ -222,7 +216,6 @@ def train_evaluator(
             check_choice(argument, one, allowed)
     for folder in data:
         options.check_dataset("data", folder)
-    options.check_encoder(text_encoder)
     import torch
 
     from lw_torchrl.data.dataset import read_metadata
@@ -236,8 +229,7 @@ def train_evaluator(
     make_config = lw.training.ImageQueryEvaluatorConfig if cameras else lw.training.QueryEvaluatorConfig
     config = make_config(states_per_task=states_per_task, **numbers)
     torch.manual_seed(seed)
-    network: dict[str, Any] = {"structure": structure, "depth": depth, "hidden" if cameras else "width": width}
-    network["text_encoder"] = options.read_encoder(text_encoder)
+    network: dict[str, Any] = {"depth": depth, "hidden" if cameras else "width": width}
     pictures: dict[str, Any] = {"cameras": cameras, "height": picture, "width": picture}
     plans = options.read_plans(("MT50",), known)
     evaluator: Any

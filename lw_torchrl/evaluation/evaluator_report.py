@@ -153,14 +153,13 @@ def _score(evaluator: ClauseEvaluator, data: LabelledQueries, part: str) -> Part
 
 
 def clause_logits(evaluator: ClauseEvaluator, asked: Asked) -> list[tuple[Tensor, Tensor]]:
-    """Logits (R, Q) that the predicates hold, and their truth; one that reads texts is asked negations too."""
-    coded, vectors = evaluator.code([(asked.task, clause) for clause in asked.clauses])
+    """Logits (R, Q) that the predicates hold, and their truth."""
+    coded = evaluator.code([(asked.task, clause) for clause in asked.clauses])
     every = [
-        evaluator.network(rows, coded.pick(torch.arange(len(coded.predicate)).expand(len(rows), -1)), vectors)
+        evaluator.network(rows, coded.pick(torch.arange(len(coded.predicate)).expand(len(rows), -1)))
         for rows in asked.seen(str(evaluator.in_keys[0])).split(_ROWS)
     ]
-    found = torch.cat(every).split(len(asked.clauses), -1)
-    return [(logits if number == 0 else -logits, asked.truth) for number, logits in enumerate(found)]
+    return [(torch.cat(every), asked.truth)]
 
 
 @dataclass(frozen=True)

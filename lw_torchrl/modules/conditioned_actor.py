@@ -231,8 +231,9 @@ class ConditionedActor(Policy):
         return self.head.loc_scale(self._encoding(*self.prepare(tensordict)).joined)
 
     def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> Self:
-        """Return a copy with a distribution whose mode is this actor's action, for RL; its features have no noise, jitter
-        nor swaps.
+        """Return a copy with a distribution, whose mode is this actor's action, for RL.
+
+        Its features have no noise, jitter or swaps.
 
         Args:
             distribution: "tanh_normal", or "normal", whose actions the environment clips.

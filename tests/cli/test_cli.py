@@ -183,7 +183,6 @@ def test_without_a_text_all_queries_that_hold_are_listed(capsys):
         (["evaluate", "expert", "--tasks", "reach", "--episodes", "0"], "error: --episodes must be at least 1"),
         (["view", "NOWHERE"], "NOWHERE"),
         (["train", "NOWHERE", "--out", "OUT", "--learning-rate", "-1"], "error: --learning-rate must be finite"),
-        (["train", "NOWHERE", "--out", "OUT", "--latent-consistency", "-1"], "error: --latent-consistency must be"),
         (["scripted", "reach", "--episodes", "0", "--out", "OUT"], "error: --episodes must be at least 1"),
         (["reproduce", "few-shot", "--jobs", "0", "--out", "OUT"], "error: --jobs must be at least 1"),
     ],
@@ -285,12 +284,6 @@ def test_evaluate_runs_the_tasks_of_the_training(capsys, demos, checkpoint, tmp_
     lw.save_actor(lw.load_actor(checkpoint), tmp_path / "plain.zip")  # which says nothing of data
     assert run(capsys, "evaluate", tmp_path / "plain.zip", "--episodes", 1).count("\n") == 12
     assert run(capsys, "evaluate", checkpoint, "--plans", "MT10", "--episodes", 1).count("\n") == 12
-
-
-def test_an_option_for_plans_is_refused_without_them(capsys, demos, tmp_path):
-    for method in ("dc", "one-hot"):
-        near = ("train", demos, "--out", tmp_path / "p.zip", "--latent-consistency", 0.1, "--method", method)
-        assert "--latent-consistency is for a method that reads plans" in fails(capsys, *near)
 
 
 def test_train_names_a_task_that_the_dataset_lacks(capsys, demos, tmp_path):

@@ -296,7 +296,7 @@ def test_training_without_statistics_wants_contacts_first():
         *(
             (
                 {"roles": True, "distribution": "tanh_normal", name: 0.1},
-                "jitter and swap_unmentioned must be 0 with a distribution",
+                "jitter and swap_unmentioned must be 0 with",
             )
             for name in ("jitter", "swap_unmentioned")
         ),
