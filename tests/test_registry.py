@@ -6,7 +6,6 @@ import sys
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 import lw_torchrl as lw
 from lw_torchrl import _registry
@@ -159,43 +158,3 @@ def test_classes_are_registered_by_their_own_name():
         POLICIES["Tensor"] = torch.Tensor
     with pytest.raises(TypeError, match="method 'mine' must be a Method"):
         METHODS["mine"] = "PlanConditionedActor"
-
-
-class Careless(lw.Policy):
-    """Returns tensors where tuples are wanted."""
-
-    def __init__(self, tasks, given="act"):
-        super().__init__()
-        self.tasks, self.given = tuple(tasks), given
-        self.in_keys, self.out_keys = ["observation"], ["action"]
-
-    def prepare(self, tensordict):
-        observation = tensordict["observation"]
-        return observation if self.given == "prepare" else (observation,)
-
-    def act(self, observation):
-        return {"act": observation[:, :4], "more": (observation, observation)}.get(self.given)
-
-
-class Headless(lw.Policy):
-    def __init__(self, tasks):
-        self.tasks = tuple(tasks)
-
-
-@pytest.mark.parametrize(
-    ("given", "says"),
-    [
-        ("act", r"act of Careless must return a tuple of tensors, got a tensor of shape \(2, 4\)"),
-        ("prepare", r"prepare of Careless must return a tuple of tensors, got a tensor of shape \(2, 39\)"),
-        ("nothing", "act of Careless must return a tuple of tensors, got a NoneType"),
-        ("more", "act of Careless must return a tensor for each of out_keys, action, got 2 tensors"),
-    ],
-)
-def test_what_a_policy_returns_is_checked(given, says):
-    with pytest.raises((TypeError, ValueError), match=says):
-        Careless(["reach"], given)(TensorDict({"observation": torch.zeros(2, 39)}, [2]))
-
-
-def test_a_policy_that_is_no_module_yet_is_told():
-    with pytest.raises(TypeError, match=r"__init__ of Headless must begin with super\(\).__init__\(\)"):
-        Headless.for_plans(lw.load_plans("MT10"))

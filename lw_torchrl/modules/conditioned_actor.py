@@ -158,19 +158,9 @@ class ConditionedActor(Policy):
         """What is written of an encoding beside the action: with plans attention (B, S) and the mixed latent (B, D)."""
         return () if encoding.weights is None else (encoding.weights, encoding.latent)
 
-    def _encoding(self, *prepared: Tensor) -> Encoding:
-        found = self.encoder.encode(*prepared)
-        if not isinstance(found, Encoding):
-            name, got = type(self.encoder).__name__, type(found).__name__
-            raise TypeError(f"encode of {name} must return an Encoding(latent, features), got {got}")
-        if (found.weights is None) != (self.plans is None):
-            what = "weights, the attention over the steps" if self.plans is not None else "no weights without plans"
-            raise TypeError(f"encode of {type(self.encoder).__name__} must return {what}")
-        return found
-
     def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
         if self.head.distribution is None:
-            encoding = self._encoding(*prepared)
+            encoding = self.encoder.encode(*prepared)
             return self.decide(self.head(encoding.joined)), *self.extras(encoding)
         *extras, loc, scale = self.before_sampling(*prepared)
         dist = self.head.dist(loc, scale)
@@ -184,7 +174,7 @@ class ConditionedActor(Policy):
 
     def before_sampling(self, *prepared: Tensor) -> tuple[Tensor, ...]:
         """From what :meth:`prepare` gives to the extras, ``loc`` and ``scale``."""
-        encoding = self._encoding(*prepared)
+        encoding = self.encoder.encode(*prepared)
         return *self.extras(encoding), *self.head.loc_scale(encoding.joined)
 
     def get_dist(self, tensordict: TensorDictBase) -> Distribution:
@@ -228,7 +218,7 @@ class ConditionedActor(Policy):
 
     def _loc_scale(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         self._require_distribution()
-        return self.head.loc_scale(self._encoding(*self.prepare(tensordict)).joined)
+        return self.head.loc_scale(self.encoder.encode(*self.prepare(tensordict)).joined)
 
     def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> Self:
         """Return a copy with a distribution, whose mode is this actor's action, for RL.

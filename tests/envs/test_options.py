@@ -92,17 +92,3 @@ def test_a_single_environment_has_no_dimension_of_rows(options):
     several = SerialEnv(2, lambda: lw.LanguageWorldEnv("reach", batch_size=(), **options))
     assert several.rollout(3)["episode"].tolist() == [[0] * 3, [1] * 3]
     several.close()
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"batch_size": (2,)}, ValueError, r"batch_size must be \(\), for a single environment, .* got \(2,\)"),
-        ({"batch_size": (), "num_envs": 2}, ValueError, "or None for one dimension of 2 rows"),
-        ({"frame_skip": 0}, ValueError, "frame_skip must be at least 1, got 0"),
-        ({"frame_skip": 1.5}, TypeError, "frame_skip must be an integer"),
-    ],
-)
-def test_wrong_options_are_named(options, error, message):
-    with pytest.raises(error, match=message):
-        lw.LanguageWorldEnv("reach", **options)

@@ -133,29 +133,6 @@ def test_other_plans_share_its_weights():
     assert torch.allclose(other(found)["qaf_logits"], expected, atol=1e-6)
 
 
-def test_what_cannot_be_is_named():
-    with pytest.raises(ValueError, match=r"pixels must be uint8 of shape .*16, 48, 3.*by corner, corner3 side by side"):
-        make()(states(shape=(16, 24)))
-    with pytest.raises(ValueError, match=r"pixels must be uint8 .* got torch.float32"):
-        make()(states().set("pixels", torch.zeros(10, 16, 48, 3)))
-    with pytest.raises(ValueError, match=r"task_id must be of shape .10,., one for each row of 'pixels'"):
-        make().answers(states()["pixels"], torch.zeros(3).long())
-    with pytest.raises(ValueError, match=r"thing in \"the robot's gripper .*drawer-open must be one of .*an evaluator"):
-        make(names=("robot's gripper",))
-    with pytest.raises(ValueError, match=r"encoder must be one of.*small"):
-        make(encoder="smal")
-    with pytest.raises(ValueError, match=r"height and width must be at most 512 pixels, got 513 and 8"):
-        lw.modules.ImageQueryEvaluator(PLANS, height=513, width=8)
-    with pytest.raises(ValueError, match=r"camera must be"):
-        make(cameras="korner")
-    IMAGE_ENCODERS["flat"] = lambda: nn.Flatten()
-    try:
-        with pytest.raises(ValueError, match=r"encoder 'flat' must give a map of features"):
-            make(encoder="flat")
-    finally:
-        del IMAGE_ENCODERS["flat"]
-
-
 def test_an_encoder_of_ones_own_stays_frozen():
     def frozen():
         return nn.Sequential(nn.Conv2d(3, 4, 4, 4)).requires_grad_(False)

@@ -71,14 +71,6 @@ def test_what_is_missing_is_named(kind):
             module(rows.exclude(key))
 
 
-@pytest.mark.parametrize(
-    "given", ["action", ["action"], ["a", "b", "c", "d"], ["a", "a", "b"], [1, 2, 3], [[], [], []], 3]
-)
-def test_what_is_no_list_of_keys_is_refused(given):
-    with pytest.raises(ValueError, match="out_keys must be a list of 3, in this order: action, skill_weights, skill_l"):
-        lw.PlanConditionedActor(PLANS, out_keys=given)
-
-
 def test_keys_travel_with_the_policy(tmp_path):
     keys = dict(
         in_keys=["state", ("words", "task"), ("words", "qaf")], out_keys=["action", ("why", "weights"), "latent"]

@@ -11,7 +11,7 @@ from torchrl.objectives import BCLoss
 
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.language.tasks import MT10, task_id
+from lw_torchrl.language.tasks import task_id
 from lw_torchrl.language.text import encode_texts
 from lw_torchrl.modules import PlanConditionedActor
 
@@ -317,33 +317,3 @@ def test_normalisation_cannot_be_fitted_to_what_are_no_numbers(wrong):
     with pytest.raises(ValueError, match="observation must hold finite numbers"):
         actor.fit_normalization(poke((2, 2), wrong)(make_state(5)["observation"]))
     actor(make_state(2))
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (dict(features="difference"), "features must be one of .*did you mean 'differences'"),
-        (dict(feature_noise=-0.1), "feature_noise must be finite and at least 0, got -0.1"),
-        (dict(latent_size=0), "latent_size must be at least 1, got 0"),
-        (dict(width=0), "width must be at least 1, got 0"),
-        (dict(depth=-1), "depth must be at least 0, got -1"),
-        (dict(encoder_width=0), "encoder_width must be at least 1"),
-        (dict(encoder_depth=-1), "encoder_depth must be at least 0"),
-    ],
-)
-def test_wrong_options_are_named(options, message):
-    with pytest.raises(ValueError, match=message):
-        make_actor(**options)
-
-
-def test_plans_of_a_wrong_kind_are_named():
-    with pytest.raises(TypeError, match="plans must map task names"):
-        PlanConditionedActor("MT10")
-    with pytest.raises(ValueError, match="another task"):
-        PlanConditionedActor({"push": PLANS["reach"]})
-    assert set(PlanConditionedActor(dict(PLANS), **SMALL).plans) == set(MT10)
-
-
-def test_squash_is_a_flag():
-    with pytest.raises(TypeError, match="squash must be True or False, got 'no'"):
-        make_actor(squash="no")

@@ -281,28 +281,3 @@ def test_training_without_statistics_wants_contacts_first():
             make()
     fit_normalization(actor, replay)
     lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"jitter": 0.1}, "jitter moves the way of the roles, and roles is False; got jitter=0.1"),
-        ({"roles": True, "jitter": -1.0}, "jitter must be finite and at least 0"),
-        ({"roles": True, "canonical": False}, "canonical must be true with roles=True, which are those of canonical"),
-        *(
-            ({"features": features}, f"features='{features}' shows nothing of where things are; it needs roles=True or")
-            for features in ("opening", "none")
-        ),
-        *(
-            (
-                {"roles": True, "distribution": "tanh_normal", name: 0.1},
-                "jitter and swap_unmentioned must be 0 with",
-            )
-            for name in ("jitter", "swap_unmentioned")
-        ),
-        ({"roles": True, "evaluator": lw.StateQueryEvaluator(MT10)}, "focus, roles, .* an evaluator takes away"),
-    ],
-)
-def test_wrong_options_are_named(options, message):
-    with pytest.raises(ValueError, match=message):
-        lw.PlanConditionedActor(MT10, **options)

@@ -133,24 +133,6 @@ def test_keys_of_ones_own():
     assert moved.spec["agent", "action"].shape == (4,)
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        (
-            {"distribution": "gaussian"},
-            ValueError,
-            "must be one of 'tanh_normal', 'normal', got 'gaussian'",
-        ),
-        ({"squash": False}, ValueError, "squash must be true for the distribution 'tanh_normal'"),
-        ({"init_std": 0.0}, ValueError, r"init_std must be over 0\.001, got 0\.0"),
-        ({"init_std": "wide"}, TypeError, "init_std must be a number"),
-    ],
-)
-def test_wrong_options_are_named(options, error, message):
-    with pytest.raises(error, match=message):
-        make(**options)
-
-
 def test_without_a_distribution_that_is_said():
     actor = make("plan", None)
     for ask in (lambda: actor.get_dist(make_state()), actor.as_sequential):

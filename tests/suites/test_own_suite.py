@@ -321,20 +321,6 @@ def test_a_number_is_one_thing(change, says):
         replace(TOY, **change)
 
 
-@pytest.mark.parametrize(
-    ("change", "error", "says"),
-    [
-        ({"plans": {}}, TypeError, "plans of suite 'toy' must be a Plans"),
-        ({"skills": ["go"]}, TypeError, "skills of suite 'toy' must be a Mapping"),
-        ({"tasks": []}, TypeError, "tasks of suite 'toy' must be a Mapping"),
-        ({"layout": replace(TOY, thresholds={"nearr": 0.05})}, ValueError, "got 'nearr'; did you mean 'near'"),
-    ],
-)
-def test_wrong_fields_of_a_suite_are_named(change, error, says):
-    with pytest.raises(error, match=says):
-        replace(SUITE, **change)
-
-
 def td3(plans):
     actor, critic = lw.PlanConditionedActor(plans, **SMALL), lw.PlanConditionedQValue(plans, width=8)
     return TD3Loss(actor, critic, bounds=(-1.0, 1.0))

@@ -249,28 +249,6 @@ def test_other_plans_are_spoilt_alike():
 # --- bad input -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"flip": 1.5}, ValueError, "flip must be from 0 to 1, got 1.5"),
-        ({"stick": -0.1}, ValueError, "stick must be finite and at least 0, got -0.1"),
-        ({"delay": -1}, ValueError, "delay must be at least 0, got -1"),
-        ({"seed": "x"}, TypeError, "seed must be an integer"),
-        ({"drop": OPEN}, TypeError, "drop must be a list of queries, got 'the gripper is open'"),
-        ({"drop": [3]}, TypeError, "drop must be a list of queries, got 3 in it"),
-        (
-            {"drop": ["the gripper is left of the pck"]},
-            ValueError,
-            r"drop must be one of .*did you mean .*left of the p",
-        ),
-        ({"drop": ["the gripper is closed"]}, ValueError, "drop must be one of .*got 'the gripper is closed'"),
-    ],
-)
-def test_wrong_options_are_named(options, error, message):
-    with pytest.raises(error, match=message):
-        lw.CorruptQAF(PLANS, **options)
-
-
 def test_without_answers_it_says_who_writes_them():
     env = TransformedEnv(RandomStates(2), lw.CorruptQAF(PLANS))
     with pytest.raises(ValueError, match=r"without qaf: QAFTransform\(plans\) in the environment"):
