@@ -118,8 +118,8 @@ def test_tanh_is_the_papers_ten_times_the_probability_less_five():
     from lw_torchrl.modules.plan_attention import attention_logits
 
     logits = torch.linspace(-8, 8, 33)
-    assert torch.allclose(attention_logits(logits, "tanh", 0.5), 10 * logits.sigmoid() - 5, atol=1e-5)
-    assert torch.equal(attention_logits(logits, "logit", 0.5), logits)
+    assert torch.allclose(attention_logits(logits, "tanh"), 10 * logits.sigmoid() - 5, atol=1e-5)
+    assert torch.equal(attention_logits(logits, "logit"), logits)
 
 
 def test_with_evaluator_shares_the_weights():
