@@ -152,7 +152,6 @@ class Odd(lw.Policy):
             TypeError,
             "must return the TensorDict that it is given, got a Tensor",
         ),
-        (torch.nn.Linear(39, 4), {}, TypeError, "must be a Policy, a TensorDictModule, or a function .*; got a Linear"),
         (Odd("dtype"), {}, ValueError, "must be float32"),
         (Odd("shape"), {}, ValueError, r"must be float32 of shape \(2, 4\), got torch.float32 of shape \(2, 3\)"),
         (lw.ScriptedSkillActor(PLANS, "random"), {}, ValueError, "would depend on num_envs and on interruptions"),

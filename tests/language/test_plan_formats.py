@@ -159,7 +159,6 @@ def test_a_description_of_several_lines_stays_in_one(tmp_path):
 @pytest.mark.parametrize(
     ("plan", "format", "error", "says"),
     [
-        (None, "chain_py", TypeError, "plan must be a ConditionalPlan"),
         (SHIPPED[0], "chain", ValueError, "format must be one of .* did you mean 'chain_py'"),
         (SHIPPED[0], None, TypeError, "format must be a string"),
     ],

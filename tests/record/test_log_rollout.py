@@ -312,11 +312,6 @@ def test_wrong_rollouts_of_tasks_are_named(tmp_path, pushed, change, kwargs, mes
         assert logger.episodes == []
 
 
-def test_a_rollout_must_be_a_tensordict(tmp_path):
-    with lw.RerunLogger(tmp_path / "a.rrd") as logger, pytest.raises(TypeError, match="rollout must be a TensorDict"):
-        lw.log_rollout(logger, {"observation": torch.rand(3, 39)})
-
-
 def test_importing_a_recording_loads_no_rendering(tmp_path, pushed, monkeypatch):
     # The scene is rerun's to draw: neither OpenGL nor MuJoCo's renderer is touched.
     import mujoco
