@@ -85,8 +85,6 @@ def test_a_single_environment_has_no_dimension_of_rows(options):
     other = lw.LanguageWorldEnv("reach", num_envs=1, seed=2, **options)
     assert torch.equal(other.reset()["observation"][0], data["observation"][0])
     assert torch.equal(env.reset(episode=3)["episode"], torch.tensor(3))
-    state = env.reset()
-    assert torch.equal(env.base_env.reset(state, set_state=True)["observation"], state["observation"])
     env.close()
     other.close()
     several = SerialEnv(2, lambda: lw.LanguageWorldEnv("reach", batch_size=(), **options))
