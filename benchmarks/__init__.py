@@ -1,2 +1,2 @@
-"""What lw_torchrl costs: ``python -m benchmarks``. Every row is a ratio measured in one run; docs/performance.md
-says against what."""
+"""The laboratory beside the package: ``python -m benchmarks`` measures speed, ``python -m benchmarks.paper`` executes
+the paper's experiments, and other modules measure ablations, plans, evaluators and diagnoses."""

@@ -15,6 +15,9 @@ import tyro
 from torch import Tensor
 
 import lw_torchrl as lw
+from benchmarks.paper.imitation import ImitationRun
+from benchmarks.paper.recipes import EXECUTIONS, PRESETS, SETTINGS, Member, Preset
+from benchmarks.paper.runs import execute_run
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import count_solved
 from lw_torchrl.evaluation.summary import markdown_table
@@ -22,9 +25,6 @@ from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.things import role_object
 from lw_torchrl.modules.relative_positions import PlanRoles
-from lw_torchrl.paper.imitation import ImitationRun
-from lw_torchrl.paper.recipes import EXECUTIONS, PRESETS, SETTINGS, Member, Preset
-from lw_torchrl.paper.runs import execute_run
 
 Setting = Literal["few-shot", "zero-shot"]
 FULL: Mapping[str, Preset] = PRESETS["strong"]
@@ -122,7 +122,7 @@ class Arguments:
     episodes: int = 20
     """Evaluated for each task."""
     out: Path = Path("runs/reproduce")
-    """The experiments' folder: datasets and runs that `lw-torchrl reproduce` left there are used."""
+    """The experiments' folder: datasets and runs that `python -m benchmarks.paper` left there are used."""
 
 
 def main(arguments: Arguments) -> None:

@@ -34,7 +34,7 @@ class Arguments:
     """
 
     policies: tyro.conf.Positional[Path]
-    """The folder strong of `lw-torchrl reproduce zero-shot`."""
+    """The folder strong of `python -m benchmarks.paper zero-shot`."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Of the trainings."""
     methods: tuple[str, ...] = METHODS
@@ -97,7 +97,7 @@ def main(arguments: Arguments) -> None:
 
 
 def trained(folder: Path, method: str, seed: int) -> lw.Policy:
-    """The policy that `lw-torchrl reproduce zero-shot` wrote."""
+    """The policy that `python -m benchmarks.paper zero-shot` wrote."""
     return lw.load_actor(folder / method / f"seed{seed}" / "policy.zip").eval()
 
 

@@ -49,7 +49,7 @@ class Arguments:
     """
 
     policies: tyro.conf.Positional[Path]
-    """The folder strong of `lw-torchrl reproduce zero-shot`; "no-roles" is beside it."""
+    """The folder strong of `python -m benchmarks.paper zero-shot`; "no-roles" is beside it."""
     rows: tuple[Rows, ...] = ("default", "ours", "natural", "palm2", "dc", "one-hot")
     """Which plans."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)

@@ -11,19 +11,19 @@ import torch
 import tyro
 
 import lw_torchrl as lw
+from benchmarks.paper.imitation import ImitationRun
+from benchmarks.paper.recipes import PRESETS, SETTINGS
+from benchmarks.paper.runs import execute_run
 from lw_torchrl._files import write_json, write_text
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.evaluation.figures import COLORS, new_figure, saved, trim
 from lw_torchrl.evaluation.statistics import mean_rate
 from lw_torchrl.evaluation.summary import markdown_table
-from lw_torchrl.paper.imitation import ImitationRun
-from lw_torchrl.paper.recipes import PRESETS, SETTINGS
-from lw_torchrl.paper.runs import execute_run
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Train and evaluate the recipes of `lw-torchrl reproduce` on fewer demonstrations of each task.
+    """Train and evaluate the recipes of `python -m benchmarks.paper` on fewer demonstrations of each task.
 
     Zero-shot's rates are of the 40 tasks that were not demonstrated, few-shot's of all 50, by one network instead of
     four, which is as good in a quarter of the time. The number of training steps is the recipe's whatever the number

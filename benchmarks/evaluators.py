@@ -12,10 +12,11 @@ import torch
 import tyro
 
 import lw_torchrl as lw
+from benchmarks.evaluator_report import condition_drift, drift_table, write_report
 from lw_torchrl._files import write_text
-from lw_torchrl.evaluation import EvaluationResult, condition_drift, drift_table, score_evaluator
+from lw_torchrl.cli.demo import DemoConfig
+from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.evaluation.summary import markdown_table
-from lw_torchrl.paper.demo import DemoConfig
 
 RECIPE = DemoConfig()
 WHO = ("expert", "scripted", "spoilt-30", "random")
@@ -120,10 +121,10 @@ class Bench:
         evaluator = lw.StateQueryEvaluator(self.plans)
         file = self.folder / f"evaluator-{share:g}.zip"
         lw.training.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=file).train()
-        report = score_evaluator(evaluator, labelled if config == most else lw.training.LabelledQueries(states, most))
-        report.save(file.with_suffix(".json"))
+        held_out = labelled if config == most else lw.training.LabelledQueries(states, most)
+        report = write_report(evaluator, held_out, self.folder / f"evaluator-{share:g}.json", most=2)
         number = labelled.describe()["states"]["training"]
-        print(f"seed {self.seed}, {number} labelled states:\n{report.table(most=2)}", flush=True)
+        print(f"seed {self.seed}, {number} labelled states:\n{report}", flush=True)
         return lw.training.load_evaluator(file, self.plans)
 
     def tuned(self, name: str, actor: Any, anchor: float) -> Any:

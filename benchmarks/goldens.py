@@ -192,7 +192,7 @@ def check_success(args: Arguments) -> Iterator[tuple[str, bool]]:
 
 
 def check_demo(args: Arguments) -> Iterator[tuple[str, bool]]:
-    from lw_torchrl.paper.demo import DemoConfig, run_demo
+    from lw_torchrl.cli.demo import DemoConfig, run_demo
 
     path = DATA / "demo.json"
     with TemporaryDirectory() as folder:

@@ -12,9 +12,10 @@ import torch
 import tyro
 
 import lw_torchrl as lw
+from benchmarks.evaluator_report import plot_wrong_answers, write_report, wrong_answers
 from benchmarks.evaluators import WHO, demonstrations, evaluated
 from lw_torchrl._files import write_text
-from lw_torchrl.evaluation import EvaluationResult, plot_reliability, plot_wrong_answers, score_evaluator
+from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.evaluation.statistics import Estimate, wilson_interval
 from lw_torchrl.evaluation.summary import markdown_table
 
@@ -93,11 +94,9 @@ def evaluator(args: Arguments, plans: lw.Plans) -> Any:
     made = lw.modules.ImageQueryEvaluator(plans, **args.pictures, every=args.every)
     file = args.out / "evaluator.zip"
     lw.training.ImageQueryEvaluatorTrainer(made, labelled, config, checkpoint=file).train()
-    report = score_evaluator(made, labelled)
-    report.save(args.out / "report.json")
-    plot_reliability(report, args.out / "reliability.png")
-    plot_wrong_answers(made, labelled, args.out / "wrong.png")
-    print(f"{labelled.describe()['states']['training']} drawn states trained\n{report.table(most=20)}", flush=True)
+    report = write_report(made, labelled, args.out / "reliability.json", most=20)
+    plot_wrong_answers(wrong_answers(made, labelled), args.out / "wrong.png")
+    print(f"{labelled.describe()['states']['training']} drawn states trained\n{report}", flush=True)
     return lw.training.load_evaluator(file, plans)
 
 
@@ -147,7 +146,7 @@ def main(args: Arguments) -> None:
         rows.append([row, str(Estimate(float(hits.mean()), *wilson_interval(int(hits.sum()), hits.size))), *each])
     table = markdown_table(["", "mean", *args.tasks], rows)
     write_text(args.out / "table.md", table)
-    print(f"\n{table}\nwritten to {args.out / 'table.md'}, report.json, reliability.png and wrong.png")
+    print(f"\n{table}\nwritten to {args.out / 'table.md'}, reliability.json, reliability.png and wrong.png")
 
 
 if __name__ == "__main__":

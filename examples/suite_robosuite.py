@@ -4,7 +4,7 @@ python examples/suite_robosuite.py check --arms Panda Sawyer                 # m
 python examples/suite_robosuite.py expert --arms Panda --task stack --seed 7 # scripted skills
 python examples/suite_robosuite.py POLICY --arms Panda Sawyer --task lift --episodes 50 --seed 3000
 
-POLICY is a file of the zero-shot recipe, `lw-torchrl reproduce zero-shot --methods pcbc`: it has seen no robosuite.
+POLICY is a file that `python -m benchmarks.paper zero-shot --methods pcbc` wrote; it was not trained on robosuite.
 Its words are in robosuite_words/. pip install 'lw_torchrl[robosuite]'; beside mujoco 3.3 Sawyer needs robosuite 1.5.2.
 """
 

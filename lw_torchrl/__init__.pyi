@@ -4,7 +4,6 @@ from lw_torchrl import evaluation as evaluation
 from lw_torchrl import language as language
 from lw_torchrl import modules as modules
 from lw_torchrl import objectives as objectives
-from lw_torchrl import paper as paper
 from lw_torchrl import planners as planners
 from lw_torchrl import record as record
 from lw_torchrl import suites as suites

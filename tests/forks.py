@@ -22,7 +22,7 @@ import numpy as np
 PARENT = """
 import json, os, sys, traceback
 import lw_torchrl as lw
-import lw_torchrl.evaluation, lw_torchrl.paper.demo, lw_torchrl.paper.imitation, matplotlib.figure
+import lw_torchrl.evaluation, lw_torchrl.record.rollouts, matplotlib.figure
 from lw_torchrl.cli.main import main
 
 lw.LanguageWorldEnv("MT50", num_threads=1).close()

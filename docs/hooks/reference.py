@@ -30,8 +30,7 @@ def pages() -> dict[str, str]:
 
 
 def room_page(room: str) -> str:
-    inner = {"language": WORDS.split(), "paper": ["recipes", "runs"]}.get(room)
-    modules = [f"::: lw_torchrl.{room}.{word}\n" for word in inner or ()]
+    modules = [f"::: lw_torchrl.language.{word}\n" for word in WORDS.split()] if room == "language" else []
     whole = f"::: lw_torchrl.{room}\n    options: {{show_root_heading: false, show_root_toc_entry: false}}\n"
     return "\n".join([f"# lw.{room}", "", *(modules or [whole])])
 

@@ -39,7 +39,7 @@ class Commands(UserDict[str, Any]):
 
 COMMANDS = Commands(
     {
-        "demo": "reproduce",
+        "demo": "demo",
         "collect": "data",
         "data": "data",
         "train": "train",
@@ -56,12 +56,9 @@ COMMANDS = Commands(
         "plans": "language",
         "plan": "plan",
         "check": "check",
-        "reproduce": "reproduce",
-        "offline": "online",
-        "online": "online",
     }
 )
-_OF_PLAN = dict(prompt="plan", generate="plan_models", serve="plan", read="plan", check="plan", compare="plan")
+_OF_PLAN = dict(prompt="plan", generate="plan_models", serve="plan", read="plan", check="plan")
 _OF_PLAN |= dict(repair="plan_models")
 _OF_DATA = {"show": "data", "export": "exchange", "import": "exchange"}
 GROUPS = {"plan": Commands(_OF_PLAN), "data": Commands(_OF_DATA)}
@@ -75,8 +72,7 @@ Exit status: 0, done; 1, a bug of ours, with a traceback; 2, an error that you c
 error, which names the line of a module of yours if it is there (LW_TORCHRL_TRACEBACK=1 shows the traceback); 130,
 stopped by Ctrl-C; 141, nobody reads the output. What prints a table prints JSON with --json."""
 
-_RESUMABLE = {"demo", "collect", "train", "train-evaluator", "reproduce", "offline", "online"}
-_RESUMABLE |= {"plan generate", "plan compare", "plan repair"}
+_RESUMABLE = {"demo", "collect", "train", "train-evaluator", "plan generate", "plan repair"}
 
 
 def main(args: Sequence[str] | None = None) -> None:

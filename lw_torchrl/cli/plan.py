@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
@@ -156,62 +156,6 @@ def check(
     return output.show("success", None if found.own is None else found.success)
 
 
-def compare(
-    source: Positional[Annotated[Path, arg(metavar="DIR|FILE")]],
-    /,
-    episodes: int = 20,  # of each plan, the same initial states for all plans of a task
-    seed: int = 1000,  # fixes initial states, goals and what is chosen
-    choose: Literal["random", "first"] = "random",  # of true steps a random one, as in the paper, or the first
-    noise: float = 0.0,  # standard deviation of the noise on the executed action
-    max_steps: int = 500,  # of an episode
-    task_file: options.TaskFile = None,
-    out: Path = Path("runs/compare"),  # folder for results.json, summary.md, models.png, formats.png and best/
-    json: options.Json = False,
-) -> Output:
-    """Compare models by the plans they wrote: decode every answer, and carry out all plans by scripted skills.
-
-    The plan of each task that did best, be it one that never succeeds, is kept in OUT/best/MODEL/FORMAT, for --plans of
-    any other command. If it is stopped, the same command resumes it.
-
-    Example: lw-torchrl plan compare runs/plans --out runs/compare
-
-    Args:
-        source: a folder MODEL/FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it, or a .jsonl file of answers.
-    """
-    options.check_folder("--out", out)
-    from lw_torchrl.planners.answer_files import ignored_files, recorded_answers
-
-    known = options.read_tasks(task_file)
-    recorded_answers(source)
-    from lw_torchrl.planners.comparing import compare_plans, no_plans, write_report
-
-    options.use_one_thread()
-    how: dict[str, Any] = {"episodes": episodes, "seed": seed, "choose": choose, "noise_scale": noise}
-    found = compare_plans(source, max_steps=max_steps, tasks=known, resume=out / "fared.json", **how)
-    output = Output(json)
-    groups = [
-        {"model": model, "format": format, "success": found.mean(model, format)}
-        | {"trusted_answer": found.trusted(model, format), "best_answer": found.best_of(model, format)}
-        for model, format in found.groups
-    ]
-    output.show("models", groups, f"{found.table()}\n\n{found.task_table()}\n")
-    answers = [
-        {"model": one.model, "format": one.format, "task": one.task, "attempt": one.attempt, "steps": one.steps}
-        | {"dropped": one.dropped, "reason": one.reason or None, "trust": one.worth[1], "success": one.rate}
-        for one in found.answers
-    ]
-    output.show("answers", answers)
-    if lines := no_plans(found):
-        print("\n".join(lines), end="\n\n")
-    if strays := ignored_files(source):
-        names = ", ".join(map(str, strays[:5])) + (", ..." if len(strays) > 5 else "")
-        print(f"not read, since no answer is named so (<task>-<attempt>.<ext>): {names}\n")
-    for file in write_report(found, out):
-        best = ": of each task the plan that did best, be it one that never succeeds" if file.name == "best" else ""
-        print(f"written to {file}{best}")
-    return output
-
-
 def serve(
     model: Positional[Annotated[Path | None, arg(metavar="[MODEL.gguf]")]] = None,
     /,
@@ -244,4 +188,4 @@ def serve(
 
 
 def plan() -> None:
-    """Plans from language models: the prompt, asking a model, and checking, comparing and repairing what it wrote."""
+    """Plans from language models: the prompt, asking a model, and checking and repairing what it wrote."""

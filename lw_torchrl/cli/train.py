@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import asdict
 from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -140,11 +139,6 @@ def train(
     output.show("policy", out)
     output.show("steps", steps)
     output.show("loss", loss, f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}") + f": {out}")
-    if inside is not None:
-        drifts = lw.evaluation.condition_drift(actor, replay[:])
-        heading = "conditions that drifted most from their words, in the demonstrations' states:"
-        table = lw.evaluation.drift_table(drifts, most=5)
-        output.show("drift", [asdict(one) for one in drifts], f"{heading}\n{table}")
     return output
 
 
@@ -169,7 +163,7 @@ WHO = ("expert", "scripted", "spoilt-30", "random")
 def train_evaluator(
     tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],  # MT10, MT50, or names, held-out ones too
     /,
-    out: Path,  # folder for evaluator.zip, report.json, reliability.png, the episodes, and, with --cameras, wrong.png
+    out: Path,  # folder for evaluator.zip, report.json and the episodes
     data: tuple[Path, ...] = (),  # datasets of `lw-torchrl collect` to use instead of running episodes
     behaviours: tuple[str, ...] = WHO,  # who acts in the episodes that are run, as for `lw-torchrl collect`
     episodes: int = 5,  # of each task and behaviour
@@ -262,11 +256,8 @@ def train_evaluator(
     output.show("evaluator", out / "evaluator.zip")
     output.show("steps", config.steps)
     output.show("loss", loss, f"trained to step {config.steps}" + ("" if loss != loss else f", loss {loss:.4f}"))
-    report = lw.evaluation.score_evaluator(evaluator, labelled)
-    output.show("parts", {name: one.to_json() for name, one in report.parts.items()}, report.table())
-    report.save(out / "report.json")
-    lw.evaluation.plot_reliability(report, out / "reliability.png")
-    if cameras:
-        lw.evaluation.plot_wrong_answers(evaluator, labelled, out / "wrong.png")
+    score = lw.evaluation.score_evaluator(evaluator, labelled)
+    output.show("parts", {name: part.to_json() for name, part in score.parts.items()}, score.table())
+    score.save(out / "report.json")
     print(f"written to {out}")
     return output

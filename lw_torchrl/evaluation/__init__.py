@@ -3,21 +3,12 @@
 import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.evaluation.attribution import attribute_failures
 from lw_torchrl.evaluation.card import policy_card
-from lw_torchrl.evaluation.evaluator_figures import WrongAnswer, plot_reliability, plot_wrong_answers, wrong_answers
-from lw_torchrl.evaluation.evaluator_report import Drift, EvaluatorReport, condition_drift, drift_table, score_evaluator
+from lw_torchrl.evaluation.evaluator_score import EvaluatorScore, score_evaluator
 from lw_torchrl.evaluation.failure_records import CAUSES, Failure, MendedEpisode
-from lw_torchrl.evaluation.figures import (
-    plot_failures,
-    plot_learning_curves,
-    plot_methods,
-    plot_sorted_tasks,
-    plot_success,
-)
+from lw_torchrl.evaluation.figures import plot_failures, plot_sorted_tasks, plot_success
 from lw_torchrl.evaluation.hub import from_pretrained, push_to_hub, save_pretrained
-from lw_torchrl.evaluation.many_plans import evaluate_plans
 from lw_torchrl.evaluation.plan_use import PlanUse, StuckStep, stuck_steps, stuck_table, weakest_step
 from lw_torchrl.evaluation.protocol import evaluate
-from lw_torchrl.evaluation.published import published, published_curves, published_plans
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.evaluation.statistics import (
     Estimate,
@@ -27,15 +18,12 @@ from lw_torchrl.evaluation.statistics import (
     mean_rate,
     probability_of_improvement,
 )
-from lw_torchrl.evaluation.summary import MethodComparison, Pair, Summary, TaskSummary, summarize, summarize_rates
+from lw_torchrl.evaluation.summary import Summary, TaskSummary, summarize, summarize_rates
 
 __all__ = [
-    "CAUSES", "Drift", "EpisodeResult", "Estimate", "EvaluationResult", "EvaluatorReport", "Failure", "MendedEpisode",
-    "MethodComparison", "Pair", "PlanUse", "StuckStep", "Summary", "TaskSummary", "WrongAnswer", "attribute_failures",
-    "condition_drift", "count_solved", "drift_table", "evaluate", "evaluate_plans", "from_pretrained",
-    "interquartile_mean", "mean_difference", "mean_rate", "plot_failures", "plot_learning_curves", "plot_methods",
-    "plot_reliability", "plot_sorted_tasks", "plot_success", "plot_wrong_answers", "policy_card",
-    "probability_of_improvement", "published", "published_curves", "published_plans", "push_to_hub",
-    "save_pretrained", "score_evaluator", "stuck_steps", "stuck_table", "summarize", "summarize_rates",
-    "weakest_step", "wrong_answers",
+    "CAUSES", "EpisodeResult", "Estimate", "EvaluationResult", "EvaluatorScore", "Failure", "MendedEpisode", "PlanUse",
+    "StuckStep", "Summary", "TaskSummary", "attribute_failures", "count_solved", "evaluate", "from_pretrained",
+    "interquartile_mean", "mean_difference", "mean_rate", "plot_failures", "plot_sorted_tasks", "plot_success",
+    "policy_card", "probability_of_improvement", "push_to_hub", "save_pretrained", "score_evaluator", "stuck_steps",
+    "stuck_table", "summarize", "summarize_rates", "weakest_step",
 ]  # fmt: skip

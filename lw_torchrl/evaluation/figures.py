@@ -1,4 +1,4 @@
-"""Figures of results: success, failures, methods, tasks sorted by success, learning."""
+"""Figures of results: success, failures, tasks sorted by success."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ _CAUSE_COLORS: dict[str, str] = {
     **{"not reproducible": "#d5cec9", "perception": "#72b7b2", "gripper": "#eeca3b", "actuation": "#9d755d"},
     **{"policy": "#e45756"},
 }
-Curve = Sequence[tuple[float, float]]  # points: steps of the environment, success rate in [0, 1]
 
 
 def check_image(path: AnyPath | None) -> None:
@@ -160,7 +159,7 @@ def plot_sorted_tasks(
         curves: a method's name to its :class:`Summary`, or to (task to its rates, one per seed), in [0, 1]. All have
             the same tasks.
         path, title: as for :func:`plot_success`.
-        published: label to (task to rate), of the same tasks at least; :func:`published_curves` gives them.
+        published: label to (task to rate), of the same tasks at least.
         order: "shared" sorts the tasks by the first method, so that each place on x is one named task; "own" sorts
             every curve for itself, as the paper does: x is then a rank.
         of: what a rate is of, for the legend: "seed", "plan".
@@ -244,102 +243,3 @@ def _as_rates(argument: str, given: Rates | Summary | Mapping[str, float]) -> di
         raise ValueError(f"{argument} must hold a rate per seed for each task, got different numbers of them")
     check_rates(argument, list(columns.values()))
     return columns
-
-
-@checked
-def plot_learning_curves(
-    curves: Mapping[str, Mapping[str, Sequence[Curve]]],
-    path: AnyPath | None = None,
-    *,
-    starts: Mapping[str, float] | None = None,
-    title: str = "",
-) -> Figure:
-    """Draw success by steps of the environment: a panel for each task, a line for each method's mean over seeds, in a
-    band from the least to the greatest.
-
-    Args:
-        curves: task to method to the curve of each seed; those of a method in a task have the same steps, else
-            :class:`ValueError`.
-        path, title: as for :func:`plot_success`.
-        starts: task to the success rate before, as a dotted line.
-
-    Example:
-        >>> figure = plot_learning_curves({"push": {"td3": [[(0, 0.2), (5000, 0.9)], [(0, 0.3), (5000, 0.7)]]}})
-        >>> figure.axes[0].get_title()
-        'push'
-    """
-    check_image(path)
-    if not curves:
-        raise ValueError("curves must hold at least one task, got none")
-    methods = list(dict.fromkeys(method for found in curves.values() for method in found))
-    columns = min(len(curves), 4)
-    rows = -(-len(curves) // columns)
-    figure = new_figure(max(4.8, 3.4 * columns), 3.0 * rows + 0.9)
-    panels = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True)).ravel()
-    for axes, (task, found) in zip(panels, curves.items(), strict=False):
-        for method, seeds in found.items():
-            steps = [[step for step, _ in curve] for curve in seeds]
-            if any(one != steps[0] for one in steps):
-                raise ValueError(f"curves[{task!r}][{method!r}] must have the same steps in all seeds")
-            rates = np.array([[rate for _, rate in curve] for curve in seeds])
-            color, x = COLORS[methods.index(method) % len(COLORS)], np.array(steps[0]) / 1000
-            axes.fill_between(x, rates.min(0), rates.max(0), color=color, alpha=0.16, linewidth=0)
-            label = f"{method} ({counted(len(seeds), 'seed')})"
-            axes.plot(x, rates.mean(0), color=color, linewidth=2, marker=".", label=label)
-        if starts is not None and task in starts:
-            axes.axhline(starts[task], color="#333333", linewidth=1.2, linestyle=":", label="start, evaluated")
-        axes.set_title(task, fontsize=10)
-        axes.set_xlabel("thousand steps of the environment", fontsize=9)
-        axes.set_ylim(-0.02, 1.02)
-        trim(axes, "y")
-    for axes in panels[len(curves) :]:
-        axes.set_visible(False)
-    figure.supylabel("success in training", fontsize=10)
-    named = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=4, frameon=False, fontsize=9)
-    figure.suptitle(title)
-    return saved(figure, path)
-
-
-@checked
-def plot_methods(
-    groups: Mapping[str, Mapping[str, Summary]], path: AnyPath | None = None, *, title: str = ""
-) -> Figure:
-    """Draw the mean success of each method: a bar for the mean over seeds and tasks with its 95 % interval, a dot for
-    each seed; methods from the top in the order in which they are given.
-
-    Args:
-        groups: a column's name to its methods' summaries by name.
-        path, title: as for :func:`plot_success`.
-
-    Example:
-        >>> from lw_torchrl.evaluation import summarize_rates
-        >>> figure = plot_methods({"B": {"bc": summarize_rates({"push": [0.5, 0.7]})}})
-        >>> figure.axes[0].get_title()
-        'B'
-    """
-    check_image(path)
-    if not groups:
-        raise ValueError("groups must hold at least one, got none")
-    labels = list(dict.fromkeys(label for methods in groups.values() for label in methods))
-    figure = new_figure(2.6 + 3.0 * len(groups), 1.3 + 0.3 * len(labels))
-    columns = np.atleast_1d(figure.subplots(1, len(groups), sharey=True))
-    for axes, (group, methods) in zip(columns, groups.items(), strict=True):
-        for place, label in enumerate(labels):
-            if (found := methods.get(label)) is None:
-                continue
-            mean, seeds = found.mean, found.array.mean(1)
-            axes.barh(place, mean.value, color="#4c78a8" if place == 0 else "#b8c9de", height=0.7)
-            if mean.low is not None:
-                axes.plot([mean.low, mean.high], [place, place], color="#333333", linewidth=1.2)
-            axes.plot(seeds, np.full(len(seeds), place), ".", color="#f58518", markersize=5, zorder=3)
-            axes.text(1.04, place, f"{mean.value:.2f}", va="center", fontsize=8, color="#222222")
-        axes.set_title(group)
-        axes.set_xlim(0, 1.18)
-        axes.set_xticks(np.linspace(0, 1, 6))
-        axes.set_yticks(range(len(labels)), labels, fontsize=9)
-        trim(axes, "x")
-    figure.axes[0].invert_yaxis()
-    figure.supxlabel("episodes with success at any step; dots: seeds; lines: 95 %", fontsize=9)
-    figure.suptitle(title)
-    return saved(figure, path)

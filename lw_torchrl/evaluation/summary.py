@@ -1,4 +1,4 @@
-"""summarize: several training seeds as headline numbers and a row per task; MethodComparison: methods side by side."""
+"""Summarize the evaluations of several training seeds as headline numbers and a row per task."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from lw_torchrl._checks import checked, counted, shown
 from lw_torchrl.evaluation import statistics
 from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.evaluation.statistics import Array, Estimate
-from lw_torchrl.language.tasks import MT10
 
 _SETTINGS = ("episodes_per_task", "noise_scale", "max_steps")  # what rates must share to be averaged
 
@@ -79,26 +78,16 @@ class Summary:
             },
         }
 
-    def table(self, beside: Mapping[str, Mapping[str, float]] | None = None) -> str:
-        """The headline, then a row per task, as text in columns.
-
-        Args:
-            beside: more columns, name to (task to rate), such as :func:`published_curves` gives; "-" where a task is
-                missing. Their names stand in full below the table.
-        """
-        columns = dict(beside or {})
-        head = "".join(f" {f'({k + 1})':>6}" for k in range(len(columns)))
+    def table(self) -> str:
+        """Return the headline, then a row per task, as text in columns."""
         solved = f"{self.solved} of {len(self.tasks)} tasks >= {self.threshold:g}"
         lines = [f"mean {self.mean}, IQM {self.iqm}; {solved}; {counted(len(self.seeds), 'seed')}"]
-        lines.append(f"{'task':28} {'mean':>6} {'min':>6} {'max':>6}{head}")
+        lines.append(f"{'task':28} {'mean':>6} {'min':>6} {'max':>6}")
         seeds = self.by_seed.values()
         total = TaskSummary(self.mean.value, min(seeds), max(seeds))
-        for name, found in [*self.per_task.items(), ("mean", total)]:
-            tasks = self.tasks if found is total else (name,)
-            there = [None if set(tasks) - set(rates) else _mean(rates, tasks) for rates in columns.values()]
-            cells = "".join(f" {'-':>6}" if rate is None else f" {rate:6.2f}" for rate in there)
-            lines.append(f"{name:28} {found.mean:6.2f} {found.min:6.2f} {found.max:6.2f}{cells}")
-        return "\n".join([*lines, *(f"({k + 1}) {name}" for k, name in enumerate(columns))])
+        for name, row in [*self.per_task.items(), ("mean", total)]:
+            lines.append(f"{name:28} {row.mean:6.2f} {row.min:6.2f} {row.max:6.2f}")
+        return "\n".join(lines)
 
 
 @checked
@@ -186,100 +175,6 @@ def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResul
                 raise ValueError(f"results must share {key}, got {got}")
     rates: dict[str, Any] = {task: [result.success_once[task] for result in named.values()] for task in tasks}
     return summarize_rates(rates, seeds=list(named), **options)
-
-
-@dataclass(frozen=True)
-class Pair:
-    """How much better the first of two methods is on the same tasks: the difference of the mean success rates, and the
-    probability that a seed of the first beats one of the second on a task, where a tie counts half."""
-
-    methods: tuple[str, str]
-    difference: Estimate
-    improvement: Estimate
-
-
-class MethodComparison:
-    """Several methods' summaries.
-
-    Args:
-        summaries: method to :class:`Summary`, of the same tasks; the first is compared with each of the others.
-        published: label to (task to success rate), such as :func:`published_curves` gives.
-        confidence: of the intervals of differences, in (0, 1).
-
-    Example:
-        >>> from lw_torchrl.evaluation import summarize_rates
-        >>> a = summarize_rates({"push": [0.5, 0.7], "reach": [1.0, 0.9]})
-        >>> b = summarize_rates({"push": [0.3, 0.3], "reach": [0.6, 0.7]})
-        >>> print(MethodComparison({"a": a, "b": b}).pairs[0].difference)
-        0.300 [0.148, 0.452]
-    """
-
-    def __init__(
-        self,
-        summaries: Mapping[str, Summary],
-        published: Mapping[str, Mapping[str, float]] | None = None,
-        *,
-        confidence: float = 0.95,
-    ) -> None:
-        if not summaries:
-            raise ValueError("summaries must hold at least one method, got none")
-        self.summaries, self.published = dict(summaries), dict(published or {})
-        first, *others = self.summaries
-        self.tasks, self.threshold = self.summaries[first].tasks, self.summaries[first].threshold
-        for other in others:
-            if different := sorted(set(self.tasks) ^ set(self.summaries[other].tasks)):
-                raise ValueError(f"summaries of {first!r} and {other!r} do not share the tasks {different}")
-        self.pairs: list[Pair] = []
-        for other in others:
-            order = [self.summaries[other].tasks.index(task) for task in self.tasks]
-            rates = self.summaries[first].array, self.summaries[other].array[:, order]
-            difference = statistics.mean_difference(*rates, confidence=confidence)
-            improvement = statistics.probability_of_improvement(*rates, confidence=confidence)
-            self.pairs.append(Pair((first, other), difference, improvement))
-
-    def to_json(self) -> dict[str, Any]:
-        """As plain numbers, lists and mappings."""
-        return {
-            "methods": {method: summary.to_json() for method, summary in self.summaries.items()},
-            "pairs": [{**asdict(pair), "methods": list(pair.methods)} for pair in self.pairs],
-            "published_means": {label: _mean(rates, self.tasks) for label, rates in self.published.items()},
-        }
-
-    def headline(self) -> str:
-        """A Markdown table with a row per method, then a line per pair."""
-        outside = [task for task in self.tasks if task not in MT10]
-        outside = [] if len(outside) == len(self.tasks) else outside
-        head = ["method", "mean", "IQM", f"tasks >= {self.threshold:g}, of {len(self.tasks)}", "seeds"]
-        head += [f"mean of the {len(outside)} outside MT10"] if outside else []
-        rows = []
-        for method, summary in self.summaries.items():
-            each = ", ".join(f"{mean:.3f}" for mean in summary.by_seed.values())
-            means = {task: found.mean for task, found in summary.per_task.items()}
-            last = [f"{_mean(means, outside):.3f}"] if outside else []
-            rows.append([method, str(summary.mean), str(summary.iqm), str(summary.solved), each, *last])
-        for label, rates in self.published.items():
-            solved = sum(rates[task] >= self.threshold - 1e-9 for task in self.tasks)
-            last = [f"{_mean(rates, outside):.3f}"] if outside else []
-            rows.append([label, f"{_mean(rates, self.tasks):.3f}", "", str(solved), "", *last])
-        more = "probability of improvement"
-        lines = [f"{' - '.join(pair.methods)}: {pair.difference}; {more} {pair.improvement}" for pair in self.pairs]
-        return "\n\n".join(filter(None, [markdown_table(head, rows), "  \n".join(lines)]))
-
-    def per_task(self) -> str:
-        """A Markdown table with a row per task: each method's mean, its least and greatest seed, and the published."""
-        found = {method: summary.per_task for method, summary in self.summaries.items()}
-        rows = []
-        for task in self.tasks:
-            cells = []
-            for each in found.values():
-                spread = f" ({each[task].min:.2f}-{each[task].max:.2f})" if each[task].min < each[task].max else ""
-                cells.append(f"{each[task].mean:.2f}{spread}")
-            rows.append([task, *cells, *(f"{rates[task]:.2f}" for rates in self.published.values())])
-        return markdown_table(["task", *found, *self.published], rows)
-
-
-def _mean(rates: Mapping[str, float], tasks: Sequence[str]) -> float:
-    return sum(rates[task] for task in tasks) / len(tasks)
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -56,7 +56,7 @@ def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks
     # A name with a dot in front is what a killed save_plans leaves.
     listed = [path] if path.is_file() else sorted(p for p in path.glob("*.plan") if p.name[0] != ".")
     if not listed:
-        how = "of a folder of models' answers `lw-torchrl plan compare` makes them"
+        how = "lw.decode_plan reads a language model's answer, lw.save_plans writes .plan files"
         raise FileNotFoundError(f"the folder {str(path)!r} holds no .plan files; {how}")
     return _read_all(list[Traversable](listed), tasks)
 

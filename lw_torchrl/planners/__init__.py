@@ -1,6 +1,6 @@
 """Plans from language models: how they are asked for, and who answers.
 
-How answers fare needs the simulator: :mod:`~lw_torchrl.planners.checking`, :mod:`~lw_torchrl.planners.comparing`.
+How answers fare needs the simulator: :mod:`~lw_torchrl.planners.checking`.
 """
 
 from lw_torchrl.planners.answer_files import FilePlanner, Planner, answer_path, folder_name, write_answer

@@ -93,19 +93,6 @@ def recorded_answers(source: AnyPath) -> dict[str, dict[_Place, str | Path]]:
     return found
 
 
-def ignored_files(source: AnyPath) -> list[Path]:
-    """Files that look like answers and lie where answers do, but have another name or ending."""
-    root = Path(source)
-    read = {path for answers in _of_folder(root).values() for path in answers.values()}
-    endings = {f".{known.extension}" for known in PLAN_FORMATS.values()} | {".txt"}
-    return sorted(
-        path
-        for format in PLAN_FORMATS
-        for path in root.glob(f"*/{format}/*")
-        if path.suffix in endings and path not in read and path.name[0] != "." and path.parts[-3][0] != "."
-    )
-
-
 def answer_text(found: str | Path) -> str:
     """The text of an answer that :func:`recorded_answers` gives."""
     return storable(read_text(found, ValueError) if isinstance(found, Path) else found)

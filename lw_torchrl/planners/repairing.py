@@ -95,7 +95,7 @@ def repair_plans(
 ) -> list[Repair]:
     """Carry out plans, tell the model what became of those that fail, and ask for others, round by round.
 
-    Every answer is kept: ``out`` is a folder for :func:`compare_plans`, in which each round counts as a model.
+    Every answer is kept in ``out``, where each round counts as a model.
 
     Args:
         planner: who wrote the answers.

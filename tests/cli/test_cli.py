@@ -16,10 +16,10 @@ from commands import fails, run
 
 import lw_torchrl as lw
 import lw_torchrl.cli.main as cli
+from lw_torchrl.cli.demo import QUICK
 from lw_torchrl.cli.main import main
 from lw_torchrl.cli.output import BROKEN_PIPE
 from lw_torchrl.cli.parsing import arguments
-from lw_torchrl.paper.demo import QUICK
 
 COMMANDS = (
     "demo",
@@ -39,9 +39,6 @@ COMMANDS = (
     "plans",
     "plan",
     "check",
-    "reproduce",
-    "offline",
-    "online",
 )
 
 
@@ -184,7 +181,6 @@ def test_without_a_text_all_queries_that_hold_are_listed(capsys):
         (["view", "NOWHERE"], "NOWHERE"),
         (["train", "NOWHERE", "--out", "OUT", "--learning-rate", "-1"], "error: --learning-rate must be finite"),
         (["scripted", "reach", "--episodes", "0", "--out", "OUT"], "error: --episodes must be at least 1"),
-        (["reproduce", "few-shot", "--jobs", "0", "--out", "OUT"], "error: --jobs must be at least 1"),
     ],
 )
 def test_an_error_is_one_line_and_code_2(capsys, tmp_path, monkeypatch, args, message):
@@ -335,7 +331,7 @@ def test_the_quick_demo_killed_twice_ends_and_then_does_nothing_twice(forks, tmp
     config, out = replace(QUICK, training_steps=200, episodes_per_task=2), tmp_path / "demo"
     shorter = f"""
 from dataclasses import replace
-from lw_torchrl.paper import demo
+from lw_torchrl.cli import demo
 demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episodes_per_task={config.episodes_per_task})
 """
     demonstrations = out / "demonstrations"
@@ -396,7 +392,7 @@ def test_a_demo_of_another_configuration_is_not_overwritten(capsys, tmp_path):
     with pytest.raises(SystemExit) as caught:
         main(["demo", "--quick", "--out", str(tmp_path)])
     assert caught.value.code == 2
-    assert "holds a demo of another configuration" in capsys.readouterr().err
+    assert "holds a demo with another configuration" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
     assert (tmp_path / "config.json").read_bytes() == before
 

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from commands import check_documented, document, documented, run
+from commands import check_documented, document, documented
 
 import lw_torchrl as lw
 from lw_torchrl.cli.main import COMMANDS, GROUPS, main
@@ -175,12 +175,6 @@ def test_a_plan_that_is_checked(capsys):
     found = document(capsys, "plan", "check", "push.plan", "--episodes", 1)
     check_documented("plan check", found)
     assert found["steps"][0]["expert"] > 0
-
-
-@pytest.mark.parametrize("args", [("reproduce", "few-shot"), ("offline", "quick"), ("online", "reach")])
-def test_lists_of_runs(capsys, args):
-    listed = run(capsys, *args, "--list").split()
-    assert document(capsys, *args, "--list") == {"runs": listed}
 
 
 def test_all_that_print_a_table_have_it():

@@ -197,36 +197,6 @@ def test_a_killed_run_asks_only_for_what_is_missing(capsys, tmp_path):
     assert not list(tmp_path.rglob(".*tmp*"))
 
 
-# ---- compare
-
-
-def test_compare_runs_what_generate_wrote(capsys, tmp_path):
-    path = tmp_path / "plans" / "mine" / "chain_py" / "reach-0.py"
-    path.parent.mkdir(parents=True)
-    path.write_text(lw.encode_plan(lw.load_plans("MT10")["reach"], "chain_py"))
-    command = ("plan", "compare", tmp_path / "plans", "--episodes", 2, "--max-steps", 80, "--out", tmp_path / "out")
-    printed = run(capsys, *command)
-    assert "| mine  | chain_py | 1     | 1       | 1                     | 1.000   |" in printed
-    assert "written to" in printed
-    names = ["best", "fared.json", "formats.png", "models.png", "results.json", "summary.md"]
-    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == names
-    assert run(capsys, *command) == printed
-    assert f"{tmp_path / 'out/best'}: of each task the plan that did best, be it one that never succeeds" in printed
-    assert "not read" not in printed
-    path.with_name("reach_1.py").write_text("?")
-    path.with_name("reach-1.py").write_text("No.")
-    printed = run(capsys, *command)
-    found = document(capsys, *command)
-    check_documented("plan compare", found)
-    assert [one["success"] for one in found["answers"]] == [1.0, 0.0]
-    assert [one["reason"] is None for one in found["answers"]] == [True, False]
-    assert "1 answer has no plan:\n1: it has no steps, neither for the task" in printed
-    assert f"not read, since no answer is named so (<task>-<attempt>.<ext>): {path.with_name('reach_1.py')}" in printed
-    message = fails(capsys, *command, "--episodes", 3)
-    assert "--out: " in message
-    assert "of other settings: episodes (2, now 3); choose another folder" in message
-
-
 # ---- check
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from commands import check_documented, document, documented, fails, run
+from commands import check_documented, document, fails, run
 from pictures import why_no_pictures
 
 import lw_torchrl as lw
@@ -39,12 +39,8 @@ def weights(path, part="head"):
 def test_a_new_one_is_trained_with_the_policy(capsys, demos, tmp_path):
     out = tmp_path / "policy.zip"
     args = "train", demos, "--out", out, "--evaluator", "new", "--qaf-anchor", 1, *SMALL, *NET
-    printed = run(capsys, *args)
-    told = document(capsys, *args)
-    check_documented("train", told, also=["drift"])
-    assert [*told["drift"][0]] == documented("train --evaluator")["drift"]
-    assert "conditions that drifted most from their words" in printed
-    assert "reach, step" in printed
+    run(capsys, *args)
+    check_documented("train", document(capsys, *args))
     actor = lw.load_actor(out)
     assert isinstance(actor.evaluator, lw.StateQueryEvaluator)
     assert actor.config["answers"] == "tanh"
@@ -86,10 +82,6 @@ def test_what_makes_no_sense_is_refused(capsys, demos, trained, tmp_path):
         capsys, "train", demos, *out, *begin, "--qaf-anchor", 1
     ).replace("--qaf-anchor", "qaf_anchor")
     assert not (tmp_path / "x.zip").exists()
-    assert "--preset evaluator is for few-shot" in fails(capsys, "reproduce", "all", "--preset", "evaluator", "--list")
-    listed = run(capsys, "reproduce", "few-shot", "--preset", "evaluator", "--seeds", 0, "--list", "--out", tmp_path)
-    assert "few-shot/evaluator/pcbc/seed0" in listed
-    assert "dc" not in listed
 
 
 def test_what_cannot_be_begun_with_is_named(capsys, demos, trained, tmp_path):
@@ -115,7 +107,6 @@ def test_cameras(capsys, demos, tmp_path):
     args = ["train-evaluator", "reach", "--out", out, "--data", demos, "--cameras", "corner", "--picture", 24]
     printed = run(capsys, *args, *SMALL, *NET, "--every", 4, "--held-out-pairs", 0)
     assert "trained to step 4" in printed
-    assert (out / "wrong.png").stat().st_size > 1000
     plans = lw.load_plans("MT50")
     lw.save_plans({"reach": plans["reach"]}, tmp_path / "plans")
     reach = next((tmp_path / "plans").iterdir())

@@ -18,11 +18,7 @@ FOLDERS = {
     "data import": ["demos", "--out"],
     "evaluate": ["expert", "--out"],
     "scripted": ["reach", "--out"],
-    "reproduce": ["few-shot", "--out"],
-    "offline": ["quick", "--out"],
-    "online": ["reach", "--out"],
     "plan generate": ["reach", "--model", "m", "--out"],
-    "plan compare": ["plans", "--out"],
     "plan repair": ["reach", "--model", "m", "--out"],
 }
 FILES = {
@@ -39,7 +35,7 @@ def _no_work(monkeypatch):
     import builtins
 
     original = builtins.__import__
-    working = ("lw_torchrl.data", "lw_torchrl.paper.demo", "lw_torchrl.paper.runs", "openai")
+    working = ("lw_torchrl.data", "lw_torchrl.record.rollouts", "openai")
 
     def refuse(name, *args, **kwargs):
         assert name not in working, name

@@ -106,22 +106,10 @@ def test_scripts_carry_them_out(capsys, tmp_path):
     assert len(found["origin"]["plans"]) == 32
 
 
-def test_demonstrations_are_collected_and_runs_listed_with_them(capsys, tmp_path):
+def test_demonstrations_are_collected_with_them(capsys, tmp_path):
     files = ("--task-file", "tasks.toml")
     out = run(capsys, "collect", "reach", *files, "--episodes", 1, "--out", tmp_path / "demos")
     assert "reach  1.00     1" in out
-    listed = run(capsys, "online", "reach", "--plans", "reach.plan", *files, "--seeds", 0, "--list")
-    assert listed.split()[0] == "pcbc/reach/start/seed0"
-    assert "the plan of 'reach' that counts is the shipped one" in fails(capsys, "online", "reach", *files, "--list")
-
-
-@pytest.mark.slow
-def test_policies_are_trained_online_with_them(capsys, tmp_path):
-    files = ("--task-file", "tasks.toml", "--plans", "reach.plan", "--condition", "one-hot")
-    few = ("--methods", "expert-iteration", "--frames", 100, "--seeds", 0, "--episodes", 1)
-    run(capsys, "online", "reach", *files, *few, "--out", tmp_path)
-    found = lw.load_actor(next(tmp_path.glob("one-hot/reach/expert-iteration/seed0/policy.zip")))
-    assert found.definition("reach").description == "Bring the hand to the ball."
 
 
 def test_a_policy_is_trained_and_evaluated_with_them(capsys, tmp_path):
@@ -197,10 +185,3 @@ def test_a_task_that_the_simulator_lacks_is_named(capsys, tmp_path):
 )
 def test_an_encoder_that_is_none_is_refused(capsys, tmp_path, name, message):
     assert message in fails(capsys, "train", "demos", "--out", tmp_path / "p.zip", "--text-encoder", name, *TINY)
-
-
-def test_experiments_take_an_encoder_too(capsys, tmp_path):
-    given = ("reproduce", "few-shot", "--methods", "pcbc", "--seeds", 0, "--text-encoder")
-    listed = run(capsys, *given, "my_texts:encode", "--list")
-    assert "few-shot/strong-my_texts.encode/pcbc/seed0" in listed
-    assert "names no function" in fails(capsys, *given, "my_texts:nothing", "--out", tmp_path / "out")

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from lw_torchrl.cli import exchange, online, options
+from lw_torchrl.cli import exchange, options
 from lw_torchrl.cli.main import COMMANDS, GROUPS
 
 HEAVY = ("torch", "torchrl", "mujoco", "metaworld", "rerun", "matplotlib")
@@ -58,8 +58,6 @@ WRONG = {
     "collect reach --out o --noise 0 -1": "--noise must be finite and at least 0, got -1.0",
     "collect reach --out o --num-envs none": "--num-envs must be an integer, got 'none'",
     "collect reach --out o --num-envs 0": "--num-envs must be at least 1, got 0",
-    "reproduce few-shot --seeds 0 x": "--seeds must be an integer, got 'x'",
-    "reproduce few-shot --jobs 0": "--jobs must be at least 1, got 0",
     # every verb: names, choices, files, places
     "demo --out file": "--out must be a folder, 'file' is none",
     "demo --qick": "there is no option --qick; did you mean --quick?",
@@ -83,7 +81,6 @@ WRONG = {
     "train demos --out o.zip --begin nowhere.zip": "--begin: no file 'nowhere.zip'",
     "train demos --out o.zip --evaluator nowhere.zip": "--evaluator: no file 'nowhere.zip'",
     "train demos --out o.zip --evaluator Softtruth": "--evaluator must be one of 'new', got 'Softtruth'",
-    "online reach --condition pcb": "--condition must be one of 'pcbc', 'dc', 'one-hot', got 'pcb'",
     "train demos --out o.zip --task-file bad.toml": "--task-file bad.toml: ",
     "train demos --out o.zip --text-encoder mine": "--text-encoder must be like my_texts:encode",
     "train-evaluator raech --out o": "TASKS must be one of",
@@ -141,27 +138,11 @@ WRONG = {
     "plan read MT10 --task pusch": "--task must be one of",
     "plan read MT10 --task soccer": "--task soccer: MT10 has no plan for it",
     "plan read bad.toml --task push": "--format must be given, one of basic_py, ",
-    "plan compare nowhere": "SOURCE: there is no file or folder 'nowhere'",
-    "plan compare demos": "SOURCE: 'demos' holds no answers",
     f"plan repair raech {MODEL}": "TASKS must be one of",
     f"plan repair reach {MODEL} --format chain": "--format must be one of",
     "check nowhere": "FILE: there is no 'nowhere'",
     "check push.plan": "1 fault in 1 file",
     "check bad.toml": "bad.toml: ",
-    "reproduce few-shto": "EXPERIMENT must be one of 'zero-shot', 'few-shot', 'one-shot', 'scripted', 'all', got",
-    "reproduce few-shot --methods pcb": "--methods must be one of 'pcbc', ",
-    "reproduce few-shot --plans push.plan": "--plans push.plan: push.plan, line 2: ",
-    "reproduce few-shot --passes 3": "--passes is for --preset paper",
-    "reproduce few-shot --out file": "--out must be a folder, 'file' is none",
-    "offline metods": "TABLE must be one of 'methods', ",
-    "offline quick --mixtures D": "--mixtures must be one of 'B', 'W', 'C', got 'D'",
-    "offline quick --methods awr": "--methods must be one of 'advantage', ",
-    "offline quick --plans nowhere": "--plans nowhere: no plan file or folder 'nowhere'",
-    "online raech": "TASKS must be one of",
-    "online reach --methods td4": "--methods must be one of 'advantage', ",
-    "online reach --start nowhere.zip": "--start: no file 'nowhere.zip'",
-    "online reach --methods residual --step 9": "--step: the plan of 'reach' has 3 steps, got 9",
-    "online reach --plans push.plan": "--plans push.plan: push.plan, line 2: ",
 }
 
 
@@ -251,14 +232,7 @@ def test_the_words_of_the_command_line_are_those_of_the_library():
     from lw_torchrl.data import BEHAVIOURS
     from lw_torchrl.data.exchange import FORMATS
     from lw_torchrl.modules import METHODS
-    from lw_torchrl.paper.online import WEAKEST
-    from lw_torchrl.paper.recipes import MIXTURES, OFFLINE_METHODS
-    from lw_torchrl.training import LEARNERS
 
     assert tuple(BEHAVIOURS) == options.ACTORS
     assert get_args(exchange.ExchangeFormat) == FORMATS
     assert tuple(METHODS) == options.CONDITIONS
-    assert tuple(LEARNERS) == online.ALGORITHMS
-    assert get_args(online.Mixture) == tuple(MIXTURES)
-    assert get_args(online.OfflineMethod) == tuple(OFFLINE_METHODS)
-    assert online.WEAKEST == WEAKEST

@@ -185,17 +185,12 @@ def cloning(replay, checkpoint):
     return lw.BehavioralCloningTrainer(make_actor(), replay, config, checkpoint=checkpoint, progress=False)
 
 
-def stacked(replay, checkpoint):
-    config = lw.BehavioralCloningConfig(steps=4, batch_size=8)
-    return lw.training.StackedBehavioralCloning([make_actor()], [replay], config, checkpoint=checkpoint, progress=False)
-
-
 def offline(replay, checkpoint):
     config = lw.OfflineConfig(steps=4, batch_size=8)
     return lw.OfflineTrainer(bc_loss(make_actor(), "l2"), replay, config, checkpoint=checkpoint, progress=False)
 
 
-@pytest.mark.parametrize("trainer", [cloning, stacked, offline])
+@pytest.mark.parametrize("trainer", [cloning, offline])
 def test_a_training_goes_on_with_verified_rows_alone(root, tmp_path, trainer):
     checkpoint = tmp_path / "checkpoint.zip"
     trainer(LanguageWorldExperienceReplay(root, transform=make_actor().transform()), checkpoint).train()

@@ -12,13 +12,11 @@ from pretend_device import COPIES, MODULE, PRETEND, WAITS
 from small_training import CONFIG, PLANS, SMALL, assert_same, collect_demos, flat, make_actor
 from tensordict import TensorDict
 from test_losses import LOSSES, make_batch, make_loss, ready, total, trained
-from test_runs import PLANS as RUN_PLANS
-from test_runs import PRESET, TINY, TINY_ONE_SHOT, a_run, task_of
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose
 
 import lw_torchrl as lw
-from lw_torchrl.paper.runs import execute_run, load_result
+from benchmarks.paper.stacked import StackedBehavioralCloning
 
 ACTORS = {
     "plan": lambda: make_actor(feature_noise=0.0),
@@ -154,7 +152,7 @@ def make_stack(demos, device, checkpoint=None, actor="plan", **config):
     replays = [make_replay(demos, device) for _ in range(3)]
     options = {"checkpoint": checkpoint, "progress": False, "device": device}
     actors = [ACTORS[actor]() for _ in replays]
-    return lw.training.StackedBehavioralCloning(actors, replays, replace(CONFIG, **config), **options)
+    return StackedBehavioralCloning(actors, replays, replace(CONFIG, **config), **options)
 
 
 def test_many_at_once_wait_for_nothing(demos):
@@ -379,24 +377,6 @@ def test_rows_ahead_are_there_too_and_a_buffer_that_grows_is_not(demos):
     assert (there.sample(16).cpu() == here.sample(16)).all()
     with pytest.raises(ValueError, match="device: a buffer that grows is on the CPU"):
         lw.LanguageWorldExperienceReplay(demos, label="executed", grow=10, device="pretend")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("setting", [TINY, TINY_ONE_SHOT])
-def test_a_run_is_the_same_wherever_it_is_done(tmp_path, setting):
-    one = a_run("dc", setting=setting, preset=replace(PRESET, training=replace(PRESET.training, steps=5)))
-    WAITS.clear()
-    found = execute_run(one, RUN_PLANS, tmp_path, tasks=task_of(one), progress=False, device="pretend")
-    assert [wait for wait in WAITS if "loop" in wait], "trained there"
-    assert [wait for wait in WAITS if "episodes" in wait], "evaluated there"
-    there = {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()}
-    assert load_result(one, RUN_PLANS, tmp_path) == found
-    (tmp_path / one.folder / "results.json").unlink()
-    WAITS.clear()
-    again = execute_run(one, RUN_PLANS, tmp_path, tasks=task_of(one), progress=False)  # of the policy that is kept
-    assert WAITS == []
-    assert again.success_once == found.success_once
-    assert {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if path.is_file()} == there
 
 
 @pytest.mark.parametrize("name", ["bc", "advantage", "value"])  # copies of critics are drawn where they are

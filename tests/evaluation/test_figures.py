@@ -15,11 +15,10 @@ from lw_torchrl.evaluation import (
     EvaluationResult,
     plot_sorted_tasks,
     plot_success,
-    published,
-    published_curves,
     summarize_rates,
 )
 from lw_torchrl.evaluation.statistics import wilson_interval
+from lw_torchrl.language.tasks import MT50
 
 
 def make_result(rates, trials=4):
@@ -32,6 +31,7 @@ def make_result(rates, trials=4):
     return EvaluationResult(config, tuple(episodes))
 
 
+RATES = {task: number / 50 for number, task in enumerate(MT50)}
 RESULT = make_result({"push": 1, "reach": 4, "sweep": 0})
 
 
@@ -159,11 +159,12 @@ def test_each_curve_can_be_sorted_for_itself(tmp_path):
 
 
 def test_published_curves_are_dashed_and_say_what_they_are(tmp_path):
-    ours = {task: [rate, 1.0] for task, rate in published("few-shot").items()}
-    figure = plot_sorted_tasks({"PCBC": ours}, tmp_path / "figure.png", published=published_curves("few-shot"))
-    labels = ["PCBC published, best of the last 10 evaluations: mean 0.63", "PCBC published, last: mean 0.39"]
+    ours = {task: [rate, 1.0] for task, rate in RATES.items()}
+    curves = {"best": dict.fromkeys(RATES, 0.63), "last": RATES}
+    figure = plot_sorted_tasks({"PCBC": ours}, tmp_path / "figure.png", published=curves)
+    labels = ["best: mean 0.63", "last: mean 0.49"]
     tasks = [label.get_text() for label in figure.axes[0].get_xticklabels()]
-    assert lines(figure)[labels[1]] == [published("few-shot")[task] for task in tasks]
+    assert lines(figure)[labels[1]] == [RATES[task] for task in tasks]
     for line in figure.axes[0].lines:
         assert line.is_dashed() == (line.get_label() in labels) or line.get_label()[0] == "_"
     shown = [text.get_text() for text in figure.legends[0].get_texts()]
@@ -173,11 +174,11 @@ def test_published_curves_are_dashed_and_say_what_they_are(tmp_path):
 
 @pytest.mark.parametrize("tasks", [50, 34, 10, 2])
 def test_neither_labels_nor_legend_are_cut_or_overlap(tmp_path, tasks):
-    ours = {task: [rate, 1.0] for task, rate in [*published("few-shot").items()][:tasks]}
+    ours = {task: [rate, 1.0] for task, rate in [*RATES.items()][:tasks]}
     figure = plot_sorted_tasks(
         {name: ours for name in ("PCBC", "DC", "one-hot")},
         tmp_path / "figure.png",
-        published=published_curves("few-shot", ["PCBC", "DC"]),
+        published={f"{name} published, {which}": RATES for name in ("PCBC", "DC") for which in ("best", "last")},
     )
     figure.draw_without_rendering()  # saving used another resolution
     width, height = figure.bbox.size

@@ -12,8 +12,8 @@ import pytest
 from commands import fails
 
 import lw_torchrl as lw
+from benchmarks.plan_comparison import compare_plans
 from lw_torchrl.planners import model_server
-from lw_torchrl.planners.comparing import compare_plans
 from lw_torchrl.planners.model_server import serve_model
 
 TASKS = [*lw.MT10]

@@ -6,11 +6,11 @@ import pytest
 from fake_server import PLANS, FakeServer, asked_for, completion, serving
 
 import lw_torchrl as lw
+from benchmarks.plan_comparison import compare_plans
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.structured import write_structured
 from lw_torchrl.language.tasks import TASKS
 from lw_torchrl.planners.checking import check_plan
-from lw_torchrl.planners.comparing import compare_plans
 from lw_torchrl.planners.repairing import plan_facts, repair_plans
 
 

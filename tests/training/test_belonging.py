@@ -8,7 +8,7 @@ from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, 
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules import PlanConditionedActor
-from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer, StackedBehavioralCloning
+from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.transforms import QAFTransform
 
 SMALL = dict(latent_size=4, width=16, depth=1, encoder_width=8)
@@ -36,8 +36,6 @@ def test_other_plans_of_the_same_length_are_refused(demos):
     actor = PlanConditionedActor(PLANS, **SMALL)
     with pytest.raises(ValueError, match=message):
         BehavioralCloningTrainer(actor, replay, CONFIG)
-    with pytest.raises(ValueError, match=message):
-        StackedBehavioralCloning([actor], [replay], CONFIG)
 
 
 def test_an_actor_that_writes_no_action_is_named(demos):
@@ -59,7 +57,5 @@ def test_a_buffer_for_minibatches_of_another_size_is_refused(demos):
     message = "batch_size of the replay buffer must be None or .* 8, got 16"
     with pytest.raises(ValueError, match=message):
         BehavioralCloningTrainer(actor, replay, CONFIG)
-    with pytest.raises(ValueError, match=message):
-        StackedBehavioralCloning([actor], [replay], CONFIG)
     same = LanguageWorldExperienceReplay(demos, batch_size=8, transform=QAFTransform(PLANS))
     BehavioralCloningTrainer(actor, same, CONFIG, progress=False).train()

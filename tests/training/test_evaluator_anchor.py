@@ -9,7 +9,7 @@ import torch
 from small_training import CONFIG, PLANS, SMALL, Stopping, assert_same, collect_demos, everything, make_actor
 
 import lw_torchrl as lw
-from lw_torchrl.evaluation import condition_drift, drift_table
+from benchmarks.evaluator_report import condition_drift
 
 
 @pytest.fixture(scope="module")
@@ -58,31 +58,7 @@ def test_training_moves_the_evaluator_and_goes_on_to_the_bit(root, tmp_path):
     assert torch.equal(loaded(rows.clone())["action"], whole.actor.eval()(rows.clone())["action"])
 
 
-def test_a_drift_says_what_a_condition_came_to_mean(root):
-    class Never(lw.QueryEvaluator):
-        def logits(self, observation, task_id):
-            return torch.full((*task_id.shape, self.plans.num_steps), -1.0)
-
-    rows = lw.LanguageWorldExperienceReplay(root)[:]
-    found = condition_drift(lw.ScriptedSkillActor(PLANS, evaluator=Never(PLANS)), rows)
-    assert {one.task for one in found} == {"push", "reach"}
-    assert len(found) == len(PLANS["push"].steps) + len(PLANS["reach"].steps)
-    assert [one.agreement for one in found] == sorted(one.agreement for one in found)
-    truth = lw.QAFTransform(PLANS)(rows.clone())["qaf"]
-    for one in found:
-        own = truth[rows["task_id"] == lw.task_id(one.task)][:, one.step]
-        assert (one.states, one.believed) == (len(own), 0.0)
-        assert one.exact == pytest.approx(own.float().mean().item())
-        assert one.agreement == pytest.approx(1.0 - one.exact)
-        assert one.condition == str(PLANS[one.task].steps[one.step].condition)
-    assert found[0].condition in drift_table(found, most=1)
-
-
 def test_what_has_no_evaluator_is_refused(root):
     replay = lw.LanguageWorldExperienceReplay(root, transform=lw.QAFTransform(PLANS))
     with pytest.raises(ValueError, match="qaf_anchor is for a policy with an evaluator, this PlanConditionedActor"):
         lw.BehavioralCloningTrainer(make_actor(), replay, replace(CONFIG, qaf_anchor=1.0))
-    with pytest.raises(ValueError, match="qaf_anchor is for BehavioralCloningTrainer"):
-        lw.training.StackedBehavioralCloning([make_actor()], [replay], replace(CONFIG, qaf_anchor=1.0))
-    with pytest.raises(ValueError, match="policy must have an evaluator"):
-        condition_drift(make_actor(), replay[:])

@@ -10,7 +10,7 @@ from small_training import flat
 
 import lw_torchrl as lw
 from lw_torchrl._tensor_archive import TensorArchive, write_archive
-from lw_torchrl.evaluation import plot_reliability, score_evaluator
+from lw_torchrl.evaluation import score_evaluator
 
 PLANS = lw.load_plans("MT10")
 SMALL = lw.training.QueryEvaluatorConfig(steps=12, batch_size=64, checkpoint_every=5)
@@ -131,14 +131,10 @@ def test_a_report_counts_every_answer_once(replay, tmp_path):
     asked = data.parts["states"]
     states = report.parts["states"]
     assert states.answers == sum(one.truth.numel() for one in asked)
-    assert states.answers == int(states.reliability[:, 0].sum())
     assert sum(true for _, true in states.asked.values()) == int(sum(one.truth.sum() for one in asked))
     assert states.balanced_accuracy(states.worst[0]) == min(map(states.balanced_accuracy, states.asked))
-    assert 0 < states.calibration_error < 1
     report.save(tmp_path / "report.json")
     assert json.loads((tmp_path / "report.json").read_text())["parts"]["states"]["accuracy"] == states.accuracy()
-    plot_reliability(report, tmp_path / "reliability.png")
-    assert (tmp_path / "reliability.png").read_bytes().startswith(b"\x89PNG")
     assert "held-out queries" in report.table()
 
 

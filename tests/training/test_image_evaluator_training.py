@@ -10,7 +10,6 @@ from pictures import why_no_pictures
 from small_training import flat
 
 import lw_torchrl as lw
-from lw_torchrl.evaluation import plot_wrong_answers, wrong_answers
 
 PLANS = lw.Plans({task: lw.load_plans("MT10")[task] for task in ("drawer-open", "reach")})
 PICTURES = {"cameras": ("corner", "corner3"), "height": 24, "width": 24}
@@ -123,20 +122,6 @@ def test_only_states_with_a_picture_of_their_own_are_asked(replay):
     held.add_column("pixels", pictures[torch.arange(len(held)) // 20 * 20])
     with pytest.raises(ValueError, match=r"every must be as many steps as the pictures are apart"):
         lw.training.LabelledQueries(held, CONFIG)
-
-
-def test_wrong_answers_are_wrong_and_drawn(replay, tmp_path):
-    data, evaluator = lw.training.LabelledQueries(replay, CONFIG), make()
-    found = wrong_answers(evaluator, data, most=5)
-    assert 0 < len(found) <= 5
-    for one in found:
-        assert (one.believed > 0.5) != one.holds
-        assert {*one.off} == {one.clause.subject, *([one.clause.object] if one.clause.object else [])}
-        assert all(0 < far < 3 for far in one.off.values())
-    sureness = [abs(one.believed - one.holds) for one in found]
-    assert sureness == sorted(sureness, reverse=True)
-    plot_wrong_answers(evaluator, data, tmp_path / "wrong.png", most=5)
-    assert (tmp_path / "wrong.png").stat().st_size > 5000
 
 
 def test_what_does_not_fit_is_named(replay, tmp_path):

@@ -9,7 +9,7 @@ import zipfile
 import pytest
 import small_online
 import torch
-from small_training import CONFIG, PLANS, SMALL, collect_demos, make_actor, make_replay, make_trainer
+from small_training import PLANS, SMALL, collect_demos, make_actor, make_replay, make_trainer
 
 import lw_torchrl as lw
 from lw_torchrl._tensor_archive import TensorArchive
@@ -29,11 +29,6 @@ def offline(demos, path):
     return lw.OfflineTrainer(bc_loss(make_actor(), "l2"), make_replay(demos), OFFLINE, checkpoint=path, progress=False)
 
 
-def stacked(demos, path):
-    actors, replays = [make_actor(0), make_actor(1)], [make_replay(demos), make_replay(demos)]
-    return lw.training.StackedBehavioralCloning(actors, replays, CONFIG, checkpoint=path, progress=False)
-
-
 def evaluator(demos, path):
     data = lw.training.LabelledQueries(lw.LanguageWorldExperienceReplay(demos, label="executed"), EVALUATOR)
     torch.manual_seed(0)
@@ -45,7 +40,7 @@ def online(demos, path):
     return small_online.make_online(demos, "td3", path, config=small_online.configure(frames=60))
 
 
-TRAINERS = {"cloning": make_trainer, "stacked": stacked, "offline": offline, "evaluator": evaluator, "online": online}
+TRAINERS = {"cloning": make_trainer, "offline": offline, "evaluator": evaluator, "online": online}
 of_all = pytest.mark.parametrize("make", TRAINERS.values(), ids=TRAINERS)
 
 

@@ -1,0 +1,135 @@
+"""Compare methods over seeds: tables beside the published results, and figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.paper.runs import Run
+from lw_torchrl._files import write_json, write_text
+from lw_torchrl.evaluation import EvaluationResult, Summary, statistics, summarize
+from lw_torchrl.evaluation.figures import new_figure, saved, trim
+from lw_torchrl.evaluation.statistics import Estimate
+from lw_torchrl.evaluation.summary import markdown_table
+from lw_torchrl.language.tasks import MT10
+
+
+@dataclass(frozen=True)
+class Pair:
+    """The difference of two methods' mean success, and the probability that a seed of the first beats one of the second
+    on a task, where a tie counts half."""
+
+    methods: tuple[str, str]
+    difference: Estimate
+    improvement: Estimate
+
+
+class MethodComparison:
+    """Summaries of several methods on the same tasks. The first method is compared with each of the others.
+
+    Args:
+        summaries: method to summary.
+        published: label to (task to success rate).
+    """
+
+    def __init__(
+        self, summaries: Mapping[str, Summary], published: Mapping[str, Mapping[str, float]] | None = None
+    ) -> None:
+        self.summaries, self.published = dict(summaries), dict(published or {})
+        first, *others = self.summaries
+        self.tasks, self.threshold = self.summaries[first].tasks, self.summaries[first].threshold
+        self.pairs: list[Pair] = []
+        for other in others:
+            order = [self.summaries[other].tasks.index(task) for task in self.tasks]
+            rates = self.summaries[first].array, self.summaries[other].array[:, order]
+            difference, improvement = statistics.mean_difference(*rates), statistics.probability_of_improvement(*rates)
+            self.pairs.append(Pair((first, other), difference, improvement))
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "methods": {method: summary.to_json() for method, summary in self.summaries.items()},
+            "pairs": [{**asdict(pair), "methods": list(pair.methods)} for pair in self.pairs],
+            "published_means": {label: _mean(rates, self.tasks) for label, rates in self.published.items()},
+        }
+
+    def headline(self) -> str:
+        """Return a Markdown table with a row per method, then a line per pair."""
+        outside = [task for task in self.tasks if task not in MT10]
+        outside = [] if len(outside) == len(self.tasks) else outside
+        head = ["method", "mean", "IQM", f"tasks >= {self.threshold:g}, of {len(self.tasks)}", "seeds"]
+        head += [f"mean of the {len(outside)} outside MT10"] if outside else []
+        rows = []
+        for method, summary in self.summaries.items():
+            by_seed = ", ".join(f"{mean:.3f}" for mean in summary.by_seed.values())
+            means = {task: spread.mean for task, spread in summary.per_task.items()}
+            last = [f"{_mean(means, outside):.3f}"] if outside else []
+            rows.append([method, str(summary.mean), str(summary.iqm), str(summary.solved), by_seed, *last])
+        for label, rates in self.published.items():
+            solved = sum(rates[task] >= self.threshold - 1e-9 for task in self.tasks)
+            last = [f"{_mean(rates, outside):.3f}"] if outside else []
+            rows.append([label, f"{_mean(rates, self.tasks):.3f}", "", str(solved), "", *last])
+        more = "probability of improvement"
+        lines = [f"{' - '.join(pair.methods)}: {pair.difference}; {more} {pair.improvement}" for pair in self.pairs]
+        return "\n\n".join(filter(None, [markdown_table(head, rows), "  \n".join(lines)]))
+
+    def per_task(self) -> str:
+        """Return a Markdown table with a row per task: mean, minimum and maximum over seeds, and published rates."""
+        spreads = [summary.per_task for summary in self.summaries.values()]
+        rows = []
+        for task in self.tasks:
+            cells = []
+            for method in spreads:
+                spread = method[task]
+                span = f" ({spread.min:.2f}-{spread.max:.2f})" if spread.min < spread.max else ""
+                cells.append(f"{spread.mean:.2f}{span}")
+            rows.append([task, *cells, *(f"{rates[task]:.2f}" for rates in self.published.values())])
+        return markdown_table(["task", *self.summaries, *self.published], rows)
+
+
+def _mean(rates: Mapping[str, float], tasks: Sequence[str]) -> float:
+    return sum(rates[task] for task in tasks) / len(tasks)
+
+
+def compare(
+    results: Iterable[tuple[Run, EvaluationResult]], published: Mapping[str, Mapping[str, float]] | None = None
+) -> MethodComparison:
+    """Compare runs by their labels, over seeds, beside published rates."""
+    by_label: dict[str, dict[int, EvaluationResult]] = {}
+    for run, result in results:
+        by_label.setdefault(run.label, {})[run.seed] = result
+    return MethodComparison({label: summarize(seeds) for label, seeds in by_label.items()}, published)
+
+
+def write_summary(path: Path, text: str, numbers: Mapping[str, Any]) -> None:
+    """Write a table to ``path``.md and its numbers to ``path``.json."""
+    write_json(path.with_name(f"{path.name}.json"), numbers)
+    write_text(path.with_name(f"{path.name}.md"), text)
+
+
+def plot_methods(groups: Mapping[str, Mapping[str, Summary]], path: Path) -> None:
+    """Draw the mean success of each method, with its 95 % interval and a dot for each seed; a column for each group."""
+    labels = list(dict.fromkeys(label for methods in groups.values() for label in methods))
+    figure = new_figure(2.6 + 3.0 * len(groups), 1.3 + 0.3 * len(labels))
+    columns = np.atleast_1d(figure.subplots(1, len(groups), sharey=True))
+    for axes, (group, methods) in zip(columns, groups.items(), strict=True):
+        for place, label in enumerate(labels):
+            if label not in methods:
+                continue
+            mean, seeds = methods[label].mean, methods[label].array.mean(1)
+            axes.barh(place, mean.value, color="#4c78a8" if place == 0 else "#b8c9de", height=0.7)
+            if mean.low is not None:
+                axes.plot([mean.low, mean.high], [place, place], color="#333333", linewidth=1.2)
+            axes.plot(seeds, np.full(len(seeds), place), ".", color="#f58518", markersize=5, zorder=3)
+            axes.text(1.04, place, f"{mean.value:.2f}", va="center", fontsize=8, color="#222222")
+        axes.set_title(group)
+        axes.set_xlim(0, 1.18)
+        axes.set_xticks(np.linspace(0, 1, 6))
+        axes.set_yticks(range(len(labels)), labels, fontsize=9)
+        trim(axes, "x")
+    figure.axes[0].invert_yaxis()
+    figure.supxlabel("episodes with success at any step; dots: seeds; lines: 95 %", fontsize=9)
+    saved(figure, path)

@@ -1,0 +1,272 @@
+"""The paper's runs: policies that clone demonstrations, one for all tasks or one for each target; plans by scripts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torchrl.envs import Compose
+
+from benchmarks.paper.recipes import DataSetting, Execution, Member, Preset
+from benchmarks.paper.runs import Dataset, Run, Work, load_result, own_tasks, plain
+from benchmarks.paper.stacked import StackedBehavioralCloning
+from lw_torchrl._progress import Progress
+from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, TaskBalancedSampler
+from lw_torchrl.evaluation import EvaluationResult
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import resolve_tasks
+from lw_torchrl.modules import ActorEnsemble, DemonstratedActor, ScriptedSkillActor
+from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.registry import find_method, make_policy
+from lw_torchrl.training import BehavioralCloningTrainer
+from lw_torchrl.training.envelope import check_description
+from lw_torchrl.training.files import describe_data, load_actor, save_actor
+from lw_torchrl.transforms import RandomYaw
+
+SCRIPTED = "scripted"
+"""Plans with scripted skills: a method beside those of :data:`lw_torchrl.modules.METHODS`, without training."""
+
+
+@dataclass(frozen=True)
+class ExpertDataset(Dataset):
+    """Demonstrations of the scripted experts."""
+
+    tasks: str  # "MT10" or another argument of :func:`resolve_tasks`
+    episodes: int  # demonstrations of each
+    execution: Execution  # how the experts are executed
+    seed: int  # of the initial states and the noise
+
+    @property
+    def folder(self) -> Path:
+        return Path("demonstrations") / f"{self.tasks}x{self.episodes}-{self.execution.name}-seed{self.seed}"
+
+    @property
+    def options(self) -> dict[str, Any]:
+        noise = {name: value for name, value in asdict(self.execution).items() if name != "name"}
+        return {"tasks": self.tasks, "episodes_per_task": self.episodes, "seed": self.seed, **noise}
+
+
+@dataclass(frozen=True)
+class _Trained:
+    """A member of a policy, of a method."""
+
+    member: Member
+    method: str
+
+    @property
+    def reads_plans(self) -> bool:
+        return find_method(self.method).reads_plans
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Of its actor; a method of the user's may not have all."""
+        given = {**self.member.actor, **(self.member.plan_actor if self.reads_plans else {})}
+        return {name: value for name, value in given.items() if find_method(self.method).takes(name)}
+
+    @property
+    def yaw(self) -> float:
+        plan_yaw = self.member.plan_yaw
+        return plan_yaw if self.reads_plans and plan_yaw is not None else self.member.yaw
+
+    def turned(self, actor: Policy) -> list[RandomYaw]:
+        """How its rows are turned."""
+        if not self.yaw:
+            return []
+        if not self.reads_plans:
+            return [RandomYaw(self.yaw)]
+        free, tilt = self.member.any_yaw, self.member.tilt
+        return [RandomYaw(self.yaw, plans=actor.plans if free or tilt else None, tilt=tilt)]
+
+    def describe(self) -> dict[str, Any]:
+        more = {"any_yaw": self.member.any_yaw, "tilt": self.member.tilt} if self.reads_plans else {}
+        return {"actor": self.options, "yaw": self.yaw} | {name: value for name, value in more.items() if value}
+
+
+@dataclass(frozen=True)
+class ImitationRun(Run):
+    """One policy, or one for each target, or plans with scripts."""
+
+    setting: DataSetting  # what data it sees; scripts see none, and are the same in every setting
+    method: str  # one of :data:`~lw_torchrl.modules.METHODS`, or "scripted"
+    seed: int  # of demonstrations, initial weights and minibatches
+    preset: Preset  # how to train
+    episodes: int = 20  # evaluated for each task
+    plans_name: str = ""  # part of the folder's name, for other plans than ours
+    any_device = True
+
+    def __post_init__(self) -> None:
+        if self.method != SCRIPTED:
+            find_method(self.method)
+
+    @property
+    def group(self) -> Path:
+        """The folder of the setting, the preset and the plans, within which methods are compared."""
+        return Path(self.setting.name) / "-".join(filter(None, (self.preset.name, self.plans_name)))
+
+    @property
+    def folder(self) -> Path:
+        if self.method == SCRIPTED:
+            return Path("-".join(filter(None, ("scripted", self.plans_name)))) / f"seed{self.seed}"
+        return self.group / self.method / f"seed{self.seed}"
+
+    @property
+    def datasets(self) -> tuple[ExpertDataset, ...]:
+        if self.method == SCRIPTED:
+            return ()
+        base = ExpertDataset(self.setting.base, self.setting.episodes, self.preset.base, self.seed)
+        if self.setting.targets is None:
+            return (base,)
+        assert self.preset.target is not None
+        return base, ExpertDataset(self.setting.targets, 1, self.preset.target, self.seed)
+
+    @property
+    def scope(self) -> str:
+        return "MT50" if self.method == SCRIPTED else self.setting.targets or "MT50"
+
+    @property
+    def reads_plans(self) -> bool:
+        return self.method == SCRIPTED or _Trained(Member({}), self.method).reads_plans
+
+    @property
+    def skills(self) -> Literal["own", "MT10"]:
+        """Whose skills its plans speak of: what is trained on MT10 and never saw another task knows MT10's alone."""
+        return "MT10" if self.setting.name == "zero-shot" and self.method != SCRIPTED else "own"
+
+    @property
+    def demonstrated(self) -> tuple[Member, ...]:
+        """The actors of descriptions beside those with plans, for the tasks that were demonstrated."""
+        return self.preset.demonstrated if self.reads_plans else ()
+
+    def describe(self, plans: Plans) -> dict[str, Any]:
+        described: dict[str, Any] = {"method": self.method, "seed": self.seed}
+        described["plans"] = plans.fingerprint if self.reads_plans else None
+        if self.method != SCRIPTED:
+            described |= {"setting": self.setting.name, "preset": self.preset.name}
+            described["datasets"] = [asdict(dataset) for dataset in self.datasets]
+            described["members"] = [_Trained(one, self.method).describe() for one in self.preset.members]
+            if self.demonstrated:
+                described["demonstrated"] = [_Trained(one, "dc").describe() for one in self.demonstrated]
+            described["training"] = self.preset.training.describe()
+            described |= {name: getattr(self.preset, name) for name in ("label", "after_success", "passes")}
+            if self.preset.evaluations > 1:
+                described["evaluations"] = self.preset.evaluations
+        if not self.reads_plans:
+            described |= own_tasks(plans)
+        return plain(described)
+
+    def learn(self, work: Work) -> tuple[Any, dict[str, Any]]:
+        if self.method == SCRIPTED:
+            return ScriptedSkillActor(work.plans), {}
+        targets = None if self.setting.targets is None else resolve_tasks(self.setting.targets)
+        folder, described = work.out / self.folder, {"run": self.describe(work.plans)}
+        files = [folder / "models" / f"{target}.zip" for target in targets or ()] or [folder / "policy.zip"]
+        policies = []
+        if all(file.is_file() for file in files):
+            for file in files:
+                check_description(file, described)
+                policies.append(load_actor(file))
+        else:
+            members, replays = self._train(work, targets or ())
+            for file, replay, *actors in zip(files, replays, *members, strict=True):
+                others, seen = (
+                    _mean(part) for part in (actors[: len(self.preset.members)], actors[len(self.preset.members) :])
+                )
+                policies.append(others if seen is None else DemonstratedActor(seen, others))
+                save_actor(policies[-1], file, data=describe_data(replay), **described)
+        for checkpoint in folder.glob("checkpoint-*.zip"):
+            checkpoint.unlink()
+        return policies[0] if targets is None else dict(zip(targets, policies, strict=True)), {}
+
+    def evaluate(self, policy: Any, work: Work) -> tuple[EvaluationResult, dict[str, Any]]:
+        result = self._rollouts(policy, work)
+        if self.preset.evaluations == 1 or self.method == SCRIPTED:
+            return result, {}
+        files = sorted(file.name for file in (work.out / self.folder / "evaluations").glob("*.json"))
+        earlier = [load_result(self, work.plans, work.out, work.tasks, f"evaluations/{file}") for file in files]
+        every = [result, *filter(None, earlier)]
+        rates = {task: max(one.success_once[task] or 0.0 for one in every) for task in result.success_once}
+        return result, {"best": {"of": len(every), "rates": rates}}
+
+    def _rollouts(self, policy: Any, work: Work) -> EvaluationResult:
+        options = {} if self.method == SCRIPTED else {"device": work.device}
+        if not isinstance(policy, Mapping):
+            return self.rollouts(policy, work, **options)
+        each = []
+        with Progress("evaluating", len(work.tasks), "model", show=work.progress) as bar:
+            for task in work.tasks:
+                each.append(self.rollouts(policy[task], work, tasks=task, progress=False, **options))
+                bar.update()
+        return joined(each)
+
+    def _train(
+        self, work: Work, targets: Sequence[str]
+    ) -> tuple[list[list[Policy]], list[LanguageWorldExperienceReplay]]:
+        """The policies, one of all tasks or one of each target, member by member. Seeds count from the run's by
+        thousands; with targets, from 1000 times the run's, target by target."""
+        preset, roots = self.preset, [work.out / dataset.folder for dataset in self.datasets]
+        steps = preset.training.steps
+        if preset.passes is not None:  # over the base tasks, which have half of each minibatch of a target
+            rows = len(LanguageWorldExperienceReplay(roots[0], after_success=preset.after_success))
+            steps = max(1, preset.passes * (2 if targets else 1) * rows // preset.training.batch_size)
+        members: list[list[Policy]] = []
+        trained = [_Trained(one, self.method) for one in preset.members] + [
+            _Trained(one, "dc") for one in self.demonstrated
+        ]
+        for number, member in enumerate(trained):
+            first = 1_000 * self.seed + len(targets) * number if targets else self.seed + 1_000 * number
+            config = replace(preset.training, steps=steps, seed=first)
+            actors = []
+            for i in range(len(targets) or 1):
+                torch.manual_seed(first + i)
+                known = (
+                    work.plans
+                    if number < len(preset.members)
+                    else Plans({t: work.plans[t] for t in resolve_tasks(self.setting.base)})
+                )
+                actors.append(make_policy(member.method, known, **member.options))
+            checkpoint = work.out / self.folder / f"checkpoint-{number}.zip"
+            options: dict[str, Any] = {"checkpoint": checkpoint, "progress": work.progress, "device": work.device}
+            trainer: BehavioralCloningTrainer | StackedBehavioralCloning
+            if targets:
+                replays = [
+                    self._replay(member, work, actor, roots, CoLearningSampler(target), episodes=[None, {target: 1}])
+                    for target, actor in zip(targets, actors, strict=True)
+                ]
+                trainer = StackedBehavioralCloning(actors, replays, config, **options)
+            else:
+                replays = [self._replay(member, work, actors[0], roots[0], TaskBalancedSampler())]
+                trainer = BehavioralCloningTrainer(actors[0], replays[0], config, **options)
+            policy = dict(zip(targets, actors, strict=True)) if targets else actors[0]
+            for step in preset.evaluated_before(steps):
+                if trainer.steps > step:
+                    continue
+                trainer.train(until=step)
+                if load_result(self, work.plans, work.out, work.tasks, f"evaluations/{step}.json") is None:
+                    result = self._rollouts(policy, work)
+                    result = replace(result, config=result.config | {"run": self.describe(work.plans)})
+                    result.save(work.out / self.folder / "evaluations" / f"{step}.json")
+            trainer.train()
+            members.append(actors)
+        return members, replays
+
+    def _replay(
+        self, member: _Trained, work: Work, actor: Policy, roots: Any, sampler: Any, **options: Any
+    ) -> LanguageWorldExperienceReplay:
+        queries = actor.transform()
+        transform = Compose(*([] if queries is None else [queries]), *member.turned(actor))
+        options |= {"label": self.preset.label, "after_success": self.preset.after_success, "device": work.device}
+        return LanguageWorldExperienceReplay(roots, sampler=sampler, transform=transform, **options)
+
+
+def joined(results: Sequence[EvaluationResult]) -> EvaluationResult:
+    """One result of those of several tasks, evaluated alike."""
+    tasks = [task for one in results for task in one.config["tasks"]]
+    return EvaluationResult(results[0].config | {"tasks": tasks}, tuple(e for one in results for e in one.episodes))
+
+
+def _mean(actors: Sequence[Policy]) -> Any:
+    """The policy of some actors; None of none."""
+    return (actors[0] if len(actors) == 1 else ActorEnsemble(actors)) if actors else None

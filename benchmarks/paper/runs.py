@@ -1,0 +1,206 @@
+"""Runs: what every run of an experiment is, how it is executed, and how results are compared."""
+
+import json
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lw_torchrl._checks import differences
+from lw_torchrl._devices import CPU, check_device
+from lw_torchrl._files import held
+from lw_torchrl.data import collect_demonstrations
+from lw_torchrl.evaluation import EvaluationResult, evaluate
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import TASKS
+from lw_torchrl.modules.policy import Policy
+from lw_torchrl.suites.suite import find_suite
+from lw_torchrl.training import load_actor, save_actor
+from lw_torchrl.training.envelope import check_description
+from lw_torchrl.training.files import describe_data
+
+EVALUATION_SEED = 10_000  # training seeds count from 0; the evaluation of training seed k has seed 10000 + k
+RESULTS = "results.json"
+
+
+@dataclass(frozen=True)
+class Work:
+    """With what a run is executed: the arguments of :func:`execute_run`, checked."""
+
+    plans: Plans
+    out: Path
+    tasks: tuple[str, ...] = ()
+    progress: bool = True
+    device: torch.device = CPU
+
+
+class Dataset(ABC):
+    """Episodes that runs share."""
+
+    @property
+    @abstractmethod
+    def folder(self) -> Path:
+        """Where it goes, below the experiments' folder."""
+
+    @property
+    @abstractmethod
+    def options(self) -> dict[str, Any]:
+        """Of :func:`~lw_torchrl.collect_demonstrations`."""
+
+    def collect(self, out: Path, progress: bool) -> None:
+        """Collect it, or what is left; of several processes one does, and the others wait."""
+        root = out / self.folder
+        with held(root, "out", wait=True):
+            collect_demonstrations(**self.options, root=root, progress=progress)
+
+
+class Run(ABC):
+    """Policies of one training seed, and their evaluation: what a scheduler runs."""
+
+    method: str
+    seed: int  # of data, initial weights and minibatches
+    episodes: int  # evaluated for each task
+    any_device = False  # whether its networks can be trained and evaluated on a GPU
+
+    @property
+    @abstractmethod
+    def folder(self) -> Path:
+        """Where its files go, below the experiments' folder."""
+
+    @property
+    def label(self) -> str:
+        """Its name in tables."""
+        return self.method
+
+    @property
+    @abstractmethod
+    def datasets(self) -> tuple[Dataset, ...]:
+        """What it learns from."""
+
+    @property
+    @abstractmethod
+    def scope(self) -> str | tuple[str, ...]:
+        """The tasks that it can be evaluated in, as for :func:`resolve_tasks`."""
+
+    @abstractmethod
+    def describe(self, plans: Plans) -> dict[str, Any]:
+        """Everything that its result depends on, as JSON."""
+
+    @abstractmethod
+    def learn(self, work: Work) -> tuple[Any, dict[str, Any]]:
+        """The trained policy, or what the files there hold of it, and what the result says of the training."""
+
+    def evaluate(self, policy: Any, work: Work) -> tuple[EvaluationResult, dict[str, Any]]:
+        """The evaluation of what was learned, and what the result says of it."""
+        return self.rollouts(policy, work), {}
+
+    def evaluated(self, tasks: str | Sequence[str] | None) -> tuple[str, ...]:
+        """Those of its tasks that are among the ones named; None for all."""
+        own = tuple(find_suite(self.scope).named_tasks(self.scope))
+        names = own if tasks is None else tuple(find_suite(tasks).named_tasks(tasks))
+        if not (shown := tuple(name for name in names if name in own)):
+            raise ValueError(f"tasks must name some of the run's, {', '.join(own)}, got {', '.join(names)}")
+        return shown
+
+    def rollouts(self, policy: Any, work: Work, **options: Any) -> EvaluationResult:
+        """Evaluate one policy, as all runs do: fresh seeds, action noise 0.1."""
+        given: dict[str, Any] = {"tasks": work.tasks, "episodes_per_task": self.episodes, "progress": work.progress}
+        given |= {"seed": EVALUATION_SEED + self.seed, "noise_scale": 0.1, "stop_at_success": True}
+        return evaluate(policy, **given | options)
+
+
+def load_result(
+    run: Run, plans: Plans, out: Path, tasks: Sequence[str] | None = None, file: str = RESULTS
+) -> EvaluationResult | None:
+    """The result of a run, if it is there; one of another configuration, or of other tasks, is refused."""
+    path = out / run.folder / file
+    if not path.is_file():
+        return None
+    result = EvaluationResult.load(path)
+    found = (result.config.get("run") or {}) | {"episodes": result.config["episodes_per_task"]}
+    ours = run.describe(plans) | {"episodes": run.episodes}
+    if tasks is not None:
+        found, ours = found | {"tasks": result.config["tasks"]}, ours | {"tasks": [*tasks]}
+    if different := differences(found, ours):
+        mend = f"choose another folder, or delete {run.folder} there to do the run again"
+        how = f"it differs in {', '.join(different)}"
+        raise ValueError(f"out: {str(path)!r} is of another configuration, {how}; {mend}")
+    return result
+
+
+def execute_run(
+    run: Run,
+    plans: Plans,
+    out: Path,
+    *,
+    tasks: str | Sequence[str] | None = None,
+    progress: bool = True,
+    device: str | torch.device = "cpu",
+) -> EvaluationResult:
+    """Execute a run, or the rest of it, and return its evaluation. Its result is written last, to results.json.
+
+    Args:
+        run: the run.
+        plans: a plan for each of its tasks.
+        out: the experiments' folder.
+        tasks: the tasks to evaluate; None for all of the run.
+        progress: show progress bars.
+        device: device of the networks, for runs that support others than the CPU.
+
+    Returns:
+        The evaluation of the last step's policy on seeds that no training used, with action noise 0.1.
+        ``config["run"]`` describes the run, ``config["seconds"]`` is the duration of this call, and with several
+        evaluations ``config["best"]`` holds their number and each task's best success rate among them.
+
+    Raises:
+        ValueError: ``out`` holds the same run with another configuration, or evaluated on other tasks.
+
+    Source: paper section 'Conditional Plan Experiments'.
+    """
+    work = Work(plans, out, run.evaluated(tasks), progress, check_device("device", device))
+    if work.device.type != "cpu" and not run.any_device:
+        raise ValueError(f"device must be the CPU for {type(run).__name__}, got {device}")
+    if (done := load_result(run, plans, out, work.tasks)) is not None:
+        return done
+    with held(out / run.folder, "out", folder=True, wait=True):
+        if (done := load_result(run, plans, out, work.tasks)) is not None:
+            return done
+        started = time.perf_counter()
+        for dataset in run.datasets:
+            dataset.collect(out, progress)
+        policy, trained = run.learn(work)
+        result, evaluated = run.evaluate(policy, work)
+        seconds = round(time.perf_counter() - started, 1)
+        described = {"run": run.describe(plans), **trained, **evaluated, "seconds": seconds}
+        result = replace(result, config=result.config | described)
+        result.save(out / run.folder / RESULTS)
+        return result
+
+
+def kept_policy(file: Path, described: dict[str, Any], train: Callable[[Path], Mapping[str, Any]]) -> Policy:
+    """The policy of a file, which must say what is ``described``; if there is none, it is trained and saved first.
+
+    ``train`` is given the checkpoint to use meanwhile; it returns arguments of :func:`~lw_torchrl.save_actor`.
+    """
+    checkpoint = file.with_name("checkpoint.zip")
+    if not file.is_file():
+        trained = dict(train(checkpoint))
+        save_actor(trained.pop("actor"), file, data=describe_data(trained.pop("replay")), **trained, **described)
+    checkpoint.unlink(missing_ok=True)  # another process may have done so, where files cannot be locked
+    check_description(file, described)
+    return load_actor(file)
+
+
+def own_tasks(plans: Plans) -> dict[str, Any]:
+    """The tasks of plans that are not ours of that name: no plan's fingerprint says what a description says."""
+    own = {task: plan.definition.to_json() for task, plan in plans.items() if plan.definition != TASKS.get(task)}
+    return {"own_tasks": own} if own else {}
+
+
+def plain(value: Any) -> Any:
+    """As JSON gives it back: lists for tuples."""
+    return json.loads(json.dumps(value))

@@ -1,0 +1,118 @@
+"""``lw-torchrl demo``: collect demonstrations, train a plan-conditioned policy, evaluate it, and record a rollout."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import lw_torchrl as lw
+from lw_torchrl.cli import options
+from lw_torchrl.cli.output import Output
+from lw_torchrl.language.tasks import MT10
+
+RECORDED = ("drawer-open", "window-open")
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """Settings of the demo, written to config.json in its folder."""
+
+    tasks: tuple[str, ...] = MT10
+    demonstrations_per_task: int = 10
+    demonstration_seed: int = 0
+    demonstration_noise: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4)
+    noise_hold: int = 10
+    after_success: int = 20
+    training_steps: int = 8000
+    batch_size: int = 500
+    training_seed: int = 0
+    episodes_per_task: int = 20
+    evaluation_seed: int = 1000
+    evaluation_noise: float = 0.1
+
+
+QUICK = DemoConfig(tasks=RECORDED, demonstrations_per_task=4, training_steps=800, batch_size=100, episodes_per_task=5)
+
+
+def demo(out: Path | None = None, quick: bool = False, json: options.Json = False) -> Output:
+    """Train a plan-conditioned policy on MT10 and show it: demonstrations, training, evaluation, a recording.
+
+    Takes some minutes on two cores. If it is stopped, the same command resumes it.
+
+    Args:
+        out: folder for results.json, success.png, rollout.rrd, checkpoint.zip and config.json; runs/demo, or
+            runs/demo-quick with --quick.
+        quick: two tasks and little training, in under a minute; not a measure of anything.
+    """
+    folder = options.check_folder("--out", out or Path("runs/demo-quick" if quick else "runs/demo"))
+    options.use_one_thread()
+    result = run_demo(folder, QUICK if quick else DemoConfig())
+    return Output(json).result(result) if json else Output(json)  # run_demo has printed the table
+
+
+def run_demo(out: Path, config: DemoConfig) -> lw.EvaluationResult:
+    """Run the demo, or the rest of it, and print its results.
+
+    Writes config.json, demonstrations/, checkpoint.zip, results.json, success.png and rollout.rrd to ``out``.
+
+    Raises:
+        ValueError: ``out`` holds a demo with another configuration.
+    """
+    from lw_torchrl._files import held, read_json, write_json
+
+    stated = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(config).items()}
+    path = out / "config.json"
+    with held(out, "out", folder=True):
+        if not path.is_file():
+            write_json(path, stated)
+        elif read_json(path, "out: the configuration") != stated:
+            raise ValueError(f"out: {str(out)!r} holds a demo with another configuration; choose another folder")
+        return _run(out, config)
+
+
+def _run(out: Path, config: DemoConfig) -> lw.EvaluationResult:
+    import torch
+
+    from lw_torchrl.record.rollouts import active_skills, run_recorded, write_recording
+
+    plans = lw.load_plans("MT10")
+    print(f"1/4  collecting {config.demonstrations_per_task} demonstrations per task, tasks: {len(config.tasks)}")
+    lw.collect_demonstrations(
+        config.tasks,
+        episodes_per_task=config.demonstrations_per_task,
+        root=out / "demonstrations",
+        seed=config.demonstration_seed,
+        noise_scale=config.demonstration_noise,
+        noise_hold=config.noise_hold,
+        redraw_failures=True,
+    )
+    print(f"2/4  training a plan-conditioned policy for {config.training_steps} steps")
+    torch.manual_seed(config.training_seed)
+    actor = lw.PlanConditionedActor(plans)
+    rows: dict[str, Any] = {"after_success": config.after_success, "transform": lw.QAFTransform(plans)}
+    replay = lw.LanguageWorldExperienceReplay(out / "demonstrations", sampler=lw.TaskBalancedSampler(), **rows)
+    cloning = lw.BehavioralCloningConfig(config.training_steps, config.batch_size, seed=config.training_seed)
+    lw.BehavioralCloningTrainer(actor, replay, cloning, checkpoint=out / "checkpoint.zip").train()
+    print(f"3/4  evaluating {config.episodes_per_task} episodes per task on seeds that no demonstration used")
+    results = out / "results.json"
+    noise: dict[str, Any] = {"seed": config.evaluation_seed, "noise_scale": config.evaluation_noise}
+    if results.is_file():
+        result = lw.EvaluationResult.load(results)
+    else:
+        result = lw.evaluate(actor, tasks=config.tasks, episodes_per_task=config.episodes_per_task, **noise)
+        result.save(results, checkpoint=out / "checkpoint.zip", plans=plans.fingerprint)
+    lw.evaluation.plot_success(result, out / "success.png", title="Plan-conditioned behavioral cloning")
+    print("4/4  recording a rollout")
+    episodes = run_recorded(actor, config.tasks, **noise)
+    chosen = [episode for episode in episodes if episode.task in RECORDED] or episodes[:1]
+    write_recording(out / "rollout.rrd", chosen, plans, seed=config.evaluation_seed, policy="demo")
+    print(f"\n{result.table()}\n")
+    print("most attended skills, in order, up to the first success (steps):")
+    for episode in episodes:
+        skills = [f"{skill} ({steps})" for skill, steps in active_skills(episode, plans[episode.task])]
+        shown = skills if len(skills) <= 8 else [*skills[:4], f"... {len(skills) - 7} changes ...", *skills[-3:]]
+        print(f"  {episode.task}: " + " > ".join(shown))
+    print(f"\nresults   {results}\nfigure    {out / 'success.png'}\npolicy    {out / 'checkpoint.zip'}")
+    print(f"recording lw-torchrl view {out / 'rollout.rrd'}")
+    return result

@@ -1,0 +1,149 @@
+"""Score a learned query evaluator: how often it answers held-out conditions correctly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lw_torchrl._checks import checked
+from lw_torchrl._files import AnyPath, write_json
+from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
+from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.training.labelled_queries import Asked, LabelledQueries
+
+PARTS = {
+    "states": "trained queries, held-out states",
+    "queries": "held-out queries, held-out states",
+    "tasks": "held-out tasks",
+}
+_ROWS = 256
+
+
+@dataclass(frozen=True)
+class PartScore:
+    """Answers to one held-out part of :class:`LabelledQueries`, counted by predicate.
+
+    Attributes:
+        right: predicate to the number of correct answers where it is false and where it is true. A negated clause
+            counts with its predicate.
+        asked: predicate to the number of all answers, likewise.
+    """
+
+    right: dict[str, tuple[int, int]]
+    asked: dict[str, tuple[int, int]]
+
+    @property
+    def answers(self) -> int:
+        """The number of answers."""
+        return sum(map(sum, self.asked.values()))
+
+    def accuracy(self, predicate: str | None = None) -> float:
+        """Return the fraction of correct answers, for one predicate or all."""
+        names = self.asked if predicate is None else [predicate]
+        return sum(sum(self.right[name]) for name in names) / sum(sum(self.asked[name]) for name in names)
+
+    def balanced_accuracy(self, predicate: str | None = None) -> float:
+        """Return the mean of the accuracies where the predicate is false and where it is true, as far as both occur."""
+        names = self.asked if predicate is None else [predicate]
+        counts = [[sum(table[name][truth] for name in names) for table in (self.right, self.asked)] for truth in (0, 1)]
+        rates = [right / asked for right, asked in counts if asked]
+        return sum(rates) / len(rates)
+
+    @property
+    def worst(self) -> list[str]:
+        """The predicates, sorted by balanced accuracy, lowest first."""
+        return sorted(self.asked, key=lambda name: (self.balanced_accuracy(name), name))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the rates and counts as JSON."""
+        return {
+            "answers": self.answers,
+            "accuracy": self.accuracy(),
+            "balanced_accuracy": self.balanced_accuracy(),
+            "predicates": {
+                name: {
+                    "accuracy": self.accuracy(name),
+                    "balanced_accuracy": self.balanced_accuracy(name),
+                    "false_and_true": list(self.asked[name]),
+                    "right": list(self.right[name]),
+                }
+                for name in self.worst
+            },
+        }
+
+
+@dataclass(frozen=True)
+class EvaluatorScore:
+    """The score of an evaluator on held-out data.
+
+    Attributes:
+        parts: "states", "queries" and "tasks", where the data hold out any, to their scores.
+        about: the data and the split, as JSON.
+    """
+
+    parts: dict[str, PartScore]
+    about: dict[str, Any]
+
+    def table(self, most: int = 4) -> str:
+        """Return the rates as text, with this many of the worst predicates of each part."""
+        lines = [f"{'':36}{'answers':>10}{'accuracy':>10}{'balanced':>10}"]
+        for part, score in self.parts.items():
+            lines.append(f"{PARTS[part]:36}{score.answers:10}{score.accuracy():10.4f}{score.balanced_accuracy():10.4f}")
+            for name in score.worst[:most]:
+                rates = f"{score.accuracy(name):10.4f}{score.balanced_accuracy(name):10.4f}"
+                lines.append(f"  {name:34}{sum(score.asked[name]):10}{rates}")
+        return "\n".join(lines)
+
+    def save(self, path: AnyPath) -> None:
+        """Write the score as JSON."""
+        write_json(path, {"about": self.about, "parts": {name: part.to_json() for name, part in self.parts.items()}})
+
+
+@checked
+def score_evaluator(evaluator: ClauseEvaluator, data: LabelledQueries) -> EvaluatorScore:
+    """Score an evaluator, whatever its plans, on the held-out parts of the data.
+
+    Raises:
+        ValueError: the data hold out nothing.
+
+    Example:
+        >>> import lw_torchrl as lw, tempfile
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     _ = lw.collect_demonstrations("push", episodes_per_task=2, root=root + "/demos", max_steps=40)
+        ...     replay = lw.LanguageWorldExperienceReplay(root + "/demos", label="executed")
+        ...     data = lw.training.LabelledQueries(replay, lw.training.QueryEvaluatorConfig())
+        >>> untrained = lw.StateQueryEvaluator(lw.load_plans("MT10"))
+        >>> list(score_evaluator(untrained, data).parts)
+        ['states', 'queries']
+    """
+    parts = {part: _score(evaluator, data.parts[part]) for part in PARTS if data.parts[part]}
+    if not parts:
+        raise ValueError("data must hold out states, queries or tasks to score an evaluator on")
+    return EvaluatorScore(parts, data.describe())
+
+
+def _score(evaluator: ClauseEvaluator, part: list[Asked]) -> PartScore:
+    right: dict[str, tuple[int, int]] = {}
+    asked: dict[str, tuple[int, int]] = {}
+    with torch.no_grad(), evaluating(evaluator):
+        for queries in part:
+            logits, truth = clause_logits(evaluator, queries)
+            for table, counted in ((asked, torch.ones_like(truth)), (right, (logits > 0) == truth)):
+                numbers = zip((counted & ~truth).sum(0).tolist(), (counted & truth).sum(0).tolist(), strict=True)
+                for clause, (false, true) in zip(queries.clauses, numbers, strict=True):
+                    before = table.get(clause.predicate, (0, 0))
+                    table[clause.predicate] = before[0] + false, before[1] + true
+    return PartScore(right, asked)
+
+
+def clause_logits(evaluator: ClauseEvaluator, asked: Asked) -> tuple[Tensor, Tensor]:
+    """Return logits (R, Q) that the clauses hold, and their truth (R, Q)."""
+    coded = evaluator.code([(asked.task, clause) for clause in asked.clauses])
+    chunks = [
+        evaluator.network(rows, coded.pick(torch.arange(len(coded.predicate)).expand(len(rows), -1)))
+        for rows in asked.seen(str(evaluator.in_keys[0])).split(_ROWS)
+    ]
+    return torch.cat(chunks), asked.truth

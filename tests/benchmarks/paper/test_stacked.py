@@ -1,0 +1,92 @@
+"""Many actors trained at once learn what each would learn separately."""
+
+import pytest
+import torch
+from speed import first_fast
+from torchrl.envs import Compose
+
+import lw_torchrl as lw
+from benchmarks.paper.stacked import StackedBehavioralCloning
+
+TASKS = ("push", "reach", "window-open")
+PLANS = lw.load_plans("MT10")
+CONFIG = lw.BehavioralCloningConfig(steps=100, batch_size=30, seed=5)
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    root = tmp_path_factory.mktemp("stacked") / "demos"
+    lw.collect_demonstrations(TASKS, episodes_per_task=2, root=root, max_steps=100, progress=False)
+    return root
+
+
+def replay(demos):
+    turned = Compose(lw.QAFTransform(PLANS), lw.RandomYaw(0.3))
+    return lw.LanguageWorldExperienceReplay(demos, sampler=lw.TaskBalancedSampler(), transform=turned, after_success=20)
+
+
+def make(kind, seed):
+    torch.manual_seed(seed)
+    if kind in ("description", "one-hot"):
+        return lw.DescriptorConditionedActor(TASKS, width=32, condition=kind)
+    options = {"focused plan": {"focus": True, "swap_unmentioned": 0.5}, "mixed actions": {"mix": "actions"}}
+    return lw.PlanConditionedActor(PLANS, width=32, **options.get(kind, {}))
+
+
+def stack(demos, number=2, config=CONFIG, kind="focused plan", checkpoint=None):
+    actors, replays = [make(kind, seed) for seed in range(number)], [replay(demos) for _ in range(number)]
+    return StackedBehavioralCloning(actors, replays, config, checkpoint=checkpoint, progress=False)
+
+
+@pytest.mark.parametrize("kind", first_fast(["plan", "focused plan", "mixed actions", "description", "one-hot"]))
+def test_every_loss_is_that_of_separate_training(demos, kind):
+    together = stack(demos, 3, kind=kind)
+    losses = torch.stack([together.step() for _ in range(CONFIG.steps)])
+    assert losses[-10:].mean() < losses[:10].mean() / 2
+    for number in range(3):
+        config = lw.BehavioralCloningConfig(**{**vars(CONFIG), "seed": CONFIG.seed + number})
+        alone = lw.BehavioralCloningTrainer(make(kind, number), replay(demos), config, progress=False)
+        own = torch.tensor([alone.step() for _ in range(CONFIG.steps)])
+        assert (losses[:, number] - own).abs().max() < 1e-5
+
+
+def test_it_resumes_from_its_checkpoint_and_writes_the_weights_back(demos, tmp_path):
+    config = lw.BehavioralCloningConfig(steps=20, batch_size=30, checkpoint_every=10)
+    whole, path = stack(demos, config=config), tmp_path / "checkpoint.zip"
+    losses = torch.stack([whole.step() for _ in range(20)])
+    first = stack(demos, config=config, checkpoint=path)
+    for _ in range(10):
+        first.step()
+    first.save()
+    first.step()  # lost
+    second = stack(demos, config=config, checkpoint=path)
+    assert second.steps == 10
+    assert torch.equal(torch.stack([second.step() for _ in range(10)]), losses[10:])
+    second.save()
+    done = stack(demos, config=config, checkpoint=path)
+    assert done.train().isnan().all()
+    for number, actor in enumerate(done.actors):
+        assert not actor.training
+        for name, value in actor.named_parameters():
+            assert torch.equal(value, whole._parameters[f"actor.{name}"][number])
+    with pytest.raises(ValueError, match="is of another configuration, its training differs in steps"):
+        stack(demos, config=lw.BehavioralCloningConfig(steps=21, batch_size=30, checkpoint_every=10), checkpoint=path)
+
+
+def test_actors_that_differ_in_more_than_weights_and_plans_are_refused(demos):
+    """With the same shapes, they would be trained as the first one is."""
+    actors = [lw.PlanConditionedActor(PLANS, width=32), lw.PlanConditionedActor(PLANS, width=32, squash=False)]
+    with pytest.raises(ValueError, match="actors must be of one architecture, 0 and 1 differ in squash"):
+        StackedBehavioralCloning(actors, [replay(demos), replay(demos)], CONFIG)
+    with pytest.raises(ValueError, match="actors must have weights of their own"):
+        StackedBehavioralCloning([actors[0], actors[0]], [replay(demos), replay(demos)], CONFIG)
+
+
+def test_the_actor_with_a_loss_that_is_not_finite_is_named(demos):
+    broken = make("plan", 0)
+    torch.nn.init.constant_(broken.head.network[0].weight, float("nan"))
+    trainer = StackedBehavioralCloning(
+        [make("plan", 0), broken], [replay(demos), replay(demos)], CONFIG, progress=False
+    )
+    with pytest.raises(ValueError, match="the loss of actor 1 is nan at step 0"):
+        trainer.step()

@@ -1,0 +1,84 @@
+"""Reports on query evaluators: calibration, confident errors, and drift of conditions."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+import lw_torchrl as lw
+from benchmarks.evaluator_report import (
+    calibration_error,
+    condition_drift,
+    drift_table,
+    plot_wrong_answers,
+    reliability,
+    write_report,
+    wrong_answers,
+)
+
+PLANS = lw.Plans({task: lw.load_plans("MT10")[task] for task in ("push", "reach")})
+PICTURES = {"cameras": ("corner",), "height": 16, "width": 16}
+
+
+class Never(lw.QueryEvaluator):
+    """Answers that no condition holds."""
+
+    def logits(self, observation, task_id):
+        return torch.full((*task_id.shape, self.plans.num_steps), -1.0)
+
+
+@pytest.fixture(scope="module")
+def replay(tmp_path_factory):
+    root = tmp_path_factory.mktemp("report") / "demos"
+    lw.collect_demonstrations(PLANS, episodes_per_task=3, root=root, max_steps=60, progress=False)
+    return lw.LanguageWorldExperienceReplay(root, label="executed")
+
+
+def test_a_report_has_the_calibration_of_every_answer(replay, tmp_path):
+    data = lw.training.LabelledQueries(replay, lw.training.QueryEvaluatorConfig(held_out_tasks=("reach",)))
+    evaluator = lw.StateQueryEvaluator(PLANS, width=16, depth=1)
+    bins = reliability(evaluator, data)
+    for part, counts in bins.items():
+        assert counts[:, 0].sum() == sum(asked.truth.numel() for asked in data.parts[part])
+        assert counts[:, 2].sum() == sum(int(asked.truth.sum()) for asked in data.parts[part])
+    table = write_report(evaluator, data, tmp_path / "report.json", most=2)
+    parts = json.loads((tmp_path / "report.json").read_text())["parts"]
+    assert parts["tasks"]["calibration_error"] == calibration_error(bins["tasks"])
+    assert f"calibration error, held-out tasks: {calibration_error(bins['tasks']):.4f}" in table
+    assert (tmp_path / "report.png").stat().st_size > 5000
+    right = torch.tensor([[10.0, 2.0, 2.0], [10.0, 9.0, 7.0]], dtype=torch.float64)
+    assert calibration_error(right) == pytest.approx(0.1)
+
+
+def test_drift_compares_answers_with_the_exact_ones(replay):
+    rows = replay[:]
+    drifts = condition_drift(lw.ScriptedSkillActor(PLANS, evaluator=Never(PLANS)), rows)
+    assert len(drifts) == len(PLANS["push"].steps) + len(PLANS["reach"].steps)
+    assert [drift.agreement for drift in drifts] == sorted(drift.agreement for drift in drifts)
+    truth = lw.QAFTransform(PLANS)(rows.clone())["qaf"]
+    for drift in drifts:
+        own = truth[rows["task_id"] == lw.task_id(drift.task)][:, drift.step]
+        assert (drift.states, drift.believed) == (len(own), 0.0)
+        assert drift.exact == pytest.approx(own.float().mean().item())
+        assert drift.agreement == pytest.approx(1.0 - drift.exact)
+        assert drift.condition == str(PLANS[drift.task].steps[drift.step].condition)
+    assert drifts[0].condition in drift_table(drifts, most=1)
+
+
+def test_wrong_answers_are_the_most_confident_ones(replay, tmp_path):
+    lw.data.add_pictures(replay.root, **PICTURES, every=20)
+    seen = lw.LanguageWorldExperienceReplay(replay.root, label="executed")
+    seen.add_column("pixels", lw.data.load_pictures(seen, **PICTURES, every=20))
+    config = lw.training.ImageQueryEvaluatorConfig(every=20, held_out_states=0.4, held_out_pairs=0.0)
+    data = lw.training.LabelledQueries(seen, config)
+    wrong = wrong_answers(lw.modules.ImageQueryEvaluator(PLANS, **PICTURES), data, most=5)
+    assert 0 < len(wrong) <= 5
+    for answer in wrong:
+        assert (answer.believed > 0.5) != answer.holds
+        assert all(0 < far < 3 for far in answer.off.values())
+    errors = [abs(answer.believed - answer.holds) for answer in wrong]
+    assert errors == sorted(errors, reverse=True)
+    plot_wrong_answers(wrong, tmp_path / "wrong.png")
+    assert (tmp_path / "wrong.png").stat().st_size > 5000

@@ -1,0 +1,106 @@
+"""python -m benchmarks.plan_comparison: every answer is decoded and carried out, and none twice."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import lw_torchrl as lw
+from benchmarks import plan_comparison
+from benchmarks.plan_comparison import Arguments, compare_plans, main, no_plans, write_report
+from lw_torchrl.planners import answer_path
+
+PLANS = lw.load_plans("MT10")
+SHORT = {"episodes": 4, "max_steps": 60, "progress": False}
+
+
+def write(folder, model, format, task, attempt, text):
+    path = answer_path(folder, model, format, task, attempt)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, "utf-8")
+
+
+@pytest.fixture
+def answers(tmp_path):
+    """A model with good plans in one format and refusals in another, and a model that writes about other things."""
+    folder = tmp_path / "plans"
+    for task in ("reach", "drawer-open"):
+        write(folder, "good", "chain_py", task, 0, lw.encode_plan(PLANS[task], "chain_py"))
+        write(folder, "good", "chain_py", task, 1, "I cannot do that.")
+        write(folder, "good", "basic_md", task, 0, lw.encode_plan(PLANS[task], "basic_md"))
+        write(folder, "other", "chain_py", task, 0, "def bake_a_cake(robot):\n    pass\n")
+    return folder
+
+
+def test_every_answer_is_compared(answers):
+    comparison = compare_plans(answers, choose="first", **SHORT)
+    assert comparison.groups == (("good", "basic_md"), ("good", "chain_py"), ("other", "chain_py"))
+    actor = lw.ScriptedSkillActor({task: PLANS[task] for task in ("reach", "drawer-open")})
+    options = {"episodes_per_task": 4, "seed": 1000, "max_steps": 60, "noise_scale": 0.0, "progress": False}
+    rates = lw.evaluate(actor, tasks=["reach", "drawer-open"], **options).success_once
+    assert comparison.rates("good", "basic_md") == {task: [rate] for task, rate in rates.items()}
+    assert comparison.rates("good", "chain_py") == {task: [rate, 0.0] for task, rate in rates.items()}
+    assert comparison.mean("other", "chain_py") == 0.0
+    assert comparison.best_format("good") == "basic_md"
+    assert "| good  | chain_py | 2     | 4       | 2 " in comparison.table()
+    reason = "it has no steps, neither for the task nor for another task"
+    assert no_plans(comparison) == ["answers without a plan: 4", f"4: {reason}"]
+
+
+def test_the_best_answer_is_chosen_and_counted_in_different_episodes():
+    def answer(attempt, success):
+        return plan_comparison.ComparedAnswer("m", "chain_py", "reach", attempt, 1, 0, "", success)
+
+    lucky = answer(0, (True, False, True, False))  # in all episodes that choose, in none of the others
+    sound = answer(1, (True, True, False, True))
+    assert plan_comparison.PlanComparison([lucky, sound], {}).best_of("m", "chain_py") == 0.0
+    assert plan_comparison.PlanComparison([sound], {}).best_of("m", "chain_py") == 1.0
+
+
+def test_stopped_it_resumes_with_the_plans_that_are_left(answers, tmp_path, monkeypatch):
+    kept = tmp_path / "success.json"
+    whole = compare_plans(answers, **SHORT).to_json()
+    monkeypatch.setattr(plan_comparison, "_SAVE_SECONDS", 0.0)
+    real, numbers = plan_comparison.evaluate_plans, []
+
+    def stopped(plans, *, on_plan, **options):
+        numbers.append(len(plans))
+
+        def after_one(index, success):
+            on_plan(index, success)
+            raise KeyboardInterrupt
+
+        return real(plans, on_plan=after_one if len(numbers) == 1 else on_plan, **options)
+
+    monkeypatch.setattr(plan_comparison, "evaluate_plans", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        compare_plans(answers, resume=kept, **SHORT)
+    assert compare_plans(answers, resume=kept, **SHORT).to_json() == whole
+    assert compare_plans(answers, resume=kept, **SHORT).to_json() == whole
+    assert numbers == [2, 1], "equal plans run once, and finished plans not again"
+    with pytest.raises(ValueError, match=r"has other settings: max_steps \(60, now 50\)"):
+        compare_plans(answers, resume=kept, **SHORT | {"max_steps": 50})
+
+
+def test_the_command_writes_a_report_and_the_best_plans(tmp_path, capsys):
+    good = PLANS["drawer-open"]
+    bad = lw.ConditionalPlan("drawer-open", good.steps[:1])  # it stays above the handle
+    for attempt, plan in enumerate((bad, good, bad)):
+        write(tmp_path / "plans", "m", "chain_py", "drawer-open", attempt, lw.encode_plan(plan, "chain_py"))
+    write(tmp_path / "plans", "n", "chain_py", "push", 0, "nothing")
+    stale = tmp_path / "out/best/m/chain_py/window-open.plan"
+    stale.parent.mkdir(parents=True)
+    stale.write_text("an earlier run")
+    main(Arguments(tmp_path / "plans", episodes=2, max_steps=150, out=tmp_path / "out"))
+    assert dict(lw.load_plans(stale.parent)) == {"drawer-open": good}
+    assert "Plans of m, n" in (tmp_path / "out/summary.md").read_text("utf-8")
+    assert len(json.loads((tmp_path / "out/results.json").read_text())["answers"]) == 4
+    assert (tmp_path / "out/formats.png").is_file()
+    assert not (tmp_path / "out/models.png").exists(), "the models have no task in common"
+    assert "answers without a plan: 1" in capsys.readouterr().out
+
+
+def test_a_report_has_both_figures(answers, tmp_path):
+    written = write_report(compare_plans(answers, **SHORT), tmp_path)
+    assert [file.name for file in written] == ["results.json", "summary.md", "models.png", "formats.png", "best"]
