@@ -292,7 +292,7 @@ def test_whatever_is_made_of_the_relations_sees_what_is_added_and_taken_away():
         (3, OWN["beside"], "lower-case words"),
         ("open", OWN["beside"], "own meaning"),
         ("not near", OWN["beside"], "own meaning"),
-        ("near and dear to", OWN["beside"], "'and' has a own meaning"),
+        ("near and dear to", OWN["beside"], "'and' has its own meaning"),
         ("beside", (), "at least one"),
         ("beside", OWN["beside"][0], "tuple of Comparison"),
         ("beside", ("xy < 0.1",), "tuple of Comparison"),

@@ -212,7 +212,6 @@ def test_suites_are_found_by_name(monkeypatch):
 @pytest.mark.parametrize(
     ("change", "error", "says"),
     [
-        ({"tasks": {}}, ValueError, "tasks of suite 'toy' must name at least one task"),
         ({"tasks": {"toy/other": TASKS["toy/touch-red"]}}, TypeError, "must map names to their Task"),
         ({"tasks": {"reach": lw.TASKS["reach"]}}, ValueError, "task 'reach' must have the layout of suite 'toy'"),
         ({"name": "tay"}, ValueError, "tasks of suite 'tay' must be named 'tay/...'"),
