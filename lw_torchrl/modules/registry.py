@@ -51,17 +51,17 @@ class Method:
 
     @property
     def reads_plans(self) -> bool:
-        """Whether what it makes is conditioned on plans."""
-        return self._made.plan_options
+        """Whether its class is conditioned on plans."""
+        return self._class.plan_options
 
     def takes(self, option: str) -> bool:
-        """Whether what it makes has an option of that name."""
-        known = signature(self._made).parameters
+        """Return whether its class has an option of that name."""
+        known = signature(self._class).parameters
         of_head = "encoder" in self.options and option in signature(POLICIES[self.policy]).parameters
         return option in known or of_head or any(one.kind is one.VAR_KEYWORD for one in known.values())
 
     @property
-    def _made(self) -> type[Prepared]:
+    def _class(self) -> type[Prepared]:
         encoder = self.options.get("encoder")
         return ENCODERS[encoder] if encoder else POLICIES[self.policy]
 
