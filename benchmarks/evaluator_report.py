@@ -47,11 +47,11 @@ def reliability(evaluator: ClauseEvaluator, data: LabelledQueries) -> dict[str, 
         for asked in data.parts[part]:
             counts = parts.setdefault(part, torch.zeros(BINS, 3, dtype=torch.float64))
             with evaluating(evaluator):
-                for logits, truth in clause_logits(evaluator, asked):
-                    probability = logits.double().sigmoid().reshape(-1)
-                    place = (probability * BINS).long().clamp(max=BINS - 1)
-                    entries = (torch.ones_like(probability), probability, truth.reshape(-1).double())
-                    counts.index_add_(0, place, torch.stack(entries, -1))
+                logits, truth = clause_logits(evaluator, asked)
+            probability = logits.double().sigmoid().reshape(-1)
+            place = (probability * BINS).long().clamp(max=BINS - 1)
+            entries = (torch.ones_like(probability), probability, truth.reshape(-1).double())
+            counts.index_add_(0, place, torch.stack(entries, -1))
     return parts
 
 
@@ -98,7 +98,7 @@ def wrong_answers(evaluator: ImageQueryEvaluator, data: LabelledQueries, most: i
     wrong = []
     with torch.no_grad(), evaluating(evaluator):
         for asked in data.parts["states"]:
-            logits, truth = clause_logits(evaluator, asked)[0]
+            logits, truth = clause_logits(evaluator, asked)
             believed = logits.sigmoid()
             surest = (believed - truth.float()).abs().argmax(0).tolist()  # per clause
             for column, (row, clause) in enumerate(zip(surest, asked.clauses, strict=True)):

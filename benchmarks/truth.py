@@ -50,7 +50,7 @@ class Cell(NamedTuple):
         if self.exact:
             return None
         if self.kind == "every":
-            return lw.QAFTransform(plans, every=int(self.value))
+            return lw.CorruptQAF(plans, every=int(self.value))
         return lw.CorruptQAF(plans, flip=self.value, seed=seed)
 
 

@@ -44,7 +44,6 @@ from lw_torchrl.language.tasks import Task as Task
 from lw_torchrl.language.tasks import load_tasks as load_tasks
 from lw_torchrl.language.tasks import task_id as task_id
 from lw_torchrl.modules import DescriptorConditionedActor as DescriptorConditionedActor
-from lw_torchrl.modules import HeldEvaluator as HeldEvaluator
 from lw_torchrl.modules import PlanConditionedActor as PlanConditionedActor
 from lw_torchrl.modules import PlanConditionedQValue as PlanConditionedQValue
 from lw_torchrl.modules import PlanConditionedValue as PlanConditionedValue

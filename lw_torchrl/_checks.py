@@ -5,16 +5,14 @@ import inspect
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import fields
 from difflib import get_close_matches
-from fractions import Fraction
-from numbers import Integral, Real
+from numbers import Real
 from reprlib import Repr
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
-
-from lw_torchrl._tables import Table
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -26,7 +24,7 @@ def nearest(given: str, allowed: Iterable[str], *, n: int = 3) -> list[str]:
 
 def unknown_name(argument: str, given: object, allowed: Iterable[str]) -> ValueError:
     """The error for a name outside a fixed set, with those close in spelling; the caller raises it."""
-    names = allowed.names() if isinstance(allowed, Table) else list(allowed)
+    names = list(allowed)
     listed = ", ".join(repr(name) for name in names[:12]) + (", ..." if len(names) > 12 else "")
     message = f"{argument} must be one of {listed}, got {shown(given)}"
     if isinstance(given, str) and (close := nearest(given, names)):
@@ -59,8 +57,6 @@ def missing_keys(found: Iterable[Any], *needed: str) -> ValueError:
     names = [str(key) for key in found]
     absent = [key for key in needed if key not in names]
     hint = ": QAFTransform(plans) in the environment, and in the buffer, writes it" if "qaf" in absent else ""
-    if "qaf_held_logits" in absent:
-        hint = ": HeldEvaluator.transform() writes it in an environment; rows without steps train what it holds"
     return ValueError(
         f"{' and '.join(needed)} are needed, got {', '.join(names)}; without {' and '.join(absent)}{hint}"
     )
@@ -68,7 +64,7 @@ def missing_keys(found: Iterable[Any], *needed: str) -> ValueError:
 
 def check_choice(argument: str, given: Any, allowed: Iterable[str]) -> Any:
     """Return ``given`` if it is one of ``allowed``, else raise :class:`ValueError` with the nearest name."""
-    names = allowed if isinstance(allowed, Table) else list(allowed)
+    names = list(allowed)
     if given not in names:
         raise unknown_name(argument, given, names)
     return given
@@ -150,136 +146,67 @@ Positive = Annotated[float, check_positive]  # finite and above 0,
 Probability = Annotated[float, check_probability]  # from 0 to 1.
 
 _PLAIN: dict[Any, Check] = {bool: check_flag, int: check_int, float: _check_real, str: check_text}
-_PLAIN_KINDS = {*_PLAIN, Annotated, Literal, os.PathLike, NoneType}
-_SEVERAL: dict[Any, tuple[type, str]] = {
-    int: (Integral, "an integer"),
-    float: (Real, "a number"),
-    str: (str, "a string"),
-    os.PathLike: (os.PathLike, "a path"),
-    Fraction: (Fraction, "a fraction"),
-    Mapping: (Mapping, "a mapping"),
-    **dict.fromkeys((Sequence, Iterable, list, tuple), (Iterable, "a list")),
-}
 
 
-def _resolved(annotation: object, names: dict[str, Any]) -> Any:
-    """What an annotation means, whose names stand in ``names``."""
-    try:
-        return eval(annotation, names) if isinstance(annotation, str) else annotation
-    except (NameError, AttributeError, TypeError):  # imported for type checkers alone, or no type
-        return Any
-
-
-def _check_of_type(found: Any) -> Check | None:
-    """The check of a type: of a class, a Literal, a function, or a collection of these."""
-    origin, inside = get_origin(found) or found, get_args(found)
+def _check_of(annotation: Any) -> Check | None:
+    """Return the check of an annotation: a flag, number, text, path, choice or range, or None; others have none."""
+    origin, inside = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return inside[1]
-    if origin in (Union, UnionType):
-        others = [one for one in inside if one is not NoneType]
-        origins = [get_origin(one) for one in others]
-        if str not in others and Callable in origins and Literal not in origins:
-            others = [Callable]  # a module is called too
-        if len(others) == 1:
-            check = _check_of_type(others[0])
-        elif {*origins, *others} == {None, os.PathLike, str, os.PathLike[str]}:
-            check = check_path
-        else:
-            kinds = {_SEVERAL.get(get_origin(one) or one): None for one in others}
-            check = None if None in kinds else functools.partial(_check_kinds, kinds)
-        return _or_none(check) if NoneType in inside else check
     if origin is Literal:
         return functools.partial(check_choice, allowed=inside)
-    protocol = getattr(origin, "_is_protocol", False)
-    if origin is Callable or (protocol and "__call__" in vars(origin)):
-        return _check_function
-    if origin in (Mapping, Sequence, Iterable):
-        held = _check_of_type(inside[-1]) if isinstance(inside[-1], type) else None
-        return held and functools.partial(_check_collection, origin, held)  # of the others the function tells more
-    if not isinstance(origin, type) or origin in (tuple, object, Any) or protocol or origin.__name__ == "NestedKey":
-        return None
-    return _PLAIN.get(origin) or functools.partial(_check_class, origin)
+    if origin in (Union, UnionType):
+        others = {part for part in inside if part is not NoneType}
+        check = check_path if others == {str, os.PathLike[str]} else _check_of(*others) if len(others) == 1 else None
+        if check is not None and NoneType in inside:
+            return lambda argument, given: None if given is None else check(argument, given)
+        return check
+    return _PLAIN.get(annotation)
 
 
-def _or_none(check: Check | None) -> Check | None:
-    return check and (lambda argument, given: None if given is None else check(argument, given))
+def _checks_of(annotations: Mapping[str, Any], names: dict[str, Any]) -> dict[str, Check]:
+    """Return the checks of annotations, by name; ``names`` are those of the module that they stand in."""
+    checks = {}
+    for name, annotation in annotations.items():
+        with suppress(NameError, AttributeError, TypeError):  # imported only for type checkers
+            checks[name] = _check_of(eval(annotation, names) if isinstance(annotation, str) else annotation)
+    return {name: check for name, check in checks.items() if check is not None}
 
 
-def _check_kinds(kinds: Iterable[Any], argument: str, given: Any) -> None:
-    """Check that a value is of one of several kinds; its function checks what it holds."""
-    taken = tuple(kind for kind, _ in kinds)
-    text = isinstance(given, (str, bytes)) and not (str in taken and isinstance(given, str))
-    if text or not isinstance(given, taken):
-        raise _wrong_type(argument, " or ".join(word for _, word in kinds), given)
+def checked(function: Function) -> Function:
+    """Check a function's flags, numbers, texts, paths, choices and ranges by their annotations.
 
-
-def _check_function(argument: str, given: Any) -> None:
-    if not callable(given):
-        raise _wrong_type(argument, "a function", given)
-
-
-def _check_class(wanted: type, argument: str, given: Any) -> None:
-    if not isinstance(given, wanted):
-        what = f"the class {given.__name__}" if isinstance(given, type) else f"{shown(given)} ({type(given).__name__})"
-        article = "an" if wanted.__name__[0] in "AEIOU" else "a"
-        raise TypeError(f"{argument} must be {article} {wanted.__name__}, got {what}")
-
-
-def _check_collection(wanted: Any, check: Check, argument: str, given: Any) -> None:
-    """Check a collection, and what it holds unless it can be iterated only once."""
-    of_texts = isinstance(given, (str, bytes))
-    right = isinstance(given, Mapping) if wanted is Mapping else hasattr(given, "__iter__") and not of_texts
-    if not right or isinstance(given, type):
-        raise _wrong_type(argument, "a mapping" if wanted is Mapping else "a list", given)
-    if isinstance(given, (Mapping, Sequence)):
-        for place, one in given.items() if isinstance(given, Mapping) else enumerate(given):
-            check(f"{argument}[{shown(place)}]", one)
-
-
-def checked_but(*arguments: str) -> Callable[[Function], Function]:
-    """Check a function's arguments, but for those named, by their annotations: flags, numbers, texts, paths, choices,
-    classes, functions, and collections of these. The function itself checks what may be a name or a :class:`Task`, for
-    example; :class:`TypeError` or :class:`ValueError` name the argument, what was given and what is allowed.
+    :class:`TypeError` or :class:`ValueError` name the argument, what was given and what is allowed.
 
     Example:
-        >>> @checked_but("color")
-        ... def draw(points: int, filled: bool = False, color: str = "red"): ...
+        >>> @checked
+        ... def draw(points: int, filled: bool = False): ...
         >>> draw(3, filled="no")
         Traceback (most recent call last):
         TypeError: filled must be True or False, got 'no' (str)
     """
+    signature = inspect.signature(function)
+    single = (
+        name for name, one in signature.parameters.items() if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)
+    )
+    annotations = {name: signature.parameters[name].annotation for name in single}
 
-    def decorate(function: Function) -> Function:
-        signature = inspect.signature(function)
+    @functools.cache
+    def checks() -> dict[str, Check]:  # at the first call: by then the module has all names of the annotations
+        return _checks_of(annotations, function.__globals__)
 
-        @functools.cache
-        def checks() -> dict[str, Check]:  # at the first call: by then all names of the annotations are there
-            found = {
-                name: _check_of_type(_resolved(one.annotation, function.__globals__))
-                for name, one in signature.parameters.items()
-                if name not in arguments
-                and one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)
-                and one.annotation is not one.empty
-            }
-            return {name: check for name, check in found.items() if check is not None}
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        try:
+            given = signature.bind_partial(*args, **kwargs).arguments
+        except TypeError:
+            given = {}  # the function itself says which argument is unknown or too many
+        for name, check in checks().items():
+            if name in given:
+                check(name, given[name])
+        return function(*args, **kwargs)
 
-        @functools.wraps(function)
-        def call(*args: Any, **kwargs: Any) -> Any:
-            try:
-                given = signature.bind_partial(*args, **kwargs).arguments
-            except TypeError:
-                given = {}  # the function itself says which argument is unknown or too many
-            for name, check in checks().items():
-                if name in given:
-                    check(name, given[name])
-            return function(*args, **kwargs)
-
-        return call  # type: ignore[return-value]
-
-    return decorate
-
-
-checked = checked_but()  # all of a function's arguments
+    return call  # type: ignore[return-value]
 
 
 def passes_on(*others: Callable[..., Any]) -> Callable[[Function], Function]:
@@ -320,16 +247,11 @@ def check_fields(instance: Any, inside: str = "") -> None:
 
 @functools.cache
 def _checks_of_fields(kind: Any) -> dict[str, Check]:
-    """The checks of a dataclass's flags, numbers, texts and choices."""
-    found: dict[str, Check | None] = {}
+    checks: dict[str, Check] = {}
     for base in reversed(kind.__mro__):
-        names = getattr(sys.modules.get(base.__module__), "__dict__", {})  # of the module that it stands in
-        for name, stated in inspect.get_annotations(base).items():
-            meant = _resolved(stated, names)
-            parts = get_args(meant) if get_origin(meant) in (Union, UnionType) else [meant]
-            plain = all((get_origin(part) or part) in _PLAIN_KINDS for part in parts)
-            found[name] = _check_of_type(meant) if plain else None
-    return {field.name: check for field in fields(kind) if (check := found[field.name])}
+        names = getattr(sys.modules.get(base.__module__), "__dict__", {})
+        checks |= _checks_of(inspect.get_annotations(base), names)
+    return {field.name: checks[field.name] for field in fields(kind) if field.name in checks}
 
 
 _SHOWN = Repr()

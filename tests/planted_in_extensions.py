@@ -1,4 +1,4 @@
-"""What a user adds to the tables, typed, with six mistakes: mypy --strict finds them (test_packaging.py)."""
+"""What a user adds to the tables, typed, with four mistakes: mypy --strict finds them (test_packaging.py)."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -56,6 +56,4 @@ POLICIES["Linear"] = nn.Linear  # planted
 LEARNERS["copies"] = CopyConfig  # planted
 RELATIONS["near to"] = Comparison("xyz", "<", 0.3)  # planted
 plans = lw.load_plans("MT10")
-actor = lw.PlanConditionedActor(plans, width=64, evaluator=Flat(plans), mix="actions")
-lw.PlanConditionedActor(plans, featurs="raw")  # planted
-lw.PlanConditionedQValue(plans, features="row", ensemble=2)  # planted
+actor = lw.PlanConditionedActor(plans, width=64, evaluator=Flat(plans))

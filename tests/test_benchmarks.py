@@ -14,7 +14,8 @@ import torch
 
 import lw_torchrl as lw
 from benchmarks import __main__ as cli
-from benchmarks import ablations, faults, latents, truth
+from benchmarks import ablations, faults, truth
+from benchmarks.finding_points import PADS, find_points
 from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
 from lw_torchrl.language.task_index import PlanTables
@@ -148,24 +149,6 @@ def test_ablations_write_a_table_of_what_was_run(setting, monkeypatch, tmp_path,
     assert table in capsys.readouterr().out
 
 
-def test_latents_writes_a_table_of_what_was_run(monkeypatch, tmp_path):
-    seen = []
-
-    def run(unit, plans, out):
-        training = unit.preset.training
-        seen.append((str(unit.folder), training.latent_consistency, training.latent_contrast))
-        return SimpleNamespace(success_once={"reach": 1.0, "push": 0.5}, mean_success=0.75)
-
-    monkeypatch.setattr(latents, "execute_run", run)
-    latents.main(latents.Arguments(setting="one-shot", consistency=(0.0, 0.5), contrast=(2.0,), out=tmp_path))
-    assert seen == [
-        ("one-shot/strong/pcbc/seed0", 0.0, 0.0),
-        ("one-shot/strong-latent-consistency-0.5/pcbc/seed0", 0.5, 0.0),
-        ("one-shot/strong-latent-contrast-2/pcbc/seed0", 0.0, 2.0),
-    ]
-    assert "latent_contrast 2" in (tmp_path / "one-shot" / "latents.md").read_text("utf-8")
-
-
 def test_truth_writes_a_table_and_a_figure_and_carries_on(tmp_path, monkeypatch, capsys):
     plans = lw.Plans({task: lw.load_plans("MT10")[task] for task in ("push", "reach")})
     file = tmp_path / "untrained.zip"
@@ -233,3 +216,11 @@ def test_outside_the_list_no_sound_part_is_right():
     ]
     missing = faults.FAULTS["missing step"]
     assert [faults.is_right(missing, {"cause": cause}) for cause in ("plan", "undecided")] == [True, False]
+
+
+def test_points_of_shapes_are_where_fingers_fit_or_where_a_hand_pushes():
+    tasks = find_points(["push", "plate-slide-side", "dial-turn"], episodes=1)
+    points = {name: {one.name: one.offset for one in task.objects if one.ours} for name, task in tasks.items()}
+    assert points["push"]["puck grip"] == pytest.approx((0.0, 0.0, PADS - 0.015), abs=2e-3)
+    assert points["plate-slide-side"]["plate side"][0] == pytest.approx(0.05 + 0.015, abs=5e-3)
+    assert not points["dial-turn"]

@@ -189,7 +189,7 @@ def test_a_kind_that_is_not_there_is_named(plans, replay, tmp_path, monkeypatch)
     monkeypatch.setitem(POLICIES, "LearnedTaskActor", LearnedTaskActor)
     lw.save_actor(LearnedTaskActor(plans), tmp_path / "policy.zip")
     monkeypatch.delitem(POLICIES, "LearnedTaskActor")
-    with pytest.raises(ValueError, match="is of a script; add it to its table in a module"):
+    with pytest.raises(ValueError, match="is of a script; register it in a module"):
         lw.load_actor(tmp_path / "policy.zip")
 
 

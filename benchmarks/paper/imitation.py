@@ -13,7 +13,6 @@ from torchrl.envs import Compose
 from benchmarks.paper.recipes import DataSetting, Execution, Member, Preset
 from benchmarks.paper.runs import Dataset, Run, Work, load_result, own_tasks, plain
 from benchmarks.paper.stacked import StackedBehavioralCloning
-from lw_torchrl._checks import unknown_name
 from lw_torchrl._progress import Progress
 from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.evaluation import EvaluationResult
@@ -21,7 +20,7 @@ from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.modules import ActorEnsemble, DemonstratedActor, ScriptedSkillActor
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.modules.tables import METHODS, make_policy
+from lw_torchrl.modules.registry import find_method, make_policy
 from lw_torchrl.training import BehavioralCloningTrainer
 from lw_torchrl.training.envelope import check_description
 from lw_torchrl.training.files import describe_data, load_actor, save_actor
@@ -59,13 +58,13 @@ class _Trained:
 
     @property
     def reads_plans(self) -> bool:
-        return METHODS[self.method].reads_plans
+        return find_method(self.method).reads_plans
 
     @property
     def options(self) -> dict[str, Any]:
         """Of its actor; a method of the user's may not have all."""
         given = {**self.member.actor, **(self.member.plan_actor if self.reads_plans else {})}
-        return {name: value for name, value in given.items() if METHODS[self.method].takes(name)}
+        return {name: value for name, value in given.items() if find_method(self.method).takes(name)}
 
     @property
     def yaw(self) -> float:
@@ -99,8 +98,8 @@ class ImitationRun(Run):
     any_device = True
 
     def __post_init__(self) -> None:
-        if self.method != SCRIPTED and self.method not in METHODS:
-            raise unknown_name("method", self.method, [*METHODS.names(), SCRIPTED])
+        if self.method != SCRIPTED:
+            find_method(self.method)
 
     @property
     def group(self) -> Path:

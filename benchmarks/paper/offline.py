@@ -23,7 +23,7 @@ from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules import DescriptorEncoder, PlanEncoder, QValue, Value
 from lw_torchrl.modules.policy import Encoder, Policy
-from lw_torchrl.modules.tables import METHODS, make_policy
+from lw_torchrl.modules.registry import find_method, make_policy
 from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
 from lw_torchrl.training import OfflineConfig, OfflineTrainer
 from lw_torchrl.training.behavioral_cloning import bc_loss
@@ -225,9 +225,9 @@ class OfflineRun(_Learned, Run):
 
 def _encoder(condition: str, plans: Plans, noise: float = 0.0) -> Encoder:
     """What a critic sees, as actors of the same condition see it."""
-    if METHODS[condition].policy == "PlanConditionedActor":
+    if find_method(condition).policy == "PlanConditionedActor":
         return PlanEncoder(plans, feature_noise=noise)
-    return DescriptorEncoder(tuple(plans), feature_noise=noise, **METHODS[condition].options)
+    return DescriptorEncoder(tuple(plans), feature_noise=noise, **find_method(condition).options)
 
 
 DISTRIBUTIONS = {

@@ -17,7 +17,7 @@ from lw_torchrl._checks import checked, passes_on
 from lw_torchrl._devices import place
 from lw_torchrl.data.replay_checks import check_replay
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig, LatentTerms, make_optimizer
+from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig, make_optimizer
 from lw_torchrl.training.envelope import POLICY
 from lw_torchrl.training.file_checks import text_vectors
 from lw_torchrl.training.files import check_can_be_saved, describe_data, describe_replay
@@ -117,8 +117,6 @@ class StackedBehavioralCloning(Training):
         except RuntimeError as error:
             raise ValueError(f"actors must be of one architecture ({error})") from error
         self._parameters = {name: nn.Parameter(value.detach()) for name, value in parameters.items()}
-        terms = LatentTerms(actors[0], config)
-        self._latent_terms = vmap(lambda p, b: functional_call(terms, (p, b), ())) if terms.weights else None
         self._act = vmap(lambda p, b, prepared: functional_call(modules[0], (p, b), prepared))
         self.optimizer = make_optimizer(self._parameters.values(), config)
         self.schedule = make_schedule(config.schedule, self.optimizer, config.steps)
@@ -141,8 +139,6 @@ class StackedBehavioralCloning(Training):
         inputs = tuple(torch.stack(column) for column in zip(*prepared, strict=True))
         actions = self._act(self._parameters, self._buffers, inputs)
         losses = distance_loss(actions, torch.stack(targets), self.config.loss_function).flatten(1).mean(1)
-        if self._latent_terms is not None:
-            losses = losses + self._latent_terms(self._parameters, self._buffers)
         return self.descend(losses)
 
     def clip_gradients(self) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import lw_torchrl as lw
-from lw_torchrl._tables import plugins_of
+from lw_torchrl._registry import entry_points_of
 from lw_torchrl.cli import options
 from lw_torchrl.language.plans import Plans
 
@@ -65,7 +65,8 @@ def _read_evaluator(named: str, plans: Plans, text_encoder: str | None) -> lw.Qu
     encoder = options.read_encoder(text_encoder)
     if not is_object(named) and (Path(named).exists() or not _is_class(named)):
         return lw.training.load_evaluator(named, plans, text_encoder=encoder)
-    found = options.imported("--evaluator", named, "evaluator") if is_object(named) else lw.modules.EVALUATORS[named]
+    found: Any = options.imported("--evaluator", named, "evaluator") if is_object(named) else None
+    found = lw.modules.EVALUATORS[named] if found is None else found
     if isinstance(found, lw.QueryEvaluator):
         return found.with_plans(plans)
     if not isinstance(found, type) or not issubclass(found, lw.QueryEvaluator):
@@ -90,7 +91,7 @@ def fresh_evaluator(named: str, made: type[lw.QueryEvaluator], plans: Plans, enc
 
 def _is_class(name: str) -> bool:
     """Whether a word is a class in the table of evaluators, to which a module of yours may have added."""
-    added = "lw_torchrl.modules" in sys.modules or bool(plugins_of("lw_torchrl.evaluators"))
+    added = "lw_torchrl.modules" in sys.modules or bool(entry_points_of("lw_torchrl.evaluators"))
     return name.isidentifier() and added and name in lw.modules.EVALUATORS
 
 

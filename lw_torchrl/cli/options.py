@@ -20,7 +20,7 @@ from tyro.conf import arg
 import lw_torchrl as lw
 from lw_torchrl._checks import check_choice, unknown_name
 from lw_torchrl._files import absent_policy, read_text, shipped_policy
-from lw_torchrl._tables import plugins_of
+from lw_torchrl._registry import entry_points_of
 from lw_torchrl.cli.parsing import own_module
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plan_text import PLAN_LIMIT
@@ -215,7 +215,13 @@ def check_condition(argument: str, *names: str) -> None:
     """Refuse the first name of a method that is neither ours nor added by a module or a package."""
     groups = ("methods", "policies", "encoders")
     for name in names:
-        check_listed(argument, name, CONDITIONS, "lw_torchrl.modules:METHODS", groups)
+        if name in CONDITIONS:
+            continue
+        if "lw_torchrl.modules" not in sys.modules and not any(entry_points_of(f"lw_torchrl.{one}") for one in groups):
+            raise unknown_name(argument, name, CONDITIONS)
+        from lw_torchrl.modules.registry import find_method
+
+        find_method(name, argument)
 
 
 def check_listed(argument: str, name: str, ours: Sequence[str], place: str, groups: Sequence[str]) -> None:
@@ -224,7 +230,7 @@ def check_listed(argument: str, name: str, ours: Sequence[str], place: str, grou
     module, _, table = place.partition(":")
     if name in ours:
         return
-    if module not in sys.modules and not any(plugins_of(f"lw_torchrl.{group}") for group in groups):
+    if module not in sys.modules and not any(entry_points_of(f"lw_torchrl.{group}") for group in groups):
         raise unknown_name(argument, name, ours)
     check_choice(argument, name, getattr(import_module(module), table))
 

@@ -21,7 +21,7 @@ from lw_torchrl._checks import check_choice, check_int, check_scale, nearest, sh
 
 COUNTS = ("attempts", "batch_size", "episodes", "jobs", "max_steps", "num_envs", "passes", "steps")
 """Arguments that count something, in every command: at least 1."""
-SCALES = ("beta", "gripper_noise", "latent_consistency", "learning_rate", "noise", "qaf_anchor")
+SCALES = ("beta", "gripper_noise", "learning_rate", "noise", "qaf_anchor")
 """Arguments that say how much of something: finite and at least 0."""
 _BESIDE = re.compile(r"^    (\w+): .*,  # (.+)$", re.MULTILINE)
 _NUMBERS = {int: "an integer", float: "a number"}

@@ -51,9 +51,7 @@ def _answer(
     if format is None:
         format = "basic_py" if file.suffix == ".plan" else file.absolute().parent.name
         if format not in PLAN_FORMATS:
-            raise ValueError(
-                f"--format must be given, one of {', '.join(PLAN_FORMATS.names())}: the file's folder is none"
-            )
+            raise ValueError(f"--format must be given, one of {', '.join(PLAN_FORMATS)}: the file's folder is none")
     check_task(task, known)
     check_choice("format", format, PLAN_FORMATS)
     return read_text(file, ValueError), task, format, known

@@ -70,13 +70,11 @@ def generate(
     Example: lw-torchrl plan generate MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --attempts 4
     """
     planner, chosen, _ = asking.begin(tasks)
-    formats = PLAN_FORMATS.names() if format == ("all",) else list(dict.fromkeys(format))
+    formats = [*PLAN_FORMATS] if format == ("all",) else list(dict.fromkeys(format))
     for one in formats:
         if one == "all":
-            raise ValueError(
-                f"--format must be one of 'all', {', '.join(map(repr, PLAN_FORMATS.names()))}, and 'all' alone"
-            )
-        check_choice("format", one, ["all", *PLAN_FORMATS.names()])
+            raise ValueError(f"--format must be one of 'all', {', '.join(map(repr, PLAN_FORMATS))}, and 'all' alone")
+        check_choice("format", one, ["all", *PLAN_FORMATS])
     rows, notes, total = [], [], 0
     for one in formats:
         answers = planner.plans([*chosen.values()], format=one, attempts=asking.attempts, out=asking.out)

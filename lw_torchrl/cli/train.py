@@ -29,7 +29,6 @@ def train(
     task_file: options.TaskFile = None,
     text_encoder: options.EncoderName = None,
     method: options.Condition = "pcbc",
-    mix: Literal["latents", "actions"] | None = None,
     features: Literal["raw", "differences", "relative", "both"] | None = None,
     width: int | None = None,  # of the action decoder's hidden layers; by default the method's, 256
     depth: int | None = None,  # number of them; by default the method's, 3
@@ -37,7 +36,6 @@ def train(
     batch_size: int = 500,  # rows of a minibatch, equally many of each task
     learning_rate: float = 1e-3,  # at the start; a cosine brings it to 0
     after_success: int | None = 20,  # leave out steps so long after an episode's first success; None keeps all
-    latent_consistency: float = 0.0,  # weight of a term that keeps skills with similar texts similar; with plans
     begin: Path | None = None,  # a trained policy to start from: its weights, plans, options and statistics
     evaluator: str | None = None,
     answers: Literal["logit", "tanh", "hard"] | None = None,
@@ -54,7 +52,6 @@ def train(
     Example: lw-torchrl train demos/mt10 --out runs/tuned.zip --begin runs/mt10.zip --evaluator runs/eyes/evaluator.zip
 
     Args:
-        mix: of a policy with plans, mix the skills' latents, as in the paper and by default, or their actions.
         features: what the policy sees: the raw observation; differences between hand, objects and goal, the default of
             our methods; relative, these without the hand's height and the gripper's opening; or both the first and the
             second.
@@ -83,7 +80,7 @@ def train(
     chosen = resolve_tasks(options.one_or_many(tasks), tasks=known) if tasks else ()
     if begin is not None:
         options.check_saved("--begin", begin)
-        given = {"method": method, "mix": mix, "features": features, "width": width, "depth": depth, "plans": plans}
+        given = {"method": method, "features": features, "width": width, "depth": depth, "plans": plans}
         for name, one in given.items():
             if one != signature(train).parameters[name].default:
                 raise ValueError(f"--{name} is that of the policy that --begin names; leave it out")
@@ -96,21 +93,18 @@ def train(
 
     from lw_torchrl._devices import check_device
     from lw_torchrl.data.dataset import read_metadata
-    from lw_torchrl.modules.tables import METHODS, make_policy
+    from lw_torchrl.modules.registry import find_method, make_policy
 
     options.use_one_thread()
     there, held = check_device("device", device), read_metadata(data).config
     encoder = options.read_encoder(text_encoder)
     asked: dict[str, Any] = {"features": features, "width": width, "depth": depth}
     actor_options = {name: value for name, value in asked.items() if value is not None}
-    reads_plans = METHODS[method].reads_plans
-    if mix is not None or METHODS[method].takes("mix"):
-        actor_options["mix"] = mix or "latents"
-    for option, value in (("mix", mix), ("latent-consistency", latent_consistency), ("evaluator", evaluator)):
-        if value and not reads_plans:
-            raise ValueError(f"--{option} is for a method that reads plans, --method {method} does not")
+    reads_plans = find_method(method).reads_plans
+    if evaluator and not reads_plans:
+        raise ValueError(f"--evaluator is for a method that reads plans, --method {method} does not")
     numbers: dict[str, Any] = {"steps": steps, "batch_size": batch_size, "learning_rate": learning_rate, "seed": seed}
-    numbers |= {"latent_consistency": latent_consistency, "qaf_anchor": qaf_anchor}
+    numbers["qaf_anchor"] = qaf_anchor
     config = lw.BehavioralCloningConfig(normalize=begin is None, **numbers)
     wanted = {check_choice("tasks", task, held.tasks): held.episodes_per_task for task in chosen}
     rows: dict[str, Any] = {"episodes": wanted or None, "after_success": after_success}
@@ -133,12 +127,6 @@ def train(
         actor = make_policy(method, shown, text_encoder=encoder, **actor_options)
     loaded.require(replay.tasks)
     inside = getattr(actor, "evaluator", None)
-    if isinstance(inside, lw.HeldEvaluator):
-        which, mend = "--begin must have", "give the one to train by --evaluator"
-        if evaluator is not None:
-            which = "--evaluator must be"
-            mend = "train with the one inside it, lw.training.save_evaluator(held.evaluator, FILE)"
-        raise ValueError(f"{which} no HeldEvaluator, of whose steps a dataset's rows tell nothing: {mend}")
     if isinstance(inside, lw.modules.ImageQueryEvaluator):
         pictures: dict[str, Any] = {"cameras": inside.cameras, "height": inside.height, "width": inside.width}
         lw.data.add_pictures(data, **pictures)
@@ -187,8 +175,6 @@ def train_evaluator(
     held_out_tasks: tuple[str, ...] = (),  # names, or a number of tasks to draw: none of their queries is trained
     held_out_pairs: float = 0.1,  # the share of pairs of objects none of whose queries is trained
     held_out_states: float = 0.2,  # the share of episodes that are not trained on
-    structure: bool = True,  # read parsed clauses, and objects' positions where the tasks' table says; else only texts
-    text_encoder: str | None = None,  # with --no-structure, your function from texts to vectors, as my_texts:encode
     width: int = 128,  # of the hidden layers
     depth: int = 3,  # number of them
     steps: int | None = None,  # minibatches; by default 6000, with --cameras 4000
@@ -212,8 +198,6 @@ def train_evaluator(
             topview, behindGripper, gripperPOV.
     """
     options.check_folder("--out", out)
-    if text_encoder is not None and structure:
-        raise ValueError("--text-encoder is for --no-structure; with structure no text is read")
     known = options.read_tasks(None, tasks)
     names = options.simulated("tasks", options.one_or_many(tasks), known)
     drawn = len(held_out_tasks) == 1 and held_out_tasks[0].isdigit()
@@ -226,7 +210,6 @@ def train_evaluator(
             check_choice(argument, one, allowed)
     for folder in data:
         options.check_dataset("data", folder)
-    options.check_encoder(text_encoder)
     import torch
 
     from lw_torchrl.data.dataset import read_metadata
@@ -240,8 +223,7 @@ def train_evaluator(
     make_config = lw.training.ImageQueryEvaluatorConfig if cameras else lw.training.QueryEvaluatorConfig
     config = make_config(states_per_task=states_per_task, **numbers)
     torch.manual_seed(seed)
-    network: dict[str, Any] = {"structure": structure, "depth": depth, "hidden" if cameras else "width": width}
-    network["text_encoder"] = options.read_encoder(text_encoder)
+    network: dict[str, Any] = {"depth": depth, "hidden" if cameras else "width": width}
     pictures: dict[str, Any] = {"cameras": cameras, "height": picture, "width": picture}
     plans = options.read_plans(("MT50",), known)
     evaluator: Any

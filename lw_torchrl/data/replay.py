@@ -18,7 +18,7 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import Count, Natural, checked_but
+from lw_torchrl._checks import Count, Natural, checked
 from lw_torchrl._devices import CPU, check_device
 from lw_torchrl._files import AnyPath
 from lw_torchrl.data import replay_checks, selection
@@ -107,7 +107,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
     Source: the datasets of ``torchrl.data.datasets``.
     """
 
-    @checked_but("episodes")
+    @checked
     def __init__(
         self,
         root: AnyPath | Sequence[AnyPath],

@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 
 from lw_torchrl._devices import CPU, in_blocks, place
@@ -34,27 +33,10 @@ class FinishedEpisode(NamedTuple):
 def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[[TensorDictBase], TensorDictBase]:
     """The actor, on a device or where it is; networks run on blocks of one size, so no row depends on the others."""
     there = place(actor, device)
-    policy = _told(actor, actor if getattr(actor, "row_by_row", False) else in_blocks(actor))
+    policy = actor if getattr(actor, "row_by_row", False) else in_blocks(actor)
     if there == CPU:
         return policy
     return lambda tensordict: tensordict.update(policy(tensordict.to(there)).to(CPU))
-
-
-def _told(actor: Any, policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[TensorDictBase], TensorDictBase]:
-    """The policy; :class:`TypeError` says what is allowed where a network is given as it is, which wants tensors."""
-    if not isinstance(actor, nn.Module) or isinstance(actor, TensorDictModuleBase):
-        return policy
-
-    def run(tensordict: TensorDictBase) -> TensorDictBase:
-        try:
-            return policy(tensordict)
-        except TypeError as error:
-            wanted = "the actor must be a Policy, a TensorDictModule, or a function from TensorDict to TensorDict"
-            wrapped = 'TensorDictModule(network, in_keys=["observation"], out_keys=["action"])'
-            failed = f"got a {type(actor).__name__} that fails on one ({str(error).split(chr(10))[0]:.100})"
-            raise TypeError(f"{wanted}, like {wrapped}; {failed}") from error
-
-    return run
 
 
 def read_action(tensordict: TensorDictBase, size: int) -> Tensor:

@@ -6,7 +6,6 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from threading import RLock
 from typing import Any, Literal, NoReturn
 
 import numpy as np
@@ -21,8 +20,8 @@ from lw_torchrl._checks import Count, check_int, checked
 from lw_torchrl._keys import row_mask
 from lw_torchrl._rendering import check_picture
 from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, done_spec, observation_spec
-from lw_torchrl.envs.seeding import EpisodeCounter, check_worker, stated_episode
-from lw_torchrl.envs.workers import OneThread, one_thread_at_a_time, torchrl_worker
+from lw_torchrl.envs.seeding import EpisodeCounter, check_worker
+from lw_torchrl.envs.workers import torchrl_worker
 from lw_torchrl.language.tasks import Task, one_layout
 from lw_torchrl.suites.engine import Engine, EngineStep
 from lw_torchrl.suites.metaworld.engines import make_engine
@@ -40,8 +39,7 @@ class LanguageWorldEnv(EnvBase):
 
     ``env.reset(episode=7)`` or ``env.reset(episode=tensor)``, int64 (N,), starts these episodes and counts as a reset.
     A SerialEnv or ParallelEnv takes ``reset(list_of_kwargs=[{"episode": ...}, ...])``. A reset ignores the ``episode``
-    in a tensordict, unless ``reset(tensordict, set_state=True)`` asks for its beginning; an ``observation`` that is not
-    the episode's first is refused, and a TransformedEnv hands down no outputs.
+    in a tensordict.
 
     TorchRL's SerialEnv, ParallelEnv, AsyncEnvPool and multi-process collectors are recognised when they call the
     function that makes the environment; elsewhere (Ray, RPC, your own processes) give ``worker=(w, W)``, or another
@@ -83,8 +81,7 @@ class LanguageWorldEnv(EnvBase):
         batch_size: () for a single environment without the dimension of rows, for AsyncEnvPool.
 
     Raises:
-        RuntimeError: a step of a row that has ended; a reset or step in a forked process that did not make it, or while
-            another thread is in one, or draws.
+        RuntimeError: a step of a row that has ended; a reset or step in a forked process that did not make it.
         TypeError: it is pickled or copied; pass the function that makes it.
         ValueError: the step of an engine of your own returns no EngineStep.
         ImportError: a rendering library named by MUJOCO_GL is missing, or the vectorized engine does not know the
@@ -100,7 +97,6 @@ class LanguageWorldEnv(EnvBase):
     Source: paper section 'Task Formalism'; ``metaworld.sawyer_xyz_env.SawyerXYZEnv``.
     """
 
-    _supports_set_state = True
     _has_frame_skip = True  # else TorchRL puts a transform of its own around it, which knows nothing of rows that end
 
     @checked
@@ -139,8 +135,6 @@ class LanguageWorldEnv(EnvBase):
         found = torchrl_worker()  # which refuses some pools
         self.worker = found if worker is None else check_worker(worker)
         self._process = os.getpid()
-        lock = RLock()  # a Lock would stay taken if an interrupt came between taking it and the block
-        self._one_thread, self._last_one = OneThread(lock), OneThread(lock, patience=10.0)
         self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_int("seed", seed), self.worker)
         super().__init__(device=torch.device("cpu"), batch_size=(num_envs,) if batch_size is None else ())
         self._rows = RowStates(self.row_tasks, self.layout)
@@ -162,8 +156,7 @@ class LanguageWorldEnv(EnvBase):
         return seed if seed is None or static_seed else seed_generator(abs(seed))
 
     def _set_seed(self, seed: int | None) -> None:
-        with self._one_thread:
-            self._counter.start_again(seed)
+        self._counter.start_again(seed)
 
     @property
     def task_of_row(self) -> tuple[Task, ...]:
@@ -186,9 +179,8 @@ class LanguageWorldEnv(EnvBase):
 
     def set_extra_state(self, state: Tensor) -> None:
         """Take seed and counters; the episodes that ran are over."""
-        with self._one_thread:
-            self._counter.load(state)
-            self._rows.over[:] = True
+        self._counter.load(state)
+        self._rows.over[:] = True
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """Take seed and episode counters from another's ``state_dict()``, of the same rows, and require a reset."""
@@ -211,26 +203,19 @@ class LanguageWorldEnv(EnvBase):
                 "process (give ParallelEnv or a collector a function that makes it)"
             )
 
-    @one_thread_at_a_time
-    def _reset(
-        self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None, set_state: bool = False
-    ) -> TensorDict:
+    def _reset(self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None) -> TensorDict:
+        self._check_usable()
         rows = np.flatnonzero(row_mask(tensordict, "_reset", len(self.row_tasks)))
-        if set_state:
-            episode = stated_episode(tensordict, episode)
-            self._rows.refuse_other_tasks(tensordict, rows)
         episodes = self._counter.next(rows) if episode is None else self._counter.asked(episode, rows)
         self._rows.begin(rows, episodes, self._engine.reset(rows.tolist(), self._counter.seeds(rows, episodes)))
         self._counter.resets[rows] += 1
-        if set_state:
-            self._rows.refuse_later_steps(tensordict, rows)
         return self._shown(self._rows.as_tensordict())
 
     def _shown(self, rows: TensorDict) -> TensorDict:
         return rows if self.batch_size else rows[0]
 
-    @one_thread_at_a_time
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
+        self._check_usable()
         size = self.layout.action_size
         action = clipped_action(tensordict, (*self.batch_size, size)).cpu().numpy().reshape(-1, size)
         active = row_mask(tensordict, "_step", len(self.row_tasks))
@@ -282,7 +267,6 @@ class LanguageWorldEnv(EnvBase):
         self._rows.fault |= rows
         warnings.warn(f"{message}; the row is truncated and flagged, the others go on", stacklevel=4)
 
-    @one_thread_at_a_time
     def render(
         self, *, camera: str = "corner2", height: int = 240, width: int = 320, rows: Sequence[int] | None = None
     ) -> Tensor:
@@ -309,6 +293,7 @@ class LanguageWorldEnv(EnvBase):
             torch.Size([1, 48, 64, 3])
             >>> env.close()
         """
+        self._check_usable()
         check_picture(camera, height, width)
         asked = range(len(self.row_tasks)) if rows is None else [check_int("rows", row, minimum=0) for row in rows]
         if asked and max(asked) >= len(self.row_tasks):
@@ -323,8 +308,7 @@ class LanguageWorldEnv(EnvBase):
         return pictures if self.batch_size else pictures[0]
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free the simulators; RuntimeError if another thread is still in one after ten seconds."""
-        with self._last_one:
-            if not self.is_closed:
-                self._engine.close()
-            super().close(raise_if_closed=raise_if_closed)
+        """Free the simulators."""
+        if not self.is_closed:
+            self._engine.close()
+        super().close(raise_if_closed=raise_if_closed)

@@ -135,24 +135,3 @@ class RowStates:
             batch_size=(n,),
             device=torch.device("cpu"),
         )
-
-    def refuse_other_tasks(self, tensordict: TensorDictBase, rows: Rows) -> None:
-        """Raise :class:`ValueError` if a state to go to is of other tasks."""
-        given = tensordict.get("task_id", None)
-        if given is not None and not torch.equal(given.cpu().reshape(-1)[rows], self.task_id[rows]):
-            told = f"those of this one, {', '.join(self.tasks[:6])}{', ...' * (len(self.tasks) > 6)}"
-            raise ValueError(f"set_state=True needs the state of the same rows, task_id names other tasks than {told}")
-
-    def refuse_later_steps(self, tensordict: TensorDictBase, rows: Rows) -> None:
-        """Raise :class:`ValueError`, and require a reset, if a state to go to is not the first of its episode."""
-        wanted = tensordict.get("observation", None)
-        if wanted is None:
-            return
-        wanted = wanted.cpu().numpy().reshape(-1, self.layout.size)[rows]
-        later = rows[(wanted != self.observation[rows]).any(-1)]
-        if len(later):
-            self.over[later] = True
-            raise ValueError(
-                f"set_state=True goes to the beginning of an episode, and the observation of rows {later[:5].tolist()} "
-                "is of a later step or another seed: leave it out, or repeat the actions, physics cannot be restored"
-            )

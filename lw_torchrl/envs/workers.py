@@ -1,11 +1,10 @@
-"""Which of TorchRL's workers makes an environment, found on the call stack; and a lock for one thread at a time."""
+"""Which of TorchRL's workers makes an environment, found on the call stack."""
 
 import sys
 from collections.abc import Callable, Mapping
-from functools import wraps
 from multiprocessing import current_process, parent_process
 from types import FrameType
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn
 
 MANY = 2**16  # stands for a number of workers that TorchRL does not tell: more than there are
 
@@ -63,36 +62,3 @@ def torchrl_worker() -> tuple[int, int]:
         outer, count = _by_process(-2)
         rank, of = rank + outer * of, of * count
     return rank, of
-
-
-Method = TypeVar("Method", bound=Callable[..., Any])
-
-
-class OneThread:
-    """Lets one thread in at a time, which may enter again; two would break MuJoCo's memory or, silently, its numbers.
-    Entering raises a RuntimeError if another thread is in for longer than ``patience`` seconds."""
-
-    def __init__(self, lock: Any, patience: float = 0.0) -> None:
-        self._lock, self._patience = lock, patience
-
-    def __enter__(self) -> None:
-        if not self._lock.acquire(timeout=self._patience):
-            raise RuntimeError(
-                "another thread is stepping, resetting or drawing this environment, which takes one thread at a time: "
-                "make an environment in each thread, or one with num_envs= and step its rows together"
-            )
-
-    def __exit__(self, *error: object) -> None:
-        self._lock.release()
-
-
-def one_thread_at_a_time(method: Method) -> Method:
-    """A method of a usable environment that one thread may be in at a time."""
-
-    @wraps(method)
-    def run(self: Any, *args: Any, **kwargs: Any) -> Any:
-        with self._one_thread:
-            self._check_usable()
-            return method(self, *args, **kwargs)
-
-    return run  # type: ignore[return-value]

@@ -130,22 +130,20 @@ def _score(evaluator: ClauseEvaluator, part: list[Asked]) -> PartScore:
     asked: dict[str, tuple[int, int]] = {}
     with torch.no_grad(), evaluating(evaluator):
         for queries in part:
-            for logits, truth in clause_logits(evaluator, queries):
-                for table, counted in ((asked, torch.ones_like(truth)), (right, (logits > 0) == truth)):
-                    numbers = zip((counted & ~truth).sum(0).tolist(), (counted & truth).sum(0).tolist(), strict=True)
-                    for clause, (false, true) in zip(queries.clauses, numbers, strict=True):
-                        before = table.get(clause.predicate, (0, 0))
-                        table[clause.predicate] = before[0] + false, before[1] + true
+            logits, truth = clause_logits(evaluator, queries)
+            for table, counted in ((asked, torch.ones_like(truth)), (right, (logits > 0) == truth)):
+                numbers = zip((counted & ~truth).sum(0).tolist(), (counted & truth).sum(0).tolist(), strict=True)
+                for clause, (false, true) in zip(queries.clauses, numbers, strict=True):
+                    before = table.get(clause.predicate, (0, 0))
+                    table[clause.predicate] = before[0] + false, before[1] + true
     return PartScore(right, asked)
 
 
-def clause_logits(evaluator: ClauseEvaluator, asked: Asked) -> list[tuple[Tensor, Tensor]]:
-    """Return logits (R, Q) that the clauses hold, and their truth; twice if the evaluator reads texts, once from the
-    negated clauses."""
-    coded, vectors = evaluator.code([(asked.task, clause) for clause in asked.clauses])
+def clause_logits(evaluator: ClauseEvaluator, asked: Asked) -> tuple[Tensor, Tensor]:
+    """Return logits (R, Q) that the clauses hold, and their truth (R, Q)."""
+    coded = evaluator.code([(asked.task, clause) for clause in asked.clauses])
     chunks = [
-        evaluator.network(rows, coded.pick(torch.arange(len(coded.predicate)).expand(len(rows), -1)), vectors)
+        evaluator.network(rows, coded.pick(torch.arange(len(coded.predicate)).expand(len(rows), -1)))
         for rows in asked.seen(str(evaluator.in_keys[0])).split(_ROWS)
     ]
-    logits = torch.cat(chunks).split(len(asked.clauses), -1)
-    return [(values if number == 0 else -values, asked.truth) for number, values in enumerate(logits)]
+    return torch.cat(chunks), asked.truth

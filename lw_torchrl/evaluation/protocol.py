@@ -113,7 +113,7 @@ def evaluate(
         device: where the actor works: "cpu", "cuda", "cuda:1", "mps", or "auto"; it is moved there, and stays. None for
             where it is. The environment and its queries are always on the CPU.
         evaluator: answers the conditions in the query answering function's place, as for :func:`attribute_failures`: a
-            :class:`~lw_torchrl.CorruptQAF`, or ``QAFTransform(plans, every=5)``; None for exact truth at every step.
+            :class:`~lw_torchrl.CorruptQAF`; None for exact truth at every step.
         attribute: say why episodes failed, see :func:`attribute_failures`: ``.failures`` of the result.
         reference: trusted plans for the same tasks, with which failed episodes are run again.
 

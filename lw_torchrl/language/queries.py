@@ -222,15 +222,6 @@ def read_query(text: str, task: Task) -> Query | None:
 
 
 def _parse(text: str, task: Task, explain: bool) -> Query:
-    try:
-        return _parse_known(text, task, explain)
-    except QueryError:
-        if not any([RELATIONS.load_plugins(), STATES.load_plugins()]):
-            raise
-        return _parse_known(text, task, explain)  # a package that is installed has the word
-
-
-def _parse_known(text: str, task: Task, explain: bool) -> Query:
     plain = re.sub(r"\s+", " ", text.replace("’", "'").casefold()).strip(" ?.!")
     clauses: list[Clause] = []
     parts = re.split(r" and |^and | and$", plain)

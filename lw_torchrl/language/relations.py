@@ -2,7 +2,7 @@
 
 import re
 from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from types import MappingProxyType
@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from lw_torchrl._checks import check_choice, shown
 from lw_torchrl._files import read_toml
-from lw_torchrl._tables import Table
+from lw_torchrl._registry import Registry
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.named_objects import is_number
 
@@ -60,40 +60,38 @@ PREDICATES = ChainMap[str, tuple[Comparison, ...]]()
 """All that a clause can say: the relations, also those that are added, then the predicates of one object."""
 
 
-class Relations(Table[tuple[Comparison, ...]]):
-    """Relations by name, to which others may be added; a name that a query cannot hold is a ValueError."""
-
-    def check(self, name: str, parts: Any) -> tuple[Comparison, ...]:
-        words = name.split() if isinstance(name, str) else []
-        if not words or name != " ".join(words) or not re.fullmatch(r"[a-z][a-z '-]*", name):
-            raise ValueError(f"a relation must be named by lower-case words, like 'left of', got {shown(name)}")
-        taken = name not in self.data and any(name in list(table) for table in PREDICATES.maps)
-        own = [name] * taken + [one for one in words[:1] if one in ("is", "isn't", "not")]
-        if own := own + [one for one in words if one in ("and", "the", "a", "an")]:
-            raise ValueError(f"a relation may not be named {name!r}: {own[0]!r} has a meaning of its own in a query")
-        if isinstance(parts, Comparison) or not parts or not all(isinstance(part, Comparison) for part in parts):
-            raise ValueError(f"relation {name!r} must be a tuple of Comparison, at least one, got {shown(parts)}")
-        return tuple(parts)
+def _check_predicate(name: str, parts: Any, others: Iterable[str]) -> tuple[Comparison, ...]:
+    """Return the comparisons of a predicate; :class:`ValueError` for a name that a query cannot contain."""
+    words = name.split() if isinstance(name, str) else []
+    if not words or name != " ".join(words) or not re.fullmatch(r"[a-z][a-z '-]*", name):
+        raise ValueError(f"a relation must be named by lower-case words, like 'left of', got {shown(name)}")
+    reserved = [name] * (name in others) + [word for word in words[:1] if word in ("is", "isn't", "not")]
+    if reserved := reserved + [word for word in words if word in ("and", "the", "a", "an")]:
+        raise ValueError(f"a relation may not be named {name!r}: {reserved[0]!r} has its own meaning in a query")
+    if isinstance(parts, Comparison) or not parts or not all(isinstance(part, Comparison) for part in parts):
+        raise ValueError(f"relation {name!r} must be a tuple of Comparison, at least one, got {shown(parts)}")
+    return tuple(parts)
 
 
-class States(Relations):
-    """What is said of an object's opening, by name; comparisons of anything but that number are a ValueError."""
-
-    def check(self, name: str, parts: Any) -> tuple[Comparison, ...]:
-        for one in parts if isinstance(parts, tuple) else ():
-            if isinstance(one, Comparison) and (one.axes, one.length) != ("z", False):
-                asked = "compare the opening, Comparison('z', ..., length=False)"
-                raise ValueError(f"state {name!r} must {asked}, got {shown(one)}")
-        return super().check(name, parts)
+def _check_relation(name: str, parts: Any) -> tuple[Comparison, ...]:
+    return _check_predicate(name, parts, UNARY)
 
 
-STATES = States("state", "lw_torchrl.states", _predicates("states"))
+def _check_state(name: str, parts: Any) -> tuple[Comparison, ...]:
+    for part in parts if isinstance(parts, tuple) else ():
+        if isinstance(part, Comparison) and (part.axes, part.length) != ("z", False):
+            needed = "compare the opening, Comparison('z', ..., length=False)"
+            raise ValueError(f"state {name!r} must {needed}, got {shown(part)}")
+    return _check_predicate(name, parts, {*_OF_POSITION, *PREDICATES.maps[-1]})
+
+
+_OF_POSITION: Mapping[str, tuple[Comparison, ...]] = MappingProxyType(_predicates("unary"))
+STATES = Registry("state", "lw_torchrl.states", _predicates("states"), _check_state)
 """What is said of an opening, a number from 0, closed, to 1, open: "open", "closed", and what you add,
 ``STATES["on"] = STATES["open"]``. It stands in place of z."""
-_OF_POSITION: Mapping[str, tuple[Comparison, ...]] = MappingProxyType(_predicates("unary"))
 UNARY = ChainMap[str, tuple[Comparison, ...]](STATES, _OF_POSITION)  # type: ignore[arg-type]
 """The predicates of one object: "touching the table" compares its z with the table's, :data:`STATES` its opening."""
-RELATIONS = Relations("relation", "lw_torchrl.relations", _predicates("relations"))
+RELATIONS = Registry("relation", "lw_torchrl.relations", _predicates("relations"), _check_relation)
 """The relations between two objects: the 13 published ones, and those that you add (docs/queries.md shows how).
 
 Source: paper section 'Query Answering Function'; the thresholds are the published ones.

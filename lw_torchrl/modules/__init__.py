@@ -5,7 +5,6 @@ from lw_torchrl.modules.composed_actors import ActorEnsemble, DemonstratedActor,
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedValue, QValue, Value, plan_actor_value
 from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor, DescriptorEncoder
-from lw_torchrl.modules.held_evaluator import HeldEvaluator
 from lw_torchrl.modules.image_query_evaluator import IMAGE_ENCODERS, ImageQueryEvaluator
 from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.modules.plan_attention import PlanAttention
@@ -13,15 +12,15 @@ from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 from lw_torchrl.modules.policy import Encoder, Encoding, Policy
 from lw_torchrl.modules.query_evaluator import EVALUATORS, QueryEvaluator
+from lw_torchrl.modules.registry import ENCODERS, METHODS, POLICIES, Method, make_policy
 from lw_torchrl.modules.relative_positions import PlanFocus
 from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
-from lw_torchrl.modules.tables import ENCODERS, METHODS, POLICIES, Method, make_policy
 
 __all__ = [
     "ENCODERS", "EVALUATORS", "IMAGE_ENCODERS", "METHODS", "POLICIES", "ActorEnsemble", "ConditionedActor",
-    "DemonstratedActor", "DescriptorConditionedActor", "DescriptorEncoder", "Encoder", "Encoding", "HeldEvaluator",
+    "DemonstratedActor", "DescriptorConditionedActor", "DescriptorEncoder", "Encoder", "Encoding",
     "ImageQueryEvaluator", "Method", "ObservationFeatures", "PlanAttention", "PlanConditionedActor",
     "PlanConditionedQValue", "PlanConditionedValue", "PlanEncoder", "PlanFocus", "Policy", "QValue", "QueryEvaluator",
     "ResidualActor", "ScriptedSkillActor", "StateQueryEvaluator", "TransferredActor", "Value", "make_policy",

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple, Self
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -15,8 +14,6 @@ from lw_torchrl.language.queries import Clause
 from lw_torchrl.language.relations import PREDICATES, STATES
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.language.text import TextEncoder, encoded
-from lw_torchrl.modules.networks import unit_scale
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 
 _PADDING = -1e4  # as QueryProgram.logits has it
@@ -31,7 +28,6 @@ class Clauses(NamedTuple):
     shift: Tensor  # (..., 3) float32, metres
     predicate: Tensor  # (...) int64, its number in the list of predicates
     negated: Tensor  # (...) bool
-    text: Tensor  # (...) int64, its number in the list of texts
     subject: Tensor  # (...) int64, its name's number in the list of names
     object: Tensor  # (...) int64, likewise; the number behind the last for none
     # Of T tasks' plans alone, whose clauses (T, C) come once each:
@@ -40,7 +36,7 @@ class Clauses(NamedTuple):
 
     def pick(self, which: Tensor) -> Clauses:
         """Of (G,) clauses those of these numbers, (...) int64."""
-        return Clauses(*(table[which] for table in self[:8]))
+        return Clauses(*(table[which] for table in self[:7]))
 
 
 def conjunction(logits: Tensor, mask: Tensor) -> Tensor:
@@ -56,59 +52,33 @@ class ClauseEvaluator(QueryEvaluator):
 
     Reads what is seen of a state and ``task_id`` (B,) int64; writes ``qaf_logits`` (B, S) float32, positive where a
     condition of the row's plan holds, -1e4 beyond its last step. A condition's clauses are answered one by one, and put
-    together as :func:`conjunction` says. A subclass gives ``network``, from what is seen of B states, their clauses
-    (B, C) and the texts' vectors to logits (B, C), and in ``seen_dims`` how many dimensions a state has.
+    together as :func:`conjunction` says. A subclass gives ``network``, from what is seen of B states and their clauses
+    (B, C) to logits (B, C), and in ``seen_dims`` how many dimensions a state has.
 
     Args:
         plans: whose conditions it answers.
-        structure: a clause is read as the query language parses it: its predicate and its things by number, "not" as
-            the opposite. False: only its text's vector is known.
-        predicates, names: with ``structure``, the relations and predicates, and the things, that it can tell; None for
-            all predicates, no names where things are not told apart by name.
-        text_encoder: without ``structure``, texts to vectors (n, E) float32; None for the sentence encoder, which
-            needs the extra ``[text]``: clauses' vectors are not shipped.
+        predicates, names: the relations and predicates, and the things, that it can tell; None for all predicates, and
+            for no names where things are not told apart by name.
 
     Raises:
         ValueError: a plan asks for what it cannot tell; at call time, another shape, or a task_id without a plan.
-        ImportError: without ``structure``, the extra ``[text]`` is not installed and there is no ``text_encoder``.
 
     Source: paper section 'Differentiability and Optimization', which names a visual question answering model.
     """
 
     network: nn.Module
-    text_vectors: Tensor | None
     seen_dims: ClassVar[int] = 1
 
     def __init__(
-        self,
-        plans: Plans,
-        *,
-        structure: bool,
-        predicates: Sequence[str] | None,
-        names: Sequence[str] | None = None,
-        text_encoder: TextEncoder | None,
+        self, plans: Plans, *, predicates: Sequence[str] | None = None, names: Sequence[str] | None = None
     ) -> None:
         super().__init__(plans)
-        if not structure and predicates is not None:
-            raise ValueError("predicates is for structure=True; without, an evaluator reads texts alone")
-        self.predicates = _checked("predicates", sorted(PREDICATES) if predicates is None else predicates, structure)
-        self.names = _checked("names", names or (), structure and bool(names))
-        self.config = {"structure": structure}
-        if structure:
-            self.config["predicates"] = list(self.predicates)
-        self.text_encoder = text_encoder
+        self.predicates = _different("predicates", sorted(PREDICATES) if predicates is None else predicates)
+        self.names = () if names is None else _different("names", names)
+        self.config = {"predicates": list(self.predicates)}
         index = TaskIndex(plans)
-        asked = [(plan.definition, clause) for plan in plans.values() for clause in _of(plan)]
-        texts = None if structure else _texts(asked)
-        tables = _plan_clauses(plans, index.tasks, self.predicates, texts, self.names)
-        vectors = None if texts is None else unit_scale(_vectors(texts, text_encoder))
-        self.register_buffer("text_vectors", vectors, persistent=False)
+        tables = _plan_clauses(plans, index.tasks, self.predicates, self.names)
         self.tables: TaskTables[Clauses] = TaskTables(index, tables, f"tasks without a plan in {plans!r}")
-
-    @property
-    def text_size(self) -> int:
-        """E, the numbers of a text's vector; 0 where none is read."""
-        return 0 if self.text_vectors is None else self.text_vectors.shape[1]
 
     def check_seen(self, seen: Tensor) -> None:
         """Raise :class:`ValueError` unless it is what the network was made for."""
@@ -124,40 +94,20 @@ class ClauseEvaluator(QueryEvaluator):
             raise ValueError(f"task_id must be of shape {tuple(shape)}, {each}, got {tuple(task_id.shape)}")
         rows = seen.reshape(-1, *seen.shape[-self.seen_dims :])
         tables = self.tables.select(task_id.reshape(-1), rows)
-        clauses = self.network(rows, tables, self.text_vectors)
+        clauses = self.network(rows, tables)
         parts = clauses.gather(-1, tables.parts.flatten(1)).reshape(tables.parts.shape)
         found = torch.where(tables.mask.any(-1), conjunction(parts, tables.mask), _PADDING)
         return found.reshape(*task_id.shape, self.plans.num_steps)
 
-    def code(self, clauses: Sequence[tuple[Task, Clause]]) -> tuple[Clauses, Tensor | None]:
-        """Any clauses of tasks, for the network: (G,) of them, and the vectors of their texts, if it reads texts; the
-        second half are then the negations of the first."""
-        if self.predicates:
-            return _as_tensors(clauses, self.predicates, None, self.names), None
-        both = [*clauses, *((task, replace(clause, negated=not clause.negated)) for task, clause in clauses)]
-        texts = _texts(both)
-        return _as_tensors(both, (), texts), unit_scale(_vectors(texts, self.text_encoder))
-
-    @classmethod
-    def from_options(cls, plans: Plans, options: Mapping[str, Any], text_encoder: TextEncoder | None) -> Self:
-        return cls(plans, text_encoder=text_encoder, **options)
+    def code(self, clauses: Sequence[tuple[Task, Clause]]) -> Clauses:
+        """Return any clauses of tasks as tensors, (G,), for the network."""
+        return _as_tensors(clauses, self.predicates, self.names)
 
 
-def _checked(argument: str, given: Sequence[str], wanted: bool) -> tuple[str, ...]:
-    if not wanted:
-        return ()
-    named = not isinstance(given, str) and all(isinstance(name, str) for name in given)
-    if not named or not given or len({*given}) < len(given):
+def _different(argument: str, given: Sequence[str]) -> tuple[str, ...]:
+    if isinstance(given, str) or not given or len({*given}) < len(given):
         raise ValueError(f"{argument} must be different names, at least one, got {shown(given)}")
     return tuple(given)
-
-
-def _vectors(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
-    try:
-        return encoded(texts, encoder)
-    except ImportError as error:
-        what = f"structure=False reads the vectors of clauses' texts, which are not shipped: {error}"
-        raise ImportError(f"{what}; or give a text_encoder, or take structure=True") from error
 
 
 def _position(task: Task, name: str) -> tuple[list[int], list[float]]:
@@ -180,16 +130,11 @@ def _ends(clause: Clause, task: Task) -> tuple[list[int], list[int], list[float]
     return first, second, [a - b for a, b in zip(shift, other, strict=True)]
 
 
-def _as_tensors(
-    clauses: Sequence[tuple[Task, Clause]],
-    predicates: Sequence[str],
-    texts: Sequence[str] | None,
-    names: Sequence[str] = (),
-) -> Clauses:
-    """Clauses of tasks as tensors, (G,); where a list of what is numbered is empty or None, all are number 0."""
-    predicate, text, place = ({name: at for at, name in enumerate(those or ())} for those in (predicates, texts, names))
+def _as_tensors(clauses: Sequence[tuple[Task, Clause]], predicates: Sequence[str], names: Sequence[str]) -> Clauses:
+    """Return clauses of tasks as tensors, (G,); without ``names`` all things are number 0."""
+    predicate, place = ({name: at for at, name in enumerate(those)} for those in (predicates, names))
     for task, clause in clauses:
-        if predicates and clause.predicate not in predicate:
+        if clause.predicate not in predicate:
             error = unknown_name(f"predicate of {str(clause)!r}, in {task.name}", clause.predicate, predicates)
             raise ValueError(f"{error}; an evaluator answers what it was made for: make and train one that has it")
         for thing in (clause.subject, clause.object):
@@ -201,25 +146,18 @@ def _as_tensors(
         first=torch.tensor([first for first, _, _ in ends]),
         second=torch.tensor([second for _, second, _ in ends]),
         shift=torch.tensor([shift for _, _, shift in ends], dtype=torch.float32),
-        predicate=torch.tensor([predicate.get(clause.predicate, 0) for _, clause in clauses]),
+        predicate=torch.tensor([predicate[clause.predicate] for _, clause in clauses]),
         negated=torch.tensor([clause.negated for _, clause in clauses]),
-        text=torch.tensor([text.get(str(clause), 0) for _, clause in clauses]),
         subject=torch.tensor([place.get(clause.subject, 0) for _, clause in clauses]),
         object=torch.tensor([place.get(clause.object or "", len(names)) for _, clause in clauses]),
     )
-
-
-def _texts(clauses: Iterable[tuple[Task, Clause]]) -> list[str]:
-    return sorted({str(clause) for _, clause in clauses})
 
 
 def _of(plan: ConditionalPlan) -> list[Clause]:
     return list(dict.fromkeys(clause for step in plan.steps for clause in step.condition.clauses))
 
 
-def _plan_clauses(
-    plans: Plans, tasks: Sequence[str], predicates: Sequence[str], texts: Sequence[str] | None, names: Sequence[str]
-) -> Clauses:
+def _plan_clauses(plans: Plans, tasks: Sequence[str], predicates: Sequence[str], names: Sequence[str]) -> Clauses:
     """The clauses of plans as tensors, with a row for each of ``tasks``; errors as of :func:`_as_tensors`."""
     listed = [_of(plans[task]) for task in tasks]
     flat = [(plans[task].definition, clause) for task, found in zip(tasks, listed, strict=True) for clause in found]
@@ -235,4 +173,4 @@ def _plan_clauses(
             own = [found.index(clause) for clause in dict.fromkeys(step.condition.clauses)]
             parts[row, column, : len(own)] = torch.tensor(own)
             mask[row, column, : len(own)] = True
-    return _as_tensors(flat, predicates, texts, names).pick(number)._replace(parts=parts, mask=mask)
+    return _as_tensors(flat, predicates, names).pick(number)._replace(parts=parts, mask=mask)

@@ -16,9 +16,8 @@ from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.language.text import TextEncoder
-from lw_torchrl.modules.held_evaluator import HeldEvaluator
 from lw_torchrl.modules.policy import Policy, decided
-from lw_torchrl.modules.tables import from_description
+from lw_torchrl.modules.registry import from_description
 
 
 class ActorEnsemble(Policy):
@@ -32,7 +31,7 @@ class ActorEnsemble(Policy):
         members: M policies with the same plans, or the same tasks, and the same keys.
 
     Raises:
-        ValueError: no member, members of different plans, tasks or keys, or one with a :class:`HeldEvaluator`.
+        ValueError: no member, or members of different plans, tasks or keys.
 
     Example:
         >>> import lw_torchrl as lw
@@ -53,8 +52,6 @@ class ActorEnsemble(Policy):
             if any(_shared(one)[name] != own for one in members):
                 raise ValueError(f"members must have the same {name}")
         self.members: Any = nn.ModuleList(members)
-        if any(isinstance(part, HeldEvaluator) for one in members for part in one.modules()):
-            raise ValueError("members must have no HeldEvaluator of their own: give it to evaluate(..., evaluator=)")
         self.plans, self.tasks, self.layout = first.plans, first.tasks, first.layout
         self.in_keys = first.in_keys
         self.out_keys = first.out_keys_source[: 1 if first.plans is None else 2]

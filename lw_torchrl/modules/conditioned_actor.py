@@ -21,10 +21,10 @@ from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import DISTRIBUTIONS, ActionHead, DistributionName
 from lw_torchrl.modules.policy import Encoder, Encoding, Policy, decided, kind_of
-from lw_torchrl.modules.tables import ENCODERS, class_of
+from lw_torchrl.modules.registry import ENCODERS, class_of
 
 _OF_HEAD = ("width", "depth", "squash", "distribution", "init_std", "decided_gripper", "action_size", "out_keys")
-_ALTERING = ("jitter", "swap_unmentioned", "hide_opening")
+_ALTERING = ("jitter", "swap_unmentioned")
 
 
 class ConditionedActor(Policy):
@@ -102,7 +102,7 @@ class ConditionedActor(Policy):
             self.encoder = self.encoder_class(about, feature_noise=feature_noise, **options)
         if distribution is not None and any(self.encoder.config.get(name) for name in _ALTERING):
             raise ValueError(
-                f"{', '.join(_ALTERING[:-1])} and {_ALTERING[-1]} must be 0 with a distribution, whose likelihood they "
+                f"{' and '.join(_ALTERING)} must be 0 with a distribution, whose likelihood they "
                 "would change from call to call; train an actor without one, and take actor.stochastic()"
             )
         head: Any = dict(width=width, depth=depth, squash=squash, distribution=distribution, init_std=init_std)
@@ -158,19 +158,9 @@ class ConditionedActor(Policy):
         """What is written of an encoding beside the action: with plans attention (B, S) and the mixed latent (B, D)."""
         return () if encoding.weights is None else (encoding.weights, encoding.latent)
 
-    def _encoding(self, *prepared: Tensor) -> Encoding:
-        found = self.encoder.encode(*prepared)
-        if not isinstance(found, Encoding):
-            name, got = type(self.encoder).__name__, type(found).__name__
-            raise TypeError(f"encode of {name} must return an Encoding(latent, features), got {got}")
-        if (found.weights is None) != (self.plans is None):
-            what = "weights, the attention over the steps" if self.plans is not None else "no weights without plans"
-            raise TypeError(f"encode of {type(self.encoder).__name__} must return {what}")
-        return found
-
     def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
         if self.head.distribution is None:
-            encoding = self._encoding(*prepared)
+            encoding = self.encoder.encode(*prepared)
             return self.decide(self.head(encoding.joined)), *self.extras(encoding)
         *extras, loc, scale = self.before_sampling(*prepared)
         dist = self.head.dist(loc, scale)
@@ -184,7 +174,7 @@ class ConditionedActor(Policy):
 
     def before_sampling(self, *prepared: Tensor) -> tuple[Tensor, ...]:
         """From what :meth:`prepare` gives to the extras, ``loc`` and ``scale``."""
-        encoding = self._encoding(*prepared)
+        encoding = self.encoder.encode(*prepared)
         return *self.extras(encoding), *self.head.loc_scale(encoding.joined)
 
     def get_dist(self, tensordict: TensorDictBase) -> Distribution:
@@ -228,11 +218,12 @@ class ConditionedActor(Policy):
 
     def _loc_scale(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         self._require_distribution()
-        return self.head.loc_scale(self._encoding(*self.prepare(tensordict)).joined)
+        return self.head.loc_scale(self.encoder.encode(*self.prepare(tensordict)).joined)
 
     def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> Self:
-        """A copy with a distribution, whose mode is what this actor does, to be trained by RL; its features have no
-        noise, jitter, swaps nor hidden opening.
+        """Return a copy with a distribution, whose mode is this actor's action, for RL.
+
+        Its features have no noise, jitter or swaps.
 
         Args:
             distribution: "tanh_normal", or "normal", whose actions the environment clips.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Unpack
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -15,13 +15,12 @@ from torchrl.envs import Transform
 from lw_torchrl._checks import check_int, checked, passes_on
 from lw_torchrl._keys import as_keys, check_apart, check_key, dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans
-from lw_torchrl.modules.networks import DistributionName, check_width, head
-from lw_torchrl.modules.options import CriticOptions, PlanQValueOptions, PlanValueOptions
+from lw_torchrl.modules.networks import DistributionName, head
 from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 from lw_torchrl.modules.policy import Encoder
 
-_OWN = ("ensemble", "width", "depth", "layer_norm", "out_keys")  # options of a critic, not of its encoder
+_OWN = ("ensemble", "width", "depth", "out_keys")  # options of a critic, not of its encoder
 
 
 class Value(TensorDictModuleBase):
@@ -34,8 +33,7 @@ class Value(TensorDictModuleBase):
         encoder: what it is conditioned on; one that is an actor's too is trained by both.
         ensemble: E, networks on the one encoder. TorchRL's losses copy the whole critic ``num_qvalue_nets`` times
             themselves, and draw the copies' weights anew.
-        width, depth: hidden layers; a tuple of widths says both.
-        layer_norm: a LayerNorm behind each hidden layer.
+        width, depth: hidden layers, each followed by a LayerNorm; a tuple of widths says both.
         out_keys: other names for what it writes, in the order above; nested ones too.
 
     Example:
@@ -60,7 +58,6 @@ class Value(TensorDictModuleBase):
         ensemble: int = 1,
         width: int | Sequence[int] = 256,
         depth: int = 2,
-        layer_norm: bool = True,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__()
@@ -71,7 +68,7 @@ class Value(TensorDictModuleBase):
         check_apart(self.in_keys, self.out_keys)
         more = encoder.layout.action_size if self._of_action else 0
         self.heads = nn.ModuleList(
-            head(encoder.width + more, self._numbers, width, depth, layer_norm=layer_norm)
+            head(encoder.width + more, self._numbers, width, depth, layer_norm=True)
             for _ in range(check_int("ensemble", ensemble, minimum=1))
         )
 
@@ -102,7 +99,7 @@ class QValue(Value):
     ``quantiles``, ``state_action_value`` is (B, Q) float32.
 
     Args:
-        encoder, ensemble, width, depth, layer_norm, out_keys: as for :class:`Value`.
+        encoder, ensemble, width, depth, out_keys: as for :class:`Value`.
         action_key: where the action is; may be nested.
         quantiles: Q, how many quantiles of the return are the value, for ``torchrl.objectives.TQCLoss``; 1: its mean.
 
@@ -121,7 +118,7 @@ class QValue(Value):
         ensemble: int = 1,
         action_key: NestedKey = "action",
         quantiles: int = 1,
-        **options: Unpack[CriticOptions],
+        **options: Any,
     ) -> None:
         self._numbers = check_int("quantiles", quantiles, minimum=1)
         if quantiles > 1 and ensemble != 1:
@@ -153,10 +150,9 @@ class PlanConditionedValue(Value):
     """
 
     @passes_on(Value.__init__, PlanEncoder.__init__)
-    def __init__(self, plans: AnyPlans, **options: Unpack[PlanValueOptions]) -> None:
-        given: dict[str, Any] = {**options}
-        own = {name: given.pop(name) for name in _OWN if name in given}
-        super().__init__(PlanEncoder(plans, **given), **own)
+    def __init__(self, plans: AnyPlans, **options: Any) -> None:
+        own = {name: options.pop(name) for name in _OWN if name in options}
+        super().__init__(PlanEncoder(plans, **options), **own)
 
 
 class PlanConditionedQValue(QValue):
@@ -176,10 +172,9 @@ class PlanConditionedQValue(QValue):
     """
 
     @passes_on(QValue.__init__, PlanEncoder.__init__)
-    def __init__(self, plans: AnyPlans, **options: Unpack[PlanQValueOptions]) -> None:
-        given: dict[str, Any] = {**options}
-        own = {name: given.pop(name) for name in (*_OWN, "action_key", "quantiles") if name in given}
-        super().__init__(PlanEncoder(plans, **given), **own)
+    def __init__(self, plans: AnyPlans, **options: Any) -> None:
+        own = {name: options.pop(name) for name in (*_OWN, "action_key", "quantiles") if name in options}
+        super().__init__(PlanEncoder(plans, **options), **own)
 
 
 @passes_on(PlanConditionedActor.__init__)
@@ -188,8 +183,6 @@ def plan_actor_value(
     plans: AnyPlans,
     *,
     distribution: DistributionName = "tanh_normal",
-    value_width: int | tuple[int, ...] = 256,
-    value_depth: int = 2,
     **options: Any,
 ) -> tuple[PlanConditionedActor, Value]:
     """An actor and the value of its states on one shared encoder, as PPO and A2C take them.
@@ -197,7 +190,6 @@ def plan_actor_value(
     Args:
         plans: a plan for each task that will be seen.
         distribution: the actor's.
-        value_width, value_depth: hidden layers of the value.
         **options: of :class:`PlanConditionedActor`.
 
     Returns:
@@ -211,5 +203,4 @@ def plan_actor_value(
     Source: ``torchrl.modules.ActorValueOperator``.
     """
     actor = PlanConditionedActor(plans, distribution=distribution, **options)
-    check_width("value_width", value_width)
-    return actor, Value(actor.encoder, width=value_width, depth=value_depth)
+    return actor, Value(actor.encoder)

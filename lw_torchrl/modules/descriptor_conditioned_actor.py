@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal, Self, Unpack
+from typing import Any, Literal, Self
 
 import torch
 from tensordict import TensorDictBase
@@ -19,7 +19,6 @@ from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.networks import text_to_latent, unit_scale
 from lw_torchrl.modules.observation_features import Features, ObservationFeatures
-from lw_torchrl.modules.options import DescriptorActorOptions
 from lw_torchrl.modules.policy import Encoder, Encoding, described_tasks
 
 
@@ -119,7 +118,7 @@ class DescriptorConditionedActor(ConditionedActor):
     encoder: DescriptorEncoder
 
     @passes_on(ConditionedActor.__init__, DescriptorEncoder.__init__)
-    def __init__(self, tasks: str | Iterable[str | Task], **options: Unpack[DescriptorActorOptions]) -> None:
+    def __init__(self, tasks: str | Iterable[str | Task], **options: Any) -> None:
         super().__init__(tasks, **options)
 
     @classmethod

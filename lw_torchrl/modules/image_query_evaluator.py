@@ -10,10 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import check_choice, check_int, checked
+from lw_torchrl._registry import Registry, is_function
 from lw_torchrl._rendering import check_cameras
-from lw_torchrl._tables import Functions
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
 from lw_torchrl.modules.networks import head
 from lw_torchrl.modules.state_query_evaluator import ClauseNetwork
@@ -47,19 +46,18 @@ def _conv(before: int, after: int, stride: int = 1) -> nn.Sequential:
 class PointingNetwork(ClauseNetwork):
     """Points at things in pictures, and judges clauses by where they are, as :class:`ClauseNetwork` does.
 
-    A thing's vector, its own or one that a clause's text gives, is compared with the features of every place in each
-    camera's picture; the softmax over the places is where it points. From the places' mean coordinates and features,
-    and from some landmarks' coordinates, which are the same for all things, an MLP gives the thing's four numbers: its
-    position in metres, and how far it is open.
+    A thing's learned vector is compared with the features of every place in each camera's picture; the softmax over the
+    places is where it points. From the places' mean coordinates and features, and from the coordinates of some
+    landmarks, which are the same for all things, an MLP gives the thing's four numbers: its position in metres, and how
+    far it is open.
 
     ``encoder`` makes a map of ``features`` (n, F, h, w) of pictures (n, 3, H, W) float32 in [0, 1]; ``names`` is the
-    number of things, 0 for a network that reads texts; ``trunk`` is as of :class:`ClauseNetwork`.
+    number of things; ``trunk`` is as of :class:`ClauseNetwork`.
 
     Source: the spatial softmax of 'Deep spatial autoencoders for visuomotor learning' (Finn et al., 2016).
     """
 
     numbers = 4
-    ends = 2 * KEYS + 2
 
     def __init__(self, encoder: nn.Module, features: int, *, cameras: int, names: int, **trunk: Any) -> None:
         super().__init__(**trunk)
@@ -67,22 +65,12 @@ class PointingNetwork(ClauseNetwork):
         self.key = nn.Conv2d(features, KEYS, 1)
         self.seen = nn.Conv2d(features, _KEPT, 1)
         self.landmarks = nn.Conv2d(features, _LANDMARKS, 1)
-        if names:
-            self.names = nn.Embedding(names, KEYS)
+        self.names = nn.Embedding(names, KEYS)
         self.place = head(cameras * (2 + _KEPT + 2 * _LANDMARKS) + KEYS, self.numbers, self.width, 2)
 
-    def forward(self, seen: Tensor, clauses: Clauses, text_vectors: Tensor | None = None) -> Tensor:
+    def forward(self, seen: Tensor, clauses: Clauses) -> Tensor:
         """As :class:`ClauseNetwork`, of pictures (B, H, W·C, 3) uint8 side by side."""
-        if not self.reads_text:
-            return self.tell(self.places(seen, self.names.weight)[0], clauses)
-        assert text_vectors is not None
-        read = self.texts(text_vectors)
-        things, gates, shift, asked = read.split([2 * KEYS, 2, self.numbers, self.width + 1], -1)
-        places = self.places(seen, things.unflatten(-1, (2, -1)).flatten(0, 1))[0].unflatten(-2, (-1, 2))
-        ends = gates.sigmoid().unsqueeze(-1) * places  # (B, U, 2, 4)
-        d = ends[..., 0, :] - ends[..., 1, :] + 0.1 * shift
-        picked = d.gather(-2, clauses.text.unsqueeze(-1).expand(*clauses.text.shape, self.numbers))
-        return self.judge(picked, asked[clauses.text], None)
+        return self.tell(self.places(seen, self.names.weight)[0], clauses)
 
     def tell(self, places: Tensor, clauses: Clauses) -> Tensor:
         """The logits (B, Q) of clauses (B, Q) about named things at places (B, N, 4)."""
@@ -91,7 +79,7 @@ class PointingNetwork(ClauseNetwork):
             known.gather(-2, which.unsqueeze(-1).expand(*which.shape, self.numbers))
             for which in (clauses.subject, clauses.object)
         )
-        return self.judge(first - second, self.predicates.weight[clauses.predicate], clauses.negated)
+        return self.judge(first - second, clauses)
 
     def places(self, seen: Tensor, things: Tensor) -> tuple[Tensor, Tensor]:
         """Of pictures (B, H, W·C, 3) uint8 and things' vectors (N, 32) float32: positions in metres and how far they
@@ -113,7 +101,7 @@ class PointingNetwork(ClauseNetwork):
         return places, pointed.unflatten(0, (rows, self.cameras)).unflatten(-1, (height, width))
 
 
-IMAGE_ENCODERS = Functions("image encoder", "lw_torchrl.image_encoders", {"small": SmallImageEncoder})
+IMAGE_ENCODERS = Registry("image encoder", "lw_torchrl.image_encoders", {"small": SmallImageEncoder}, is_function)
 """What makes an encoder of pictures, by name: a module from (n, 3, H, W) float32 in [0, 1] to a map of features
 (n, F, h, w). Put yours here, one that is frozen with ``requires_grad_(False)`` too, to have it in files."""
 
@@ -129,13 +117,13 @@ class ImageQueryEvaluator(ClauseEvaluator):
     :class:`CameraTransform` that takes its pictures.
 
     Args:
-        plans, structure, predicates, text_encoder: as for
-            :class:`~lw_torchrl.modules.clause_evaluator.ClauseEvaluator`, whose errors and source it has.
+        plans, predicates: as for :class:`~lw_torchrl.modules.clause_evaluator.ClauseEvaluator`, whose errors and
+            source it has.
         cameras, height, width: as for :class:`CameraTransform`; at most 512 pixels.
         every: steps from one picture to the next when it acts; in between its answers stay.
         encoder: a name in :data:`IMAGE_ENCODERS`.
         hidden, depth: hidden layers of what judges differences.
-        names: with ``structure``, the things that it can tell; None for those of the plans' tasks.
+        names: the things that it can tell; None for those of the plans' tasks.
 
     Example:
         >>> import lw_torchrl as lw
@@ -162,18 +150,14 @@ class ImageQueryEvaluator(ClauseEvaluator):
         width: int = 64,
         every: int = 1,
         encoder: str = "small",
-        structure: bool = True,
         hidden: int = 128,
         depth: int = 3,
         predicates: Sequence[str] | None = None,
         names: Sequence[str] | None = None,
-        text_encoder: TextEncoder | None = None,
     ) -> None:
-        if not structure and names is not None:
-            raise ValueError("names is for structure=True; without, an evaluator reads texts alone")
-        if structure and names is None:
+        if names is None:
             names = sorted({name for plan in plans.values() for name in plan.definition.object_names})
-        super().__init__(plans, structure=structure, predicates=predicates, names=names, text_encoder=text_encoder)
+        super().__init__(plans, predicates=predicates, names=names)
         self.cameras, self.every = check_cameras(cameras, height, width), check_int("every", every, minimum=1)
         if max(height, width) > _LARGEST:
             raise ValueError(f"height and width must be at most {_LARGEST} pixels, got {height} and {width}")
@@ -189,10 +173,9 @@ class ImageQueryEvaluator(ClauseEvaluator):
             width=hidden,
             depth=depth,
             predicates=len(self.predicates),
-            text_size=self.text_size,
         )
         self.config |= dict(cameras=list(self.cameras), height=height, width=width, every=self.every, encoder=encoder)
-        self.config |= dict(hidden=hidden, depth=depth) | ({"names": list(self.names)} if structure else {})
+        self.config |= dict(hidden=hidden, depth=depth, names=list(self.names))
 
     def transform(self) -> CameraTransform:
         """A new transform that takes its pictures."""

@@ -26,12 +26,15 @@ def attend(logits: Tensor, steps: Tensor) -> Tensor:
     return logits.masked_fill(~steps, -torch.inf).softmax(-1)
 
 
-def attention_logits(logits: Tensor, answers: Answers, scale: float) -> Tensor:
-    """What an evaluator's logits (...,) count in the attention's softmax, where exact truth counts 5 and -5: what they
-    are ("logit"), 5·tanh(scale·logit) ("tanh"), or 5 above 0 and else -5, with the gradient of "tanh" ("hard")."""
+def attention_logits(logits: Tensor, answers: Answers) -> Tensor:
+    """Return an evaluator's logits (...,) as logits of the attention, where exact truth counts 5 and -5.
+
+    They stay as they are ("logit"), become 5·tanh(logit / 2) ("tanh"), or 5 above 0 and else -5, with the gradient of
+    "tanh" ("hard").
+    """
     if answers == "logit":
         return logits
-    soft = 5.0 * torch.tanh(scale * logits)
+    soft = 5.0 * torch.tanh(0.5 * logits)
     if answers == "tanh":
         return soft
     return torch.where(logits > 0, 5.0, -5.0) + (soft - soft.detach())

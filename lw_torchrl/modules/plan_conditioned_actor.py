@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, Self, Unpack
+from typing import Any, Self
 
 import torch
-from torch import Tensor
 
-from lw_torchrl._checks import check_choice, passes_on
+from lw_torchrl._checks import passes_on
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
-from lw_torchrl.modules.options import PlanActorOptions
 from lw_torchrl.modules.plan_attention import Answers
 from lw_torchrl.modules.plan_encoder import PlanEncoder
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description, plans_and_evaluator
@@ -28,7 +26,6 @@ class PlanConditionedActor(ConditionedActor):
 
     Args:
         plans: a plan for each task it is to act in.
-        mix: "latents", decode the mixed latent, as in the paper; "actions", decode all latents and mix the actions.
         **options: of :class:`ConditionedActor` and of :class:`PlanEncoder`; ``out_keys`` are the actor's.
 
     Attributes:
@@ -56,18 +53,8 @@ class PlanConditionedActor(ConditionedActor):
     plans: Plans
 
     @passes_on(ConditionedActor.__init__, PlanEncoder.__init__)
-    def __init__(
-        self,
-        plans: AnyPlans,
-        *,
-        mix: Literal["latents", "actions"] = "latents",
-        **options: Unpack[PlanActorOptions],
-    ) -> None:
-        check_choice("mix", mix, ("latents", "actions"))
-        if mix == "actions" and options.get("distribution") is not None:
-            raise ValueError("mix must be 'latents' with a distribution: a mean of several actions has no likelihood")
+    def __init__(self, plans: AnyPlans, **options: Any) -> None:
         super().__init__(plans, **options)
-        self.config["mix"] = mix
         self.skills = self.encoder.skills
 
     @property
@@ -82,16 +69,6 @@ class PlanConditionedActor(ConditionedActor):
             options["evaluator"] = evaluator_from_description(asked, plans, text_encoder)
         return cls(plans, text_encoder=text_encoder, **options)
 
-    def act(self, *prepared: Tensor) -> tuple[Tensor, ...]:
-        if self.config["mix"] == "latents":
-            return super().act(*prepared)
-        encoding = self.encoder.encode(*prepared)
-        assert encoding.weights is not None
-        steps = self.encoder.latents()[prepared[1]]  # (B, S, D)
-        seen = encoding.features.unsqueeze(-2).expand(*steps.shape[:-1], -1)
-        actions = self.head(encoding._replace(latent=steps, features=seen).joined)
-        return self.decide((encoding.weights.unsqueeze(-1) * actions).sum(-2)), *self.extras(encoding)
-
     @classmethod
     def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> Self:
         plans, evaluator = plans_and_evaluator(found, text_encoder)
@@ -99,14 +76,12 @@ class PlanConditionedActor(ConditionedActor):
         made.encoder.check_rules(found)
         return made
 
-    def with_evaluator(
-        self, evaluator: QueryEvaluator, *, answers: Answers = "hard", answer_scale: float = 0.5
-    ) -> PlanConditionedActor:
+    def with_evaluator(self, evaluator: QueryEvaluator, *, answers: Answers = "hard") -> PlanConditionedActor:
         """An actor on the same weights that asks an evaluator in the place of ``qaf``: training either trains both.
 
         Args:
             evaluator: of its plans; the actor's own is replaced.
-            answers, answer_scale: as for the class; "hard", since the weights only know truth of 5 and -5.
+            answers: as for the class; "hard", since the weights only know truth of 5 and -5.
 
         Example:
             >>> import lw_torchrl as lw
@@ -114,7 +89,7 @@ class PlanConditionedActor(ConditionedActor):
             >>> lw.PlanConditionedActor(plans).with_evaluator(lw.StateQueryEvaluator(plans)).in_keys
             ['observation', 'task_id']
         """
-        options = self.config | {"answers": answers, "answer_scale": answer_scale, "in_keys": self.in_keys[:2]}
+        options = self.config | {"answers": answers, "in_keys": self.in_keys[:2]}
         text_encoder = self.encoder.text_encoder
         with torch.random.fork_rng(devices=[]):
             plans = self.encoder.written

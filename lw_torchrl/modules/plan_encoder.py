@@ -12,12 +12,11 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Compose, Transform
 
-from lw_torchrl._checks import check_probability, check_scale, checked
+from lw_torchrl._checks import check_probability, checked
 from lw_torchrl.language.canonical import RULES, canonical_plan, with_reserve
 from lw_torchrl.language.canonical_steps import CanonicalPlan, step_vectors
 from lw_torchrl.language.layout import METAWORLD, Layout, places
 from lw_torchrl.language.plans import AnyPlans, Plans, PlanStep, as_plans
-from lw_torchrl.language.skills import closes
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.language.text import TextEncoder, encoded
@@ -31,7 +30,6 @@ from lw_torchrl.transforms.qaf import plan_number_key, plan_program
 from lw_torchrl.transforms.random_yaw import tilt_key, yaw_key
 from lw_torchrl.transforms.take_turns import TakeTurns, turn_key
 
-_HOLDING = ("slide the", "carry the")  # in canonical plans
 IN_FORCE = 0.01  # a step whose condition does not hold beside one that does has a weight of 1e-4
 
 
@@ -60,15 +58,13 @@ class PlanEncoder(ReadsPlans, Encoder):
         jitter: standard deviation, in metres, of noise on that position while training, where the gripper pushes.
         swap_unmentioned: the probability, in training, that an object or the goal is put where it is in another row,
             if no step in force mentions it, or with ``roles`` moves it or to it.
-        hide_opening: the probability, in training, that the gripper's opening is another row's, if no step in force
-            closes it: it often tells which task this is.
         latent_size: D.
         encoder_width, encoder_depth: hidden layers of the skill encoder.
         evaluator: answers the conditions in the place of ``qaf``, which is then not read; see :class:`QueryEvaluator`.
             With ``canonical`` those of the canonical plans.
         answers: what an evaluator's logit counts in the attention's softmax, where exact truth counts 5 and -5:
-            "logit", what it is; "tanh", 5·tanh(answer_scale·logit); "hard", 5 or -5 by its sign, with tanh's gradient.
-        answer_scale: the scale in "tanh" and "hard"; 0.5 makes "tanh" the paper's 10·p - 5 of the probability p.
+            "logit", the logit; "tanh", 5·tanh(logit / 2), the paper's 10·p - 5 of the probability p; "hard", 5 or -5
+            by its sign, with the gradient of "tanh".
         text_encoder: texts to vectors (n, E) float32; None for the shipped sentence encoder.
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested ones too.
 
@@ -95,7 +91,6 @@ class PlanEncoder(ReadsPlans, Encoder):
     text_vectors: Tensor
     skill_index: Tensor
     mentioned: Tensor
-    closing: Tensor
     turns: Tensor
 
     @checked
@@ -111,13 +106,11 @@ class PlanEncoder(ReadsPlans, Encoder):
         reserve: bool = False,
         jitter: float = 0.0,
         swap_unmentioned: float = 0.0,
-        hide_opening: float = 0.0,
         latent_size: int = 64,
         encoder_width: int = 128,
         encoder_depth: int = 1,
         evaluator: QueryEvaluator | None = None,
         answers: Answers = "logit",
-        answer_scale: float = 0.5,
         text_encoder: TextEncoder | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
@@ -135,28 +128,25 @@ class PlanEncoder(ReadsPlans, Encoder):
         if canonical and evaluator is not None and evaluator.plans.fingerprint == self.written.fingerprint:
             evaluator = evaluator.with_plans(seen_plans)
         self.read_plans(seen_plans, evaluator, in_keys, out_keys, ("encoding",))
-        if evaluator is not None and (focus or roles or swap_unmentioned or hide_opening):
+        if evaluator is not None and (focus or roles or swap_unmentioned):
             raise ValueError(
-                "focus, roles, swap_unmentioned and hide_opening read exact truth, which an evaluator takes away; "
+                "focus, roles and swap_unmentioned read exact truth, which an evaluator takes away; "
                 "lw.evaluate(actor, evaluator=...) evaluates what has learned with it"
             )
         if features in ("opening", "none") and not (focus or roles):
             shows = "shows nothing of where things are; it needs roles=True or focus=True"
             raise ValueError(f"features={features!r} {shows}")
-        if features in ("relative", "none") and hide_opening:
-            raise ValueError(f"hide_opening: features={features!r} do not show the opening; got {hide_opening}")
         if jitter and not roles:
             raise ValueError(f"jitter moves the way of the roles, and roles is False; got jitter={jitter}")
-        if evaluator is None and (answers, answer_scale) != ("logit", 0.5):
-            raise ValueError("answers and answer_scale are of an evaluator's logits, and evaluator is None")
+        if evaluator is None and answers != "logit":
+            raise ValueError(f"answers={answers!r} needs an evaluator, whose logits it changes; evaluator is None")
         seen: dict[str, Any] = dict(features=features, feature_noise=feature_noise, focus=focus, roles=roles)
         seen |= dict(canonical=canonical, reserve=reserve, jitter=jitter)
         texts = dict(latent_size=latent_size, encoder_width=encoder_width, encoder_depth=encoder_depth)
-        altered = dict(swap_unmentioned=swap_unmentioned, hide_opening=hide_opening)
-        altered = {name: check_probability(name, given) for name, given in altered.items()}
+        altered = {"swap_unmentioned": check_probability("swap_unmentioned", swap_unmentioned)}
         self.config: dict[str, Any] = {**seen, **altered, **texts, "in_keys": self.own_keys}
         if evaluator is not None:
-            self.config |= {"answers": answers, "answer_scale": check_scale("answer_scale", answer_scale)}
+            self.config["answers"] = answers
         self.text_encoder = text_encoder
         self.skills = self.plans.skills
         vectors = None if self.canonical else encoded(self.skills, text_encoder)
@@ -168,8 +158,6 @@ class PlanEncoder(ReadsPlans, Encoder):
             index, vectors = _canonical_skills(self.canonical, self.attention.tables)
         self.register_buffer("skill_index", index, persistent=False)
         self.register_buffer("text_vectors", unit_scale(vectors), persistent=False)
-        closing = torch.tensor([closes(skill) or skill.startswith(_HOLDING) for skill in self.skills])
-        self.register_buffer("closing", closing[self.attention.tables.skill_index], persistent=False)
         self.latent_size = latent_size
         self.texts = text_to_latent(vectors.shape[1], latent_size, encoder_width, encoder_depth)
         self.focus = PlanFocus(self.plans, self.attention.tables, feature_noise) if focus else None
@@ -226,9 +214,6 @@ class PlanEncoder(ReadsPlans, Encoder):
         if probability := self.config["swap_unmentioned"]:
             kept = (in_force.unsqueeze(-1) & self.mentioned[rows]).any(-2)
             observation = swap_unmentioned(observation, kept, probability, self.plans.layout)
-        if probability := self.config["hide_opening"]:
-            closes_now = (in_force & self.closing[rows]).any(-1)
-            observation = hide_opening(observation, closes_now, probability, self.plans.layout)
         return observation
 
     def fit_contacts(self, observation: Tensor, task_id: Tensor) -> None:
@@ -236,7 +221,7 @@ class PlanEncoder(ReadsPlans, Encoder):
         if self.roles is not None:
             truth = plan_program(self.plans)(observation, task_id)
             rows = self.attention.tables.rows(task_id)
-            observation, truth, rows = (found.to(self.closing.device) for found in (observation, truth, rows))
+            observation, truth, rows = (found.to(self.turns.device) for found in (observation, truth, rows))
             self.roles.fit(observation, self.attention.over_steps(truth, rows, self.turns[rows, 0]), rows)
 
     def check_rules(self, found: Mapping[str, Any]) -> None:
@@ -256,7 +241,7 @@ class PlanEncoder(ReadsPlans, Encoder):
         if logits.shape != steps.shape:
             wanted = f"{tuple(steps.shape)}, a row for each observation, got shape {tuple(logits.shape)}"
             raise ValueError(f"logits of {type(self.evaluator).__name__} must be {wanted}")
-        return attend(attention_logits(logits, self.config["answers"], self.config["answer_scale"]), steps)
+        return attend(attention_logits(logits, self.config["answers"]), steps)
 
     def encode(self, *prepared: Tensor) -> Encoding:
         weights = self.weights(*prepared)
@@ -344,13 +329,3 @@ def swap_unmentioned(observation: Tensor, kept: Tensor, probability: float, layo
         for part in parts:
             swapped[:, part] = torch.where(away.unsqueeze(-1), others[:, part], rows[:, part])
     return swapped.reshape(observation.shape)
-
-
-def hide_opening(observation: Tensor, kept: Tensor, probability: float, layout: Layout = METAWORLD) -> Tensor:
-    """Observations (..., D) where the gripper's opening may be another row's, but where it is ``kept`` (...) bool."""
-    opening = observation[..., layout.opening]
-    others = opening.flatten()[torch.randint(opening.numel(), opening.shape, device=opening.device)]
-    hidden = torch.rand_like(opening) < probability
-    observation = observation.clone()
-    observation[..., layout.opening] = torch.where(hidden & ~kept, others, opening)
-    return observation

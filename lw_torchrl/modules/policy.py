@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from inspect import signature
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from tensordict import TensorDictBase
@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs import Compose, Transform
 
-from lw_torchrl._checks import check_choice, counted
+from lw_torchrl._checks import check_choice
 from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
@@ -22,9 +22,6 @@ from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import with_weights_of
 from lw_torchrl.modules.observation_features import ObservationFeatures
 from lw_torchrl.transforms.qaf import QAFTransform
-
-if TYPE_CHECKING:
-    from lw_torchrl.modules.query_evaluator import QueryEvaluator
 
 
 class Encoding(NamedTuple):
@@ -71,15 +68,7 @@ class Prepared(TensorDictModuleBase):
         if not any(one.kind is one.VAR_KEYWORD for one in known.values()):
             for name in options:
                 check_choice(f"option of {cls.__name__}", name, [*known][1:])
-        try:
-            signature(cls).bind(plans, **options)
-        except TypeError as error:
-            told = f"method must be a class made of the plans, whose other arguments have defaults; {cls.__name__}"
-            raise TypeError(f"{told}: {error}") from None
-        made = cls(plans, **options)
-        if "_modules" not in vars(made):
-            raise TypeError(f"__init__ of {cls.__name__} must begin with super().__init__()")
-        return made
+        return cls(plans, **options)
 
     def transform(self) -> Transform | None:
         """A new transform that writes what it reads and the environment does not give; None for none."""
@@ -231,12 +220,7 @@ class Policy(Prepared):
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        prepared = self.prepare(tensordict)
-        acted = self.act(*_as_tuple(self, "prepare", prepared))
-        if len(_as_tuple(self, "act", acted)) != len(self.out_keys_source):
-            wanted = f"a tensor for each of out_keys, {', '.join(map(str, self.out_keys_source))}"
-            raise ValueError(f"act of {type(self).__name__} must return {wanted}, got {counted(len(acted), 'tensor')}")
-        return write(tensordict, self, acted)
+        return write(tensordict, self, self.act(*self.prepare(tensordict)))
 
     def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
         """Take statistics of observations (R, 39) float32 with weights (R,) of sum 1, in place; by default none."""
@@ -250,7 +234,7 @@ class Policy(Prepared):
         """Make what :meth:`describe` described, with fresh weights."""
         return cls(**found["options"])
 
-    def with_evaluator(self, evaluator: QueryEvaluator) -> Policy:
+    def with_evaluator(self, evaluator: Any) -> Policy:
         """The same weights, with the conditions answered by an evaluator; :class:`TypeError` if it reads none."""
         what = f"with_evaluator is for PlanConditionedActor and ScriptedSkillActor, {type(self).__name__} has none"
         raise TypeError(f"{what}; evaluate(..., evaluator=) answers any policy's conditions")
@@ -258,14 +242,6 @@ class Policy(Prepared):
     def with_plans(self, plans: AnyPlans) -> Policy:
         """The same weights under other plans; :class:`TypeError` if it is not conditioned on plans."""
         raise TypeError(f"with_plans is for policies with plans, {type(self).__name__} has none")
-
-
-def _as_tuple(policy: Policy, method: str, given: Any) -> Any:
-    """What a method returned; :class:`TypeError` unless it is a tuple or a list."""
-    if not isinstance(given, (tuple, list)):
-        got = f"a tensor of shape {tuple(given.shape)}" if isinstance(given, Tensor) else f"a {type(given).__name__}"
-        raise TypeError(f"{method} of {type(policy).__name__} must return a tuple of tensors, got {got}")
-    return given
 
 
 def described_tasks(found: Mapping[str, Any]) -> list[str | Task]:

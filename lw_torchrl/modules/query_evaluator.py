@@ -13,12 +13,12 @@ from torchrl.envs import Transform
 
 from lw_torchrl._checks import checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, write
+from lw_torchrl._registry import Registry, is_class
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.text import TextEncoder
-from lw_torchrl.language.value_checks import finite, readable
 from lw_torchrl.modules.networks import with_weights_of
 from lw_torchrl.modules.policy import Prepared, kind_of
-from lw_torchrl.modules.tables import Kinds, class_of
+from lw_torchrl.modules.registry import class_of
 from lw_torchrl.transforms.qaf import QAFTransform
 
 
@@ -63,19 +63,15 @@ class QueryEvaluator(Prepared):
         raise NotImplementedError(f"{type(self).__name__} must override logits")
 
     def answers(self, *read: Tensor) -> Tensor:
-        """:meth:`logits` as float32; :class:`TypeError` if they are no floats, :class:`ValueError` if not (B, S) or, on
-        the CPU, NaN."""
-        found = self.logits(*read)
+        """Return :meth:`logits` as float32, checked to be floats (B, S)."""
+        logits = self.logits(*read)
         what = f"logits of {type(self).__name__} must be"
-        if not isinstance(found, Tensor) or not found.is_floating_point():
-            given = found.dtype if isinstance(found, Tensor) else type(found).__name__
-            raise TypeError(f"{what} float32, above 0 where a condition holds, got {given}")
-        if found.shape[-1:] != (self.plans.num_steps,):
-            wanted = f"(B, {self.plans.num_steps}), a column for each step of the longest plan"
-            raise ValueError(f"{what} {wanted}, got shape {tuple(found.shape)}")
-        if readable(found) and not finite(found.detach()) and found.isnan().any():
-            raise ValueError(f"{what} numbers, got NaN")
-        return found.to(torch.float32)
+        if not logits.is_floating_point():
+            raise TypeError(f"{what} float32, above 0 where a condition holds, got {logits.dtype}")
+        if logits.shape[-1:] != (self.plans.num_steps,):
+            needed = f"(B, {self.plans.num_steps}), a column for each step of the longest plan"
+            raise ValueError(f"{what} {needed}, got shape {tuple(logits.shape)}")
+        return logits.to(torch.float32)
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -83,11 +79,7 @@ class QueryEvaluator(Prepared):
 
     def with_plans(self, plans: Plans) -> QueryEvaluator:
         """One on the same weights for other plans; :class:`RuntimeError` if the weights differ in names or shapes."""
-        return with_weights_of(self, self.made_for(plans))
-
-    def made_for(self, plans: Plans) -> QueryEvaluator:
-        """Another of the same options for other plans, with fresh weights."""
-        return self.from_options(plans, self.config, self.text_encoder)
+        return with_weights_of(self, self.from_options(plans, self.config, self.text_encoder))
 
     @classmethod
     def from_options(cls, plans: Plans, options: Mapping[str, Any], text_encoder: TextEncoder | None) -> QueryEvaluator:
@@ -99,15 +91,14 @@ class QueryEvaluator(Prepared):
         return {**kind_of(self), "options": self.config}
 
 
-EVALUATORS = Kinds(
+EVALUATORS = Registry(
     "evaluator",
-    QueryEvaluator,
     "lw_torchrl.evaluators",
     {
-        "HeldEvaluator": "lw_torchrl.modules.held_evaluator:HeldEvaluator",
         "ImageQueryEvaluator": "lw_torchrl.modules.image_query_evaluator:ImageQueryEvaluator",
         "StateQueryEvaluator": "lw_torchrl.modules.state_query_evaluator:StateQueryEvaluator",
     },
+    is_class("evaluator", QueryEvaluator),
 )
 """The classes of evaluators by name, as in policy files."""
 

@@ -19,7 +19,7 @@ from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.networks import head
 from lw_torchrl.modules.plan_encoder import IN_FORCE, PlanEncoder
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.modules.tables import from_description
+from lw_torchrl.modules.registry import from_description
 
 
 class ResidualActor(Policy):
@@ -76,8 +76,6 @@ class ResidualActor(Policy):
             raise TypeError(f"base must be a PlanConditionedActor or a DescriptorConditionedActor, {got}")
         if base.head.distribution is not None:
             raise ValueError(f"base must have no distribution, this one's is {base.head.distribution!r}")
-        if base.config.get("mix") == "actions":
-            raise ValueError("base must mix latents, this one mixes actions")
         self.base = base.requires_grad_(False).eval()
         self.plans, self.tasks = base.plans, base.tasks
         self.in_keys, self.out_keys = base.in_keys, base.out_keys_source[:1]

@@ -1,7 +1,6 @@
 """Suites: simulators and robots that the language side works with; Meta-World and Fetch are shipped."""
 
 from lw_torchrl.suites.checking import Finding, check_suite
-from lw_torchrl.suites.finding_points import find_points
 from lw_torchrl.suites.suite import SUITES, Suite, find_suite, known_suite, load_suite
 
-__all__ = ["SUITES", "Finding", "Suite", "check_suite", "find_points", "find_suite", "known_suite", "load_suite"]
+__all__ = ["SUITES", "Finding", "Suite", "check_suite", "find_suite", "known_suite", "load_suite"]

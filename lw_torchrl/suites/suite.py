@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
 from lw_torchrl._checks import check_choice, check_fields, shown, unknown_name
-from lw_torchrl._tables import Table
+from lw_torchrl._registry import Registry
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import TASKS, Task, TaskList, Tasks, named_tasks
 from lw_torchrl.suites.engine import Engine
-
-_KINDS: dict[str, Any] = dict(tasks=Mapping, layout=Layout, make_engine=Callable, skills=Mapping, plans=Plans)
 
 
 @dataclass(frozen=True)
@@ -59,14 +57,8 @@ class Suite:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for name, kind in _KINDS.items():
-            value = getattr(self, name)
-            if not isinstance(value, kind) and not (value is None and name in ("skills", "plans")):
-                raise TypeError(f"{name} of suite {self.name!r} must be a {kind.__name__}, got {shown(value)}")
         for relation in self.layout.thresholds:
             check_choice(f"thresholds of layout {self.layout.name!r}", relation, PREDICATES)
-        if not self.tasks:
-            raise ValueError(f"tasks of suite {self.name!r} must name at least one task")
         for name, task in self.tasks.items():
             if not isinstance(task, Task) or task.name != name:
                 raise TypeError(f"tasks of suite {self.name!r} must map names to their Task, got {shown(task)}")
@@ -95,19 +87,15 @@ class Suite:
         return f"{self.name}/{task}"
 
 
-class Suites(Table[Suite]):
-    """Suites by name; a function that makes one stands for what it makes."""
-
-    def check(self, name: str, thing: Any) -> Suite:
-        found = thing() if callable(thing) else thing
-        if not isinstance(found, Suite):
-            raise TypeError(f"suite {name!r} must be a Suite, or a function that makes one, got {shown(thing)}")
-        return found
+def _check_suite(name: str, entry: Any) -> Suite:
+    suite = entry() if callable(entry) else entry
+    if not isinstance(suite, Suite):
+        raise TypeError(f"suite {name!r} must be a Suite, or a function that makes one, got {shown(entry)}")
+    return suite
 
 
-SUITES = Suites(
-    "suite", "lw_torchrl.suites", {name: f"lw_torchrl.suites.{name}:make_suite" for name in ("metaworld", "fetch")}
-)
+_SHIPPED = {name: f"lw_torchrl.suites.{name}:make_suite" for name in ("metaworld", "fetch")}
+SUITES = Registry("suite", "lw_torchrl.suites", _SHIPPED, _check_suite)
 """The suites by name. Add yours to use it by name; nobody has to, since every ``suite=`` takes the object too."""
 
 

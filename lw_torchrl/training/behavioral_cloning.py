@@ -21,15 +21,11 @@ from lw_torchrl.data.replay_checks import check_replay
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
-from lw_torchrl.objectives.skill_latents import Kind, latent_term, skill_encoder
 from lw_torchrl.training.envelope import POLICY
 from lw_torchrl.training.files import check_can_be_saved, describe_data, describe_replay
 from lw_torchrl.training.loop import ReplayState, Training, TrainingOptions, make_schedule
 from lw_torchrl.training.normalization import check_contacts, fit_normalization
 from lw_torchrl.transforms.qaf import plan_program
-
-_LATER = {"latent_consistency", "latent_contrast", "qaf_anchor"}
-"""Options that files did not say at first: at 0, training is what it was before them."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +45,6 @@ class BehavioralCloningConfig:
         max_grad_norm: gradients are clipped to it.
         seed: of the minibatches, and of what the buffer's transforms and the actor draw while training.
         checkpoint_every: steps between checkpoints; the last step always makes one.
-        latent_consistency: weight of :class:`SkillLatentLoss` "consistency", with plans: skills of near texts are near.
-        latent_contrast: weight of the "contrastive" one: different skills keep apart.
         qaf_anchor: weight of the cross entropy of an evaluator's answers with the query answering function's, of a
             policy with an evaluator: its conditions keep to their words.
     """
@@ -67,16 +61,14 @@ class BehavioralCloningConfig:
     max_grad_norm: Positive = 1.0
     seed: int = 0
     checkpoint_every: Count = 500
-    latent_consistency: Scale = 0.0
-    latent_contrast: Scale = 0.0
     qaf_anchor: Scale = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self)
 
     def describe(self) -> dict[str, Any]:
-        """What files say of it, as JSON: files from before an option hold what those with its default hold."""
-        return {name: value for name, value in asdict(self).items() if value or name not in _LATER}
+        """Return the options, as JSON."""
+        return asdict(self)
 
 
 def make_optimizer(parameters: Iterable[Tensor], config: BehavioralCloningConfig) -> torch.optim.Optimizer:
@@ -92,24 +84,6 @@ def bc_loss(actor: nn.Module, distance: str) -> BCLoss:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
         return BCLoss(actor, loss_function=distance)
-
-
-class LatentTerms(nn.Module):
-    """A module, for ``functional_call``: the weighted sum of a configuration's terms on the latents of skills."""
-
-    def __init__(self, actor: Any, config: BehavioralCloningConfig) -> None:
-        super().__init__()
-        kinds: dict[str, Kind] = {"latent_consistency": "consistency", "latent_contrast": "contrastive"}
-        asked = {name: weight for name in kinds if (weight := getattr(config, name))}
-        for name in asked:
-            skill_encoder(name, actor)
-        self.weights = {kinds[name]: weight for name, weight in asked.items()}
-        self.actor = actor
-
-    def forward(self) -> Tensor:
-        encoder = skill_encoder("actor", self.actor)
-        terms = [weight * latent_term(encoder, kind) for kind, weight in self.weights.items()]
-        return sum(terms[1:], terms[0])
 
 
 class EvaluatorAnchor:
@@ -146,7 +120,7 @@ class BehavioralCloningTrainer(Training):
             steps. Make the buffer with the same ``device``, or each minibatch has to go over.
 
     Raises:
-        ValueError: the actor writes no ``action``, or has no plans for terms on latents, no evaluator for the anchor.
+        ValueError: the actor writes no ``action``, or has no evaluator for the anchor.
         TypeError: a checkpoint for an actor that is no :class:`Policy`.
 
     Example:
@@ -180,7 +154,6 @@ class BehavioralCloningTrainer(Training):
         self.actor, self.module, self.replay, self.networks = actor, actor, replay, [actor]
         self.device = place(actor, device)
         check_replay(actor, replay, config.batch_size)
-        self._latent_terms = LatentTerms(actor, config)
         self._anchor = EvaluatorAnchor(actor) if config.qaf_anchor else None
         if self.checkpoint is not None:
             self.described = {"actor": check_can_be_saved(actor).describe(), "training": config.describe()}
@@ -202,8 +175,6 @@ class BehavioralCloningTrainer(Training):
         with state.drawing(self.device):
             batch = state.minibatch(self.config.batch_size, self.device)
             loss = self.loss(batch)["loss_bc"]
-        if self._latent_terms.weights:
-            loss = loss + self._latent_terms()
         if self._anchor is not None:
             loss = loss + self.config.qaf_anchor * self._anchor(batch)
         return self.descend(loss)

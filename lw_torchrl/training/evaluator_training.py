@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Unpack
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import checked_but, passes_on
+from lw_torchrl._checks import checked, passes_on
 from lw_torchrl._tensor_archive import check_like, check_optimizer_state
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
@@ -30,8 +30,7 @@ class _StateMinibatches:
     def __init__(self, evaluator: Any, asked: list[Asked], config: QueryEvaluatorConfig) -> None:
         self.evaluator, self.size = evaluator, config.batch_size
         self.observation = torch.cat([one.observation for one in asked])
-        self.clauses, self.vectors = evaluator.code([(one.task, clause) for one in asked for clause in one.clauses])
-        self.negatable = len(self.clauses.predicate) // 2 if self.vectors is not None else 0
+        self.clauses = evaluator.code([(one.task, clause) for one in asked for clause in one.clauses])
         names = [clause.predicate for one in asked for clause in one.clauses]
         kinds = sorted({*names})
         kind = torch.tensor([2 * kinds.index(name) for name in names], dtype=torch.uint8)
@@ -56,14 +55,11 @@ class _StateMinibatches:
         place = (torch.rand(self.size, generator=generator, dtype=torch.float64) * self.sizes[group]).long()
         row, clause = self.pairs[self.starts[group] + place].long().unbind(-1)
         truth = self.truths[group]
-        if self.negatable:
-            negated = torch.rand(self.size, generator=generator) < 0.5
-            clause, truth = clause + negated * self.negatable, truth ^ negated
         return self.observation[row], self.clauses.pick(clause[:, None]), truth[:, None].float()
 
     def loss(self, step: int, generator: torch.Generator) -> Tensor:
         observation, clauses, truth = self.draw(step, generator)
-        logits = self.evaluator.network(observation, clauses, self.vectors)
+        logits = self.evaluator.network(observation, clauses)
         return nn.functional.binary_cross_entropy_with_logits(logits, truth)
 
 
@@ -87,21 +83,16 @@ class _PictureMinibatches:
 
     def _task_loss(self, task: int, size: int, generator: torch.Generator) -> Tensor:
         asked, network = self.asked[task], self.evaluator.network
-        coded, vectors = self.coded[task]
+        coded = self.coded[task]
         rows = torch.randint(len(asked.observation), (size,), generator=generator)
         pixels, truth = asked.seen("pixels")[rows], asked.truth[rows]
         weights = self.weights[task].gather(0, truth.long())
         clauses = coded.pick(torch.arange(len(coded.predicate)).expand(size, -1))
-        placed = torch.zeros(())
-        if self.evaluator.names:
-            places, _ = network.places(pixels, network.names.weight)
-            logits = network.tell(places, clauses)
-            which, known, counts = self.positions[task]
-            error = nn.functional.smooth_l1_loss(places[:, which] / 0.05, known[rows] / 0.05, reduction="none")
-            placed = (error * counts).sum() / (counts.sum() * size)
-        else:
-            logits = network(pixels, clauses, vectors)
-            truth, weights = torch.cat((truth, ~truth), -1), torch.cat((weights, weights), -1)
+        places, _ = network.places(pixels, network.names.weight)
+        logits = network.tell(places, clauses)
+        which, known, counts = self.positions[task]
+        error = nn.functional.smooth_l1_loss(places[:, which] / 0.05, known[rows] / 0.05, reduction="none")
+        placed = (error * counts).sum() / (counts.sum() * size)
         errors = nn.functional.binary_cross_entropy_with_logits(logits, truth.float(), reduction="none")
         return (errors * weights).sum() / weights.sum() + self.config.position_weight * placed
 
@@ -171,7 +162,7 @@ class QueryEvaluatorTrainer(Training):
     minibatches: ClassVar[Callable[..., _StateMinibatches | _PictureMinibatches]] = _StateMinibatches
 
     @passes_on(Training.__init__)
-    @checked_but("evaluator")
+    @checked
     def __init__(
         self,
         evaluator: ClauseEvaluator,

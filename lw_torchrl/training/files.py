@@ -8,13 +8,13 @@ from typing import Any
 from torch import Tensor, nn
 from torchrl.envs import Compose, Transform
 
-from lw_torchrl._checks import checked, checked_but
+from lw_torchrl._checks import checked
 from lw_torchrl._files import AnyPath, shipped_policy
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
-from lw_torchrl.modules.tables import from_description
+from lw_torchrl.modules.registry import from_description
 from lw_torchrl.training.envelope import EVALUATOR, POLICY
 from lw_torchrl.training.file_checks import stand_in, text_vectors
 
@@ -89,7 +89,7 @@ def policy_file(path: AnyPath) -> Path:
     return shipped_policy(path) or Path(path)
 
 
-@checked_but("evaluator")
+@checked
 def save_evaluator(evaluator: QueryEvaluator, path: AnyPath, **about: Any) -> None:
     """Write an evaluator, for :func:`load_evaluator`; an earlier file is replaced whole. It holds the network alone.
 

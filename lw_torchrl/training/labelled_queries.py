@@ -71,7 +71,7 @@ class ImageQueryEvaluatorConfig(QueryEvaluatorConfig):
     Attributes:
         batch_size: states in a minibatch, each asked all clauses of its task.
         position_weight: of the error in the things' positions, in units of 5 cm, and in how far the gripper is open, in
-            the loss, of an evaluator with ``structure``: the simulator knows them. 0 to learn from answers alone.
+            the loss: the simulator knows them. 0 to learn only from answers.
     """
 
     batch_size: Count = 48

@@ -16,7 +16,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import MultiStepTransform
 from torchrl.objectives import LossModule, SoftUpdate
 
-from lw_torchrl._checks import Count, Positive, Probability, Scale, check_fields, checked_but, passes_on
+from lw_torchrl._checks import Count, Positive, Probability, Scale, check_fields, checked, passes_on
 from lw_torchrl.data.replay_checks import check_minibatches
 from lw_torchrl.objectives.reduction import with_n_steps
 from lw_torchrl.training.envelope import TRAINING
@@ -94,7 +94,7 @@ class OfflineTrainer(Training):
     envelope = TRAINING
 
     @passes_on(Training.__init__)
-    @checked_but("loss")
+    @checked
     def __init__(
         self,
         loss: LossModule,

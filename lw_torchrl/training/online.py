@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
-from lw_torchrl._checks import checked_but, passes_on
+from lw_torchrl._checks import checked, passes_on
 from lw_torchrl._devices import CPU, drawn_on
 from lw_torchrl._progress import Progress
 from lw_torchrl._tensor_archive import check_like
@@ -92,7 +92,7 @@ class OnlineTrainer(Training):
     envelope = POLICY
 
     @passes_on(Training.__init__)
-    @checked_but("critic")
+    @checked
     def __init__(
         self,
         actor: Policy,

@@ -1,8 +1,8 @@
-"""CorruptQAF: answers that are wrong on purpose, as a bad evaluator's are."""
+"""CorruptQAF: query answers that are taken rarely, come late, or are wrong."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -10,55 +10,51 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
-from lw_torchrl._checks import check_int, check_probability, checked, missing_keys, shown, unknown_name
+from lw_torchrl._checks import Count, Natural, Probability, checked, missing_keys
 from lw_torchrl._keys import as_keys, read
 from lw_torchrl._seeding import episode_generator
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
-from lw_torchrl.language.queries import Query, read_query
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.transforms.environment import DelayedAnswers, EpisodeTransform, reset_rows
+from lw_torchrl.transforms.environment import EpisodeTransform, reset_rows
 from lw_torchrl.transforms.qaf import plan_number_key
 
-_BLOCK = 64  # steps of an episode whose draws are made at once
+_BLOCK = 64  # steps of an episode whose random numbers are drawn together
 
 
 class CorruptQAF(EpisodeTransform):
-    """Spoils ``qaf`` in an environment, behind a :class:`QAFTransform`, to measure what wrong answers cost.
+    """Corrupt ``qaf`` in an environment, after a :class:`QAFTransform`, to measure the cost of slow and wrong answers.
 
     Reads ``qaf`` (B, S) bool, ``task_id`` (B,) and ``episode`` (B,) int64, and ``qaf_plan`` (B,) int64 where it is;
-    writes ``qaf`` alone. What is asked for is done in this order:
+    writes only ``qaf``. The corruptions are applied in this order:
 
-    - **lag**: a row is shown the answers of ``lag`` steps ago, until then those of its reset;
-    - **stick**: in each step each answer stays, with this probability, what it was the step before;
-    - **flip**: in each step, the reset's state included, each answer is shown as its opposite, with this probability;
-      what sticks is the answer itself, not its opposite;
-    - **drop**: the answers to these queries are always false.
+    - **every, delay**: in step t of its episode, 0 at the reset, a row is shown the answers of step
+      every · ⌊max(t - delay, 0) / every⌋;
+    - **flip**: in each step, the reset included, each answer is inverted with this probability.
 
-    What is drawn for an answer depends only on (task, seed, episode, step) and the answer's place in its plan. Of two
-    probabilities the greater one spoils what the smaller one spoils, and more. In :func:`lw_torchrl.evaluate` it is an
-    ``evaluator``. A policy with a :class:`QueryEvaluator` of its own does not read ``qaf``, and feels nothing.
+    The random draws depend only on (task, seed, episode, step) and the answer's place in its plan. A greater
+    probability inverts all that a smaller one inverts. In :func:`lw_torchrl.evaluate` it is an ``evaluator``. A policy
+    with its own :class:`QueryEvaluator` does not read ``qaf`` and is not affected.
 
     Args:
         plans: whose conditions ``qaf`` answers.
-        flip, stick, lag: probabilities, from 0 to 1, and steps.
-        drop: conditions of the plans in any spelling, each dropped in all plans that have it.
-        seed: any integer, of what is drawn.
+        every, delay: steps between two updates of a row's answers, and steps until they are shown.
+        flip: a probability.
+        seed: any integer, of the random draws.
         in_keys: where qaf, task_id and episode are, in this order; qaf is written where it was.
 
     Raises:
-        ValueError: a wrong argument, a query that no plan has (with the nearest), ``qaf`` that is absent, of another
-            shape or dtype, or of other plans, or a replay buffer, whose rows do not tell the steps of their episodes.
+        ValueError: ``qaf`` that is absent, of another shape or dtype, or of other plans, or a replay buffer, whose rows
+            do not tell the steps of their episodes.
         RuntimeError: a step of an environment that was never reset, or not since ``load_state_dict``.
 
     Example:
         >>> import lw_torchrl as lw
         >>> plans = lw.load_plans("MT10")
-        >>> spoilt = lw.CorruptQAF(plans, flip=0.05, drop=["the gripper is near the reach target"])
-        >>> actor = lw.ScriptedSkillActor(plans)
-        >>> lw.evaluate(actor, tasks="reach", episodes_per_task=2, seed=1_000, evaluator=spoilt).success_once
+        >>> actor, noisy = lw.ScriptedSkillActor(plans), lw.CorruptQAF(plans, every=2, flip=0.05)
+        >>> lw.evaluate(actor, tasks="reach", episodes_per_task=2, seed=1_000, evaluator=noisy).success_once
         {'reach': 1.0}
 
-    Source: the paper names a visual question answering model as a query answering function; such a one errs.
+    Source: the paper names a visual question answering model as a query answering function; such a model errs.
     """
 
     @checked
@@ -66,41 +62,32 @@ class CorruptQAF(EpisodeTransform):
         self,
         plans: AnyPlans,
         *,
-        flip: float = 0.0,
-        stick: float = 0.0,
-        lag: int = 0,
-        drop: Iterable[str | Query] = (),
+        every: Count = 1,
+        delay: Natural = 0,
+        flip: Probability = 0.0,
         seed: int = 0,
         in_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         keys = as_keys("in_keys", in_keys, ("qaf", "task_id", "episode"))
         super().__init__(in_keys=keys, out_keys=keys[:1])
         self.plans = as_plans(plans)
-        self.flip, self.stick = check_probability("flip", flip), check_probability("stick", stick)
-        self.lag, self.seed = check_int("lag", lag, minimum=0), check_int("seed", seed)
-        self.drop = _as_texts(drop)
+        self.every, self.delay, self.flip, self.seed = every, delay, flip, seed
         self._tables = PlanTables(self.plans)
-        self._answered = self._tables.mask.clone()
-        for text in self.drop:
-            if not (dropped := _steps_with(text, self._tables, self.plans)).any():
-                conditions = {str(step.condition) for plan in self.plans.values() for step in plan.steps}
-                raise unknown_name("drop", text, sorted(conditions))
-            self._answered &= ~dropped
         self._task: Tensor | None = None  # B int64, of the rows' episodes
         self._episode: Tensor | None = None
         self._plan = torch.empty(0, dtype=torch.int64)  # B int64, where their plans are in the tables
         self._forget_episodes()
 
     def _forget_episodes(self) -> None:
-        self._rows = DelayedAnswers(delay=self.lag)
-        self._draws = {purpose: _Draws(purpose, self.seed, self._tables, self.plans) for purpose in ("stick", "flip")}
+        self._places = -(-self.delay // self.every) + 1  # as many answers are waiting to be shown, at most
+        self._steps: Tensor | None = None  # B int64, of each row's episode
+        self._taken: Tensor | None = None  # (B, places, S) bool; the n-th answers are in place n % places
+        self._draws = _Draws(self.seed, self._tables, self.plans)
 
     def with_plans(self, plans: AnyPlans) -> CorruptQAF:
-        """One that spoils the answers of other plans alike; queries that these lack are not dropped."""
-        other = as_plans(plans)
-        dropped = [text for text in self.drop if _steps_with(text, PlanTables(other), other).any()]
-        same = {name: getattr(self, name) for name in ("flip", "stick", "lag", "seed", "in_keys")}
-        return CorruptQAF(other, drop=dropped, **same)
+        """Return a transform that corrupts the answers of other plans alike."""
+        same = {name: getattr(self, name) for name in ("every", "delay", "flip", "seed", "in_keys")}
+        return CorruptQAF(plans, **same)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         truth, task, episode = read(tensordict_reset, self.in_keys)
@@ -113,21 +100,34 @@ class CorruptQAF(EpisodeTransform):
         shape = (*self._plan.shape, self.plans.num_steps)
         if truth.dtype != torch.bool or truth.shape != shape:
             raise ValueError(f"qaf must be bool of shape {shape}, got {truth.dtype} of shape {tuple(truth.shape)}")
-        return tensordict_reset.set(self.in_keys[0], self._spoilt(self._rows.begin(truth, begun)))
+        self._steps = reset_rows(self._steps, torch.zeros_like(self._plan), begun)
+        self._taken = reset_rows(self._taken, torch.stack([truth] * self._places, -2), begun, 2)
+        return self._show(tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        stuck = (lambda: self._drawn("stick") < self.stick) if self.stick else None
-        now = self._rows.advance(next_tensordict.get(self.in_keys[0]), tensordict.get("_step", None), stuck)
-        return next_tensordict.set(self.in_keys[0], self._spoilt(now))
+        if self._steps is None or self._taken is None:
+            raise RuntimeError("rows have begun no episode, or not since load_state_dict: reset the environment")
+        moved = tensordict.get("_step", None)
+        moved = torch.ones_like(self._steps, dtype=torch.bool) if moved is None else moved.reshape(self._steps.shape)
+        self._steps = self._steps + moved
+        due = moved & (self._steps % self.every == 0)
+        place = torch.arange(self._places, device=due.device) == self._place(self._steps).unsqueeze(-1)
+        truth = next_tensordict.get(self.in_keys[0]).unsqueeze(-2)
+        self._taken = torch.where((place & due.unsqueeze(-1)).unsqueeze(-1), truth, self._taken)
+        return self._show(next_tensordict)
 
-    def _drawn(self, purpose: str) -> Tensor:
+    def _place(self, step: Tensor) -> Tensor:
+        return step // self.every % self._places
+
+    def _show(self, tensordict: TensorDictBase) -> TensorDictBase:
+        assert self._steps is not None
+        assert self._taken is not None
         assert self._episode is not None
-        return self._draws[purpose](self._plan, self._episode, self._rows.step)
-
-    def _spoilt(self, answers: Tensor) -> Tensor:
+        place = self._place((self._steps - self.delay).clamp(min=0))[..., None, None]
+        shown = self._taken.gather(-2, place.expand(*place.shape[:-1], self._taken.shape[-1])).squeeze(-2)
         if self.flip:
-            answers = answers ^ (self._drawn("flip") < self.flip)
-        return answers & self._answered[self._plan]
+            shown = shown ^ (self._draws(self._plan, self._episode, self._steps) < self.flip)
+        return tensordict.set(self.in_keys[0], shown)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         raise ValueError(
@@ -137,24 +137,24 @@ class CorruptQAF(EpisodeTransform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         assert isinstance(observation_spec, Composite)
-        found = list(observation_spec.keys(True, True))
-        if any(key not in found for key in self.in_keys):
-            raise missing_keys(found, *map(str, self.in_keys))
+        keys = list(observation_spec.keys(True, True))
+        if any(key not in keys for key in self.in_keys):
+            raise missing_keys(keys, *map(str, self.in_keys))
         return observation_spec
 
 
 class _Draws:
-    """Uniform numbers for the answers of rows, in blocks of steps, by (task, seed, episode, block)."""
+    """Uniform numbers for the answers of rows, in blocks of steps, by (task, seed, episode, block); 1 on padding."""
 
-    def __init__(self, purpose: str, seed: int, tables: PlanTables, plans: Plans) -> None:
-        self._purpose, self._seed = purpose, seed
+    def __init__(self, seed: int, tables: PlanTables, plans: Plans) -> None:
+        self._seed = seed
         self._plans = [plans[task] for task in tables.index.tasks]
         self._width = plans.num_steps
         self._which = torch.empty(0, 3, dtype=torch.int64)  # the row of the tables, episode and block of each row
         self._drawn = torch.empty(0, _BLOCK, self._width)
 
     def __call__(self, rows: Tensor, episode: Tensor, step: Tensor) -> Tensor:
-        """Rows of the tables, their episodes and their steps, each B int64, to (B, S) float64 in [0, 1)."""
+        """Rows of the tables, their episodes and their steps, each B int64, to (B, S) float64 in [0, 1]."""
         which = torch.stack([one.reshape(-1).cpu() for one in (rows, episode, step // _BLOCK)], -1)
         if which.shape != self._which.shape:
             self._which = torch.full_like(which, -1)
@@ -165,29 +165,9 @@ class _Draws:
                 if number < 0:  # never reset
                     continue
                 plan = self._plans[row]
-                purpose = f"answers/{self._purpose}/{block}"
-                drawn = episode_generator(purpose, plan.definition, self._seed, number)
+                drawn = episode_generator(f"answers/flip/{block}", plan.definition, self._seed, number)
                 steps = len(plan.steps)
                 self._drawn[place, :, :steps] = torch.from_numpy(drawn.random((_BLOCK, steps)))
             self._which = which
-        found = self._drawn[torch.arange(len(which)), step.reshape(-1).cpu() % _BLOCK]
-        return found.reshape(*step.shape, -1).to(step.device)
-
-
-def _as_texts(drop: Iterable[str | Query]) -> tuple[str, ...]:
-    if isinstance(drop, (str, Query)) or not isinstance(drop, Iterable):
-        raise TypeError(f"drop must be a list of queries, got {shown(drop)}")
-    listed = tuple(drop)
-    if wrong := [one for one in listed if not isinstance(one, (str, Query))]:
-        raise TypeError(f"drop must be a list of queries, got {shown(wrong[0])} in it")
-    return tuple(map(str, listed))
-
-
-def _steps_with(text: str, tables: PlanTables, plans: Plans) -> Tensor:
-    """(T, S) bool, the steps of the tables that have the condition."""
-    found = torch.zeros_like(tables.mask)
-    for row, task in enumerate(tables.index.tasks):
-        query = read_query(text, plans[task].definition)
-        for column, step in enumerate(plans[task].steps):
-            found[row, column] = step.condition == query
-    return found
+        numbers = self._drawn[torch.arange(len(which)), step.reshape(-1).cpu() % _BLOCK]
+        return numbers.reshape(*step.shape, -1).to(step.device)

@@ -13,12 +13,12 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-from lw_torchrl._checks import check_int, checked, missing_keys
+from lw_torchrl._checks import checked, missing_keys
 from lw_torchrl._keys import as_keys, check_apart, key_beside
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.task_index import PlanTables, TaskTables
-from lw_torchrl.transforms.environment import DelayedAnswers, KeepsEnvState, base_env, refuse_changed, reset_rows
+from lw_torchrl.transforms.environment import KeepsEnvState, base_env, refuse_changed, reset_rows
 
 _HALF = (torch.float16, torch.bfloat16)  # in which metres are not told apart as conditions do
 
@@ -47,24 +47,18 @@ class QAFTransform(KeepsEnvState):
     the environment's, as :class:`EnvState` does.
 
     Conditions speak of metres, so it comes before whatever changes the observation: a normaliser, :class:`RandomYaw`.
-    A transform that comes first and names the observation in its ``out_keys`` is refused. It cannot see one that does
-    not name it or is in a ParallelEnv's processes: put it into each worker, before them.
-
-    Answers may be slow: with ``every`` and ``delay``, in step t of its episode, 0 at the reset, a row is shown those of
-    step every · ⌊max(t - delay, 0) / every⌋. A ``_step`` or ``_reset`` mask counts for its rows alone. After
-    ``load_state_dict`` the environment must be reset. A replay buffer, whose rows have no such steps, refuses both.
+    A transform that comes first and names the observation in its ``out_keys`` is refused; those in the workers of a
+    SerialEnv or ParallelEnv cannot be seen.
 
     Args:
         plans: a plan for each task that will be seen.
-        every, delay: steps from one taking of a row's answers to the next, and until they are shown.
         in_keys: where observation and task_id are, in this order.
         out_keys: where the truth goes; the plan's number goes beside it, under that name and ``_plan``.
 
     Raises:
         PlanError: (a ValueError) the environment has a task without a plan.
         ValueError: a wrong argument, a task_id without a plan, a malformed observation, one of half precision, or a
-            transform before it that changes it; ``every`` or ``delay`` on a replay buffer.
-        RuntimeError: with ``every`` or ``delay``, a step of an environment that was not reset since it was loaded.
+            transform before it that changes it.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -82,12 +76,9 @@ class QAFTransform(KeepsEnvState):
         self,
         plans: AnyPlans,
         *,
-        every: int = 1,
-        delay: int = 0,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        self.every, self.delay = check_int("every", every, minimum=1), check_int("delay", delay, minimum=0)
         truth = as_keys("out_keys", out_keys, ("qaf",))
         read = as_keys("in_keys", in_keys, ("observation", "task_id"))
         super().__init__(in_keys=read, out_keys=[*truth, plan_number_key(truth[0])])
@@ -97,16 +88,10 @@ class QAFTransform(KeepsEnvState):
         tables = PlanTables(self.plans)
         self._number = TaskTables(tables.index, _Number(tables.number), f"tasks without a plan in {self.plans!r}")
         self._task: Tensor | None = None  # of each row, since its last reset
-        self._beside = 0
-        self._saw_workers = False
-        self._forget_episodes()
-
-    def _forget_episodes(self) -> None:
-        self._rows = DelayedAnswers(self.every, self.delay) if self.every > 1 or self.delay else None
 
     def with_plans(self, plans: AnyPlans) -> QAFTransform:
-        """One that answers the conditions of other plans as often and as late."""
-        return QAFTransform(plans, every=self.every, delay=self.delay, in_keys=self.in_keys, out_keys=self.out_keys[:1])
+        """Return a transform that answers the conditions of other plans."""
+        return QAFTransform(plans, in_keys=self.in_keys, out_keys=self.out_keys[:1])
 
     def _write(self, tensordict: TensorDictBase, task_id: Tensor | None) -> None:
         observation = tensordict.get(self.in_keys[0], None)
@@ -124,32 +109,13 @@ class QAFTransform(KeepsEnvState):
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if not self._saw_workers:  # which a SerialEnv has since its first reset
-            refuse_changed(self, self.in_keys[0])
-            self._saw_workers = True
         begun, task = tensordict.get("_reset", None), tensordict_reset.get(self.in_keys[1], None)
         self._task = task if task is None else reset_rows(self._task, task, begun)
         self._write(tensordict_reset, self._task)
-        if self._rows is not None:
-            truth = tensordict_reset.get(self.out_keys[0])
-            tensordict_reset.set(self.out_keys[0], self._rows.begin(truth, begun))
         return tensordict_reset
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        next_tensordict = self._call(next_tensordict)
-        if self._rows is not None:
-            truth = next_tensordict.get(self.out_keys[0])
-            next_tensordict.set(self.out_keys[0], self._rows.advance(truth, tensordict.get("_step", None)))
-        return next_tensordict
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._rows is not None:
-            raise ValueError(
-                f"QAFTransform(every={self.every}, delay={self.delay}) counts the steps of an environment's episodes, "
-                "which rows of a replay buffer do not tell: put it into the environment, or leave both out here"
-            )
         observation, task = self.in_keys
-        self._beside = refuse_changed(self, observation, self._beside)  # something may be put there later
         task_id = tensordict.get(task, None)
         self._write(tensordict, task_id)
         following = tensordict.get("next", None)
@@ -159,7 +125,6 @@ class QAFTransform(KeepsEnvState):
 
     def set_container(self, container: Transform | EnvBase) -> None:
         super().set_container(container)
-        self._saw_workers = False
         refuse_changed(self, self.in_keys[0])
         env = base_env(self)
         if not isinstance(env, BatchedEnvBase):  # whose workers may not be there yet
@@ -167,7 +132,7 @@ class QAFTransform(KeepsEnvState):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         assert isinstance(observation_spec, Composite)
-        refuse_changed(self, self.in_keys[0])  # it may have been put there later
+        refuse_changed(self, self.in_keys[0])  # a transform may have been inserted before it
         steps, shape, device = self.program.num_queries, observation_spec.shape, observation_spec.device
         observation_spec[self.out_keys[0]] = Binary(steps, shape=(*shape, steps), dtype=torch.bool, device=device)
         observation_spec[self.out_keys[1]] = Unbounded(shape, dtype=torch.int64, device=device)

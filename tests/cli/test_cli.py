@@ -78,7 +78,7 @@ def test_every_command_explains_itself(capsys, command):
         (["query"], "TASK must be given; `lw-torchrl query --help` says what there is"),
         (["collect", "reach"], "--out must be given; "),
         (["collect", "reach", "--out"], "--out must be given a value"),
-        (["train", "x", "--out", "y", "--mix", "z"], "--mix must be one of 'latents', 'actions', got 'z'"),
+        (["train", "x", "--out", "y", "--features", "z"], "--features must be one of 'raw', 'differences', "),
     ],
 )
 def test_a_wrong_command_line_is_refused_with_code_2(capsys, monkeypatch, args, message):
@@ -180,7 +180,6 @@ def test_without_a_text_all_queries_that_hold_are_listed(capsys):
         (["evaluate", "expert", "--tasks", "reach", "--episodes", "0"], "error: --episodes must be at least 1"),
         (["view", "NOWHERE"], "NOWHERE"),
         (["train", "NOWHERE", "--out", "OUT", "--learning-rate", "-1"], "error: --learning-rate must be finite"),
-        (["train", "NOWHERE", "--out", "OUT", "--latent-consistency", "-1"], "error: --latent-consistency must be"),
         (["scripted", "reach", "--episodes", "0", "--out", "OUT"], "error: --episodes must be at least 1"),
     ],
 )
@@ -281,14 +280,6 @@ def test_evaluate_runs_the_tasks_of_the_training(capsys, demos, checkpoint, tmp_
     lw.save_actor(lw.load_actor(checkpoint), tmp_path / "plain.zip")  # which says nothing of data
     assert run(capsys, "evaluate", tmp_path / "plain.zip", "--episodes", 1).count("\n") == 12
     assert run(capsys, "evaluate", checkpoint, "--plans", "MT10", "--episodes", 1).count("\n") == 12
-
-
-def test_an_option_for_plans_is_refused_without_them(capsys, demos, tmp_path):
-    given = ("train", demos, "--out", tmp_path / "p.zip", "--mix", "actions", "--method")
-    for method in ("dc", "one-hot"):
-        assert f"--mix is for a method that reads plans, --method {method} does not" in fails(capsys, *given, method)
-        near = ("train", demos, "--out", tmp_path / "p.zip", "--latent-consistency", 0.1, "--method", method)
-        assert "--latent-consistency is for a method that reads plans" in fails(capsys, *near)
 
 
 def test_train_names_a_task_that_the_dataset_lacks(capsys, demos, tmp_path):

@@ -49,9 +49,6 @@ def test_it_is_trained_reported_and_used(capsys, tmp_path, policy):
 
 def test_what_cannot_be_is_refused(capsys, tmp_path, policy):
     out = ["--out", tmp_path / "x"]
-    assert "--text-encoder is for --no-structure" in fails(
-        capsys, "train-evaluator", "reach", *out, "--text-encoder", "my:f"
-    )
     assert "TASKS" in fails(capsys, "train-evaluator", "reech", *out)
     assert "--steps must be at least 1" in fails(capsys, "train-evaluator", "reach", *out, "--steps", 0)
     assert "--behaviours must be one of" in fails(capsys, "train-evaluator", "reach", *out, "--behaviours", "bold")

@@ -99,23 +99,6 @@ def test_what_cannot_be_begun_with_is_named(capsys, demos, trained, tmp_path):
     assert policy.read_bytes() == before
 
 
-def test_held_answers_are_not_trained(capsys, demos, trained, tmp_path):
-    """Of pictures it was told to draw a dataset's, which could not mend it."""
-    actor = lw.load_actor(trained / "policy.zip")
-    eyes = lw.modules.ImageQueryEvaluator(actor.plans, height=16, width=24, hidden=8, depth=1)
-    out = ["--out", tmp_path / "x.zip", *SMALL]
-    for name, inside in (("state", lw.StateQueryEvaluator(actor.plans, width=8)), ("eyes", eyes)):
-        held = lw.HeldEvaluator(inside, every=5)
-        lw.training.save_evaluator(held, tmp_path / f"{name}.zip")
-        refused = fails(capsys, "train", demos, *out, "--evaluator", tmp_path / f"{name}.zip", *NET)
-        assert "error: --evaluator must be no HeldEvaluator" in refused
-        lw.save_actor(actor.with_evaluator(held), tmp_path / f"{name}-policy.zip")
-        refused = fails(capsys, "train", demos, *out, "--begin", tmp_path / f"{name}-policy.zip")
-        assert "error: --begin must have no HeldEvaluator" in refused
-        assert "--evaluator" in refused
-    assert not (tmp_path / "x.zip").exists()
-
-
 @pytest.mark.slow
 def test_cameras(capsys, demos, tmp_path):
     if missing := why_no_pictures():

@@ -75,7 +75,6 @@ WRONG = {
     "train nowhere --out o.zip": "DATA: no dataset folder 'nowhere'; make one with `lw-torchrl collect`",
     "train demos --out demos": "--out must be a file, 'demos' is a folder",
     "train demos --out o.zip --method pcb": "--method must be one of 'pcbc', 'dc', 'one-hot', got 'pcb'",
-    "train demos --out o.zip --mix latent": "--mix must be one of 'latents', 'actions', got 'latent'",
     "train demos --out o.zip --tasks raech": "did you mean 'reach'",
     "train demos --out o.zip --plans nowhere": "--plans nowhere: no plan file or folder 'nowhere'; 'MT10' and 'MT50'",
     "train demos --out o.zip --plans push.plan": "--plans push.plan: push.plan, line 2: ",

@@ -21,7 +21,6 @@ from benchmarks.paper.stacked import StackedBehavioralCloning
 ACTORS = {
     "plan": lambda: make_actor(feature_noise=0.0),
     "noisy plan": lambda: make_actor(feature_noise=0.1, focus=True, swap_unmentioned=0.5),
-    "mixed actions": lambda: make_actor(feature_noise=0.0, mix="actions"),
     "description": lambda: seeded(lw.DescriptorConditionedActor, "MT10", feature_noise=0.0, **SMALL),
     "one-hot": lambda: seeded(lw.DescriptorConditionedActor, "MT10", condition="one-hot", feature_noise=0.0, **SMALL),
     "stochastic": lambda: make_actor(feature_noise=0.0, distribution="normal"),
@@ -264,7 +263,7 @@ def test_an_evaluation_there_is_the_cpus(kind):
 
     made = {
         "scripted": lambda: lw.ScriptedSkillActor(PLANS),
-        "ensemble": lambda: lw.modules.ActorEnsemble([ACTORS["plan"](), ACTORS["mixed actions"]()]),
+        "ensemble": lambda: lw.modules.ActorEnsemble([ACTORS["plan"](), ACTORS["plan"]()]),
         "evaluator": lambda: seeded(lw.PlanConditionedActor, PLANS, evaluator=Guess(PLANS), **SMALL),
     }
     actor = made.get(kind, ACTORS.get(kind))()

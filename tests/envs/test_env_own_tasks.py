@@ -94,20 +94,6 @@ def test_the_shipped_engines_refuse_it_by_name(engine):
         make_engine(engine, [own.name])
 
 
-@pytest.mark.parametrize(
-    ("tasks", "message"),
-    [
-        ([STACK, STACK], "tasks must name each task once, got stack-cups more than once"),
-        (["reach", lw.TASKS["reach"]], "tasks must name each task once, got reach more than once"),
-        ([STACK, "reahc"], "did you mean 'reach'"),
-    ],
-    ids=str,
-)
-def test_mistakes_are_named(tasks, message):
-    with pytest.raises(ValueError, match=message):
-        lw.LanguageWorldEnv(tasks, engine=Counting)
-
-
 @pytest.mark.parametrize("tasks", ["stack-cups", ["stack-cups"], ["reach", "stack-cups"], [STACK]], ids=str)
 def test_a_task_of_ones_own_without_an_engine_is_told_how(tasks):
     with pytest.raises(ValueError, match=r"'stack-cups'.* is a Task with an engine=, see docs/training.md"):

@@ -14,7 +14,7 @@ from speed import first_fast
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.envs import GymLikeEnv, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
 from lw_torchrl._devices import in_blocks
@@ -334,17 +334,6 @@ def test_stopping_after_success_gives_the_same_success(make, after):
 def test_a_task_that_the_environment_lacks_is_named():
     with pytest.raises(ValueError, match="episodes names drawer-open, sweep, which env does not have"):
         run(plain_env(2), wavy, {"sweep": [0], "reach": [1], "drawer-open": []})
-
-
-def test_a_negative_episode_is_named():
-    with pytest.raises(ValueError, match="episode must be at least 0, got -1"):
-        run(plain_env(2), wavy, {"reach": [-1]})
-
-
-@pytest.mark.parametrize("env", [None, "reach", GymLikeEnv], ids=str)
-def test_another_environment_is_named(env):
-    with pytest.raises(TypeError, match="env must be a LanguageWorldEnv or a TransformedEnv of one, got"):
-        run(env, wavy, {"reach": [0]})
 
 
 def test_a_nan_raises_where_the_environment_is_strict():

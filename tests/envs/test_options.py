@@ -85,24 +85,8 @@ def test_a_single_environment_has_no_dimension_of_rows(options):
     other = lw.LanguageWorldEnv("reach", num_envs=1, seed=2, **options)
     assert torch.equal(other.reset()["observation"][0], data["observation"][0])
     assert torch.equal(env.reset(episode=3)["episode"], torch.tensor(3))
-    state = env.reset()
-    assert torch.equal(env.base_env.reset(state, set_state=True)["observation"], state["observation"])
     env.close()
     other.close()
     several = SerialEnv(2, lambda: lw.LanguageWorldEnv("reach", batch_size=(), **options))
     assert several.rollout(3)["episode"].tolist() == [[0] * 3, [1] * 3]
     several.close()
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        ({"batch_size": (2,)}, ValueError, r"batch_size must be \(\), for a single environment, .* got \(2,\)"),
-        ({"batch_size": (), "num_envs": 2}, ValueError, "or None for one dimension of 2 rows"),
-        ({"frame_skip": 0}, ValueError, "frame_skip must be at least 1, got 0"),
-        ({"frame_skip": 1.5}, TypeError, "frame_skip must be an integer"),
-    ],
-)
-def test_wrong_options_are_named(options, error, message):
-    with pytest.raises(error, match=message):
-        lw.LanguageWorldEnv("reach", **options)

@@ -126,22 +126,6 @@ def test_pixels_of_all_rows_are_a_key_like_any():
     env.close()
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"camera": "corner9"}, "did you mean 'corner"),
-        ({"height": 0}, "height"),
-        ({"width": 10**6}, "width must be at most"),
-        ({"width": 3.5}, "width"),
-    ],
-)
-def test_what_is_no_picture_is_refused(options, says):
-    env = opened(tasks=["reach"])
-    with pytest.raises((ValueError, TypeError), match=says):
-        env.render(**options)
-    env.close()
-
-
 def test_there_is_nothing_to_see_before_a_reset_or_after_the_end():
     env = lw.LanguageWorldEnv("reach")
     with pytest.raises(RuntimeError, match="before a reset"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from rows import FEW, ROWS, STEPS, advance, others, row_actions, same, trajectories
+from rows import ROWS, STEPS, advance, others, row_actions, same, trajectories
 from tensordict import TensorDict
 from torchrl.envs import ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
@@ -141,43 +141,6 @@ def test_a_misspelt_request_is_an_error(any_env):
         any_env.reset(episodes=3)
 
 
-# --- TorchRL's set_state -------------------------------------------------------------------------------------------
-
-
-def test_a_state_is_the_beginning_of_its_episode(env):
-    env.set_seed(3)
-    first = env.reset()
-    env.rollout(4)
-    again = env.reset(first.clone(), set_state=True)
-    assert same(first, again)
-    bare = TensorDict({"episode": torch.tensor([7, 0, 7, 0, 7, 0])}, [ROWS])
-    assert env.reset(bare, set_state=True)["episode"].tolist() == [7, 0, 7, 0, 7, 0]
-    assert env.reset(first.clone(), set_state=False)["episode"].tolist() != first["episode"].tolist()
-
-
-def test_the_middle_of_an_episode_is_refused(env):
-    env.set_seed(3)
-    state = env.reset()
-    later = advance(env, state, row_actions(state, 0))
-    with pytest.raises(ValueError, match=r"set_state=True goes to the beginning .* rows \[0, 1, 2, 3, 4\]"):
-        env.reset(later.exclude("reward"), set_state=True)
-    with pytest.raises(RuntimeError, match="have ended or were never reset"):
-        advance(env, state, row_actions(state, 0))
-
-
-def test_a_state_of_other_tasks_is_refused():
-    env, other = make_env(), lw.LanguageWorldEnv(["drawer-open", "reach"], num_threads=1)
-    env.reset()
-    foreign = other.reset(episode=5).select("episode", "task_id")
-    with pytest.raises(ValueError, match=r"set_state=True .* names other tasks than those of this one, push, reach"):
-        env.reset(foreign, set_state=True)
-    one_row = foreign.clone().set("_reset", torch.tensor([False, True]))
-    assert env.reset(one_row, set_state=True)["episode"][1] == 5
-    assert env.reset()["episode"].tolist() == [1, 2], "of the rows that were not asked for, the tasks do not count"
-    env.close()
-    other.close()
-
-
 @pytest.mark.parametrize("mask", [torch.tensor([1, 0]), torch.tensor([1.0, 0.0]), torch.ones(2, 2, dtype=torch.bool)])
 def test_a_mask_is_of_bools_one_a_row(mask):
     env = make_env()
@@ -205,14 +168,3 @@ def test_the_seed_is_any_integer(seed):
         assert following == 795726461, "as TorchRL's own environments say"
     env.close()
     made.close()
-
-
-def test_a_state_needs_its_episode_and_no_other(env, plans):
-    with pytest.raises(ValueError, match="set_state=True needs episode in the tensordict"):
-        env.reset(set_state=True)
-    state = env.reset()
-    with pytest.raises(ValueError, match="episode and set_state=True each name an episode"):
-        env.reset(state, set_state=True, episode=3)
-    transformed = TransformedEnv(env, lw.QAFTransform({task: plans[task] for task in FEW}))
-    with pytest.raises(ValueError, match=r"a TransformedEnv does not hand it down: reset\(episode=tensordict"):
-        transformed.reset(transformed.reset(), set_state=True)

@@ -79,24 +79,3 @@ def test_noise_is_standard_normal_and_independent_of_the_global_generators():
     assert np.abs(noise.std(0) - 1).max() < 0.03
     assert np.abs(np.corrcoef(noise.T) - np.eye(4)).max() < 0.04
     assert abs(np.corrcoef(noise[:-1, 0], noise[1:, 0])[0, 1]) < 0.04
-
-
-@pytest.mark.parametrize(
-    ("triple", "error", "message"),
-    [
-        (("pik-place", 0, 0), ValueError, "did you mean 'pick-place'"),
-        (("reach-v3", 0, 0), ValueError, "did you mean 'reach'"),
-        ((3, 0, 0), TypeError, "task must be a task's name, got 3"),
-        (("reach", 0, -1), ValueError, "episode must be at least 0, got -1"),
-        (("reach", 0, 1.0), TypeError, "episode must be an integer, got 1.0"),
-        (("reach", 1.5, 0), TypeError, "seed must be an integer, got 1.5"),
-        (("reach", True, 0), TypeError, "seed must be an integer, got True"),
-        (("reach", None, 0), TypeError, "seed must be an integer, got None"),
-    ],
-    ids=str,
-)
-def test_mistakes_are_named(triple, error, message):
-    with pytest.raises(error, match=message):
-        episode_seed(*triple)
-    with pytest.raises(error, match=message):
-        action_noise(*triple, 3)

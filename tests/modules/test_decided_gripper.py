@@ -14,7 +14,6 @@ PLANS = lw.load_plans("MT10")
 SMALL = {"width": 8, "depth": 1}
 KINDS = {
     "plans": lambda **options: lw.PlanConditionedActor(PLANS, **SMALL, **options),
-    "actions": lambda **options: lw.PlanConditionedActor(PLANS, mix="actions", **SMALL, **options),
     "description": lambda **options: lw.DescriptorConditionedActor("MT10", **SMALL, **options),
 }
 

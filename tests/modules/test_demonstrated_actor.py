@@ -121,5 +121,3 @@ def test_what_does_not_belong_together_is_refused():
     fetch = lw.PlanConditionedActor(load_suite("fetch").plans, **SMALL)
     with pytest.raises(ValueError, match="must be of one layout, got 'metaworld' and 'fetch'"):
         DemonstratedActor(plain, fetch)
-    with pytest.raises(TypeError, match="demonstrated must be"):
-        DemonstratedActor("push", others)

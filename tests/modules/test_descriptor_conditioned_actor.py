@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 
-import lw_torchrl as lw
 from lw_torchrl.language.tasks import MT10, MT50, TASKS, task_id
 from lw_torchrl.language.text import encode_texts
 from lw_torchrl.modules import DescriptorConditionedActor
@@ -135,53 +134,3 @@ def poke(index, value):
         return tensor
 
     return change
-
-
-@pytest.mark.parametrize(
-    ("key", "change", "message"),
-    [
-        ("observation", poke((1, 5), torch.nan), "observation must hold finite numbers"),
-        ("observation", lambda x: x[:, :38], r"observation must be float32 of shape \(..., 39\)"),
-        ("observation", lambda x: x.double(), "observation must be float32.*float64"),
-        ("task_id", poke(0, task_id("sweep-into")), "not made for: sweep-into"),
-        ("task_id", poke(0, 50), "task_id.*50"),
-        ("task_id", poke(0, -1), "task_id.*-1"),
-        ("task_id", lambda x: x.float(), "task_id.*float32"),
-    ],
-)
-def test_wrong_input_is_named(key, change, message):
-    state = make_state(3)
-    with pytest.raises(ValueError, match=message):
-        make_actor()(TensorDict({**state, key: change(state[key])}, [3]))
-
-
-@pytest.mark.parametrize(
-    ("tasks", "options", "message"),
-    [
-        ("raech", {}, "reach"),
-        ("MT10", dict(features="row"), "features must be one of"),
-        ("MT10", dict(latent_size=0), "latent_size must be at least 1"),
-        ("MT10", dict(width=0), "width must be at least 1"),
-        ("MT10", dict(depth=-1), "depth must be at least 0"),
-    ],
-)
-def test_wrong_options_are_named(tasks, options, message):
-    with pytest.raises(ValueError, match=message):
-        make_actor(tasks, **options)
-
-
-@pytest.mark.parametrize(
-    ("encoder", "error", "message"),
-    [
-        (lambda texts: torch.full((len(texts), 4), torch.nan), ValueError, "it gives NaN or infinity for"),
-        (lambda texts: [[1.0] * 4 for _ in texts], TypeError, "must give a tensor of floats"),
-        ("my_texts:encode", TypeError, "text_encoder must be a function, got 'my_texts:encode'"),
-    ],
-)
-def test_an_encoder_that_gives_no_vectors_is_named(encoder, error, message):
-    for make in (
-        lambda: lw.DescriptorConditionedActor("MT10", text_encoder=encoder),
-        lambda: lw.PlanConditionedActor(lw.load_plans("MT10"), text_encoder=encoder),
-    ):
-        with pytest.raises(error, match=message):
-            make()

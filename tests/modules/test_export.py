@@ -25,7 +25,6 @@ def moved(residual):
 ACTORS = {
     "plan": lambda: lw.PlanConditionedActor(PLANS, **SMALL),
     "focus": lambda: lw.PlanConditionedActor(PLANS, focus=True, **SMALL),
-    "actions": lambda: lw.PlanConditionedActor(PLANS, mix="actions", **SMALL),
     "stochastic": lambda: lw.PlanConditionedActor(PLANS, distribution="tanh_normal", **SMALL),
     "description": lambda: lw.DescriptorConditionedActor("MT10", **SMALL),
     "scripted": lambda: lw.ScriptedSkillActor(PLANS),

@@ -71,14 +71,6 @@ def test_what_is_missing_is_named(kind):
             module(rows.exclude(key))
 
 
-@pytest.mark.parametrize(
-    "given", ["action", ["action"], ["a", "b", "c", "d"], ["a", "a", "b"], [1, 2, 3], [[], [], []], 3]
-)
-def test_what_is_no_list_of_keys_is_refused(given):
-    with pytest.raises(ValueError, match="out_keys must be a list of 3, in this order: action, skill_weights, skill_l"):
-        lw.PlanConditionedActor(PLANS, out_keys=given)
-
-
 def test_keys_travel_with_the_policy(tmp_path):
     keys = dict(
         in_keys=["state", ("words", "task"), ("words", "qaf")], out_keys=["action", ("why", "weights"), "latent"]
@@ -125,7 +117,6 @@ def plan_actor(**more):
 networks = dict(width=8, depth=1)
 MODULES = {
     "plan": plan_actor,
-    "actions": lambda: plan_actor(mix="actions"),
     "tanh_normal": lambda: plan_actor(distribution="tanh_normal"),
     "normal": lambda: lw.DescriptorConditionedActor("MT10", distribution="normal", **SMALL),
     "description": lambda: lw.DescriptorConditionedActor("MT10", **SMALL),
@@ -142,7 +133,6 @@ MODULES = {
     "quantiles": lambda: QValue(PlanEncoder(PLANS), quantiles=5, **networks),
     "attention": lambda: PlanAttention(PLANS),
     "evaluator": lambda: lw.StateQueryEvaluator(PLANS, width=8),
-    "held evaluator": lambda: lw.HeldEvaluator(lw.StateQueryEvaluator(PLANS, width=8)),
 }
 each_module = pytest.mark.parametrize("name", MODULES)
 
@@ -151,7 +141,7 @@ def made(name):
     """A module, what it reads of some rows, and what it writes."""
     torch.manual_seed(0)
     module, rows = MODULES[name]().eval(), state()
-    rows["action"], rows["qaf_held_logits"] = torch.rand(3, 4), torch.randn(3, PLANS.num_steps)
+    rows["action"] = torch.rand(3, 4)
     read = rows.select(*module.in_keys)
     return module, read, module(read.copy()).select(*module.out_keys)
 

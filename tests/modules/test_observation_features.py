@@ -116,11 +116,6 @@ def test_the_normalisation_is_saved_with_the_module():
     assert not torch.equal(ObservationFeatures("both")(observation), features(observation))
 
 
-def test_another_kind_is_refused_with_the_nearest():
-    with pytest.raises(ValueError, match=r"features must be one of .*'raws'; did you mean 'raw'"):
-        ObservationFeatures("raws")
-
-
 @pytest.mark.parametrize(
     ("observation", "said"),
     [

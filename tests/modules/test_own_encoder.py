@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import nn
 
 import lw_torchrl as lw
@@ -110,31 +109,11 @@ def test_its_own_tasks_and_texts_travel(tmp_path):
         lw.load_actor(tmp_path / "policy.zip", text_encoder=lambda texts: torch.zeros(len(texts), TEXT_DIMENSION))
 
 
-def test_one_that_needs_more_than_plans_is_no_method(own, monkeypatch):
-    class Needs(own):
-        def __init__(self, tasks, size):
-            super().__init__(tasks, size=size)
-
-    monkeypatch.setitem(ENCODERS, "Needs", Needs)
-    with pytest.raises(TypeError, match=r"method must be a class made of the plans.*; Needs: missing .*'size'"):
-        lw.modules.make_policy("Needs", lw.load_plans("MT10"))
-
-
 def test_what_is_no_encoder_and_options_of_one_are_refused():
     with pytest.raises(TypeError, match=r"about must be an Encoder, got Plans.*PlanEncoder\(plans\)"):
         ConditionedActor(PLANS)
     with pytest.raises(TypeError, match=r"feature_noise: give it to the encoder, PlanEncoder\(..., feature_noise=\)"):
         ConditionedActor(PlanEncoder(PLANS), feature_noise=0.1)
-
-
-def test_what_is_no_encoding_is_named(own):
-    class Bare(own):
-        def encode(self, rows, seen):
-            return seen
-
-    actor = ConditionedActor(Bare(PLANS), width=8)
-    with pytest.raises(TypeError, match=r"encode of Bare must return an Encoding\(latent, features\), got Tensor"):
-        actor(**states())
 
 
 class Holding(Encoder):
@@ -171,13 +150,3 @@ def test_one_for_plans_carries_out_others_on_the_same_weights():
         ConditionedActor(Holding(reach, by_skill=True)).with_plans(PLANS)
     with pytest.raises(TypeError, match="conditioned on descriptions"):
         DescriptorEncoder(PLANS).with_plans(PLANS)
-
-
-def test_an_encoder_of_plans_that_gives_no_attention_is_named():
-    class Bare(Holding):
-        def encode(self, holds, seen):
-            return super().encode(holds, seen)._replace(weights=None)
-
-    told = states() | {"qaf": torch.zeros(4, 6, dtype=torch.bool)}
-    with pytest.raises(TypeError, match="encode of Bare must return weights, the attention over the steps"):
-        ConditionedActor(Bare(PLANS), width=8)(TensorDict(told, [4]))

@@ -11,7 +11,7 @@ from torchrl.objectives import BCLoss
 
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.language.tasks import MT10, task_id
+from lw_torchrl.language.tasks import task_id
 from lw_torchrl.language.text import encode_texts
 from lw_torchrl.modules import PlanConditionedActor
 
@@ -47,11 +47,10 @@ def make_loss(actor):
         return BCLoss(actor, loss_function="l2")
 
 
-@pytest.mark.parametrize("mix", ["latents", "actions"])
 @pytest.mark.parametrize("features", ["raw", "differences", "relative", "both"])
 @pytest.mark.parametrize("shape", [(), (5,), (3, 4)])
-def test_it_writes_the_documented_keys_on_any_leading_shape(mix, features, shape):
-    actor = make_actor(mix=mix, features=features)
+def test_it_writes_the_documented_keys_on_any_leading_shape(features, shape):
+    actor = make_actor(features=features)
     state = make_state(*shape)
     given = state.clone()
     out = actor(state)
@@ -76,9 +75,8 @@ def test_it_can_be_called_with_tensors():
     assert (weights.shape, latent.shape) == ((5, PLANS.num_steps), (5, 6))
 
 
-@pytest.mark.parametrize("mix", ["latents", "actions"])
-def test_mixing_step_by_step_by_hand(mix):
-    actor = make_actor(mix=mix)
+def test_mixing_step_by_step_by_hand():
+    actor = make_actor()
     state = make_state(12)
     out = actor(state.clone())
     for row in range(12):
@@ -90,20 +88,10 @@ def test_mixing_step_by_step_by_hand(mix):
         latents = actor.encoder.texts(vectors / vectors.square().mean(-1, keepdim=True).sqrt())  # numbers of size 1
         mixed = weights @ latents
         features = actor.encoder.features(state["observation"][row])
-        if mix == "latents":
-            action = actor.head(torch.cat((mixed, features), -1))
-        else:
-            action = weights @ torch.stack([actor.head(torch.cat((latent, features), -1)) for latent in latents])
+        action = actor.head(torch.cat((mixed, features), -1))
         torch.testing.assert_close(out["skill_weights"][row, : len(steps)], weights)
         torch.testing.assert_close(out["skill_latent"][row], mixed)
         torch.testing.assert_close(out["action"][row], action)
-
-
-def test_mixing_latents_and_actions_differ():
-    one, other = make_actor(mix="latents"), make_actor(mix="actions")
-    other.load_state_dict(one.state_dict())
-    state = make_state(8)
-    assert not torch.allclose(one(state.clone())["action"], other(state.clone())["action"])
 
 
 def test_the_plan_decides_what_is_done():
@@ -126,10 +114,9 @@ def test_two_actors_of_one_seed_are_equal_and_a_call_repeats():
     assert not torch.equal(make_actor(4)(state.clone())["action"], one(state.clone())["action"])
 
 
-@pytest.mark.parametrize("mix", ["latents", "actions"])
-def test_noise_is_on_the_features_while_training_and_only_then(mix):
+def test_noise_is_on_the_features_while_training_and_only_then():
     state = make_state(7)
-    actor, plain = make_actor(mix=mix, feature_noise=0.3), make_actor(mix=mix, feature_noise=0.0)
+    actor, plain = make_actor(feature_noise=0.3), make_actor(feature_noise=0.0)
     assert torch.equal(actor(state.clone())["action"], plain(state.clone())["action"])
     assert torch.equal(plain.train()(state.clone())["action"], plain.eval()(state.clone())["action"])
     actor.train()
@@ -197,7 +184,7 @@ def test_with_plans_follows_the_other_plans():
 
 @pytest.mark.parametrize("training", [True, False])
 def test_with_plans_keeps_options_normalisation_and_mode(training):
-    actor = make_actor(mix="actions", features="differences", text_encoder=hashed).train(training)
+    actor = make_actor(features="differences", text_encoder=hashed).train(training)
     actor.fit_normalization(make_state(50)["observation"])
     other = actor.with_plans(other_plans())
     assert other.config == actor.config
@@ -245,9 +232,8 @@ def make_batch(rows=64, seed=0):
     return state.set("action", torch.cat((target, target[:, :1] * 0), -1) * 0.8)
 
 
-@pytest.mark.parametrize("mix", ["latents", "actions"])
-def test_bc_loss_trains_it(mix):
-    actor = make_actor(mix=mix)
+def test_bc_loss_trains_it():
+    actor = make_actor()
     loss, batch = make_loss(actor), make_batch()
     optimizer = torch.optim.Adam(loss.parameters(), 1e-2)
     values = []
@@ -263,9 +249,8 @@ def test_bc_loss_trains_it(mix):
     assert error.mean() < 0.1, "the actor itself has learned, not a copy"
 
 
-@pytest.mark.parametrize("mix", ["latents", "actions"])
-def test_the_gradient_reaches_every_weight(mix):
-    actor = make_actor(mix=mix)
+def test_the_gradient_reaches_every_weight():
+    actor = make_actor()
     make_loss(actor)(make_batch(256))["loss_bc"].backward()
     for name, parameter in actor.named_parameters():
         assert parameter.grad is not None, name
@@ -305,7 +290,6 @@ def poke(index, value):
     return change
 
 
-@pytest.mark.parametrize("mix", ["latents", "actions"])
 @pytest.mark.parametrize(
     ("key", "change", "message"),
     [
@@ -322,9 +306,9 @@ def poke(index, value):
         ("task_id", lambda x: x.unsqueeze(-1), "qaf must have shape"),
     ],
 )
-def test_wrong_input_is_named(mix, key, change, message):
+def test_wrong_input_is_named(key, change, message):
     with pytest.raises(ValueError, match=message):
-        make_actor(mix=mix)(broken(key, change))
+        make_actor()(broken(key, change))
 
 
 @pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
@@ -333,34 +317,3 @@ def test_normalisation_cannot_be_fitted_to_what_are_no_numbers(wrong):
     with pytest.raises(ValueError, match="observation must hold finite numbers"):
         actor.fit_normalization(poke((2, 2), wrong)(make_state(5)["observation"]))
     actor(make_state(2))
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (dict(mix="latent"), "mix must be one of 'latents', 'actions', got 'latent'; did you mean 'latents'"),
-        (dict(features="difference"), "features must be one of .*did you mean 'differences'"),
-        (dict(feature_noise=-0.1), "feature_noise must be finite and at least 0, got -0.1"),
-        (dict(latent_size=0), "latent_size must be at least 1, got 0"),
-        (dict(width=0), "width must be at least 1, got 0"),
-        (dict(depth=-1), "depth must be at least 0, got -1"),
-        (dict(encoder_width=0), "encoder_width must be at least 1"),
-        (dict(encoder_depth=-1), "encoder_depth must be at least 0"),
-    ],
-)
-def test_wrong_options_are_named(options, message):
-    with pytest.raises(ValueError, match=message):
-        make_actor(**options)
-
-
-def test_plans_of_a_wrong_kind_are_named():
-    with pytest.raises(TypeError, match="plans must map task names"):
-        PlanConditionedActor("MT10")
-    with pytest.raises(ValueError, match="another task"):
-        PlanConditionedActor({"push": PLANS["reach"]})
-    assert set(PlanConditionedActor(dict(PLANS), **SMALL).plans) == set(MT10)
-
-
-def test_squash_is_a_flag():
-    with pytest.raises(TypeError, match="squash must be True or False, got 'no'"):
-        make_actor(squash="no")

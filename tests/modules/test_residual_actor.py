@@ -112,8 +112,6 @@ def test_a_base_that_cannot_be_is_refused():
         lw.ResidualActor(lw.ResidualActor(make_base(), **SMALL))
     with pytest.raises(ValueError, match="base must have no distribution, this one's is 'normal'"):
         lw.ResidualActor(make_base(distribution="normal"))
-    with pytest.raises(ValueError, match="base must mix latents"):
-        lw.ResidualActor(make_base(mix="actions"))
     with pytest.raises(ValueError, match="scale"):
         lw.ResidualActor(make_base(), scale=-1.0)
 

@@ -122,17 +122,3 @@ def test_what_it_refuses():
         lw.ScriptedSkillActor({"push": plan})
     with pytest.raises(ValueError, match=r"seed must be from -2\*\*63 to 2\*\*64 - 1, got 1180591620717411303424"):
         lw.ScriptedSkillActor(PLANS, "random", seed=2**70)
-
-
-@pytest.mark.parametrize(
-    ("qaf", "message"),
-    [
-        ([[True, False]], r"qaf must have shape \(1, 4\), one column for each step .* got \(1, 2\)"),
-        ([[0.2, float("nan"), 0.0, 0.0]], "qaf must be bool, or numbers from 0 to 1"),
-        ([[0.2, 100.0, 0.0, 0.0]], "qaf must be bool, or numbers from 0 to 1"),
-    ],
-)
-@pytest.mark.parametrize("select", ["first", "random", "mix"])
-def test_truth_that_is_none_is_named(select, qaf, message):
-    with pytest.raises(ValueError, match=message):
-        acting(select, qaf)

@@ -15,21 +15,19 @@ from lw_torchrl.language.relations import RELATIONS, Comparison
 from lw_torchrl.modules.clause_evaluator import conjunction
 
 PLANS = lw.load_plans("MT10")
-KINDS = {"structure": {}, "texts": {"structure": False}}
 
 
 def letters(texts):
     return torch.tensor([[float(text.count(letter)) for letter in "abdefghilnoprstuw"] for text in texts])
 
 
-def make(kind, plans=PLANS, seed=0, **options):
+def make(plans=PLANS, seed=0, **options):
     torch.manual_seed(seed)
-    encoder = {} if kind == "structure" else {"text_encoder": letters}
-    return lw.StateQueryEvaluator(plans, width=8, depth=1, **KINDS[kind], **encoder, **options)
+    return lw.StateQueryEvaluator(plans, width=8, depth=1, **options)
 
 
-def make_actor(kind, **options):
-    evaluator = make(kind)
+def make_actor(**options):
+    evaluator = make()
     return lw.PlanConditionedActor(PLANS, evaluator=evaluator, width=8, text_encoder=letters, **options).eval()
 
 
@@ -44,14 +42,13 @@ def states(rows=20, plans=PLANS):
     )
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_logit_for_each_step_whatever_the_order_and_shape_of_rows(kind):
-    evaluator, found = make(kind), states(64)  # as many rows as evaluation's blocks have
+def test_a_logit_for_each_step_whatever_the_order_and_shape_of_rows():
+    evaluator, found = make(), states(64)  # as many rows as evaluation's blocks have
     assert_a_logit_for_each_step(evaluator, found)
 
 
 def test_structure_sees_only_the_difference_of_the_two_positions():
-    evaluator, found = make("structure"), states()
+    evaluator, found = make(), states()
     logits = evaluator(found.clone())["qaf_logits"]
     moved = found.clone()
     moved["observation"][:, 7:11] += 1.0  # a quaternion, which no relation compares
@@ -62,7 +59,7 @@ def test_not_is_the_opposite_with_structure():
     texts = ["the gripper is above the puck", "the gripper is not above the puck"]
     steps = [PlanStep(lw.parse_query(text, "push"), "grasp the puck") for text in texts]
     plans = lw.Plans([lw.ConditionalPlan("push", tuple(steps))])
-    logits = make("structure", plans)(states(6, plans))["qaf_logits"]
+    logits = make(plans)(states(6, plans))["qaf_logits"]
     assert torch.allclose(logits[:, 0], -logits[:, 1], atol=1e-5)
     assert (logits[:, 0] != 0).all()
 
@@ -84,11 +81,10 @@ def test_a_conjunction_has_a_gradient_everywhere():
     assert (logits.grad[2] == 0).all()
 
 
-@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("answers", ["logit", "tanh", "hard"])
 @pytest.mark.filterwarnings("ignore:.*target_actor_network_params")
-def test_the_loss_of_imitation_reaches_the_evaluator(kind, answers):
-    actor = make_actor(kind, answers=answers).train()
+def test_the_loss_of_imitation_reaches_the_evaluator(answers):
+    actor = make_actor(answers=answers).train()
     loss = BCLoss(actor, loss_function="l2")
     loss(states())["loss_bc"].backward()
     found = dict(actor.evaluator.named_parameters())
@@ -122,42 +118,40 @@ def test_tanh_is_the_papers_ten_times_the_probability_less_five():
     from lw_torchrl.modules.plan_attention import attention_logits
 
     logits = torch.linspace(-8, 8, 33)
-    assert torch.allclose(attention_logits(logits, "tanh", 0.5), 10 * logits.sigmoid() - 5, atol=1e-5)
-    assert torch.equal(attention_logits(logits, "logit", 0.5), logits)
+    assert torch.allclose(attention_logits(logits, "tanh"), 10 * logits.sigmoid() - 5, atol=1e-5)
+    assert torch.equal(attention_logits(logits, "logit"), logits)
 
 
 def test_with_evaluator_shares_the_weights():
     actor = lw.PlanConditionedActor(PLANS, width=8)
-    other = actor.with_evaluator(make("structure"))
+    other = actor.with_evaluator(make())
     own = {id(one) for one in other.evaluator.parameters()}
     assert {id(one) for one in actor.parameters()} == {id(one) for one in other.parameters()} - own
     assert other.config["answers"] == "hard"
     with pytest.raises(TypeError, match="DescriptorConditionedActor has none"):
-        lw.DescriptorConditionedActor("MT10").with_evaluator(make("structure"))
+        lw.DescriptorConditionedActor("MT10").with_evaluator(make())
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_with_plans_shares_the_network_alone(kind):
-    actor, other = make_actor(kind), lw.Plans([PLANS["push"]])
+def test_with_plans_shares_the_network_alone():
+    actor, other = make_actor(), lw.Plans([PLANS["push"]])
     found = actor.with_plans(other)
     assert {id(one) for one in actor.evaluator.parameters()} == {id(one) for one in found.evaluator.parameters()}
     rows = states(4, other)
     assert torch.allclose(found(rows.clone())["action"], actor(rows.clone())["action"], atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_saved_and_loaded_with_the_policy_to_the_bit(kind, tmp_path):
-    actor = make_actor(kind, answers="tanh", answer_scale=0.7)
+def test_saved_and_loaded_with_the_policy_to_the_bit(tmp_path):
+    actor = make_actor(answers="tanh")
     lw.save_actor(actor, tmp_path / "policy.zip")
     loaded = lw.load_actor(tmp_path / "policy.zip", text_encoder=letters)
-    assert loaded.config["answer_scale"] == 0.7
+    assert loaded.config["answers"] == "tanh"
     for key in actor.out_keys:
         assert torch.equal(loaded(states())[key], actor(states())[key]), key
 
 
 def test_scripted_skills_act_on_its_answers(tmp_path):
     plans = lw.load_plans("MT10")
-    evaluator = make("structure", plans)
+    evaluator = make(plans)
     actor = lw.ScriptedSkillActor(plans, evaluator=evaluator)
     assert actor.in_keys == ["observation", "task_id"]
     assert actor.transform() is None
@@ -175,7 +169,7 @@ def test_scripted_skills_act_on_its_answers(tmp_path):
 
 
 def test_true_answers_in_its_place_are_worth_what_exact_truth_is():
-    actor = make_actor("structure", answers="tanh")
+    actor = make_actor(answers="tanh")
     plain = lw.PlanConditionedActor(PLANS, width=8, text_encoder=letters).eval()
     plain.encoder.texts, plain.encoder.features, plain.head = actor.encoder.texts, actor.encoder.features, actor.head
     found = with_true_answers(actor)(states())
@@ -206,43 +200,11 @@ def test_as_an_evaluator_of_an_evaluation_its_sign_counts():
 # ---- refusals
 
 
-def test_what_cannot_be_is_named():
-    with pytest.raises(ValueError, match=r"float32 of shape .*39.*got torch.float32 of shape .2, 38"):
-        make("structure")(TensorDict(observation=torch.rand(2, 38), task_id=torch.zeros(2).long(), batch_size=2))
-    with pytest.raises(ValueError, match=r"task_id must be of shape .2,., one for each row of .observation."):
-        make("structure").logits(torch.rand(2, 39), torch.zeros(3).long())
-    with pytest.raises(ValueError, match="tasks without a plan"):
-        make("structure").logits(torch.rand(1, 39), torch.tensor([lw.task_id("hammer")]))
-    with pytest.raises(ValueError, match="answers must be one of"):
-        make_actor("structure", answers="soft")
-    with pytest.raises(ValueError, match="answers and answer_scale are of an evaluator's logits"):
-        lw.PlanConditionedActor(PLANS, answers="tanh")
-    with pytest.raises(TypeError, match="structure must be True or False, got 'no'"):
-        lw.StateQueryEvaluator(PLANS, structure="no")
-    with pytest.raises(ValueError, match="predicates is for structure=True"):
-        lw.StateQueryEvaluator(PLANS, structure=False, predicates=["near"], text_encoder=letters)
-    with pytest.raises(ValueError, match="predicates must be different names"):
-        lw.StateQueryEvaluator(PLANS, predicates=["near", "near"])
-    with pytest.raises(TypeError, match="evaluator must be a QueryEvaluator"):
-        lw.ScriptedSkillActor(PLANS, evaluator=torch.nn.Linear(1, 1))
-
-
 def test_a_relation_that_it_was_not_made_for_is_refused(monkeypatch):
-    made = make("structure")
+    made = make()
     monkeypatch.setitem(RELATIONS, "beside", (Comparison("xyz", "<", 0.05),))
     step = PlanStep(lw.parse_query("the gripper is beside the puck", "push"), "grasp the puck")
     plans = lw.Plans([lw.ConditionalPlan("push", (step,))])
     with pytest.raises(ValueError, match=r"predicate of .*beside the puck\", in push.*make and train one that has it"):
         made.with_plans(plans)
-    assert "beside" in make("structure", plans).predicates
-
-
-def test_texts_without_vectors_name_the_mend(monkeypatch):
-    import lw_torchrl.language.text as text
-
-    def absent():
-        raise ImportError("no sentence_transformers")
-
-    monkeypatch.setattr(text, "_sentence_transformer", absent)
-    with pytest.raises(ImportError, match=r"clauses' texts.*lw_torchrl\[text\].*text_encoder.*structure=True"):
-        lw.StateQueryEvaluator(PLANS, structure=False)
+    assert "beside" in make(plans).predicates

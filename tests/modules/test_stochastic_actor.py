@@ -133,25 +133,6 @@ def test_keys_of_ones_own():
     assert moved.spec["agent", "action"].shape == (4,)
 
 
-@pytest.mark.parametrize(
-    ("options", "error", "message"),
-    [
-        (
-            {"distribution": "gaussian"},
-            ValueError,
-            "must be one of 'tanh_normal', 'normal', got 'gaussian'",
-        ),
-        ({"squash": False}, ValueError, "squash must be true for the distribution 'tanh_normal'"),
-        ({"init_std": 0.0}, ValueError, r"init_std must be over 0\.001, got 0\.0"),
-        ({"init_std": "wide"}, TypeError, "init_std must be a number"),
-        ({"mix": "actions"}, ValueError, "mix must be 'latents' with a distribution"),
-    ],
-)
-def test_wrong_options_are_named(options, error, message):
-    with pytest.raises(error, match=message):
-        make(**options)
-
-
 def test_without_a_distribution_that_is_said():
     actor = make("plan", None)
     for ask in (lambda: actor.get_dist(make_state()), actor.as_sequential):
@@ -172,7 +153,7 @@ def test_a_trained_one_is_evaluated_and_collects(tmp_path):
 
 
 def test_nothing_random_is_left_in_the_likelihoods_of_one_made_of_a_trained_one():
-    trained = make("plan", None, roles=True, focus=True, jitter=0.03, swap_unmentioned=0.5, hide_opening=1.0)
+    trained = make("plan", None, roles=True, focus=True, jitter=0.03, swap_unmentioned=0.5)
     actor, state = trained.stochastic().train(), make_state(50, plans=trained.plans)
     first, second = (actor.get_dist(state).log_prob(torch.zeros(50, 4)) for _ in range(2))
     assert torch.equal(first, second)

@@ -305,29 +305,6 @@ def test_by_default_a_step_is_discounted_by_099():
     assert torch.equal(loss.advantage(batch), wanted)
 
 
-def test_what_is_refused():
-    critic = CRITICS["plan"](2)
-    for wrong in (-0.1, 1.5, float("nan")):
-        with pytest.raises(ValueError, match="expectile must be"):
-            lw.objectives.ExpectileValueLoss(critic, expectile=wrong)
-    with pytest.raises(TypeError, match="expectile must be a number"):
-        lw.objectives.ExpectileValueLoss(critic, expectile="0.7")
-    loss, batch = make_loss(), make_batch()
-    with pytest.raises(ValueError, match=r"are needed, got .*without qaf"):
-        loss(batch.exclude("qaf"))
-    with pytest.raises(RuntimeError, match="shape"):
-        loss(batch.set(("next", "reward"), torch.rand(12)))
-    renamed = Value(DescriptorEncoder("MT10"), ensemble=2, out_keys=["v", "vs"])
-    loss = lw.objectives.ExpectileValueLoss(renamed, delay_value=False)
-    with pytest.raises(ValueError, match=r"writes \['v', 'vs'\], which lack 'state_value'.*set_keys"):
-        loss(make_batch())
-    loss.set_keys(value="v")  # the least of the ensemble alone
-    with pytest.raises(ValueError, match=r"of an ensemble, 'state_values': name them by"):
-        loss(make_batch())
-    loss.set_keys(values="vs")
-    assert loss(make_batch())["loss_value"].isfinite()
-
-
 @pytest.mark.parametrize("kind", CRITICS)
 def test_on_a_buffers_rows_of_n_steps(tmp_path, kind):
     lw.collect_demonstrations(["reach", "push"], episodes_per_task=2, root=tmp_path / "d", max_steps=60, progress=False)

@@ -27,15 +27,12 @@ from lw_torchrl.modules import (
     PlanConditionedActor,
     ResidualActor,
     ScriptedSkillActor,
-    StateQueryEvaluator,
 )
 from lw_torchrl.training import (
     BehavioralCloningConfig,
     BehavioralCloningTrainer,
     load_actor,
-    load_evaluator,
     save_actor,
-    save_evaluator,
 )
 from lw_torchrl.training.files import read_description
 
@@ -84,8 +81,8 @@ def saved(tmp_path_factory):
 @pytest.mark.parametrize(
     "options",
     [
-        dict(mix="actions", features="raw"),
-        dict(mix="latents", features="both", feature_noise=0.5),
+        dict(features="raw"),
+        dict(features="both", feature_noise=0.5),
         dict(latent_size=7, width=9, depth=2, encoder_width=5, encoder_depth=2),
     ],
 )
@@ -161,7 +158,6 @@ NOT_SHIPPED = {
     ),
     "an ensemble": lambda: ActorEnsemble([own_words(), own_words()]),
     "a residual": lambda: ResidualActor(own_words()),
-    "an evaluator's plan": lambda: own_words(StateQueryEvaluator(own_plans(), structure=False, width=8, depth=1)),
 }
 
 
@@ -171,16 +167,6 @@ def test_texts_that_are_not_shipped_load_in_a_new_process(make, tmp_path):
     save_actor(make(), tmp_path / "own.zip")
     text._sentence_transformer.cache_clear()  # as in a new process
     load_actor(tmp_path / "own.zip")
-    assert text._sentence_transformer.cache_info().misses
-
-
-def test_an_evaluator_that_reads_texts_loads_in_a_new_process(tmp_path):
-    gripper, target = TASKS["reach"].objects
-    ball = replace(TASKS["reach"], objects=(gripper, replace(target, name="red ball")))
-    plans = Plans([ConditionalPlan.from_pairs(ball, [("the gripper is not near the red ball", "glide over")])])
-    save_evaluator(StateQueryEvaluator(plans, structure=False, width=8, depth=1), tmp_path / "evaluator.zip")
-    text._sentence_transformer.cache_clear()
-    load_evaluator(tmp_path / "evaluator.zip", plans)
     assert text._sentence_transformer.cache_info().misses
 
 

@@ -17,16 +17,6 @@ SMALL = lw.training.QueryEvaluatorConfig(steps=12, batch_size=64, checkpoint_eve
 PARTS = ("training", "states", "queries", "tasks")
 
 
-def words(texts):
-    """Bags of words; "not" and the order of two names among them."""
-    vocabulary = sorted({word for task in PLANS for word in " ".join(lw.supported_queries(task)).split()})
-    vectors = torch.zeros(len(texts), 2 * len(vocabulary))
-    for row, text in enumerate(texts):
-        for place, word in enumerate(text.split()):
-            vectors[row, vocabulary.index(word) + (place > 4) * len(vocabulary)] += 1.0
-    return vectors
-
-
 @pytest.fixture(scope="module")
 def replay(tmp_path_factory):
     root = tmp_path_factory.mktemp("states")
@@ -135,14 +125,6 @@ def test_two_tasks_are_learned_quickly(replay):
     assert found["tasks"].accuracy() > 0.87
 
 
-def test_from_texts_alone_it_learns_too_and_what_not_means(replay):
-    config = lw.training.QueryEvaluatorConfig(steps=400, batch_size=512, learning_rate=1e-2, held_out_tasks=("reach",))
-    data = lw.training.LabelledQueries(replay, config)
-    evaluator = make(width=64, depth=2, structure=False, text_encoder=words)
-    lw.training.QueryEvaluatorTrainer(evaluator, data, config, progress=False).train()
-    assert score_evaluator(evaluator, data).parts["states"].accuracy() > 0.85
-
-
 def test_a_report_counts_every_answer_once(replay, tmp_path):
     data = lw.training.LabelledQueries(replay, SMALL)
     report = score_evaluator(make(), data)
@@ -159,22 +141,20 @@ def test_a_report_counts_every_answer_once(replay, tmp_path):
 # ---- files
 
 
-@pytest.mark.parametrize("kind", ["structure", "texts"])
-def test_training_that_was_stopped_goes_on_to_the_bit(replay, tmp_path, kind):
-    options = {} if kind == "structure" else {"structure": False, "text_encoder": words}
-    whole = make_trainer(replay, **options)
+def test_training_that_was_stopped_goes_on_to_the_bit(replay, tmp_path):
+    whole = make_trainer(replay)
     loss = whole.train()
-    first = make_trainer(replay, tmp_path / "e.zip", **options)
+    first = make_trainer(replay, tmp_path / "e.zip")
     for _ in range(7):
         first.step()
     first.save()
-    second = make_trainer(replay, tmp_path / "e.zip", seed=1, **options)
+    second = make_trainer(replay, tmp_path / "e.zip", seed=1)
     assert second.steps == 7
     assert second.train() == pytest.approx(loss, abs=1.0)
     assert_same(everything(second), everything(whole))
-    again = make_trainer(replay, tmp_path / "e.zip", **options)
+    again = make_trainer(replay, tmp_path / "e.zip")
     assert again.steps == SMALL.steps
-    loaded = lw.training.load_evaluator(tmp_path / "e.zip", PLANS, **({"text_encoder": words} if options else {}))
+    loaded = lw.training.load_evaluator(tmp_path / "e.zip", PLANS)
     assert not loaded.training
     assert_same(flat(dict(loaded.state_dict())), flat(dict(whole.evaluator.state_dict())))
 
@@ -220,7 +200,7 @@ def test_what_is_no_evaluators_file_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("part", "value"),
-    [("width", 10**6), ("width", 8), ("depth", 10**5), ("predicates", ["near"]), ("structure", False), ("own", 1)],
+    [("width", 10**6), ("width", 8), ("depth", 10**5), ("predicates", ["near"]), ("own", 1)],
 )
 def test_options_that_the_weights_do_not_have_are_refused(tmp_path, part, value):
     path = tmp_path / "e.zip"
@@ -231,12 +211,6 @@ def test_options_that_the_weights_do_not_have_are_refused(tmp_path, part, value)
     write_archive(path, {k: v for k, v in found.description.items() if k != "sha256"}, groups)
     with pytest.raises(ValueError, match=r"evaluator: the evaluator of .* cannot be made"):
         lw.training.load_evaluator(path, PLANS)
-
-
-def test_another_text_encoder_is_found_out(tmp_path):
-    lw.training.save_evaluator(make(structure=False, text_encoder=words), tmp_path / "e.zip")
-    with pytest.raises(ValueError, match="text_encoder"):
-        lw.training.load_evaluator(tmp_path / "e.zip", PLANS, text_encoder=lambda texts: words(texts).flip(-1))
 
 
 # ---- refusals

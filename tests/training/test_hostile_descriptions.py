@@ -27,7 +27,7 @@ OPTIONS = [
     ("width", 60_000), ("width", [60_000, 60_000]), ("width", BIG), ("width", -3), ("width", [16] * 100_000),
     ("depth", BIG), ("depth", 10**15), ("depth", 60_000), ("depth", 1.5), ("depth", "2"),
     ("latent_size", BIG), ("latent_size", 100_000), ("encoder_width", 10**7), ("encoder_depth", BIG),
-    ("encoder_depth", 5_000), ("features", "latent"), ("mix", 3), ("feature_noise", -1), ("feature_noise", "loud"),
+    ("encoder_depth", 5_000), ("features", "latent"), ("feature_noise", -1), ("feature_noise", "loud"),
     ("swap_unmentioned", 2), ("focus", "yes"), ("focus", True), ("in_keys", ["a"]), ("in_keys", [1, 2, 3]),
     ("in_keys", [[], [], []]), ("out_keys", ["action"] * 3), ("out_keys", "abc"), ("nonsense", 1),
     ("plans", {}), ("text_encoder", "os.system"), ("evaluator", "x"),

@@ -51,7 +51,6 @@ def refused(path, message, make):
         (dict(width=32), r"options.width \(16, now 32\)"),
         (dict(depth=2), r"options.depth \(1, now 2\)"),
         (dict(latent_size=5), r"options.latent_size \(.*, now 5\)"),
-        (dict(mix="actions"), r"options.mix \('latents', now 'actions'\)"),
         (dict(features="raw"), r"options.features \('differences', now 'raw'\)"),
     ],
 )

@@ -105,10 +105,3 @@ def test_demonstrations_train_a_policy_that_has_plans_in_reserve(tmp_path):
     lw.BehavioralCloningTrainer(
         actor, replay, lw.BehavioralCloningConfig(steps=2, batch_size=4), progress=False
     ).train()
-
-
-def test_what_is_wrong_is_named():
-    with pytest.raises(ValueError, match="patience"):
-        TakeTurns(patience=0)
-    with pytest.raises(RuntimeError, match="reset the environment"):
-        TakeTurns()._step(TensorDict(batch_size=[1]), TensorDict(observation=torch.zeros(1, 39), batch_size=[1]))

@@ -6,29 +6,27 @@ import re
 from typing import Any
 
 from lw_torchrl._checks import check_choice, checked, shown
-from lw_torchrl._tables import Table
+from lw_torchrl._registry import Registry
 from lw_torchrl.language.formats.base import STYLES, Clause, PlanFormat, Reading
 from lw_torchrl.language.formats.prose import md
 from lw_torchrl.language.formats.python import py, py_md
 from lw_torchrl.language.plans import ConditionalPlan
 
 
-class PlanFormats(Table[PlanFormat]):
-    """Plan formats by name, to which others may be added; a name that no folder can have is a ValueError."""
-
-    def check(self, name: str, format: Any) -> PlanFormat:
-        if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-            raise ValueError(f"a plan format must be named in lower case, like 'basic_py', got {shown(name)}")
-        if not isinstance(format, PlanFormat):
-            raise TypeError(f"plan format {name!r} must be a PlanFormat, got {shown(format)}")
-        return format
+def _check_format(name: str, format: Any) -> PlanFormat:
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise ValueError(f"a plan format must be named in lower case, like 'basic_py', got {shown(name)}")
+    if not isinstance(format, PlanFormat):
+        raise TypeError(f"plan format {name!r} must be a PlanFormat, got {shown(format)}")
+    return format
 
 
 _CONTAINERS = {"py": py, "py_md": py_md, "md": md}
-PLAN_FORMATS = PlanFormats(
+PLAN_FORMATS = Registry(
     "plan format",
     "lw_torchrl.formats",
     {f"{style}_{name}": make(said) for style, said in STYLES.items() for name, make in _CONTAINERS.items()},
+    _check_format,
 )
 """The formats by name: the nine of the paper, and those that you add, ``PLAN_FORMATS["mine"] = PlanFormat(...)``."""
 

@@ -4,12 +4,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl._tables import Functions
+from lw_torchrl._registry import Registry, is_function
 from lw_torchrl.suites.engine import Engine
 from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
 from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
 
-ENGINES = Functions("engine", "lw_torchrl.engines", {"vectorized": VectorizedEngine, "metaworld": MetaWorldEngine})
+_SHIPPED = {"vectorized": VectorizedEngine, "metaworld": MetaWorldEngine}
+ENGINES = Registry("engine", "lw_torchrl.engines", _SHIPPED, is_function)
 """Name to ``(row_tasks, *, reward, num_threads) -> Engine``."""
 
 

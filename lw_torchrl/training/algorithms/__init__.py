@@ -1,7 +1,7 @@
 """The methods of ``lw-torchrl online``: a file each, with what it reads and does, and a line in :data:`LEARNERS`."""
 
 from lw_torchrl._checks import check_choice
-from lw_torchrl._tables import Classes
+from lw_torchrl._registry import Registry, is_class
 from lw_torchrl.training.algorithms.advantage import AdvantageConfig, AdvantageLearner
 from lw_torchrl.training.algorithms.expert_iteration import ExpertIterationConfig, ExpertIterationLearner
 from lw_torchrl.training.algorithms.learner import (
@@ -18,9 +18,8 @@ from lw_torchrl.training.algorithms.ppo import PPOConfig, PPOLearner
 from lw_torchrl.training.algorithms.sac import SACConfig, SACLearner
 from lw_torchrl.training.algorithms.td3 import ResidualConfig, ResidualLearner, TD3Config, TD3Learner
 
-LEARNERS = Classes(
+LEARNERS = Registry(
     "algorithm",
-    Learner,
     "lw_torchrl.algorithms",
     {
         "advantage": AdvantageLearner,
@@ -30,6 +29,7 @@ LEARNERS = Classes(
         "ppo": PPOLearner,
         "expert-iteration": ExpertIterationLearner,
     },
+    is_class("algorithm", Learner, own_name=False),
 )
 """Name to method; yours can be added."""
 

@@ -24,7 +24,7 @@ from benchmarks.paper import imitation, runs
 from benchmarks.paper.imitation import SCRIPTED, ImitationRun
 from benchmarks.paper.recipes import PRESETS, SETTINGS, Member
 from benchmarks.paper.runs import load_result
-from lw_torchrl.modules.tables import make_policy
+from lw_torchrl.modules.registry import make_policy
 from lw_torchrl.training.files import demonstration_seeds
 
 RUNS = [

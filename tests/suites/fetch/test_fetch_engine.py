@@ -143,23 +143,3 @@ def test_the_absent_package_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium_robotics.envs.fetch.push", None)
     with pytest.raises(ImportError, match=r"pip install 'lw_torchrl\[fetch\]'"):
         FetchEngine(["fetch/push"])
-
-
-def test_wrong_arguments_are_named():
-    with pytest.raises(ValueError, match=r"task must be one of .*'fetch/psuh'; did you mean 'fetch/push'"):
-        FetchEngine(["fetch/psuh"])
-    with pytest.raises(ValueError, match=r"reward must be one of .*'dens'; did you mean 'dense'"):
-        FetchEngine(["fetch/push"], reward="dens")
-    with pytest.raises(ValueError, match="num_threads must be at least 1, got 0"):
-        FetchEngine(["fetch/push"], num_threads=0)
-    engine = FetchEngine(["fetch/push"], num_threads=1)
-    with pytest.raises(RuntimeError, match="row 0 must be reset"):
-        engine.step(np.zeros((1, 4), np.float32), np.ones(1, bool))
-    with pytest.raises(ValueError, match="seeds must be as many as rows, 1, got 2"):
-        engine.reset([0], [1, 2])
-    engine.reset([0], [1])
-    with pytest.raises(ValueError, match=r"action must be of shape \(1, 4\)"):
-        engine.step(np.zeros((1, 3), np.float32), np.ones(1, bool))
-    with pytest.raises(ValueError, match=r"camera must be one of 'external_camera_0'"):
-        engine.render([0], camera="corner", height=8, width=8)
-    engine.close()

@@ -33,7 +33,7 @@ from lw_torchrl.suites.metaworld.vectorized.observation import (
 from lw_torchrl.suites.metaworld.vectorized.rewards import terms
 from lw_torchrl.suites.metaworld.vectorized.rewards.dense_reward import DenseReward, EpisodeStarts
 from lw_torchrl.suites.metaworld.vectorized.rewards.formulas import FORMULAS, LIFTS
-from lw_torchrl.suites.metaworld.vectorized.tables import parse_reward_table, reward_table, simulation_table
+from lw_torchrl.suites.metaworld.vectorized.tables import reward_table, simulation_table
 
 TASKS = list(simulation_table())
 
@@ -234,29 +234,6 @@ def test_the_table_has_a_reward_for_every_task_and_uses_every_formula():
     assert list(table) == TASKS
     assert {reward.formula for reward in table.values()} == set(FORMULAS)
     assert {reward.lift for reward in table.values()} - {None} == set(LIFTS)
-
-
-@pytest.mark.parametrize(
-    ("entry", "message"),
-    [
-        ("", "formula"),
-        ('formula = "reach"\ncolour = 1', "colour"),
-        ('formula = "reach"\nnear = { between = ["object", "gaol"] }', "a point must be one of .* got 'gaol'.*'goal'"),
-        ('formula = "reach"\nnear = { between = ["object"] }', "two points"),
-        ('formula = "reach"\nnear = { curve = "steep" }', "curve must be one of"),
-        ('formula = "reach"\ncage = { radius = 1, pad = 1, across = 1, density = "low" }', "cage.density must be"),
-        ('formula = "reach"\nheld = { tight = true }', "tight"),
-    ],
-)
-def test_a_table_entry_that_is_not_understood_is_named(entry, message):
-    with pytest.raises(ValueError, match=f"task 'x'.*{message}"):
-        parse_reward_table(f"[x]\n{entry}")
-
-
-@pytest.mark.parametrize("entry", ['formula = "flee"', 'formula = "carry"\nlift = "by magic"'])
-def test_a_reward_that_nobody_wrote_is_an_error(entry):
-    with pytest.raises(ValueError, match=r"(formula|lift) must be one of .* got '(flee|by magic)'"):
-        EpisodeStarts([parse_reward_table(f"[x]\n{entry}")["x"]])
 
 
 def test_an_attribute_that_metaworld_no_longer_notes_is_an_error():

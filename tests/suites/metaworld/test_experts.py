@@ -130,21 +130,6 @@ def test_experts_succeed():
     env.close()
 
 
-@pytest.mark.parametrize(
-    ("tasks", "error", "message"),
-    [
-        ("pik-place", ValueError, "did you mean 'pick-place'"),
-        (["reach", "windw-open"], ValueError, "did you mean 'window-open'"),
-        ([], ValueError, "at least one task"),
-        (None, TypeError, "tasks must be"),
-    ],
-    ids=str,
-)
-def test_unknown_tasks_are_named(tasks, error, message):
-    with pytest.raises(error, match=message):
-        lw.ExpertActor(tasks)
-
-
 def test_a_task_id_that_is_not_its_own_is_named():
     expert = lw.ExpertActor(["reach", "push"])
     data = TensorDict({"observation": torch.zeros(2, 39), "task_id": torch.tensor([lw.task_id("reach"), 0])}, [2])
@@ -154,21 +139,6 @@ def test_a_task_id_that_is_not_its_own_is_named():
         data["task_id"][1] = wrong
         with pytest.raises(ValueError, match=f"task_id {wrong} is none"):
             expert(data)
-
-
-@pytest.mark.parametrize("shape", [(2, 36), (2, 40), (2,)], ids=str)
-def test_a_wrong_observation_is_named(shape):
-    expert = lw.ExpertActor("reach")
-    ids = torch.full((2,), lw.task_id("reach"))
-    with pytest.raises(ValueError, match=r"observation must have 39 numbers, got shape \(2"):
-        expert(TensorDict({"observation": torch.zeros(shape), "task_id": ids}, [2]))
-
-
-@pytest.mark.parametrize("key", ["observation", "task_id"])
-def test_a_missing_entry_is_named(key):
-    data = TensorDict({"observation": torch.zeros(2, 39), "task_id": torch.full((2,), lw.task_id("reach"))}, [2])
-    with pytest.raises((KeyError, ValueError), match=key):
-        lw.ExpertActor("reach")(data.exclude(key))
 
 
 def test_as_many_task_ids_as_observations():

@@ -17,7 +17,7 @@ from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
 from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
 from lw_torchrl.suites.metaworld.vectorized.observation import quaternion_of_matrix, row_norm
 from lw_torchrl.suites.metaworld.vectorized.simulated_rows import RowGroup, WorkerPool, split_into_groups
-from lw_torchrl.suites.metaworld.vectorized.tables import parse_simulation_table, simulation_table
+from lw_torchrl.suites.metaworld.vectorized.tables import simulation_table
 from lw_torchrl.suites.metaworld.vectorized.task_programs import borrow_model, model_path, return_models
 
 TASKS = list(simulation_table())
@@ -332,42 +332,10 @@ def test_other_versions_are_refused_by_name(monkeypatch, package, other):
         VectorizedEngine(["reach"])
 
 
-def test_mistakes_are_named():
-    with pytest.raises(ValueError, match=r"task must be one of .* got 'reech'; did you mean 'reach'"):
-        VectorizedEngine(["reech"])
-    with pytest.raises(ValueError, match="reward must be one of"):
-        VectorizedEngine(["reach"], reward="sparce")
-    with pytest.raises(ValueError, match="num_threads must be at least 1"):
-        VectorizedEngine(["reach"], num_threads=0)
-    engine = VectorizedEngine(["reach", "push"], num_threads=1)
-    with pytest.raises(ValueError, match="seeds must be as many as rows, 2, got 1"):
-        engine.reset([0, 1], [0])
-    engine.reset([0], [0])
-    with pytest.raises(RuntimeError, match="row 1 must be reset"):
-        engine.step(np.zeros((2, 4)), np.ones(2, bool))
-    with pytest.raises(ValueError, match=r"\(2, 4\).*\(1, 4\)"):
-        engine.step(np.zeros((1, 4)), np.ones(2, bool))
-    engine.step(np.zeros((2, 4)), np.array([True, False]))
-
-
 def test_the_table_names_metaworlds_tasks():
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
     assert {f"{task}-v3" for task in TASKS} == set(ALL_V3_ENVIRONMENTS)
-
-
-@pytest.mark.parametrize(
-    ("entry", "message"),
-    [
-        ('object = "thing x"\nquaternion = "zeros"\nsuccess.point = "thing x"', "'body NAME'"),
-        ('object = "body x"\nquaternion = "zeros"\nsuccess.rule = "luck"', "success.rule must be one of"),
-        ('object = "body x"\nquaternion = "zeros"', "success"),
-        ('object = "body x"\nquaternion = "zeros"\ncolour = 1\nsuccess.within = 1', "colour"),
-    ],
-)
-def test_a_table_entry_that_is_not_understood_is_named(entry, message):
-    with pytest.raises(ValueError, match=f"task 'x'.*{message}"):
-        parse_simulation_table(f"[x]\n{entry}")
 
 
 def test_quaternions_have_scipys_bits():

@@ -49,7 +49,7 @@ def find_points(tasks: TaskList = "MT50", *, suite: str | Suite | None = None, e
         TypeError: an engine that does not show its model.
 
     Example:
-        >>> from lw_torchrl.suites import find_points
+        >>> from benchmarks.finding_points import find_points
         >>> find_points("push")["push"].objects[-1].name
         'puck grip'
 

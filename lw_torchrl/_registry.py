@@ -1,0 +1,111 @@
+"""Registry: objects by name, to which users and installed packages add their own."""
+
+import re
+from collections import UserDict
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from lw_torchrl._checks import unknown_name
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+Entry = TypeVar("Entry")
+_PLACE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
+
+
+@cache
+def entry_points_of(group: str) -> "dict[str, EntryPoint]":
+    """Return the entry points of installed packages in a group, by name; nothing is imported."""
+    from importlib.metadata import entry_points
+
+    return {point.name: point for point in entry_points(group=group)}
+
+
+class Registry(UserDict[str, Entry]):
+    """A mapping from names to objects of one kind: those we ship, those you add, and those of installed packages.
+
+    ``REGISTRY["mine"] = entry`` adds an entry and ``del`` removes it. A string "module:object" is imported when its
+    name is first looked up. Installed packages' names are listed too; a package is imported at its first look-up.
+
+    Args:
+        kind: what errors call an entry, "policy".
+        group: the group of entry points, "lw_torchrl.policies".
+        entries: what we ship.
+        check: from a name and an object to the entry; raises if the object is of the wrong kind.
+
+    Raises:
+        KeyError: the name is unknown; the message lists the nearest names.
+        ImportError: an entry cannot be imported or is of the wrong kind; the message names its package.
+
+    Example:
+        >>> from lw_torchrl.modules import POLICIES
+        >>> POLICIES["PlanConditionedActor"].__name__
+        'PlanConditionedActor'
+
+    Source: the entry points of the Python packaging user guide; gymnasium's registry.
+    """
+
+    def __init__(self, kind: str, group: str, entries: Mapping[str, Any], check: Callable[[str, Any], Entry]) -> None:
+        self.kind, self.group, self.check = kind, group, check
+        super().__init__(entries)
+
+    def __setitem__(self, name: str, entry: Entry | str) -> None:
+        is_place = isinstance(entry, str) and _PLACE.fullmatch(entry)
+        self.data[name] = entry if is_place else self.check(name, entry)  # type: ignore[assignment]
+
+    def __contains__(self, name: object) -> bool:
+        return isinstance(name, str) and (name in self.data or name in entry_points_of(self.group))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**self.data, **entry_points_of(self.group)})
+
+    def __len__(self) -> int:
+        return len(self.data.keys() | entry_points_of(self.group).keys())
+
+    def __getitem__(self, name: str) -> Entry:
+        if name not in self:
+            raise KeyError(str(unknown_name(self.kind, name, self)))
+        entry: Any = self.data.get(name)
+        if entry is None or isinstance(entry, str):
+            entry = self.data[name] = self._load(name, entry)
+        return entry
+
+    def _load(self, name: str, place: str | None) -> Entry:
+        package = ""
+        if place is None:
+            point = entry_points_of(self.group)[name]
+            place, package = point.value, f" of the package {point.dist.name}" if point.dist else ""
+        try:
+            module, _, attributes = place.partition(":")
+            entry: Any = import_module(module)
+            for attribute in attributes.split("."):
+                entry = getattr(entry, attribute)
+            return self.check(name, entry)
+        except Exception as error:  # a plugin may fail in any way
+            if place.startswith("lw_torchrl."):
+                raise  # our own modules say which extra to install
+            failed = f"{self.kind} {name!r} is {place}{package}, which cannot be loaded"
+            raise ImportError(f"{failed} ({type(error).__name__}: {error})") from error
+
+
+def is_class(kind: str, base: type[Entry], own_name: bool = True) -> Callable[[str, Any], type[Entry]]:
+    """Return a check of classes derived from ``base``, registered by their own name, which files store."""
+
+    def check(name: str, entry: Any) -> type[Entry]:
+        if not isinstance(entry, type) or not issubclass(entry, base):
+            raise TypeError(f"{kind} {name!r} must be a class derived from {base.__name__}, got {entry!r:.80}")
+        if own_name and entry.__name__ != name:
+            raise ValueError(f"{kind} {name!r} must have the name of its class, {entry.__name__!r}")
+        return entry
+
+    return check
+
+
+def is_function(name: str, entry: Any) -> Callable[..., Any]:
+    """Check a function, or a class that is called."""
+    if not callable(entry):
+        raise TypeError(f"{name!r} must be a function, got {entry!r:.80}")
+    return entry
