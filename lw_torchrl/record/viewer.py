@@ -120,6 +120,8 @@ def find_recordings(path: AnyPath) -> list[Path]:
 @contextmanager
 def readable(recording: Path) -> Iterator[Path]:
     """Yield the recording, or if it was not closed a complete copy: rerun waits for the rest of an incomplete file."""
+    from rerun.chunk import RrdReader
+
     if is_complete(recording):
         yield recording
         return
@@ -127,9 +129,9 @@ def readable(recording: Path) -> Iterator[Path]:
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / recording.name
         command = [rerun_program(), "rrd", "merge", str(recording), "-o", str(copy)]
-        merge = subprocess.run(command, capture_output=True, text=True, check=False)
-        if merge.returncode:
-            raise ValueError(f"rerun cannot read recording {str(recording)!r}: {merge.stderr.strip()}")
+        merge = subprocess.run(command, capture_output=True, check=False)
+        if merge.returncode or not RrdReader(copy).recordings():
+            raise ValueError(f"{str(recording)!r} is not a rerun recording, or nothing was written to it")
         yield copy
 
 

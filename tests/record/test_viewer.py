@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import stat
+import warnings
 from contextlib import contextmanager
 from types import SimpleNamespace
 
@@ -59,11 +60,22 @@ def test_wrong_arguments_of_the_viewer(tmp_path):
         open_viewer(tmp_path / "empty")
     with pytest.raises(ValueError, match="episode must be one of 'reach', 'Metrics', got 'push'"):
         open_viewer(tmp_path / "a.rrd", episode="push")
+    for content in (b"", b"something else"):
+        (tmp_path / "b.rrd").write_bytes(content)
+        with pytest.raises(ValueError, match="is not a rerun recording, or nothing was written"), quietly():
+            open_viewer(tmp_path / "b.rrd")
 
 
 def test_a_folder_stands_for_its_recordings(tmp_path):
     files = [write(tmp_path / "a.rrd") for _ in range(2)]
     assert find_recordings(tmp_path) == files == [tmp_path / "a.rrd", tmp_path / "a-2.rrd"]
+
+
+@contextmanager
+def quietly():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that the recording was not closed
+        yield
 
 
 @contextmanager
