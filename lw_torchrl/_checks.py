@@ -5,14 +5,17 @@ import inspect
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from difflib import get_close_matches
-from numbers import Real
+from numbers import Integral, Real
 from reprlib import Repr
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+
+from beartype import BeartypeConf, FrozenDict
+from beartype.door import is_bearable
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -158,10 +161,51 @@ def _check_of(annotation: Any) -> Check | None:
     if origin in (Union, UnionType):
         others = {part for part in inside if part is not NoneType}
         check = check_path if others == {str, os.PathLike[str]} else _check_of(*others) if len(others) == 1 else None
+        if len(others) > 1 and check is None:
+            return _check_of_class(annotation)
         if check is not None and NoneType in inside:
             return lambda argument, given: None if given is None else check(argument, given)
         return check
-    return _PLAIN.get(annotation)
+    return _PLAIN.get(annotation) or _check_of_class(annotation)
+
+
+_LENIENT = BeartypeConf(hint_overrides=FrozenDict({float: Real, int: Integral}))
+
+
+def _check_of_class(annotation: Any) -> Check | None:
+    """Return the check of a class, function or collection; None for what cannot be checked."""
+    origin = get_origin(annotation) or annotation
+    if getattr(origin, "_is_protocol", False):
+        return _check_of_class(Callable) if "__call__" in vars(origin) else None
+    if annotation in (Any, object, inspect.Parameter.empty) or isinstance(annotation, TypeVar):
+        return None
+
+    def check(argument: str, given: Any) -> None:
+        if not is_bearable(given, annotation, conf=_LENIENT):
+            kind = (
+                f"the class {given.__name__}" if isinstance(given, type) else f"{shown(given)} ({type(given).__name__})"
+            )
+            raise TypeError(f"{argument} must be {_words(annotation)}, got {kind}")
+
+    return check
+
+
+def _words(annotation: Any) -> str:
+    """Return an annotation in words: "a Suite, a path or None"."""
+    origin, inside = get_origin(annotation) or annotation, get_args(annotation)
+    if origin in (Union, UnionType):
+        *others, last = dict.fromkeys(_words(part) for part in inside)
+        return f"{', '.join(others)} or {last}" if others else last
+    if annotation is NoneType or annotation is None:
+        return "None"
+    if origin is Annotated or origin is Literal:
+        return _words(inside[0]) if origin is Annotated else " or ".join(map(repr, inside))
+    named = {int: "an integer", float: "a number", str: "a string", os.PathLike: "a path", Callable: "a function"}
+    named |= {Mapping: "a mapping", dict: "a mapping"} | dict.fromkeys((Sequence, Iterable, list, tuple), "a list")
+    if origin in named:
+        return named[origin]
+    name = getattr(origin, "__name__", str(origin))
+    return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"
 
 
 def _checks_of(annotations: Mapping[str, Any], names: dict[str, Any]) -> dict[str, Check]:

@@ -164,7 +164,7 @@ def test_a_folder_that_comes_twice_is_refused(calls, tmp_path):
     link = tmp_path / "link"
     link.symlink_to(root)
     for again in (root, str(root), root / ".." / root.name, link):
-        with pytest.raises(ValueError, match="root must hold each folder once"):
+        with pytest.raises(ValueError, match="root must .* names each folder once"):
             lw.LanguageWorldExperienceReplay([root, again])
 
 
@@ -173,7 +173,7 @@ def test_a_column_has_finite_numbers(calls, wrong):
     replay = calls["load_pictures"]["replay"]
     values = torch.zeros(len(replay))
     values[1] = wrong
-    with pytest.raises(ValueError, match="values must hold finite numbers"):
+    with pytest.raises(ValueError, match="must be finite"):
         replay.add_column("own", values)
     assert "own" not in replay.columns
 
@@ -210,7 +210,7 @@ def test_a_misspelt_option_is_named_with_the_nearest(call, message):
 
 def test_help_shows_the_options_that_are_handed_on():
     shown = inspect.signature(lw.PlanConditionedActor).parameters
-    assert {"mix", "width", "distribution", "roles", "evaluator"} <= {*shown}
+    assert {"width", "distribution", "roles", "evaluator"} <= {*shown}
     assert not any(one.kind is one.VAR_KEYWORD for one in shown.values())
 
 

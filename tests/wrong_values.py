@@ -149,7 +149,6 @@ OF_ONE_NAME: dict[str, list[Any]] = {
     "evaluate.evaluator": FUNCTION,
     "attribute_failures.evaluator": FUNCTION,
     "attribute_failures.actor": FUNCTION,
-    "SkillLatentLoss.network": A_CLASS,
     "evaluate.also_record": ["observation", 3, [3], [None]],
     "QueryEvaluatorConfig.held_out_tasks": ["one", 1.5, -1, True, [3]],
 }
@@ -202,7 +201,6 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "EpisodeFilter": {},
         "ExpectileValueLoss": {"value_network": value},
         "ExpertActor": {"tasks": "reach"},
-        "HeldEvaluator": {"evaluator": evaluator},
         "ImageQueryEvaluator": {"plans": plans, "width": 8},
         "ImageQueryEvaluatorConfig": {},
         "ImageQueryEvaluatorTrainer": {"evaluator": images, "data": data},
@@ -234,7 +232,6 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "ResidualActor": {"base": actor, "width": 8},
         "RolloutRecorder": {"logger": logger},
         "ScriptedSkillActor": {"plans": plans},
-        "SkillLatentLoss": {"network": actor},
         "StateQueryEvaluator": {"plans": plans, "width": 8},
         "Task": {"name": "stack", "description": "stack it", "objects": lw.TASKS["reach"].objects},
         "TaskBalancedSampler": {},

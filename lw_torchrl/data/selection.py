@@ -124,9 +124,11 @@ def choose_episodes(dataset: Demonstrations, chosen: EpisodeChoice, argument: st
         if odd := sorted(set(numbers) - set(existing[task])):
             episodes, missing = shown(existing[task])[1:-1], shown(odd)[1:-1]
             raise ValueError(f"{place}: the dataset holds the episodes {episodes}, got {missing}")
-        if not numbers:
-            raise ValueError(f"{place} must name at least one episode")
+        if not numbers or len(set(numbers)) < len(numbers):
+            raise ValueError(f"{place} must name at least one episode, each once, got {shown(numbers)}")
         keep |= {(task, number) for number in numbers}
+    if not keep:
+        raise ValueError(f"{argument} must choose at least one episode, got {shown(chosen)}")
     return replace(dataset, episodes=tuple(e for e in dataset.episodes if (e.task, e.episode) in keep))
 
 
