@@ -17,7 +17,6 @@ from typing import Any
 
 AnyPath = str | os.PathLike[str]
 PATIENCE = 1.0  # seconds that `locked` waits for another writer, which may be about to finish
-JSON_LIMIT = 32 * 2**20  # of a text or JSON file: parsed JSON takes some twenty times as much memory
 
 _SHIPPED = Path(__file__).with_name("training") / "data"
 
@@ -140,19 +139,13 @@ def write_json(path: AnyPath, value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
-def read_bytes(path: Path | Traversable, limit: int) -> bytes:
-    """Return a file's content; raise :class:`ValueError` if it is larger than ``limit`` bytes."""
-    with path.open("rb") as stream:
-        content: bytes = stream.read(limit + 1)
-    if len(content) > limit:
-        raise ValueError(f"it is larger than {limit} bytes")
-    return content
-
-
-def read_text(path: Path | Traversable, error: type[ValueError], *, limit: int = JSON_LIMIT) -> str:
+def read_text(path: Path | Traversable, error: type[ValueError], *, limit: int | None = None) -> str:
     """Return a UTF-8 file's text, without a byte order mark and with ``\\n`` as line ends; else raise ``error``."""
+    content = path.read_bytes()
+    if limit is not None and len(content) > limit:
+        raise error(f"{path}: must have at most {limit} bytes, got {len(content)}")
     try:
-        return read_bytes(path, limit).decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+        return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except ValueError as fault:
         raise error(f"{path}: must be a text file in UTF-8: {fault}") from fault
 
@@ -166,13 +159,12 @@ def read_toml(path: Path | Traversable, error: type[ValueError]) -> dict[str, An
         raise error(f"{path}: {fault}") from fault
 
 
-def read_json(path: AnyPath, what: str, *, limit: int = JSON_LIMIT) -> dict[str, Any]:
+def read_json(path: AnyPath, what: str) -> dict[str, Any]:
     """Return the object in a JSON file; a :class:`ValueError` begins with ``what``, such as "root: the metadata"."""
-    file = Path(path)
     try:
-        return parse_json(read_bytes(file, limit))
+        return parse_json(Path(path).read_bytes())
     except ValueError as error:
-        raise ValueError(f"{what} {str(file)!r} cannot be read: {error}") from error
+        raise ValueError(f"{what} {str(path)!r} cannot be read: {error}") from error
 
 
 def parse_json(content: bytes) -> dict[str, Any]:

@@ -94,7 +94,7 @@ WRONG = {
     "evaluate my.safetensors --evaluator nowhere.safetensors": "--evaluator: no file 'nowhere.safetensors'",
     "evaluate my.safetensors --attribute --reference nowhere": "--reference: no plan file or folder 'nowhere'",
     "evaluate my.safetensors --out file": "--out must be a folder, 'file' is none",
-    "card few-shot-mt5": "POLICY: no file 'few-shot-mt5'; `lw-torchrl train` writes one; did you mean the shipped policy",
+    "card few-shot-mt5": "POLICY: no file 'few-shot-mt5'; `lw-torchrl train` writes one; did you mean the",
     "card nowhere.safetensors": "POLICY: no file 'nowhere.safetensors'",
     "card my.safetensors --result nowhere.json": "--result: no file 'nowhere.json'",
     "record raech": "NAMES must be one of",
