@@ -98,7 +98,7 @@ def main(arguments: Arguments) -> None:
 
 def trained(folder: Path, method: str, seed: int) -> lw.Policy:
     """The policy that `python -m benchmarks.paper zero-shot` wrote."""
-    return lw.load_actor(folder / method / f"seed{seed}" / "policy.zip").eval()
+    return lw.load_actor(folder / method / f"seed{seed}" / "policy.safetensors").eval()
 
 
 if __name__ == "__main__":

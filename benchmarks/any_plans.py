@@ -76,7 +76,7 @@ def main(arguments: Arguments) -> None:
             key = f"{name}, seed {seed}"
             if key in found:
                 continue
-            policy = lw.load_actor(folder_of(arguments, method) / f"seed{seed}" / "policy.zip").eval()
+            policy = lw.load_actor(folder_of(arguments, method) / f"seed{seed}" / "policy.safetensors").eval()
             actor = policy if plans is None else policy.with_plans(plans)
             tasks = [task for task in arguments.tasks if plans is None or task in plans]
             row, _, number = name.partition(", number ")

@@ -102,8 +102,8 @@ class Bench:
         actor = lw.PlanConditionedActor(self.plans)
         steps = 300 if self.args.quick else RECIPE.training_steps
         config = lw.BehavioralCloningConfig(steps=steps, batch_size=RECIPE.batch_size, seed=self.seed)
-        lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=self.folder / "policy.zip").train()
-        return lw.load_actor(self.folder / "policy.zip")
+        lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=self.folder / "policy.safetensors").train()
+        return lw.load_actor(self.folder / "policy.safetensors")
 
     def evaluator(self, share: float) -> Any:
         """One trained on the answers in so large a share of the states; its report is printed."""
@@ -119,7 +119,7 @@ class Bench:
         labelled = lw.training.LabelledQueries(states, config)
         torch.manual_seed(self.seed)
         evaluator = lw.StateQueryEvaluator(self.plans)
-        file = self.folder / f"evaluator-{share:g}.zip"
+        file = self.folder / f"evaluator-{share:g}.safetensors"
         lw.training.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=file).train()
         held_out = labelled if config == most else lw.training.LabelledQueries(states, most)
         report = write_report(evaluator, held_out, self.folder / f"evaluator-{share:g}.json", most=2)
@@ -140,7 +140,7 @@ class Bench:
             seed=self.seed,
             qaf_anchor=anchor,
         )
-        file = self.folder / f"{name}.zip"
+        file = self.folder / f"{name}.safetensors"
         lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=file).train()
         if getattr(actor, "evaluator", None) is not None:
             drifts = condition_drift(actor, replay[:])
@@ -165,7 +165,7 @@ class Bench:
             for anchor in self.args.anchors:
                 name = f"evaluator-{share:g}-tuned-{anchor:g}"
                 begun = self.policy().with_evaluator(
-                    lw.training.load_evaluator(self.folder / f"evaluator-{share:g}.zip", self.plans)
+                    lw.training.load_evaluator(self.folder / f"evaluator-{share:g}.safetensors", self.plans)
                 )
                 yield f"{told}, tuned, anchor {anchor:g}", self.success(name, self.tuned(name, begun, anchor))
 

@@ -240,7 +240,7 @@ def failures_of(fault: Fault, policy: str, args: Arguments, learned: Any, refere
 
 def train(args: Arguments) -> Any:
     """A policy that imitates the scripted skills under the plans, trained once."""
-    file, data = args.learned or args.out / "learned.zip", args.out / "demonstrations"
+    file, data = args.learned or args.out / "learned.safetensors", args.out / "demonstrations"
     if file.is_file():
         return lw.load_actor(file)
     tasks = dict.fromkeys((*BUILT_ON, *TASKS, *args.tasks))

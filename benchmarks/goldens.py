@@ -163,7 +163,7 @@ def check_actions(args: Arguments) -> Iterator[tuple[str, bool]]:
 def _evaluations() -> dict[str, tuple[Any, tuple[str, ...]]]:
     """Name to an actor and the tasks that it is evaluated on."""
     natural = lw.load_plans("MT50")
-    zero_shot = lw.load_actor(DATA / "zero-shot-seed0.zip")
+    zero_shot = lw.load_actor(DATA / "zero-shot-seed0.safetensors")
     outside = (*DEVELOPMENT, *TEST)
     return {
         "shipped policy few-shot-mt50": (lw.load_actor("few-shot-mt50"), lw.MT50),
@@ -208,7 +208,7 @@ def check_faults(args: Arguments) -> Iterator[tuple[str, bool]]:
 
     path = DATA / "faults.json"
     with TemporaryDirectory() as folder:
-        chosen = faults.Arguments(seed=9000, learned=DATA / "faults-policy.zip", out=Path(folder))
+        chosen = faults.Arguments(seed=9000, learned=DATA / "faults-policy.safetensors", out=Path(folder))
         now = {", ".join(key): count for key, count in faults.scores(faults.main(chosen)).items()}
     if args.write:
         path.write_text(json.dumps(now, indent=0) + "\n", "utf-8")

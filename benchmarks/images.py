@@ -92,7 +92,7 @@ def evaluator(args: Arguments, plans: lw.Plans) -> Any:
     labelled = lw.training.LabelledQueries(replay, config)
     torch.manual_seed(args.seed)
     made = lw.modules.ImageQueryEvaluator(plans, **args.pictures, every=args.every)
-    file = args.out / "evaluator.zip"
+    file = args.out / "evaluator.safetensors"
     lw.training.ImageQueryEvaluatorTrainer(made, labelled, config, checkpoint=file).train()
     report = write_report(made, labelled, args.out / "reliability.json", most=20)
     plot_wrong_answers(wrong_answers(made, labelled), args.out / "wrong.png")
@@ -109,7 +109,7 @@ def tuned(args: Arguments, name: str, actor: Any) -> Any:
     config = lw.BehavioralCloningConfig(
         steps=args.tuning_steps, batch_size=64, learning_rate=3e-4, normalize=False, seed=args.seed
     )
-    file = args.out / f"{name}.zip"
+    file = args.out / f"{name}.safetensors"
     lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=file).train()
     return lw.load_actor(file)
 
@@ -136,7 +136,7 @@ def main(args: Arguments) -> None:
         policy: Any = lw.load_actor(file).with_plans(plans)
         note("PCBC, exact answers", f"pcbc-{number}", policy)
         note("PCBC, pictures", f"pcbc-{number}-pictures", policy.with_evaluator(eyes))
-        begun = policy.with_evaluator(lw.training.load_evaluator(args.out / "evaluator.zip", plans))
+        begun = policy.with_evaluator(lw.training.load_evaluator(args.out / "evaluator.safetensors", plans))
         name = f"pcbc-{number}-pictures-tuned"
         note("PCBC, pictures, tuned", name, tuned(args, name, begun))
     rows = []

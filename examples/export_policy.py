@@ -1,7 +1,7 @@
 """A policy for a robot without Python's help: queries and actor as one exported program, for any number of rows.
 
-python examples/export_policy.py policy.zip policy.pt2
-python examples/export_policy.py policy.zip policy.pt2 --aot   # compiled ahead of time, half a minute
+python examples/export_policy.py policy.safetensors policy.pt2
+python examples/export_policy.py policy.safetensors policy.pt2 --aot   # compiled ahead of time, half a minute
 """
 
 import argparse

@@ -40,6 +40,6 @@ for seed in options.seeds:
         folder / "demonstrations", sampler=lw.TaskBalancedSampler(), transform=policy.transform()
     )
     config = lw.BehavioralCloningConfig(steps=options.steps, batch_size=300, seed=seed)
-    lw.BehavioralCloningTrainer(policy, replay, config, checkpoint=folder / "policy.zip").train()
+    lw.BehavioralCloningTrainer(policy, replay, config, checkpoint=folder / "policy.safetensors").train()
     result = lw.evaluate(policy, tasks=TASKS, episodes_per_task=options.episodes, seed=1000, noise_scale=0.1)
     print(f"seed {seed}:", ", ".join(f"{task} {rate:.2f}" for task, rate in result.success_once.items()), flush=True)

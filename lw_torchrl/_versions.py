@@ -29,7 +29,7 @@ def warn_of_other_versions(path: object, recorded: Any, names: Iterable[str] = L
     """Warn that a training which began under other versions will not continue bit for bit."""
     if changes := version_changes(recorded, names):
         warnings.warn(
-            f"checkpoint: {str(path)!r} was written under other versions ({'; '.join(changes)}): the training goes on, "
-            "but its bits are not those that it would have had; install these versions for the same bits",
+            f"checkpoint: {str(path)!r} was written under other versions ({'; '.join(changes)}): training continues, "
+            "but results will not be bit-identical to an uninterrupted run; install these versions for that",
             stacklevel=4,
         )

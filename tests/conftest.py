@@ -115,7 +115,7 @@ import importlib.util, sys
 spec = importlib.util.spec_from_file_location("_files", sys.argv[1])  # the package would take seconds to import
 files = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(files)
-with files.held(sys.argv[2], "place", folder=sys.argv[3] == "True"):
+with files.locked(sys.argv[2], "place", folder=sys.argv[3] == "True"):
     print("held", flush=True)
     sys.stdin.read()
 """

@@ -53,7 +53,7 @@ def main() -> None:
     print(f"{result.mean_sucess:.2f}", ask("reach", "the gripper is open"))  # planted
     env = TransformedEnv(lw.LanguageWorldEnv(TASKS, seed=1), actor.transform())
     print(env.rollout(20, actor.eval())["skill_weights"].shape)
-    lw.save_actor(actor, out / "actor.zip")
+    lw.save_actor(actor, out / "actor.safetensors")
 
 
 if __name__ == "__main__":

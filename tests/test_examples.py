@@ -86,7 +86,7 @@ def test_fetch_learns_from_demonstrations(tmp_path):
     pytest.importorskip("gymnasium_robotics")
     done = run("fetch_few_shot.py", tmp_path, "--demonstrations", 1, "--steps", 3, "--episodes", 1)
     assert "seed 0: fetch/pick-and-place" in done.stdout
-    assert (tmp_path / "runs/fetch-few-shot/seed0/policy.zip").is_file()
+    assert (tmp_path / "runs/fetch-few-shot/seed0/policy.safetensors").is_file()
 
 
 @pytest.mark.slow
@@ -152,8 +152,8 @@ def test_offline_rl_runs(tmp_path):
 
 @pytest.mark.slow
 def test_a_policy_is_exported(tmp_path):
-    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=16), tmp_path / "policy.zip")
-    done = run("export_policy.py", tmp_path, "policy.zip", "policy.pt2")
+    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=16), tmp_path / "policy.safetensors")
+    done = run("export_policy.py", tmp_path, "policy.safetensors", "policy.pt2")
     assert done.stdout.count("at most 0.0e+00 away") == 3
     assert (tmp_path / "policy.pt2").is_file()
 
@@ -166,7 +166,7 @@ def test_a_trainer_of_torchrls_runs(tmp_path):
     for name in ("reward", "success", "loss_objective"):
         lines = (logged / f"{name}.csv").read_text("utf-8").splitlines()
         assert [line.split(",")[0] for line in lines] == ["100", "200", "300"]
-    assert lw.load_actor(tmp_path / "runs" / "torchrl_trainer" / "policy.zip").head.distribution == "normal"
+    assert lw.load_actor(tmp_path / "runs" / "torchrl_trainer" / "policy.safetensors").head.distribution == "normal"
 
 
 @pytest.mark.slow

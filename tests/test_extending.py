@@ -154,7 +154,7 @@ def test_it_is_trained_saved_loaded_evaluated_and_recorded(kind, plans, replay, 
     monkeypatch.setitem(POLICIES, "LearnedTaskActor", LearnedTaskActor)
     monkeypatch.setitem(METHODS, "learned", Method("LearnedTaskActor"))
     monkeypatch.setitem(EVALUATORS, "NearnessEvaluator", NearnessEvaluator)
-    path = tmp_path / "policy.zip"
+    path = tmp_path / "policy.safetensors"
     actor = trained(made(kind, plans), replay, path)
     loaded = lw.load_actor(path, text_encoder=letters)
     for (name, ours), (other, found) in zip(actor.state_dict().items(), loaded.state_dict().items(), strict=True):
@@ -181,35 +181,35 @@ def test_it_is_trained_saved_loaded_evaluated_and_recorded(kind, plans, replay, 
 
 def test_a_kind_that_is_not_there_is_named(plans, replay, tmp_path, monkeypatch):
     monkeypatch.setitem(POLICIES, "LearnedTaskActor", LearnedTaskActor)
-    lw.save_actor(LearnedTaskActor(plans), tmp_path / "policy.zip")
+    lw.save_actor(LearnedTaskActor(plans), tmp_path / "policy.safetensors")
     monkeypatch.delitem(POLICIES, "LearnedTaskActor")
     with pytest.raises(ValueError, match=r"'LearnedTaskActor' is not known here.*--import test_extending"):
-        lw.load_actor(tmp_path / "policy.zip")
+        lw.load_actor(tmp_path / "policy.safetensors")
     monkeypatch.setattr(LearnedTaskActor, "__module__", "__main__")
     monkeypatch.setitem(POLICIES, "LearnedTaskActor", LearnedTaskActor)
-    lw.save_actor(LearnedTaskActor(plans), tmp_path / "policy.zip")
+    lw.save_actor(LearnedTaskActor(plans), tmp_path / "policy.safetensors")
     monkeypatch.delitem(POLICIES, "LearnedTaskActor")
     with pytest.raises(ValueError, match="is of a script; register it in a module"):
-        lw.load_actor(tmp_path / "policy.zip")
+        lw.load_actor(tmp_path / "policy.safetensors")
 
 
 def test_a_relation_that_is_not_there_is_told_of(plans, tmp_path, monkeypatch):
-    lw.save_actor(lw.PlanConditionedActor(plans, text_encoder=letters, width=8), tmp_path / "policy.zip")
+    lw.save_actor(lw.PlanConditionedActor(plans, text_encoder=letters, width=8), tmp_path / "policy.safetensors")
     monkeypatch.delitem(RELATIONS, "beside")
     with pytest.raises(ValueError, match=r"'beside'.*, '[a-z ]+' \.\.\.\); a relation of yours must be imported first"):
-        lw.load_actor(tmp_path / "policy.zip", text_encoder=letters)
+        lw.load_actor(tmp_path / "policy.safetensors", text_encoder=letters)
 
 
 def test_an_own_task_travels_with_its_policy(plans, tmp_path):
-    lw.save_actor(lw.PlanConditionedActor(plans, text_encoder=letters, width=8), tmp_path / "policy.zip")
-    loaded = lw.load_actor(tmp_path / "policy.zip", text_encoder=letters)
+    lw.save_actor(lw.PlanConditionedActor(plans, text_encoder=letters, width=8), tmp_path / "policy.safetensors")
+    loaded = lw.load_actor(tmp_path / "policy.safetensors", text_encoder=letters)
     assert loaded.plans.fingerprint == plans.fingerprint
     assert loaded.plans["touch-the-block"].definition.object_names == ("robot's gripper", "block")
     lw.save_actor(
         lw.DescriptorConditionedActor([plan.definition for plan in plans.values()], text_encoder=letters, width=8),
-        tmp_path / "dc.zip",
+        tmp_path / "dc.safetensors",
     )
-    assert lw.load_actor(tmp_path / "dc.zip", text_encoder=letters).tasks == ("touch-the-block",)
+    assert lw.load_actor(tmp_path / "dc.safetensors", text_encoder=letters).tasks == ("touch-the-block",)
 
 
 def test_a_foreign_module_acts_and_trains_too(plans, replay):

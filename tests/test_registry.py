@@ -131,8 +131,8 @@ def test_an_encoder_and_a_policy_of_plugins_are_kept_in_files(plugin, tmp_path):
     for method in ("Unseeing", "Shouted"):
         torch.manual_seed(0)
         actor = make_policy(method, plans)
-        lw.save_actor(actor, tmp_path / "policy.zip")
-        again = lw.load_actor(tmp_path / "policy.zip")
+        lw.save_actor(actor, tmp_path / "policy.safetensors")
+        again = lw.load_actor(tmp_path / "policy.safetensors")
         assert again.state_dict().keys() == actor.state_dict().keys()
         assert again.tasks == lw.MT10
 

@@ -164,7 +164,7 @@ def test_a_folder_that_comes_twice_is_refused(calls, tmp_path):
     link = tmp_path / "link"
     link.symlink_to(root)
     for again in (root, str(root), root / ".." / root.name, link):
-        with pytest.raises(ValueError, match="root must .* names each folder once"):
+        with pytest.raises(ValueError, match=r"root must .* names each folder once"):
             lw.LanguageWorldExperienceReplay([root, again])
 
 

@@ -22,8 +22,8 @@ from lw_torchrl.modules import ActorEnsemble, DemonstratedActor, ScriptedSkillAc
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.registry import find_method, make_policy
 from lw_torchrl.training import BehavioralCloningTrainer
-from lw_torchrl.training.envelope import check_description
-from lw_torchrl.training.files import describe_data, load_actor, save_actor
+from lw_torchrl.training.checkpoint import check_description, load_actor, save_actor
+from lw_torchrl.training.loop import describe_data
 from lw_torchrl.transforms import RandomYaw
 
 SCRIPTED = "scripted"
@@ -162,7 +162,9 @@ class ImitationRun(Run):
             return ScriptedSkillActor(work.plans), {}
         targets = None if self.setting.targets is None else resolve_tasks(self.setting.targets)
         folder, described = work.out / self.folder, {"run": self.describe(work.plans)}
-        files = [folder / "models" / f"{target}.zip" for target in targets or ()] or [folder / "policy.zip"]
+        files = [folder / "models" / f"{target}.safetensors" for target in targets or ()] or [
+            folder / "policy.safetensors"
+        ]
         policies = []
         if all(file.is_file() for file in files):
             for file in files:
@@ -176,7 +178,7 @@ class ImitationRun(Run):
                 )
                 policies.append(others if seen is None else DemonstratedActor(seen, others))
                 save_actor(policies[-1], file, data=describe_data(replay), **described)
-        for checkpoint in folder.glob("checkpoint-*.zip"):
+        for checkpoint in folder.glob("checkpoint-*.safetensors"):
             checkpoint.unlink()
         return policies[0] if targets is None else dict(zip(targets, policies, strict=True)), {}
 
@@ -227,7 +229,7 @@ class ImitationRun(Run):
                     else Plans({t: work.plans[t] for t in resolve_tasks(self.setting.base)})
                 )
                 actors.append(make_policy(member.method, known, **member.options))
-            checkpoint = work.out / self.folder / f"checkpoint-{number}.zip"
+            checkpoint = work.out / self.folder / f"checkpoint-{number}.safetensors"
             options: dict[str, Any] = {"checkpoint": checkpoint, "progress": work.progress, "device": work.device}
             trainer: BehavioralCloningTrainer | StackedBehavioralCloning
             if targets:

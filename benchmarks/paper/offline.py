@@ -15,8 +15,8 @@ from benchmarks.paper.offline_losses import L1CQLLoss, L1IQLLoss, L1TD3BCLoss
 from benchmarks.paper.recipes import OfflineMethod, OfflineRecipe, OfflineTable, Portion
 from benchmarks.paper.runs import Dataset, Run, Work, kept_policy, own_tasks, plain
 from lw_torchrl._checks import check_choice
-from lw_torchrl._files import held
-from lw_torchrl._tensor_archive import ArchiveError, TensorArchive, write_archive
+from lw_torchrl._files import locked
+from lw_torchrl._tensor_files import read_tensors, write_tensors
 from lw_torchrl.data import BEHAVIOURS, LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.evaluation.summary import markdown_table
@@ -27,7 +27,7 @@ from lw_torchrl.modules.registry import find_method, make_policy
 from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
 from lw_torchrl.training import OfflineConfig, OfflineTrainer
 from lw_torchrl.training.behavioral_cloning import bc_loss
-from lw_torchrl.training.envelope import check_same_description
+from lw_torchrl.training.checkpoint import check_same_description
 from lw_torchrl.transforms import QAFTransform
 
 CONDITIONS: Mapping[str, str] = {"pcbc": "plan", "dc": "description", "one-hot": "one-hot"}
@@ -120,20 +120,19 @@ class Advantages(_Learned):
         return self.group / "advantages" / CONDITIONS[self.critic] / f"seed{self.seed}"
 
     def make(self, plans: Plans, out: Path, progress: bool) -> dict[str, Tensor]:
-        """``advantage``, (R, 1) float32, standardised by task: learned once and kept in ``advantages.zip``."""
-        file = out / self.folder / "advantages.zip"
+        """``advantage``, (R, 1) float32, standardised by task: learned once and kept in ``advantages.safetensors``."""
+        file = out / self.folder / "advantages.safetensors"
         described = _FORMAT | {"run": self.describe(plans)}
-        with held(file, "out", wait=True):
+        with locked(file, "out", wait=True):
             if not file.is_file():
                 for dataset in self.datasets:
                     dataset.collect(out, progress)
                 self._learn(file, described, self.own_plans(plans), out, progress)
         try:
-            archive = TensorArchive(file)
-            advantages = archive.tensors("advantages")
-        except ArchiveError as error:
+            stored, advantages = read_tensors(file)
+        except ValueError as error:
             raise ValueError(f"out: {str(file)!r} is damaged ({error}); delete it to learn them again") from error
-        check_same_description(file, archive.description, described)
+        check_same_description(file, stored, described)
         return advantages
 
     def _learn(self, file: Path, described: dict[str, Any], plans: Plans, out: Path, progress: bool) -> None:
@@ -143,14 +142,14 @@ class Advantages(_Learned):
         value = Value(encoder, ensemble=2, width=recipe.width, depth=recipe.critic_depth)
         loss = ExpectileValueLoss(value, expectile=recipe.expectile).make_value_estimator(gamma=recipe.gamma)
         replay = self._replay(plans, out, n_steps=True)
-        checkpoint, config = file.with_name("checkpoint.zip"), self._config(recipe.value_steps)
+        checkpoint, config = file.with_name("checkpoint.safetensors"), self._config(recipe.value_steps)
         title = f"value by {CONDITIONS[self.critic]}, {self.mixture}"
         OfflineTrainer(loss, replay, config, checkpoint=checkpoint, progress=progress, title=title).train()
         starts = range(0, len(replay), _CHUNK)
         chunks = [replay[start : min(start + _CHUNK, len(replay))] for start in starts]
         advantages = torch.cat([loss.advantage(chunk) for chunk in chunks])
         found = standardize_by_task(advantages, torch.cat([chunk["task_id"] for chunk in chunks]))
-        write_archive(file, described, {"advantages": {"advantage": found}})
+        write_tensors(file, described, {"advantage": found})
         checkpoint.unlink()
 
 
@@ -217,7 +216,7 @@ class OfflineRun(_Learned, Run):
             OfflineTrainer(loss, replay, self._config(recipe.steps), **options).train()
             return {"actor": actor, "replay": replay}
 
-        return kept_policy(work.out / self.folder / "policy.zip", {"run": self.describe(work.plans)}, train), {}
+        return kept_policy(work.out / self.folder / "policy.safetensors", {"run": self.describe(work.plans)}, train), {}
 
     def evaluate(self, policy: Policy, work: Work) -> tuple[EvaluationResult, dict[str, Any]]:
         return self.rollouts(policy, work, max_steps=self.max_steps), {}

@@ -12,7 +12,7 @@ import torch
 
 from lw_torchrl._checks import differences
 from lw_torchrl._devices import CPU, check_device
-from lw_torchrl._files import held
+from lw_torchrl._files import locked
 from lw_torchrl.data import collect_demonstrations
 from lw_torchrl.evaluation import EvaluationResult, evaluate
 from lw_torchrl.language.plans import Plans
@@ -20,8 +20,8 @@ from lw_torchrl.language.tasks import TASKS
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.suites.suite import find_suite
 from lw_torchrl.training import load_actor, save_actor
-from lw_torchrl.training.envelope import check_description
-from lw_torchrl.training.files import describe_data
+from lw_torchrl.training.checkpoint import check_description, training_file
+from lw_torchrl.training.loop import describe_data
 
 EVALUATION_SEED = 10_000  # training seeds count from 0; the evaluation of training seed k has seed 10000 + k
 RESULTS = "results.json"
@@ -54,7 +54,7 @@ class Dataset(ABC):
     def collect(self, out: Path, progress: bool) -> None:
         """Collect it, or what is left; of several processes one does, and the others wait."""
         root = out / self.folder
-        with held(root, "out", wait=True):
+        with locked(root, "out", wait=True):
             collect_demonstrations(**self.options, root=root, progress=progress)
 
 
@@ -166,7 +166,7 @@ def execute_run(
         raise ValueError(f"device must be the CPU for {type(run).__name__}, got {device}")
     if (done := load_result(run, plans, out, work.tasks)) is not None:
         return done
-    with held(out / run.folder, "out", folder=True, wait=True):
+    with locked(out / run.folder, "out", folder=True, wait=True):
         if (done := load_result(run, plans, out, work.tasks)) is not None:
             return done
         started = time.perf_counter()
@@ -186,11 +186,12 @@ def kept_policy(file: Path, described: dict[str, Any], train: Callable[[Path], M
 
     ``train`` is given the checkpoint to use meanwhile; it returns arguments of :func:`~lw_torchrl.save_actor`.
     """
-    checkpoint = file.with_name("checkpoint.zip")
+    checkpoint = file.with_name("checkpoint.safetensors")
     if not file.is_file():
         trained = dict(train(checkpoint))
         save_actor(trained.pop("actor"), file, data=describe_data(trained.pop("replay")), **trained, **described)
-    checkpoint.unlink(missing_ok=True)  # another process may have done so, where files cannot be locked
+    for written in (checkpoint, training_file(checkpoint)):
+        written.unlink(missing_ok=True)  # another process may have done so, where files cannot be locked
     check_description(file, described)
     return load_actor(file)
 

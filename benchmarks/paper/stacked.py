@@ -18,10 +18,15 @@ from lw_torchrl._devices import place
 from lw_torchrl.data.replay_checks import check_replay
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig, make_optimizer
-from lw_torchrl.training.envelope import POLICY
-from lw_torchrl.training.file_checks import text_vectors
-from lw_torchrl.training.files import check_can_be_saved, describe_data, describe_replay
-from lw_torchrl.training.loop import ReplayState, Training, TrainingOptions, make_schedule
+from lw_torchrl.training.checkpoint import check_can_be_saved, text_vectors
+from lw_torchrl.training.loop import (
+    ReplayState,
+    Training,
+    TrainingOptions,
+    describe_data,
+    describe_replay,
+    make_schedule,
+)
 from lw_torchrl.training.normalization import check_contacts, fit_normalization
 
 
@@ -66,8 +71,6 @@ class StackedBehavioralCloning(Training):
 
     Source: paper section 'Conditional Plan Experiments', which trains 50 one-shot models; ``torch.func``.
     """
-
-    envelope, says_device = POLICY, True
 
     @passes_on(Training.__init__)
     @checked
@@ -125,8 +128,8 @@ class StackedBehavioralCloning(Training):
     def parameters(self) -> dict[str, Tensor]:
         return {**self._parameters}
 
-    def contents(self) -> dict[str, dict[str, Tensor]]:
-        return {"weights": self.parameters(), "texts": text_vectors(self.actors[0])}
+    def contents(self) -> dict[str, Tensor]:
+        return {**self.parameters(), **text_vectors(self.actors[0])}
 
     def step(self) -> Tensor:
         """Train every actor on one minibatch and return their losses, (M,) float32, on the device."""

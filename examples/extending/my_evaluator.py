@@ -1,8 +1,8 @@
 """A query evaluator of your own: conditions are soft near their thresholds, and how soft is learned.
 
 lw-torchrl collect reach window-open --episodes 2 --out demos
-lw-torchrl train demos --out policy.zip --steps 300 --evaluator SoftTruth --import my_evaluator
-lw-torchrl evaluate policy.zip --episodes 2 --import my_evaluator
+lw-torchrl train demos --out policy.safetensors --steps 300 --evaluator SoftTruth --import my_evaluator
+lw-torchrl evaluate policy.safetensors --episodes 2 --import my_evaluator
 """
 
 import torch

@@ -1,8 +1,8 @@
 """A way of conditioning of your own: each task has a vector that is learned, and no words are read.
 
 lw-torchrl collect reach window-open --episodes 2 --out demos
-lw-torchrl train demos --out policy.zip --steps 300 --method TaskVectors --import my_method
-lw-torchrl evaluate policy.zip --episodes 2 --import my_method
+lw-torchrl train demos --out policy.safetensors --steps 300 --method TaskVectors --import my_method
+lw-torchrl evaluate policy.safetensors --episodes 2 --import my_method
 """
 
 from torch import nn

@@ -2,8 +2,8 @@
 
 lw-torchrl check my_suite:desk
 lw-torchrl collect desk --episodes 4 --out demos --import my_suite
-lw-torchrl train demos --out policy.zip --steps 300 --import my_suite
-lw-torchrl evaluate policy.zip --tasks desk --episodes 2 --import my_suite
+lw-torchrl train demos --out policy.safetensors --steps 300 --import my_suite
+lw-torchrl evaluate policy.safetensors --tasks desk --episodes 2 --import my_suite
 """
 
 import numpy as np

@@ -41,7 +41,7 @@ def demo(out: Path | None = None, quick: bool = False, json: options.Json = Fals
     Takes some minutes on two cores. If it is stopped, the same command resumes it.
 
     Args:
-        out: folder for results.json, success.png, rollout.rrd, checkpoint.zip and config.json; runs/demo, or
+        out: folder for results.json, success.png, rollout.rrd, checkpoint.safetensors and config.json; runs/demo, or
             runs/demo-quick with --quick.
         quick: two tasks and little training, in under a minute; not a measure of anything.
     """
@@ -54,16 +54,16 @@ def demo(out: Path | None = None, quick: bool = False, json: options.Json = Fals
 def run_demo(out: Path, config: DemoConfig) -> lw.EvaluationResult:
     """Run the demo, or the rest of it, and print its results.
 
-    Writes config.json, demonstrations/, checkpoint.zip, results.json, success.png and rollout.rrd to ``out``.
+    Writes config.json, demonstrations/, checkpoint.safetensors, results.json, success.png and rollout.rrd to ``out``.
 
     Raises:
         ValueError: ``out`` holds a demo with another configuration.
     """
-    from lw_torchrl._files import held, read_json, write_json
+    from lw_torchrl._files import locked, read_json, write_json
 
     stated = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(config).items()}
     path = out / "config.json"
-    with held(out, "out", folder=True):
+    with locked(out, "out", folder=True):
         if not path.is_file():
             write_json(path, stated)
         elif read_json(path, "out: the configuration") != stated:
@@ -93,7 +93,7 @@ def _run(out: Path, config: DemoConfig) -> lw.EvaluationResult:
     rows: dict[str, Any] = {"after_success": config.after_success, "transform": lw.QAFTransform(plans)}
     replay = lw.LanguageWorldExperienceReplay(out / "demonstrations", sampler=lw.TaskBalancedSampler(), **rows)
     cloning = lw.BehavioralCloningConfig(config.training_steps, config.batch_size, seed=config.training_seed)
-    lw.BehavioralCloningTrainer(actor, replay, cloning, checkpoint=out / "checkpoint.zip").train()
+    lw.BehavioralCloningTrainer(actor, replay, cloning, checkpoint=out / "checkpoint.safetensors").train()
     print(f"3/4  evaluating {config.episodes_per_task} episodes per task on seeds that no demonstration used")
     results = out / "results.json"
     noise: dict[str, Any] = {"seed": config.evaluation_seed, "noise_scale": config.evaluation_noise}
@@ -101,7 +101,7 @@ def _run(out: Path, config: DemoConfig) -> lw.EvaluationResult:
         result = lw.EvaluationResult.load(results)
     else:
         result = lw.evaluate(actor, tasks=config.tasks, episodes_per_task=config.episodes_per_task, **noise)
-        result.save(results, checkpoint=out / "checkpoint.zip", plans=plans.fingerprint)
+        result.save(results, checkpoint=out / "checkpoint.safetensors", plans=plans.fingerprint)
     lw.evaluation.plot_success(result, out / "success.png", title="Plan-conditioned behavioral cloning")
     print("4/4  recording a rollout")
     episodes = run_recorded(actor, config.tasks, **noise)
@@ -113,6 +113,6 @@ def _run(out: Path, config: DemoConfig) -> lw.EvaluationResult:
         skills = [f"{skill} ({steps})" for skill, steps in active_skills(episode, plans[episode.task])]
         shown = skills if len(skills) <= 8 else [*skills[:4], f"... {len(skills) - 7} changes ...", *skills[-3:]]
         print(f"  {episode.task}: " + " > ".join(shown))
-    print(f"\nresults   {results}\nfigure    {out / 'success.png'}\npolicy    {out / 'checkpoint.zip'}")
+    print(f"\nresults   {results}\nfigure    {out / 'success.png'}\npolicy    {out / 'checkpoint.safetensors'}")
     print(f"recording lw-torchrl view {out / 'rollout.rrd'}")
     return result

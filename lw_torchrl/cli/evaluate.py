@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
 from lw_torchrl._checks import counted
-from lw_torchrl._files import held, write_json, write_text
+from lw_torchrl._files import locked, write_json, write_text
 from lw_torchrl.cli import objects, options
 from lw_torchrl.cli.output import Output
 from lw_torchrl.language.plans import Plans
@@ -44,7 +44,7 @@ def evaluate(
     With --suite a policy that was trained with another robot acts there, under that suite's plans. A policy of yours,
     my_module:policy, is what acts: an lw.Policy, or a module or function from TensorDict to TensorDict.
 
-    Example: lw-torchrl evaluate runs/mt10.zip --out runs/mt10
+    Example: lw-torchrl evaluate runs/mt10.safetensors --out runs/mt10
 
     Args:
         plans: carry out these instead of the policy's own: MT10, MT50, .plan or .json files, or folders; where several
@@ -65,7 +65,7 @@ def evaluate(
     from lw_torchrl._devices import check_device
     from lw_torchrl.data.missing_episodes import suite_expert
     from lw_torchrl.record.rollouts import run_recorded, write_recording
-    from lw_torchrl.training.files import demonstrated_tasks, policy_file
+    from lw_torchrl.training.checkpoint import demonstrated_tasks, policy_file
 
     options.use_one_thread()
     there = check_device("device", device)
@@ -99,7 +99,7 @@ def evaluate(
         failures = [one.to_json() for one in result.failures or ()]
         output.show("failures", failures, f"\n{result.failure_table()}")
     if out is not None:
-        with held(out, "out", folder=True, wait=True):
+        with locked(out, "out", folder=True, wait=True):
             answered = evaluator if evaluator is not None and Path(evaluator).is_file() else None
             told: dict[str, Any] = {"plans": None if own is None else own.fingerprint, "evaluator": answered}
             told["checkpoint"] = None if who == "expert" or objects.is_object(who) else policy_file(checkpoint)
@@ -146,7 +146,7 @@ def card(
     """Write a model card of a policy: what it was trained on, its success, its limits, how to load and cite it.
 
     Example: lw-torchrl card few-shot-mt50
-    Example: lw-torchrl card runs/mt10.zip --result runs/mt10/results.json --out README.md
+    Example: lw-torchrl card runs/mt10.safetensors --result runs/mt10/results.json --out README.md
     """
     if out is not None:
         options.check_file("--out", out)
@@ -154,7 +154,7 @@ def card(
     if result is not None and not result.is_file():
         raise FileNotFoundError(f"--result: no file {str(result)!r}; `lw-torchrl evaluate --out` writes results.json")
     measured = None if result is None else lw.EvaluationResult.load(result)
-    text = lw.evaluation.policy_card(policy, measured, repo=repo)
+    text = str(lw.evaluation.policy_card(policy, measured, repo=repo))
     if out is not None:
         write_text(out, text)
     return Output(json).show("card", text, text if out is None else f"written to {out}")
@@ -206,7 +206,7 @@ def scripted(
                 print(f"    true {one['true']:4.0%}  chosen {one['chosen']:4.0%}  {one['skill']}{ended}")
         print()
     output = Output(json).result(result, steps=steps)
-    with held(out, "out", folder=True, wait=True):
+    with locked(out, "out", folder=True, wait=True):
         result.save(out / "results.json", plans=loaded.fingerprint)
         write_json(out / "plan_use.json", {task: found.to_json() for task, found in seen.items()})
         lw.plot_success(result, out / "success.png", title=f"plans and scripted skills, {episodes} episodes a task")

@@ -256,7 +256,7 @@ def check_saved(argument: str, path: Path, what: str = "policy", writer: str = "
 def check_actor(argument: str, who: str) -> None:
     """Raise :class:`ValueError` for who is neither one of :data:`ACTORS` nor a policy's file."""
     if who not in ACTORS and shipped_policy(who) is None:
-        if not who.endswith(".zip") and not Path(who).exists():
+        if not who.endswith(".safetensors") and not Path(who).exists():
             raise unknown_name(argument, who, [*ACTORS, "a policy's file"])
         check_saved(argument, Path(who))
 
@@ -336,7 +336,7 @@ def load_policy(
     """The policy of a file, with the plans that are given; none that has seen the seed's states. Where it was trained
     with another robot than a suite's, it is turned into that one's actions."""
     from lw_torchrl.modules.composed_actors import TransferredActor
-    from lw_torchrl.training.files import demonstration_seeds
+    from lw_torchrl.training.checkpoint import demonstration_seeds
 
     if seed in demonstration_seeds(file):
         raise ValueError(f"seed must differ from the demonstrations' seed, {seed}; an evaluation wants fresh states")

@@ -38,7 +38,7 @@ def record(
 ) -> Output:
     """Record episodes: the robot in 3-D, the plan as it goes, what held when, and how it ended.
 
-    Example: lw-torchrl record drawer-open --policy runs/mt10.zip --compare scripted --episodes 0 1
+    Example: lw-torchrl record drawer-open --policy runs/mt10.safetensors --compare scripted --episodes 0 1
 
     Args:
         policy: expert, Meta-World's script; scripted, the plan by scripted skills; random; spoilt-60, spoilt-30 or

@@ -47,9 +47,9 @@ def train(
 ) -> Output:
     """Train a policy on demonstrations. If it is stopped, the same command resumes it.
 
-    Example: lw-torchrl train demos/mt10 --out runs/mt10.zip
+    Example: lw-torchrl train demos/mt10 --out runs/mt10.safetensors
 
-    Example: lw-torchrl train demos/mt10 --out runs/tuned.zip --begin runs/mt10.zip --evaluator runs/eyes/evaluator.zip
+    Example: lw-torchrl train demos/mt10 --out runs/tuned.safetensors --begin runs/mt10.safetensors --evaluator new
 
     Args:
         features: what the policy sees: the raw observation; differences between hand, objects and goal, the default of
@@ -85,7 +85,7 @@ def train(
             if one != signature(train).parameters[name].default:
                 raise ValueError(f"--{name} is that of the policy that --begin names; leave it out")
     if evaluator not in (None, "new") and not Path(evaluator).exists():
-        if evaluator.endswith(".zip"):
+        if evaluator.endswith(".safetensors"):
             options.check_saved("evaluator", Path(evaluator), "network", "train-evaluator")
         options.check_listed("evaluator", evaluator, ("new",), "lw_torchrl.modules:EVALUATORS", ("evaluators",))
     loaded = options.read_plans(plans, known)
@@ -163,7 +163,7 @@ WHO = ("expert", "scripted", "spoilt-30", "random")
 def train_evaluator(
     tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],  # MT10, MT50, or names, held-out ones too
     /,
-    out: Path,  # folder for evaluator.zip, report.json and the episodes
+    out: Path,  # folder for evaluator.safetensors, report.json and the episodes
     data: tuple[Path, ...] = (),  # datasets of `lw-torchrl collect` to use instead of running episodes
     behaviours: tuple[str, ...] = WHO,  # who acts in the episodes that are run, as for `lw-torchrl collect`
     episodes: int = 5,  # of each task and behaviour
@@ -251,9 +251,9 @@ def train_evaluator(
         replay.add_column("pixels", lw.data.load_pictures(replay, **pictures, every=config.every))
     labelled = lw.training.LabelledQueries(replay, config)
     trainer = lw.training.ImageQueryEvaluatorTrainer if cameras else lw.training.QueryEvaluatorTrainer
-    loss = trainer(evaluator, labelled, config, checkpoint=out / "evaluator.zip").train()
+    loss = trainer(evaluator, labelled, config, checkpoint=out / "evaluator.safetensors").train()
     output = Output(json)
-    output.show("evaluator", out / "evaluator.zip")
+    output.show("evaluator", out / "evaluator.safetensors")
     output.show("steps", config.steps)
     output.show("loss", loss, f"trained to step {config.steps}" + ("" if loss != loss else f", loss {loss:.4f}"))
     score = lw.evaluation.score_evaluator(evaluator, labelled)

@@ -6,16 +6,15 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, NoReturn
 
-from torch import Tensor
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 
 from lw_torchrl._files import AnyPath, reading
-from lw_torchrl._tensor_archive import TensorArchive, join, split, write_archive
+from lw_torchrl._tensor_files import pop_state, read_tensors, write_tensors
 from lw_torchrl.data.dataset import Demonstrations, read_metadata
 from lw_torchrl.data.memory_map import verify
 from lw_torchrl.data.selection import JoinedDemonstrations
 
-_FILE = "buffer.zip"
+_FILE = "buffer.safetensors"
 
 
 def fingerprint(parts: Sequence[Demonstrations], *cuts: Any) -> str:
@@ -58,12 +57,9 @@ class RestorableReplay(BaseDatasetExperienceReplay):
 
     def dumps(self, path: AnyPath) -> None:
         """Save the state to a folder, as one file that is there whole or not at all."""
-        tensors: dict[str, Tensor] = {}
-        tree = split(self.state_dict(), tensors)
-        write_archive(Path(path) / _FILE, {"state": tree}, {"tensors": tensors})
+        write_tensors(Path(path) / _FILE, {}, {}, self.state_dict())
 
     def loads(self, path: AnyPath) -> None:
         """Restore what :meth:`dumps` saved, after :meth:`verify`; ValueError if it is damaged or of other rows."""
         with reading(path, "buffer's state"):
-            archive = TensorArchive(Path(path) / _FILE)
-            self.load_state_dict(join(archive.description.get("state"), archive.tensors("tensors")))
+            self.load_state_dict(pop_state(*read_tensors(Path(path) / _FILE)))

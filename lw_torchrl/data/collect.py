@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from lw_torchrl._checks import checked, differences, shown
-from lw_torchrl._files import AnyPath, flush, held, read_json, write_json
+from lw_torchrl._files import AnyPath, flush, locked, read_json, write_json
 from lw_torchrl._versions import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import dataset
 from lw_torchrl.data.behaviours import Behaviour, behaviour_of
@@ -189,7 +189,7 @@ def collect_demonstrations(
     is_new = demonstrations is None and folder.is_dir() and not partial.is_dir()
     if is_new and {path.name for path in folder.iterdir()} - {dataset.LOCK}:
         raise DatasetError(f"root: {str(folder)!r} is not empty and holds no dataset; choose another folder")
-    lock = held(folder, "root", "collect_demonstrations", folder=True, error=DatasetError)
+    lock = locked(folder, "root", "collect_demonstrations", folder=True, error=DatasetError)
     with lock, evaluating(actor) if isinstance(actor, nn.Module) else nullcontext():
         if _finished(folder, config) is None:  # another process may have finished it
             versions, files = _begin(folder, config), EpisodeFiles(partial)

@@ -15,7 +15,7 @@ from torchrl.data.replay_buffers.writers import Writer
 
 from lw_torchrl._checks import check_int
 from lw_torchrl._files import reading
-from lw_torchrl._tensor_archive import TensorArchive, write_archive
+from lw_torchrl._tensor_files import pop_state, read_tensors, write_tensors
 from lw_torchrl.data import trajectories
 from lw_torchrl.data.storage import DEMONSTRATION, DONE, REWARD, TRAJECTORY, JoinedStorage, column_name
 from lw_torchrl.data.trajectories import NONE_OPEN, Columns, OpenTrajectories
@@ -199,15 +199,11 @@ class GrowingStorage(JoinedStorage):
         self._write(serial, rows, previous)
 
     def dumps(self, path: Any) -> None:
-        state = self.state_dict()
-        rows, opened = state.pop("rows"), state.pop("open")
-        write_archive(Path(path) / "grown.zip", state, {"rows": rows, "open": opened})
+        write_tensors(Path(path) / "grown.safetensors", {}, {}, self.state_dict())
 
     def loads(self, path: Any) -> None:
         with reading(path, "growing storage's state"):
-            archive = TensorArchive(Path(path) / "grown.zip")
-            groups = {name: archive.tensors(name) for name in ("rows", "open")}
-            self.load_state_dict({**archive.description, **groups})
+            self.load_state_dict(pop_state(*read_tensors(Path(path) / "grown.safetensors")))
 
     def __getstate__(self) -> dict[str, Any]:
         if get_spawning_popen() is not None:

@@ -17,10 +17,10 @@ from torchrl.data.replay_buffers.storages import Storage
 from lw_torchrl._checks import check_int
 from lw_torchrl._files import reading
 from lw_torchrl._keys import check_key
-from lw_torchrl._tensor_archive import TensorArchive, write_archive
+from lw_torchrl._tensor_files import pop_state, read_tensors, write_tensors
 from lw_torchrl.data.storage import JoinedStorage, to_device_of
 
-_FILE = "sampler.zip"
+_FILE = "sampler.safetensors"
 
 
 def column(storage: Storage, key: NestedKey) -> Tensor:
@@ -195,12 +195,12 @@ class GroupSampler(Sampler):
 
     def dumps(self, path: Any) -> None:
         """Write the state to a folder, as one file that is there whole or not at all."""
-        write_archive(Path(path) / _FILE, {}, {"state": self.state_dict()})
+        write_tensors(Path(path) / _FILE, {}, {}, self.state_dict())
 
     def loads(self, path: Any) -> None:
         """Read the state that :meth:`dumps` wrote; a ValueError if it is damaged, or of something else."""
         with reading(path, "sampler's state"):
-            self.load_state_dict(TensorArchive(Path(path) / _FILE).tensors("state"))
+            self.load_state_dict(pop_state(*read_tensors(Path(path) / _FILE)))
 
 
 class TaskBalancedSampler(GroupSampler):

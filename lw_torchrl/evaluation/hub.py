@@ -1,52 +1,43 @@
-"""Policies in folders and on the Hugging Face Hub: the file and its card."""
+"""Share policies with their cards, in folders and on the Hugging Face Hub."""
 
 from __future__ import annotations
 
-import os
-import re
+import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from lw_torchrl._checks import checked
-from lw_torchrl._files import AnyPath, replacing, shipped_policy, write_text
-from lw_torchrl.evaluation.card import policy_card
+from lw_torchrl._files import AnyPath, replacing, write_text
+from lw_torchrl.evaluation.card import hub, policy_card
 from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.policy import Policy
-from lw_torchrl.training.files import load_actor, policy_file
+from lw_torchrl.training.checkpoint import load_actor, policy_file
 
-POLICY_FILE, CARD = "policy.zip", "README.md"
-_REPOSITORY = re.compile(r"[\w.-]+/[\w.-]+")
+POLICY_FILE, CARD = "policy.safetensors", "README.md"
 
 
 @checked
 def save_pretrained(
     policy: AnyPath, folder: AnyPath, result: EvaluationResult | None = None, *, repo: str = ""
 ) -> None:
-    """Put a policy and its card in a folder, for :func:`from_pretrained`: ``policy.zip`` and ``README.md``.
+    """Write a policy and its card to a folder, as ``policy.safetensors`` and ``README.md``.
 
     Args:
-        policy, result, repo: as of :func:`policy_card`, with its errors.
-        folder: where they go; files of these names are replaced.
-
-    Raises:
-        IsADirectoryError: it holds a folder of one of these names; nothing is written.
+        policy, result, repo: as for :func:`policy_card`, with its errors.
+        folder: the folder; files of these names are replaced.
 
     Example:
         >>> import os, tempfile
         >>> folder = tempfile.mkdtemp()
         >>> save_pretrained("few-shot-mt50", folder)
         >>> sorted(os.listdir(folder)), len(from_pretrained(folder).tasks)
-        (['README.md', 'policy.zip'], 50)
+        (['README.md', 'policy.safetensors'], 50)
     """
     card = policy_card(policy, result, repo=repo)
-    for name in (POLICY_FILE, CARD):
-        if (place := Path(folder) / name).is_dir():
-            raise IsADirectoryError(f"folder must have room for the file {name}, {str(place)!r} is a folder")
     with replacing(Path(folder) / POLICY_FILE) as temporary:
-        temporary.write_bytes(policy_file(policy).read_bytes())
-    write_text(Path(folder) / CARD, card)
+        shutil.copyfile(policy_file(policy), temporary)
+    write_text(Path(folder) / CARD, str(card))
 
 
 @checked
@@ -61,63 +52,47 @@ def push_to_hub(
     """Upload a policy and its card to the Hugging Face Hub.
 
     Args:
-        policy, result: as of :func:`policy_card`, with its errors.
-        repo: "me/my-policy"; it is made if there is none.
-        private: whether a new one is seen by you alone.
-        token: of your account; None for the one that ``hf auth login`` keeps.
+        policy, result: as for :func:`policy_card`, with its errors.
+        repo: the repository, such as "me/my-policy"; it is created if necessary.
+        private: create it as a private repository.
+        token: an access token; None for the one that ``hf auth login`` stored.
 
     Returns:
-        The address of what was uploaded.
-
-    Raises:
-        ImportError: the extra ``[hub]`` is not installed.
-        Exception: huggingface_hub's own, where the Hub refuses.
+        The URL of the commit.
 
     Source: ``huggingface_hub.HfApi.upload_folder``.
     """
-    api = _hub().HfApi(token=token)
+    api = hub().HfApi(token=token)
     with TemporaryDirectory() as folder:
         save_pretrained(policy, folder, result, repo=repo)
         api.create_repo(repo, private=private, exist_ok=True)
-        return str(api.upload_folder(repo_id=repo, folder_path=folder, commit_message="A policy of lw_torchrl"))
+        return str(api.upload_folder(repo_id=repo, folder_path=folder, commit_message="Add a policy of lw_torchrl"))
 
 
 @checked
 def from_pretrained(source: AnyPath, *, revision: str | None = None, text_encoder: TextEncoder | None = None) -> Policy:
-    """The policy of a folder, or of a repository on the Hugging Face Hub, in eval mode.
+    """Load a policy from a folder or from the Hugging Face Hub, in eval mode. Nothing in the file is executed.
 
     Args:
-        source: a folder that :func:`save_pretrained` wrote, or "me/my-policy".
-        revision: of the repository: a branch, a tag or a commit.
-        text_encoder: as of :func:`~lw_torchrl.load_actor`.
+        source: a folder that :func:`save_pretrained` wrote, or a repository such as "me/my-policy".
+        revision: the repository's branch, tag or commit.
+        text_encoder: as for :func:`~lw_torchrl.load_actor`.
 
     Raises:
-        FileNotFoundError: a folder without a policy; or there is no such folder, and the Hub gives none.
-        ImportError: it is no folder, and the extra ``[hub]`` is not installed.
-        ValueError: it is a file or a shipped policy's name; or as of :func:`~lw_torchrl.load_actor`. Nothing in the
-            file is run.
+        FileNotFoundError: the folder holds no policy; or there is no such folder, nor such a repository.
+        ImportError: the extra ``[hub]`` is not installed.
+        ValueError: as for :func:`~lw_torchrl.load_actor`.
 
     Source: ``transformers.PreTrainedModel.from_pretrained``.
     """
-    named = os.fspath(source)
-    if named and Path(named).is_dir():
+    if Path(source).is_dir():
         return load_actor(Path(source) / POLICY_FILE, text_encoder=text_encoder)
-    if Path(source).is_file() or named.endswith(".zip") or shipped_policy(named) is not None:
-        raise ValueError(f"source must be a folder or a repository, got {named!r}; lw.load_actor loads it")
-    if not _REPOSITORY.fullmatch(named):
-        raise FileNotFoundError(f"source: there is no folder {named!r}; a repository is named like 'me/my-policy'")
-    hub = _hub()
+    if Path(source).is_file():
+        raise ValueError(f"source must be a folder or a repository, got the file {str(source)!r}; use lw.load_actor")
     try:
-        file = hub.hf_hub_download(named, POLICY_FILE, revision=revision)
+        path = hub().hf_hub_download(str(source), POLICY_FILE, revision=revision)
     except (OSError, ValueError) as error:
-        told = f"there is no folder {named!r}, and the Hub gave no policy"
-        raise FileNotFoundError(f"source: {told}: {error}") from error
-    return load_actor(file, text_encoder=text_encoder)
-
-
-def _hub() -> Any:
-    try:
-        import huggingface_hub
-    except ImportError as error:
-        raise ImportError("the Hugging Face Hub needs the extra [hub]: pip install 'lw_torchrl[hub]'") from error
-    return huggingface_hub
+        raise FileNotFoundError(
+            f"source: there is no folder {str(source)!r}, and no such policy on the Hub: {error}"
+        ) from error
+    return load_actor(path, text_encoder=text_encoder)

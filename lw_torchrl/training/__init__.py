@@ -3,8 +3,8 @@
 import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.training.algorithms import LEARNERS, OnlineConfig
 from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.training.checkpoint import load_actor, load_evaluator, save_actor, save_evaluator
 from lw_torchrl.training.evaluator_training import ImageQueryEvaluatorTrainer, QueryEvaluatorTrainer
-from lw_torchrl.training.files import load_actor, load_evaluator, save_actor, save_evaluator
 from lw_torchrl.training.labelled_queries import ImageQueryEvaluatorConfig, LabelledQueries, QueryEvaluatorConfig
 from lw_torchrl.training.normalization import fit_normalization
 from lw_torchrl.training.offline import OfflineConfig, OfflineTrainer

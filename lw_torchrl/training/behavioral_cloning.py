@@ -21,9 +21,15 @@ from lw_torchrl.data.replay_checks import check_replay
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
-from lw_torchrl.training.envelope import POLICY
-from lw_torchrl.training.files import check_can_be_saved, describe_data, describe_replay
-from lw_torchrl.training.loop import ReplayState, Training, TrainingOptions, make_schedule
+from lw_torchrl.training.checkpoint import check_can_be_saved
+from lw_torchrl.training.loop import (
+    ReplayState,
+    Training,
+    TrainingOptions,
+    describe_data,
+    describe_replay,
+    make_schedule,
+)
 from lw_torchrl.training.normalization import check_contacts, fit_normalization
 from lw_torchrl.transforms.qaf import plan_program
 
@@ -136,7 +142,7 @@ class BehavioralCloningTrainer(Training):
     Source: paper section 'Conditional Plan Experiments'; ``torchrl.objectives.BCLoss``.
     """
 
-    envelope, says_device = POLICY, True
+    part = "actor"
 
     @passes_on(Training.__init__)
     @checked

@@ -12,12 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import checked, passes_on
-from lw_torchrl._tensor_archive import check_like, check_optimizer_state
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
-from lw_torchrl.training.envelope import EVALUATOR
-from lw_torchrl.training.files import check_evaluator_can_be_saved, evaluator_texts
+from lw_torchrl.training.checkpoint import check_evaluator_can_be_saved
 from lw_torchrl.training.labelled_queries import Asked, ImageQueryEvaluatorConfig, LabelledQueries, QueryEvaluatorConfig
 from lw_torchrl.training.loop import Training, TrainingOptions
 
@@ -157,7 +155,7 @@ class QueryEvaluatorTrainer(Training):
         True
     """
 
-    envelope = EVALUATOR
+    part = "evaluator"
     trains: ClassVar[type[ClauseEvaluator]] = StateQueryEvaluator
     minibatches: ClassVar[Callable[..., _StateMinibatches | _PictureMinibatches]] = _StateMinibatches
 
@@ -188,19 +186,12 @@ class QueryEvaluatorTrainer(Training):
             self.described = {"evaluator": evaluator.describe(), "training": asdict(config), "data": described}
         self.resume()
 
-    def contents(self) -> dict[str, dict[str, Tensor]]:
-        return {"weights": self.evaluator.state_dict(keep_vars=True), "texts": evaluator_texts(self.evaluator)}
-
     def state_dict(self) -> dict[str, Any]:
         return {"step": self.steps, "optimizer": self.optimizer.state_dict()}
 
-    def load_state_dict(self, found: dict[str, Any]) -> None:
-        check_like({**found, "optimizer": None}, {"step": 0, "optimizer": None}, "state")
-        if not 0 <= found["step"] <= self.config.steps:
-            raise ValueError(f"step must be from 0 to {self.config.steps}")
-        check_optimizer_state(found["optimizer"], self.optimizer, found["step"])
-        self.optimizer.load_state_dict(found["optimizer"])
-        self.steps = found["step"]
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.steps = state["step"]
 
     def step(self) -> Tensor:
         """Train on one minibatch and return its loss, () float32."""

@@ -1,9 +1,10 @@
-"""Training: the loop of all trainers, with progress, logs, Ctrl-C, and checkpoints that training resumes from."""
+"""The training loop of all trainers: progress, logs, Ctrl-C, and checkpoints that training resumes from."""
 
 from __future__ import annotations
 
 import signal
 import threading
+import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -15,26 +16,35 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
+from torchrl.envs import Compose, Transform
 from torchrl.record.loggers import Logger
 
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl._devices import CPU, drawn_on
-from lw_torchrl._files import AnyPath, held, sweep
+from lw_torchrl._files import AnyPath, locked
 from lw_torchrl._progress import Progress
-from lw_torchrl._tensor_archive import check_like, check_optimizer_state, check_same
-from lw_torchrl._versions import LIBRARIES
+from lw_torchrl._tensor_files import pop_state
+from lw_torchrl._versions import LIBRARIES, warn_of_other_versions
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
-from lw_torchrl.training.envelope import Envelope
-from lw_torchrl.training.file_checks import check_finite, text_vectors
+from lw_torchrl.training.checkpoint import (
+    check_finite,
+    check_same_description,
+    copy_tensors,
+    read_file,
+    short_message,
+    text_vectors,
+    training_file,
+    write_file,
+)
 
 READ_EVERY = 100
-"""Steps between readings of the losses: to read one is to wait for its device."""
+"""Steps between readings of the losses, which wait for the device."""
 
 Schedule = torch.optim.lr_scheduler.LRScheduler
 
 
 class ReplayState:
-    """A training's buffer and its random draws: the buffer draws from a seed on, and so do transforms and networks."""
+    """A replay buffer, and the generators that it, its transforms and the networks draw from, all from one seed."""
 
     def __init__(self, replay: TensorDictReplayBuffer, seed: int) -> None:
         self.replay, self.generator = replay, torch.Generator().manual_seed(seed)
@@ -43,13 +53,13 @@ class ReplayState:
 
     @contextmanager
     def drawing(self, device: torch.device) -> Iterator[None]:
-        """Within the block the global generators are this training's own."""
+        """Use this training's generators as the global ones within the block."""
         with drawn_on(device, self.torch_generator):
             yield
             self.torch_generator = torch.get_rng_state()
 
     def minibatch(self, size: int, device: torch.device) -> TensorDictBase:
-        """A minibatch on the device; if the buffer's rows are elsewhere, it is copied there."""
+        """Return a minibatch on the device, copied if the buffer's rows are elsewhere."""
         batch = self.replay.sample(size)
         return batch if device == CPU else batch.to(device, non_blocking=True)
 
@@ -62,20 +72,15 @@ class ReplayState:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from what :meth:`state_dict` gave; :class:`ValueError` if it is not of such a buffer."""
-        sampler, ours = state.get("sampler"), self.replay.sampler
-        check_like({**state, "sampler": None}, {**self.state_dict(0), "sampler": None}, "state")
-        if not isinstance(sampler, dict) or set(sampler) != set(ours.state_dict()):
-            raise ValueError(f"state must have a sampler's state, one of a {type(ours).__name__}")
-        torch.Generator().set_state(state["torch_generator"].clone())
-        self.generator.set_state(state["generator"].clone())
+        """Restore what :meth:`state_dict` returned."""
+        self.generator.set_state(state["generator"])
         self.torch_generator = state["torch_generator"].clone()
-        if sampler:
-            ours.load_state_dict(sampler)
+        if state["sampler"]:
+            self.replay.sampler.load_state_dict(state["sampler"])
 
 
 class TrainingOptions(TypedDict, total=False):
-    """The options of :class:`Training` that every trainer takes."""
+    """Options of :class:`Training` that every trainer accepts."""
 
     checkpoint: AnyPath | None
     logger: Logger | None
@@ -84,34 +89,35 @@ class TrainingOptions(TypedDict, total=False):
 
 
 class Training:
-    """What all trainers share. A subclass makes ``optimizer`` and ``module``, and fills in :meth:`step`.
+    """Base class of the trainers. A subclass creates ``optimizer`` and ``module`` and implements :meth:`step`.
 
     Args:
         config: how to train, with ``steps``, ``checkpoint_every`` and ``learning_rate``; None for the defaults.
         replays: the buffers. Their generators are set to the configuration's seed.
-        checkpoint: a file to write checkpoints to. If it is there already, training carries on from it.
+        checkpoint: the file to write the trained policy to, "mt10.safetensors". The training state is written next to
+            it, "mt10.training.safetensors"; if it is there already, training resumes from it.
         logger: a TorchRL logger for what :meth:`means` gives, every 100 steps.
         progress, title: show a progress bar, and its title.
 
     Attributes:
-        module: holds all that is trained.
-        steps: the minibatches done.
-        states: of the buffers, one each.
-        networks, device: those that are in train mode while :meth:`run` lasts, and where they are.
-        described: what a checkpoint says, as JSON: training resumes only from one that says the same.
-        says_device: whether a checkpoint says on which kind of device it was trained.
+        module: holds everything that is trained.
+        steps: minibatches so far.
+        states: one for each buffer.
+        networks, device: the networks, in train mode during :meth:`run`, and their device.
+        described: the description of the training, as JSON: it resumes only from a state of the same description.
+        part: the kind of file that is written besides the training state, "actor" or "evaluator"; None for only the
+            training state, which then has the name ``checkpoint``.
 
     Warns:
         UserWarning: the checkpoint was written on another kind of device, or under other versions of torch, say:
-            training goes on with the same minibatches, but not bit for bit.
+            training resumes with the same minibatches, but not bit for bit.
 
     Raises:
         ValueError: the checkpoint is damaged, or of other architecture, configuration or data; a loss or weight is NaN.
         OSError: the checkpoint cannot be written; the earlier one stays.
     """
 
-    envelope: ClassVar[Envelope]
-    says_device: ClassVar[bool] = False
+    part: ClassVar[str | None] = None
     module: nn.Module
     optimizer: torch.optim.Optimizer
     schedule: Schedule | None = None
@@ -136,32 +142,32 @@ class Training:
         self.networks: list[nn.Module] = []
         self.described: dict[str, Any] = {}
         self._losses: deque[Tensor] = deque(maxlen=READ_EVERY)
-        if self.checkpoint is not None:
-            sweep(self.checkpoint)
-        self._file_known = self._file_now()  # it was read or written by this training
 
     def step(self) -> Any:
-        """Find a minibatch's loss and give it to :meth:`descend`."""
+        """Compute a minibatch's loss and pass it to :meth:`descend`."""
         raise NotImplementedError
 
     def parameters(self) -> dict[str, Tensor]:
-        """What is trained, by name."""
+        """Return the trained parameters by name."""
         return dict(self.module.named_parameters())
 
-    def contents(self) -> dict[str, dict[str, Tensor]]:
-        """The live tensors that a checkpoint holds, by group and name."""
-        return {"weights": self.module.state_dict(keep_vars=True), "texts": text_vectors(self.module)}
+    def contents(self) -> dict[str, Tensor]:
+        """Return the tensors that a checkpoint holds: weights by name, and the vectors of texts."""
+        return {**self.module.state_dict(keep_vars=True), **text_vectors(self.module)}
 
     def clip_gradients(self) -> None:
-        """Change the gradients before the optimizer's step."""
+        """Clip the gradients before the optimizer's step."""
 
     def means(self, losses: Tensor) -> dict[str, float]:
-        """What is logged, by name, of the last losses, (n,) or (n, M) float32 on the CPU; "loss" in a name is shown."""
+        """Return the values to log for the last losses, (n,) or (n, M) float32 on the CPU; the progress bar shows those
+        with "loss" in their name."""
         return {"loss": losses.mean().item()}
 
     def descend(self, losses: Tensor) -> Tensor:
-        """Take an optimizer's step on the loss, () float32, or on those of M models, (M,) float32; return it, detached.
-        Other devices than the CPU are not waited for: there :meth:`run` says later that a loss is no number."""
+        """Take an optimizer step on the loss, () float32, or those of M models, (M,) float32, and return it detached.
+
+        On a GPU this does not wait for the device: :meth:`run` reports later that a loss is not finite.
+        """
         if self.device == CPU:
             self._check_loss(losses, self.steps)
         self.optimizer.zero_grad()
@@ -175,8 +181,11 @@ class Training:
         return losses.detach()
 
     def run(self, until: int | None = None) -> Tensor:
-        """Train to the last step, or until so many in all; return the losses of the last 100 steps made, (n,) or (n, M)
-        float32 on the CPU. Ctrl-C ends it between two steps, with a checkpoint."""
+        """Train to the last step, or to step ``until``; Ctrl-C ends training between two steps, with a checkpoint.
+
+        Returns:
+            The losses of the last 100 steps, (n,) or (n, M) float32 on the CPU.
+        """
         total = self.config.steps
         if until is not None and check_int("until", until, minimum=1) > total:
             raise ValueError(f"until must be at most the configuration's steps, {total}, got {until}")
@@ -185,6 +194,8 @@ class Training:
             network.train()
         last = total if until is None else until
         with self.at_work(total, self.steps) as (bar, interrupt):
+            if self.steps >= last:
+                self.save()  # the process may have been killed after it wrote the training state, before the policy
             while self.steps < last and not interrupt.asked:
                 self.step()
                 bar.update()
@@ -209,7 +220,7 @@ class Training:
                 self.logger.log_scalar(f"train/{name}", value, step=step)
 
     def _read_losses(self) -> Tensor:
-        """The losses that are kept; :class:`ValueError` if one is no finite number."""
+        """Return the latest losses; raise :class:`ValueError` if one is not finite."""
         if not self._losses:
             return torch.empty(0)
         found = torch.stack(tuple(self._losses)).cpu()
@@ -230,52 +241,60 @@ class Training:
 
     @contextmanager
     def at_work(self, total: int, done: int) -> Iterator[tuple[Progress, Interrupt]]:
-        """Keep other trainings from the checkpoint, show progress and take Ctrl-C between steps; :class:`ValueError` if
-        another training is at work, or has written the checkpoint meanwhile."""
+        """Lock the checkpoint against other trainings, show progress and take Ctrl-C between steps."""
         bar = Progress(self.title, total, "step", initial=done, show=self.progress)
-        alone = nullcontext() if self.checkpoint is None else held(self.checkpoint, "checkpoint", "training")
-        with alone:
-            if self._file_now() not in (None, self._file_known):
-                raise ValueError(
-                    f"checkpoint: {str(self.checkpoint)!r} was written by another training after this one had begun; "
-                    "begin anew to go on from it, or choose another file"
-                )
-            with bar, interrupts_between_steps() as interrupt:
-                yield bar, interrupt
+        lock = nullcontext() if self.checkpoint is None else locked(self.checkpoint, "checkpoint", "training")
+        with lock, bar, interrupts_between_steps() as interrupt:
+            yield bar, interrupt
 
-    def _file_now(self) -> tuple[int, ...] | None:
-        """What tells the checkpoint's file from a later one; None for no file."""
-        if self.checkpoint is None or not self.checkpoint.exists():
-            return None
-        stat = self.checkpoint.stat()
-        return stat.st_ino, stat.st_size, stat.st_mtime_ns
+    @property
+    def state_file(self) -> Path | None:
+        """The file of the training state."""
+        return training_file(self.checkpoint) if self.checkpoint is not None and self.part else self.checkpoint
 
     def save(self) -> None:
-        """Write the checkpoint, if there is to be one; an earlier one is replaced whole."""
+        """Write the checkpoint, if there is one to write; earlier files are replaced whole."""
         try:
-            check_finite(self.parameters(), self.parameters())
+            check_finite(self.parameters())
         except ValueError as error:
             raise ValueError(f"{error} after step {self.steps}: the learning rate is too high") from error
-        if self.checkpoint is not None:
-            said = {"device": self.device.type} if self.says_device and self.device.type != "cpu" else {}
-            self.envelope.write(self.checkpoint, self.described | said, self.contents(), self.state_dict())
-            self._file_known = self._file_now()
+        if self.checkpoint is not None and self.state_file is not None:
+            described, tensors = {**self.described, "device": self.device.type}, self.contents()
+            write_file(self.state_file, "training", described, tensors, self.state_dict())
+            if self.part is not None:
+                write_file(self.checkpoint, self.part, self.described, tensors)
 
     def resume(self, packages: Sequence[str] = LIBRARIES) -> bool:
-        """Go on from the checkpoint, and say whether it is there."""
-        if self.checkpoint is None or not self.checkpoint.exists():
+        """Resume from the checkpoint and return True, if there is one."""
+        if self.state_file is None or not self.state_file.exists():
+            if self.checkpoint is not None and self.checkpoint.exists():
+                message = f"{str(self.checkpoint)!r} exists, but not its training state {str(self.state_file)!r}"
+                raise ValueError(f"checkpoint: {message}; choose another file, or delete it to start again")
             return False
         for replay in self.replays:
             if isinstance(replay, LanguageWorldExperienceReplay):
                 replay.verify()
-        device = self.device if self.says_device else None
-        self.envelope.resume(
-            self.checkpoint, self.described, self.contents(), self.load_state_dict, device=device, packages=packages
-        )
+        begin = f"checkpoint: {str(self.state_file)!r}"
+        description, stored = read_file(self.state_file, "training")
+        check_same_description(self.state_file, description, self.described)
+        if (before := description["device"]) != self.device.type:
+            warnings.warn(
+                f"{begin} was trained on {before!r} and resumes on {self.device.type!r}: training continues with the "
+                "same minibatches, but results will not be bit-identical to an uninterrupted run",
+                stacklevel=3,
+            )
+        warn_of_other_versions(self.state_file, description["versions"], packages)
+        try:
+            state = pop_state(description, stored)
+            copy_tensors(stored, self.contents())
+            self.load_state_dict(state)
+        except (ValueError, KeyError, TypeError, RuntimeError) as error:
+            message = f"{begin} does not fit, it is damaged or of another architecture"
+            raise ValueError(f"{message} ({short_message(error)})") from error
         return True
 
     def state_dict(self) -> dict[str, Any]:
-        """All that training resumes from, the weights aside."""
+        """Return all that training resumes from, except the weights."""
         assert self.schedule is not None
         return {
             "optimizer": self.optimizer.state_dict(),
@@ -283,33 +302,51 @@ class Training:
             "states": [state.state_dict(self.steps) for state in self.states],
         }
 
-    def load_state_dict(self, found: dict[str, Any]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         assert self.schedule is not None
-        if set(found) != {"optimizer", "schedule", "states"}:
-            raise ValueError(f"a training state has optimizer, schedule and states, got {', '.join(map(str, found))}")
-        states, steps = found["states"], self.config.steps
-        if not isinstance(states, list) or len(states) != len(self.states):
-            raise ValueError(f"states must be of {len(self.states)} trainings")
-        step = states[0]["step"]
-        if type(step) is not int or not 0 <= step <= steps or any(one["step"] != step for one in states):
-            raise ValueError(f"states must all have one step from 0 to {steps}")
-        check_optimizer_state(found["optimizer"], self.optimizer, step)
-        live, groups = self.schedule.state_dict(), found["optimizer"]["param_groups"]
-        check_like(found["schedule"], live, "schedule")
-        now = {"last_epoch": step, "_step_count": step + 1, "_last_lr": [group["lr"] for group in groups]}
-        check_same(found["schedule"], {**live, **now}, "schedule", set())
-        for state, one in zip(self.states, states, strict=True):
-            state.load_state_dict(one)
-        self.optimizer.load_state_dict(found["optimizer"])
-        self.schedule.load_state_dict(found["schedule"])
-        self.steps = step
+        for own, stored in zip(self.states, state["states"], strict=True):
+            own.load_state_dict(stored)
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.schedule.load_state_dict(state["schedule"])
+        self.steps = state["states"][0]["step"]
 
 
 def make_schedule(name: str, optimizer: torch.optim.Optimizer, steps: int) -> Schedule:
-    """The schedule of the learning rate: "cosine" to 0 after so many steps, or "constant"."""
+    """Return the schedule of the learning rate: "cosine", to 0 after ``steps`` steps, or "constant"."""
     if name == "cosine":
         return torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     return torch.optim.lr_scheduler.LambdaLR(optimizer, lambda _: 1.0)
+
+
+def describe_data(replay: Any) -> dict[str, Any] | None:
+    """Describe a replay buffer's demonstrations as JSON; None for a buffer without :class:`Demonstrations`."""
+    demonstrations = getattr(replay, "demonstrations", None)
+    return None if demonstrations is None else demonstrations.config.to_json()
+
+
+def describe_replay(replay: Any) -> dict[str, Any]:
+    """Describe how a replay buffer makes its batches, as JSON."""
+    transforms = [one for one in replay.transform.modules() if isinstance(one, Transform)]
+    options = {name: getattr(replay, name) for name in _REPLAY_OPTIONS if hasattr(replay, name)}
+    return options | {
+        "rows": None if describe_data(replay) is None else len(replay),  # after_success leaves so many
+        "grow": getattr(replay.storage, "grow", None),
+        "sampler": type(replay.sampler).__name__,
+        "transforms": [
+            {"class": type(one).__name__} | {name: repr(value) for name, value in plain_options(one).items()}
+            for one in transforms
+            if not isinstance(one, Compose)
+        ],
+    }
+
+
+_REPLAY_OPTIONS = ("label", "reward", "terminate_on_success", "n_steps", "gamma", "columns")
+
+
+def plain_options(module: nn.Module) -> dict[str, bool | int | float | str]:
+    """Return the attributes of a transform or a loss that are flags, numbers and texts."""
+    options = {name: value for name, value in vars(module).items() if name[0] != "_" and name != "training"}
+    return {name: value for name, value in options.items() if isinstance(value, (bool, int, float, str))}
 
 
 class Interrupt:
@@ -320,8 +357,10 @@ class Interrupt:
 
 @contextmanager
 def interrupts_between_steps() -> Iterator[Interrupt]:
-    """Within the block the first Ctrl-C only sets ``asked``, and the end of the block raises
-    :class:`KeyboardInterrupt`; a second does so at once. Not outside the main thread, nor where SIGINT is ignored."""
+    """Let the first Ctrl-C only set ``asked``, and raise :class:`KeyboardInterrupt` at the end of the block.
+
+    A second Ctrl-C raises at once. Nothing changes outside the main thread, or where SIGINT is ignored.
+    """
     interrupt = Interrupt()
     before = signal.getsignal(signal.SIGINT) if threading.current_thread() is threading.main_thread() else None
     if not callable(before):

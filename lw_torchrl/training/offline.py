@@ -19,10 +19,16 @@ from torchrl.objectives import LossModule, SoftUpdate
 from lw_torchrl._checks import Count, Positive, Probability, Scale, check_fields, checked, passes_on
 from lw_torchrl.data.replay_checks import check_minibatches
 from lw_torchrl.objectives.reduction import with_n_steps
-from lw_torchrl.training.envelope import TRAINING
-from lw_torchrl.training.file_checks import tensors_of
-from lw_torchrl.training.files import describe_data, describe_learning, plain_options
-from lw_torchrl.training.loop import READ_EVERY, ReplayState, Training, TrainingOptions, make_schedule
+from lw_torchrl.training.loop import (
+    READ_EVERY,
+    ReplayState,
+    Training,
+    TrainingOptions,
+    describe_data,
+    describe_replay,
+    make_schedule,
+    plain_options,
+)
 from lw_torchrl.training.normalization import fit_untrained
 
 _INSTEAD = {"loss_actor_bc"}  # minimised in place of another entry: in CQL's first steps of the actor
@@ -91,8 +97,6 @@ class OfflineTrainer(Training):
     Source: ``torchrl.trainers.Trainer``, without an environment.
     """
 
-    envelope = TRAINING
-
     @passes_on(Training.__init__)
     @checked
     def __init__(
@@ -123,13 +127,14 @@ class OfflineTrainer(Training):
         self._given: deque[Mapping[str, Tensor]] = deque(maxlen=READ_EVERY)
         if self.checkpoint is not None:
             self.described = {"loss": describe_loss(loss), "training": asdict(config)}
-            self.described |= {"data": describe_data(replay), "replay": describe_learning(replay)}
+            self.described |= {"data": describe_data(replay), "replay": describe_replay(replay)}
         if config.normalize:
             fit_untrained(loss, replay)
         self.resume()
 
-    def contents(self) -> dict[str, dict[str, Tensor]]:
-        return {"loss": tensors_of(self.loss)}
+    def contents(self) -> dict[str, Tensor]:
+        """The live tensors of the loss; target networks and statistics among them."""
+        return {**dict(self.loss.named_parameters()), **dict(self.loss.named_buffers())}
 
     def step(self) -> TensorDictBase:
         """Train on one minibatch and return what the loss gives, detached."""

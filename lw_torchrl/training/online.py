@@ -15,7 +15,6 @@ from torchrl.envs import EnvBase, TransformedEnv
 from lw_torchrl._checks import checked, passes_on
 from lw_torchrl._devices import CPU, drawn_on
 from lw_torchrl._progress import Progress
-from lw_torchrl._tensor_archive import check_like
 from lw_torchrl._versions import LIBRARIES, SIMULATORS
 from lw_torchrl.data.co_learning_sampler import GROWN, CoLearningSampler
 from lw_torchrl.data.growing import GrowingStorage
@@ -30,9 +29,8 @@ from lw_torchrl.modules.policy import Policy
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 from lw_torchrl.training.algorithms import LEARNERS, OnlineConfig, method_config
 from lw_torchrl.training.algorithms.learner import NoiseConfig
-from lw_torchrl.training.envelope import POLICY
-from lw_torchrl.training.files import check_can_be_saved, describe_data, describe_learning
-from lw_torchrl.training.loop import Interrupt, Training, TrainingOptions
+from lw_torchrl.training.checkpoint import check_can_be_saved
+from lw_torchrl.training.loop import Interrupt, Training, TrainingOptions, describe_data, describe_replay
 
 _MOST_EPISODES = 1_000_000
 
@@ -89,7 +87,7 @@ class OnlineTrainer(Training):
     Slow with Deep Learning and Tree Search', for expert iteration.
     """
 
-    envelope = POLICY
+    part = "actor"
 
     @passes_on(Training.__init__)
     @checked
@@ -136,7 +134,7 @@ class OnlineTrainer(Training):
                 "critic": {} if critic is None else {"weights": _fingerprint(critic)},
                 "online": {"method": method, "tasks": list(self.tasks), **asdict(config)},
                 "data": describe_data(replay),
-                "replay": describe_learning(replay),
+                "replay": describe_replay(replay),
             }
         self.resume((*SIMULATORS, *LIBRARIES))
 
@@ -155,11 +153,6 @@ class OnlineTrainer(Training):
         }
 
     def load_state_dict(self, found: dict[str, Any]) -> None:
-        apart = {"replay": None, "history": None, "learner": None, "episodes": None}
-        check_like({**found, **apart}, {**self.state_dict(), **apart}, "state")
-        if not 0 < found["round"] <= self.config.rounds:
-            raise ValueError(f"round must be from 1 to {self.config.rounds}, got {found['round']}")
-        torch.Generator().set_state(found["drawn"].clone())
         self.learner.load_state_dict(found["learner"])
         self.replay.load_state_dict(found["replay"])
         self._episodes, self._drawn = found["episodes"].clone(), found["drawn"].clone()

@@ -204,7 +204,7 @@ TINY = ("--steps", "30", "--batch-size", "20", "--width", "16", "--depth", "1")
 
 @pytest.fixture(scope="module")
 def checkpoint(demos, tmp_path_factory):
-    path = tmp_path_factory.mktemp("cli") / "policy.zip"
+    path = tmp_path_factory.mktemp("cli") / "policy.safetensors"
     main(["train", str(demos), "--out", str(path), *TINY])
     return path
 
@@ -234,9 +234,9 @@ def test_train_writes_a_policy_and_carries_on(capsys, demos, checkpoint):
 
 def test_train_wants_a_plan_for_every_task(capsys, tmp_path, demos):
     lw.save_plans({"push": lw.load_plans("MT10")["push"]}, tmp_path / "plans")
-    error = fails(capsys, "train", demos, "--out", tmp_path / "p.zip", "--plans", tmp_path / "plans", *TINY)
+    error = fails(capsys, "train", demos, "--out", tmp_path / "p.safetensors", "--plans", tmp_path / "plans", *TINY)
     assert "plans lack reach" in error
-    assert not (tmp_path / "p.zip").exists()
+    assert not (tmp_path / "p.safetensors").exists()
 
 
 def test_evaluate_writes_result_figure_and_recording(capsys, checkpoint, tmp_path):
@@ -273,17 +273,17 @@ def test_evaluate_runs_the_tasks_of_the_training(capsys, demos, checkpoint, tmp_
     printed = run(capsys, "evaluate", checkpoint, "--episodes", 1)
     assert [line.split()[0] for line in printed.splitlines()[2:]] == ["push", "reach", "mean"]
     assert printed.startswith(f"on the 2 tasks {said}\n")
-    run(capsys, "train", demos, "--out", tmp_path / "one.zip", "--tasks", "push", *TINY)
-    printed = run(capsys, "evaluate", tmp_path / "one.zip", "--episodes", 1)
+    run(capsys, "train", demos, "--out", tmp_path / "one.safetensors", "--tasks", "push", *TINY)
+    printed = run(capsys, "evaluate", tmp_path / "one.safetensors", "--episodes", 1)
     assert [line.split()[0] for line in printed.splitlines()[2:]] == ["push", "mean"]
     assert printed.startswith(f"on the 1 task {said}\n")
-    lw.save_actor(lw.load_actor(checkpoint), tmp_path / "plain.zip")  # which says nothing of data
-    assert run(capsys, "evaluate", tmp_path / "plain.zip", "--episodes", 1).count("\n") == 12
+    lw.save_actor(lw.load_actor(checkpoint), tmp_path / "plain.safetensors")  # which says nothing of data
+    assert run(capsys, "evaluate", tmp_path / "plain.safetensors", "--episodes", 1).count("\n") == 12
     assert run(capsys, "evaluate", checkpoint, "--plans", "MT10", "--episodes", 1).count("\n") == 12
 
 
 def test_train_names_a_task_that_the_dataset_lacks(capsys, demos, tmp_path):
-    error = fails(capsys, "train", demos, "--out", tmp_path / "p.zip", "--tasks", "reach", "door-open")
+    error = fails(capsys, "train", demos, "--out", tmp_path / "p.safetensors", "--tasks", "reach", "door-open")
     assert "error: --tasks must be one of 'push', 'reach', got 'door-open'" in error
 
 
@@ -295,7 +295,7 @@ def test_evaluating_on_the_demonstrations_seed_is_refused(capsys, checkpoint, tm
 
 def test_evaluate_refuses_what_does_not_fit(capsys, checkpoint, demos, tmp_path):
     assert "plans lack sweep-into" in fails(capsys, "evaluate", checkpoint, "--tasks", "sweep-into")
-    assert "damaged or none of ours" in fails(capsys, "evaluate", demos / "metadata.json")
+    assert "damaged or not a .safetensors file" in fails(capsys, "evaluate", demos / "metadata.json")
 
 
 def test_the_experts_can_be_evaluated(capsys):
@@ -306,7 +306,7 @@ def test_the_experts_can_be_evaluated(capsys):
 
 def test_the_baseline_trains_and_is_evaluated(capsys, demos, tmp_path, monkeypatch):
     monkeypatch.setattr(lw, "evaluate", partial(lw.evaluate, max_steps=60))
-    path = tmp_path / "baseline.zip"
+    path = tmp_path / "baseline.safetensors"
     run(capsys, "train", demos, "--out", path, "--method", "dc", *TINY)
     assert isinstance(lw.load_actor(path), lw.DescriptorConditionedActor)
     printed = run(capsys, "evaluate", path, "--episodes", 1, "--stop-at-success", "--out", tmp_path / "runs")
@@ -340,7 +340,7 @@ demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episode
     kill_when(forks, lambda: len(list(demonstrations.glob(".partial/*.npz"))) >= 2)
     assert not (demonstrations / "metadata.json").exists()
     forks.start(*demo, before=shorter)
-    kill_when(forks, (out / "checkpoint.zip").exists)
+    kill_when(forks, (out / "checkpoint.safetensors").exists)
     assert not (out / "results.json").exists()
 
     forks.start(*demo, before=shorter)
@@ -349,7 +349,7 @@ demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episode
     assert {path.name for path in out.iterdir() if path.name[0] != "."} == {
         "config.json",
         "demonstrations",
-        "checkpoint.zip",
+        "checkpoint.safetensors",
         "results.json",
         "success.png",
         "rollout.rrd",
@@ -363,7 +363,7 @@ demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episode
     assert result.table() in printed
     assert (out / "success.png").read_bytes()[-8:-4] == b"IEND"
     assert (out / "rollout.rrd").read_bytes().startswith(b"RRF")
-    actor = lw.load_actor(out / "checkpoint.zip")
+    actor = lw.load_actor(out / "checkpoint.safetensors")
     plans = lw.load_plans("MT10")
     assert actor.plans == plans
     for task in config.tasks:
@@ -372,7 +372,7 @@ demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episode
     assert f"lw-torchrl view {out / 'rollout.rrd'}" in printed
 
     kept = [
-        "checkpoint.zip",
+        "checkpoint.safetensors",
         "results.json",
         "config.json",
         "demonstrations/metadata.json",

@@ -189,8 +189,8 @@ def test_collect_by_a_behaviour_of_a_name(capsys, tmp_path, asked):
 
 def test_collect_by_a_policys_file(capsys, tmp_path, asked):
     torch.manual_seed(0)
-    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=8), tmp_path / "tiny one.zip")
-    args = ("collect", "reach", "--episodes", 2, "--policy", tmp_path / "tiny one.zip", "--out")
+    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=8), tmp_path / "tiny one.safetensors")
+    args = ("collect", "reach", "--episodes", 2, "--policy", tmp_path / "tiny one.safetensors", "--out")
     run(capsys, *args, tmp_path / "a")
     run(capsys, *args, tmp_path / "b", "--behaviour", "mine")
     labels = [lw.LanguageWorldExperienceReplay(tmp_path / one, label="executed").behaviours for one in "ab"]
@@ -204,7 +204,7 @@ def test_collect_by_a_policys_file(capsys, tmp_path, asked):
     ("policy", "message"),
     [
         ("raondm", "--policy must be one of 'expert', 'scripted'"),
-        ("nowhere.zip", "--policy: no file 'nowhere.zip'"),
+        ("nowhere.safetensors", "--policy: no file 'nowhere.safetensors'"),
         (".", "--policy: '.' is a folder; a policy is one file"),
     ],
 )

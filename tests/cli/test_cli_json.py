@@ -32,7 +32,7 @@ def folder(tmp_path_factory):
     with redirect_stdout(io.StringIO()):
         main(["collect", "push", "reach", "--out", str(made / "demos"), "--episodes", "1"])
         small = ("--steps", "3", "--width", "8", "--batch-size", "4")
-        main(["train", str(made / "demos"), "--out", str(made / "policy.zip"), *small])
+        main(["train", str(made / "demos"), "--out", str(made / "policy.safetensors"), *small])
     return made
 
 
@@ -147,8 +147,8 @@ def test_data(capsys, folder):
 
 def test_policies(capsys):
     small = ("--steps", 3, "--width", 8, "--batch-size", 4)
-    check_documented("train", document(capsys, "train", "demos", "--out", "policy.zip", *small))
-    main(["evaluate", "policy.zip", "--episodes", "1", "--json"])
+    check_documented("train", document(capsys, "train", "demos", "--out", "policy.safetensors", *small))
+    main(["evaluate", "policy.safetensors", "--episodes", "1", "--json"])
     printed = capsys.readouterr()
     found = json.loads(printed.out)
     check_documented("evaluate", found)
@@ -157,7 +157,7 @@ def test_policies(capsys):
     assert found["tasks"][0] | {"mean_return": 0.0} == {
         "task": "push", "success_once": 0.0, "success_at_end": 0.0, "first_success": None, "mean_return": 0.0
     }  # fmt: skip
-    failed = document(capsys, "evaluate", "policy.zip", "--tasks", "push", "--episodes", 1, "--attribute")
+    failed = document(capsys, "evaluate", "policy.safetensors", "--tasks", "push", "--episodes", 1, "--attribute")
     check_documented("evaluate", failed, also=["failures"])
     assert failed["failures"][0]["task"] == "push"
 

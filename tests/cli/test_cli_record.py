@@ -35,7 +35,7 @@ def test_an_expert_is_recorded_with_the_shipped_plan(capsys, tmp_path):
 
 def test_a_resumed_training_writes_a_second_recording(tmp_path):
     for value in (1.0, 2.0):
-        with options.make_logger("rerun", tmp_path / "policy.zip") as logger:
+        with options.make_logger("rerun", tmp_path / "policy.safetensors") as logger:
             logger.log_scalar("train/loss", value)
     assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == ["policy-2.rrd", "policy.rrd"]
 
@@ -48,7 +48,7 @@ def test_who_acts_by_chance_is_the_same_each_time(capsys, tmp_path, who):
 
 
 def test_two_policies_side_by_side(capsys, tmp_path):
-    policy, out = tmp_path / "mine.zip", tmp_path / "x.rrd"
+    policy, out = tmp_path / "mine.safetensors", tmp_path / "x.rrd"
     lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=16, depth=1), policy)
     printed = run(capsys, "record", "reach", "--policy", policy, "--compare", "scripted", *SHORT, "--out", out)
     assert "reach, episode 0, mine: failed" in printed
@@ -86,7 +86,7 @@ def test_a_policy_of_your_own_in_python(capsys, tmp_path, monkeypatch):
 
 
 def test_conditions_answered_by_a_network(capsys, tmp_path):
-    file, out = tmp_path / "evaluator.zip", tmp_path / "x.rrd"
+    file, out = tmp_path / "evaluator.safetensors", tmp_path / "x.rrd"
     torch.manual_seed(0)
     lw.training.save_evaluator(lw.StateQueryEvaluator(lw.load_plans("MT10"), width=8), file)
     few = ("record", "reach", "--policy", "scripted", "--max-steps", 20, "--out", out)
@@ -114,12 +114,14 @@ def test_conditions_answered_by_an_evaluator_of_yours(capsys, tmp_path, monkeypa
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "my_evaluators.py").write_text(OWN_EVALUATORS)
     roles = lw.PlanConditionedActor(lw.Plans({"reach": lw.load_plans("MT10")["reach"]}), roles=True, width=8)
-    lw.save_actor(roles, "roles.zip")  # it reads exact truth, so it takes no evaluator inside
-    for policy, named in (("scripted", "Never"), ("roles.zip", "never")):
+    lw.save_actor(roles, "roles.safetensors")  # it reads exact truth, so it takes no evaluator inside
+    for policy, named in (("scripted", "Never"), ("roles.safetensors", "never")):
         out = f"{named}.rrd"
         more = "--policy", policy, "--evaluator", f"my_evaluators:{named}", "--max-steps", 20, "--out", out
         assert "reach, episode 0" in run(capsys, "record", "reach", *more)
-    run(capsys, "evaluate", "roles.zip", "--evaluator", "my_evaluators:Never", "--episodes", 1, "--max-steps", 5)
+    run(
+        capsys, "evaluate", "roles.safetensors", "--evaluator", "my_evaluators:Never", "--episodes", 1, "--max-steps", 5
+    )
     more = "--policy", "scripted", "--evaluator", "my_evaluators:number"
     assert "must name an lw.QueryEvaluator, or a class of these, it names 3" in fails(capsys, "record", "reach", *more)
 
@@ -128,11 +130,11 @@ def test_conditions_answered_by_an_evaluator_of_yours(capsys, tmp_path, monkeypa
     ("more", "message"),
     [
         (("--policy", "my policies:x"), "must be like my_module:policy"),
-        (("--policy", "scripted", "--evaluator", "nowhere.zip"), "evaluator: no file 'nowhere.zip'"),
-        (("--policy", "random", "--evaluator", "x.zip"), "random asks no conditions"),
+        (("--policy", "scripted", "--evaluator", "nowhere.safetensors"), "evaluator: no file 'nowhere.safetensors'"),
+        (("--policy", "random", "--evaluator", "x.safetensors"), "random asks no conditions"),
         (("--suite", "metawold"), "did you mean 'metaworld'"),
         (("--policy", "experts"), "did you mean 'expert'"),
-        (("--compare", "nowhere.zip"), "'nowhere.zip'"),
+        (("--compare", "nowhere.safetensors"), "'nowhere.safetensors'"),
         (("--device", "cuda:99"), "--device must be one of"),
         (("--reference", "MT10"), "--reference is for --attribute"),
         (("--out", "x.mp4"), "--out must end in '.rrd'"),

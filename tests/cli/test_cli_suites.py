@@ -32,9 +32,9 @@ def own(tmp_path, monkeypatch):
 
 def test_a_policy_of_meta_world_is_evaluated_with_another_robot(capsys, tmp_path):
     actor = lw.PlanConditionedActor(lw.load_plans("MT10"), features="opening", roles=True, width=8, depth=1)
-    lw.save_actor(actor, tmp_path / "mt10.zip")
+    lw.save_actor(actor, tmp_path / "mt10.safetensors")
     options = ["--suite", "fetch", "--tasks", "reach", "--episodes", "1", "--max-steps", "5", "--json"]
-    main(["evaluate", str(tmp_path / "mt10.zip"), *options])
+    main(["evaluate", str(tmp_path / "mt10.safetensors"), *options])
     found = json.loads(capsys.readouterr().out)
     assert found["config"]["tasks"] == ["fetch/reach"]
     assert found["config"]["max_steps"] == 5
@@ -70,7 +70,7 @@ def test_commands_take_another_suite_s_tasks_by_name(capsys, tmp_path):
 
 
 def test_data_policies_and_recordings_of_another_suite(capsys, tmp_path):
-    demos, policy, recording = tmp_path / "demos", tmp_path / "policy.zip", tmp_path / "episode.rrd"
+    demos, policy, recording = tmp_path / "demos", tmp_path / "policy.safetensors", tmp_path / "episode.rrd"
     made = said(capsys, "collect", "fetch/reach", "fetch/push", "--out", str(demos), "--episodes", "1")
     assert made["steps"] == 100
     main(["train", str(demos), "--steps", "2", "--out", str(policy)])
@@ -124,7 +124,7 @@ def test_what_names_no_suite_is_told(capsys, own, name, says):
 
 
 def test_an_unknown_suite_gets_the_nearest(capsys, tmp_path):
-    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=8), tmp_path / "mt10.zip")
+    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=8), tmp_path / "mt10.safetensors")
     with pytest.raises(SystemExit):
-        main(["evaluate", str(tmp_path / "mt10.zip"), "--suite", "fetsh"])
+        main(["evaluate", str(tmp_path / "mt10.safetensors"), "--suite", "fetsh"])
     assert "suite must be one of 'metaworld', 'fetch', got 'fetsh'; did you mean 'fetch'?" in capsys.readouterr().err

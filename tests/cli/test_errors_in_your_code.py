@@ -100,8 +100,8 @@ def test_an_evaluator_that_cannot_be_asked(tmp_path, monkeypatch, capsys, named,
 
 
 def test_plans_for_a_policy_without_plans(tmp_path, capsys):
-    lw.save_actor(lw.DescriptorConditionedActor("reach", width=8), tmp_path / "dc.zip")
-    said = fails(capsys, "evaluate", tmp_path / "dc.zip", "--plans", "MT10", "--episodes", 1)
+    lw.save_actor(lw.DescriptorConditionedActor("reach", width=8), tmp_path / "dc.safetensors")
+    said = fails(capsys, "evaluate", tmp_path / "dc.safetensors", "--plans", "MT10", "--episodes", 1)
     assert "--plans is for policies with plans, DescriptorConditionedActor has none" in said
 
 

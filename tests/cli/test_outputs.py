@@ -23,7 +23,7 @@ FOLDERS = {
 }
 FILES = {
     "train": ["demos", "--out"],
-    "card": ["x.zip", "--out"],
+    "card": ["x.safetensors", "--out"],
     "record": ["reach", "--out"],
     "view": ["x.rrd", "--screenshot"],
 }

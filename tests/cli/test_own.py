@@ -113,7 +113,7 @@ def test_demonstrations_are_collected_with_them(capsys, tmp_path):
 
 
 def test_a_policy_is_trained_and_evaluated_with_them(capsys, tmp_path):
-    policy = tmp_path / "policy.zip"
+    policy = tmp_path / "policy.safetensors"
     files = ("--plans", "reach.plan", "--task-file", "tasks.toml", "--text-encoder", "my_texts:encode")
     training = (*TINY, "--batch-size", 8, "--logger", "csv")
     run(capsys, "train", "demos", "--out", policy, "--tasks", "reach", *files, *training)
@@ -134,13 +134,24 @@ def test_a_policy_on_words_of_ones_own_serves_in_other_processes(forks, own, tmp
     """Trained, evaluated, recorded and trained on, each time where no text has been encoded yet."""
     plan = PLAN.replace("the ball", "the reach target")
     (tmp_path / "mine.plan").write_text(plan)  # the plan itself says which task it is for
-    policy = tmp_path / "policy.zip"
+    policy = tmp_path / "policy.safetensors"
     for command in (
         ("train", own / "demos", "--tasks", "reach", "--plans", tmp_path / "mine.plan", "--out", policy, *TINY),
         ("evaluate", policy, "--episodes", 1, "--stop-at-success", "--out", tmp_path / "evaluated"),
         ("record", "reach", "--policy", policy, "--out", tmp_path / "rollout.rrd"),
-        ("train", own / "demos", "--tasks", "reach", "--begin", policy, "--out", tmp_path / "on.zip", "--steps", 5),
-        ("evaluate", tmp_path / "on.zip", "--episodes", 1, "--stop-at-success", "--out", tmp_path / "again"),
+        (
+            "train",
+            own / "demos",
+            "--tasks",
+            "reach",
+            "--begin",
+            policy,
+            "--out",
+            tmp_path / "on.safetensors",
+            "--steps",
+            5,
+        ),
+        ("evaluate", tmp_path / "on.safetensors", "--episodes", 1, "--stop-at-success", "--out", tmp_path / "again"),
     ):
         forks.start(*command)
         ended = forks.end()
@@ -158,17 +169,17 @@ def test_a_task_that_the_simulator_lacks_is_named(capsys, tmp_path):
     encoder = "--text-encoder", "my_texts:encode"
     for name, some in (("alone", plans), ("both", both)):
         actor = lw.PlanConditionedActor(some, width=8, text_encoder=read_encoder("my_texts:encode"))
-        lw.save_actor(actor, tmp_path / f"{name}.zip")
+        lw.save_actor(actor, tmp_path / f"{name}.safetensors")
     lacks = "the simulator has no stack-cup; tasks of your own run in a suite of yours"
-    message = fails(capsys, "evaluate", tmp_path / "alone.zip", "--tasks", "stack-cup", *encoder)
+    message = fails(capsys, "evaluate", tmp_path / "alone.safetensors", "--tasks", "stack-cup", *encoder)
     assert "got 'stack-cup'" in message
     assert "A task of your own is a Task with an engine=, see docs/training.md" in message
     assert f"TASK: {lacks}" in fails(capsys, "query", "stack-cup", *files)
     scripted = ("scripted", "stack-cup", "--plans", tmp_path / "plans.json", "--out", tmp_path)
     assert lacks in fails(capsys, *scripted, *files)
-    message = fails(capsys, "evaluate", tmp_path / "alone.zip", *encoder)
+    message = fails(capsys, "evaluate", tmp_path / "alone.safetensors", *encoder)
     assert "the simulator has none of the policy's tasks, stack-cup; name others with --tasks" in message
-    printed = run(capsys, "evaluate", tmp_path / "both.zip", "--episodes", 1, *encoder)
+    printed = run(capsys, "evaluate", tmp_path / "both.safetensors", "--episodes", 1, *encoder)
     assert printed.startswith("without stack-cup, which the simulator lacks\n")
     assert "A task of your own is a Task" in fails(capsys, "collect", "stack-cup", "--out", tmp_path / "demos")
     assert "did you mean 'reach'" in fails(capsys, "collect", "raech", "--out", tmp_path / "demos")
@@ -184,4 +195,6 @@ def test_a_task_that_the_simulator_lacks_is_named(capsys, tmp_path):
     ],
 )
 def test_an_encoder_that_is_none_is_refused(capsys, tmp_path, name, message):
-    assert message in fails(capsys, "train", "demos", "--out", tmp_path / "p.zip", "--text-encoder", name, *TINY)
+    assert message in fails(
+        capsys, "train", "demos", "--out", tmp_path / "p.safetensors", "--text-encoder", name, *TINY
+    )

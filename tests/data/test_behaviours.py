@@ -20,7 +20,7 @@ from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.envs.episodes import run_episodes
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
-from lw_torchrl.training.files import demonstrated_tasks, demonstration_seeds
+from lw_torchrl.training.checkpoint import demonstrated_tasks, demonstration_seeds
 
 OTHERS = [name for name in BEHAVIOURS if name != "expert"]
 
@@ -239,7 +239,7 @@ def test_a_policy_trained_on_such_data_says_which_seeds_it_saw(tmp_path, made, c
         replay = lw.LanguageWorldExperienceReplay(
             root, label="executed", sampler=lw.TaskBalancedSampler(), transform=lw.QAFTransform(PLANS)
         )
-        path = tmp_path / f"{number}.zip"
+        path = tmp_path / f"{number}.safetensors"
         config = BehavioralCloningConfig(steps=1, batch_size=8)
         BehavioralCloningTrainer(trained(), replay, config, checkpoint=path, progress=False).train()
         assert demonstration_seeds(path) == seeds

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from collecting import collect, tree
 
-from lw_torchrl._files import held
+from lw_torchrl._files import locked
 from lw_torchrl.data import DatasetError
 from lw_torchrl.data.missing_episodes import EpisodeFiles
 
@@ -29,7 +29,7 @@ def test_a_second_call_is_refused_while_the_first_is_at_work(made, tmp_path, mon
     def meanwhile(self, *args):
         if not asked:
             asked.append(True)
-            with pytest.raises(DatasetError, match=r"root: another collect_demonstrations is at work in .*demos"):
+            with pytest.raises(DatasetError, match=r"root: another collect_demonstrations is writing to .*demos"):
                 elsewhere(tmp_path / "demos")
         put(self, *args)
 
@@ -40,5 +40,5 @@ def test_a_second_call_is_refused_while_the_first_is_at_work(made, tmp_path, mon
 
 
 def test_a_finished_dataset_is_read_by_as_many_as_like(made):
-    with held(made.root, "root", folder=True):
+    with locked(made.root, "root", folder=True):
         assert elsewhere(made.root) == made

@@ -208,7 +208,7 @@ def test_a_policy_trains_on_joined_data_and_a_checkpoint_knows_the_episodes(base
         )
         config = BehavioralCloningConfig(steps=3, batch_size=8)
         actor = PlanConditionedActor(plans)
-        return BehavioralCloningTrainer(actor, replay, config, checkpoint=tmp_path / "one.zip", progress=False)
+        return BehavioralCloningTrainer(actor, replay, config, checkpoint=tmp_path / "one.safetensors", progress=False)
 
     assert trainer(1).train() < 2
     assert trainer(1).steps == 3

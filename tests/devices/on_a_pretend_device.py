@@ -173,7 +173,7 @@ def test_losses_are_read_every_100_steps(demos, tmp_path):
     mean = trainer.train()
     assert len([wait for wait in WAITS if "loop" in wait]) == 3  # at 100, at 120, and at the end
     WAITS[:] = [wait for wait in WAITS if "loop" not in wait]
-    assert all("file_checks" in wait for wait in WAITS), WAITS  # of the weights, at the end
+    assert all("checkpoint" in wait for wait in WAITS), WAITS  # of the weights, at the end
     cpu = make_trainer(demos, "cpu", steps=120, checkpoint_every=10_000)
     cpu.step()
     assert cpu.train() == mean
@@ -181,7 +181,7 @@ def test_losses_are_read_every_100_steps(demos, tmp_path):
 
 @pytest.mark.parametrize("many", [False, True])
 def test_nan_is_found_with_its_step_and_not_written(demos, tmp_path, many):
-    path = tmp_path / "c.zip"
+    path = tmp_path / "c.safetensors"
     make = make_stack if many else make_trainer
     trainer = make(demos, "pretend", checkpoint=path, steps=30, checkpoint_every=10)
     step, count = trainer.step, [0]
@@ -218,7 +218,7 @@ def test_it_carries_on_bit_for_bit_where_it_was_begun(demos, tmp_path, many):
     whole = make(demos, "pretend", **options)
     for _ in range(12):
         whole.step()
-    path = tmp_path / "c.zip"
+    path = tmp_path / "c.safetensors"
     first = make(demos, "pretend", checkpoint=path, **options)
     for _ in range(7):
         first.step()
@@ -233,12 +233,12 @@ def test_it_carries_on_bit_for_bit_where_it_was_begun(demos, tmp_path, many):
 
 @pytest.mark.parametrize(("begun", "ended"), [("pretend", "cpu"), ("cpu", "pretend")])
 def test_elsewhere_it_carries_on_and_says_so(demos, tmp_path, begun, ended):
-    path = tmp_path / "c.zip"
+    path = tmp_path / "c.safetensors"
     first = make_trainer(demos, begun, checkpoint=path)
     for _ in range(7):
         first.step()
     first.save()
-    with pytest.warns(UserWarning, match=f"was trained on '{begun}' and goes on on '{ended}': with the same"):
+    with pytest.warns(UserWarning, match=f"was trained on '{begun}' and resumes on '{ended}'"):
         second = make_trainer(demos, ended, checkpoint=path)
     assert second.steps == 7
     assert_same(weights(second), weights(first))
@@ -246,10 +246,10 @@ def test_elsewhere_it_carries_on_and_says_so(demos, tmp_path, begun, ended):
 
 
 def test_a_file_from_there_is_loaded_here(demos, tmp_path):
-    trainer = make_trainer(demos, "pretend", checkpoint=tmp_path / "c.zip")
+    trainer = make_trainer(demos, "pretend", checkpoint=tmp_path / "c.safetensors")
     trainer.train()
-    lw.save_actor(trainer.actor, tmp_path / "p.zip")
-    for name in ("c.zip", "p.zip"):
+    lw.save_actor(trainer.actor, tmp_path / "p.safetensors")
+    for name in ("c.safetensors", "p.safetensors"):
         loaded = lw.load_actor(tmp_path / name)
         assert {tensor.device.type for tensor in loaded.state_dict().values()} == {"cpu"}
         assert_same(dict(loaded.named_parameters()), weights(trainer))

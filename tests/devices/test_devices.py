@@ -85,11 +85,11 @@ def test_without_a_gpu_there_is_the_cpu(demos, tmp_path):
     ("command", "said"),
     [
         (
-            ["train", "DEMOS", "--out", "p.zip", "--device", "cuda"],
+            ["train", "DEMOS", "--out", "p.safetensors", "--device", "cuda"],
             "--device must be one of 'cpu', 'auto' here",
         ),
         (
-            ["train", "DEMOS", "--out", "p.zip", "--device", "gpu"],
+            ["train", "DEMOS", "--out", "p.safetensors", "--device", "gpu"],
             "--device must be one of 'cpu', 'cuda', 'cuda:0', 'mps', 'auto'",
         ),
     ],
@@ -105,7 +105,7 @@ def test_the_command_line_says_so(demos, tmp_path, monkeypatch, capsys, command,
 
 @pytest.mark.slow
 def test_the_command_line_trains_and_evaluates_there(demos, tmp_path, capsys):
-    out = tmp_path / "p.zip"
+    out = tmp_path / "p.safetensors"
     main(["train", str(demos), "--out", str(out), "--steps", "3", "--batch-size", "10", "--device", "auto"])
     main(["evaluate", str(out), "--episodes", "1", "--stop-at-success", "--device", "auto"])
     assert "reach" in capsys.readouterr().out
@@ -131,7 +131,7 @@ def test_on_a_gpu_nobody_waits(demos, tmp_path):
     for device in ("cpu", "cuda"):
         torch.manual_seed(0)
         actor = lw.PlanConditionedActor(PLANS, width=16, feature_noise=0.0)
-        options = {"checkpoint": tmp_path / f"{device}.zip", "progress": False, "device": device}
+        options = {"checkpoint": tmp_path / f"{device}.safetensors", "progress": False, "device": device}
         trainer = lw.BehavioralCloningTrainer(actor, make_replay(demos, device), config, **options)
         losses[device] = [trainer.step().item() for _ in range(4)]
         torch.cuda.set_sync_debug_mode("error" if device == "cuda" else "default")
@@ -144,6 +144,6 @@ def test_on_a_gpu_nobody_waits(demos, tmp_path):
     assert losses["cuda"] == pytest.approx(losses["cpu"], rel=1e-3)
     options = {"tasks": "reach", "episodes_per_task": 2, "seed": 1000, "max_steps": 20, "progress": False}
     there = lw.evaluate(actor, record_actions=True, **options)
-    here = lw.evaluate(lw.load_actor(tmp_path / "cuda.zip"), record_actions=True, **options)
+    here = lw.evaluate(lw.load_actor(tmp_path / "cuda.safetensors"), record_actions=True, **options)
     for one, other in zip(there.episodes, here.episodes, strict=True):
         assert (one.actions - other.actions).abs().max() < 1e-2

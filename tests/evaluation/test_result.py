@@ -209,7 +209,7 @@ def test_our_version_is_that_of_the_code_that_runs(monkeypatch):
 
 
 def test_it_says_where_it_came_from(tmp_path):
-    checkpoint = tmp_path / "policy.zip"
+    checkpoint = tmp_path / "policy.safetensors"
     checkpoint.write_bytes(b"weights")
     before = datetime.now(UTC).replace(microsecond=0)
     make_result().save(tmp_path / "results.json", checkpoint=checkpoint, plans="0123abcd")
@@ -222,7 +222,7 @@ def test_it_says_where_it_came_from(tmp_path):
     make_result().save(tmp_path / "plain.json")
     assert EvaluationResult.load(tmp_path / "plain.json").origin.keys() == {"date", "versions"}
     with pytest.raises(FileNotFoundError, match="nowhere"):
-        make_result().save(tmp_path / "other.json", checkpoint=tmp_path / "nowhere.zip")
+        make_result().save(tmp_path / "other.json", checkpoint=tmp_path / "nowhere.safetensors")
     assert not (tmp_path / "other.json").exists()
 
 

@@ -84,7 +84,7 @@ def test_any_condition_becomes_the_nearest_query(tmp_path_factory, condition, sk
             dict.fromkeys(("push", "reach", "door-open"), [["open", "wait"]] * 999),
             "at most 2000 pairs in all, got 2997",
         ),
-        (" " * 2**18 + "{}", "larger than 262144 bytes"),
+        (" " * 2**18 + "{}", "must have at most 262144 bytes"),
         ({"push": [["open and " * 64 + "closed", "wait"]]}, "push, step 1: query .* must have at most 64 clauses"),
     ],
 )

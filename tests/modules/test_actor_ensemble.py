@@ -7,7 +7,7 @@ from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
 from lw_torchrl.language.plans import PlanStep
-from lw_torchrl.training.files import save_actor
+from lw_torchrl.training.checkpoint import save_actor
 
 PLANS = lw.load_plans("MT10")
 
@@ -76,8 +76,8 @@ def test_it_acts_in_the_environment():
 @pytest.mark.parametrize("kind", ["plans", "descriptions"])
 def test_saved_and_loaded_it_does_the_same(kind, tmp_path):
     ensemble, state = lw.modules.ActorEnsemble(make_members(kind=kind)).eval(), make_state()
-    save_actor(ensemble, tmp_path / "policy.zip")
-    loaded = lw.load_actor(tmp_path / "policy.zip")
+    save_actor(ensemble, tmp_path / "policy.safetensors")
+    loaded = lw.load_actor(tmp_path / "policy.safetensors")
     assert torch.equal(loaded(state.clone())["action"], ensemble(state.clone())["action"])
     assert not loaded.training
 

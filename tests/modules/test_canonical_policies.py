@@ -11,8 +11,7 @@ from tensordict import TensorDict
 import lw_torchrl as lw
 from lw_torchrl.language.canonical import RULES, canonical_plan
 from lw_torchrl.language.canonical_steps import step_vectors
-from lw_torchrl.training.file_checks import text_vectors
-from lw_torchrl.training.files import read_description
+from lw_torchrl.training.checkpoint import read_description, text_vectors
 
 MT10, MT50 = lw.load_plans("MT10"), lw.load_plans("MT50")
 SMALL = {"width": 8, "depth": 1, "latent_size": 4, "encoder_width": 8}
@@ -131,9 +130,11 @@ def test_trained_on_plans_in_ones_own_words_it_acts_in_a_new_process_without_a_t
     actor = make({"coffee-pull": MINE})
     replay = lw.LanguageWorldExperienceReplay(tmp_path / "demos", transform=actor.transform())
     config = lw.BehavioralCloningConfig(steps=3, batch_size=8)
-    lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=tmp_path / "policy.zip", progress=False).train()
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    command = [sys.executable, "-c", PROGRAM, str(tmp_path / "policy.zip")]
+    lw.BehavioralCloningTrainer(
+        actor, replay, config, checkpoint=tmp_path / "policy.safetensors", progress=False
+    ).train()
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    command = [sys.executable, "-c", PROGRAM, str(tmp_path / "policy.safetensors")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr
     action, trust, words = json.loads(done.stdout)
@@ -148,11 +149,11 @@ def test_trained_on_plans_in_ones_own_words_it_acts_in_a_new_process_without_a_t
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_file_keeps_the_plans_as_written_and_the_rules(kind, tmp_path):
     actor = make({"coffee-pull": MINE}, kind)
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    said = read_description(tmp_path / "policy.zip")["actor"]
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    said = read_description(tmp_path / "policy.safetensors")["actor"]
     assert said["rules"] == RULES
     assert lw.Plans.from_json(said["plans"]).fingerprint == actor.encoder.written.fingerprint
-    loaded, state = lw.load_actor(tmp_path / "policy.zip", text_encoder=refuse), make_state(actor)
+    loaded, state = lw.load_actor(tmp_path / "policy.safetensors", text_encoder=refuse), make_state(actor)
     assert torch.equal(loaded(state.clone())["action"], actor(state.clone())["action"])
 
 
@@ -165,24 +166,24 @@ def test_a_file_of_other_rules_is_refused(kind, tmp_path, monkeypatch):
         ValueError, match=f"those before version 1 of the rules for canonical plans, here is {RULES}: train"
     ):
         lw.PlanConditionedActor.from_description(before, refuse)
-    lw.save_actor(actor, tmp_path / "policy.zip")
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
     monkeypatch.setattr("lw_torchrl.modules.plan_encoder.RULES", RULES + 1)
     made = f"trained with version {RULES} of the rules for canonical plans, here is {RULES + 1}: train it"
     with pytest.raises(ValueError, match=made):
-        lw.load_actor(tmp_path / "policy.zip")
+        lw.load_actor(tmp_path / "policy.safetensors")
 
 
 def test_a_file_with_roles_from_before_is_refused(tmp_path, monkeypatch):
     """Such a file has no rules, options without "canonical" and roles of 9 features."""
     actor = make(text_encoder=None, features="opening")
     del actor.config["canonical"], actor.encoder.config["canonical"], actor.config["decided_gripper"]
-    monkeypatch.setattr("lw_torchrl.training.files.check_can_be_saved", lambda actor: actor)
+    monkeypatch.setattr("lw_torchrl.training.checkpoint.check_can_be_saved", lambda actor: actor)
     described = actor.encoder.describe
     monkeypatch.setattr(actor.encoder, "describe", lambda: {k: v for k, v in described().items() if k != "rules"})
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    assert "rules" not in read_description(tmp_path / "policy.zip")["actor"]
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    assert "rules" not in read_description(tmp_path / "policy.safetensors")["actor"]
     with pytest.raises(ValueError, match=r"those before version 1 of the rules for canonical plans.*: train it again"):
-        lw.load_actor(tmp_path / "policy.zip")
+        lw.load_actor(tmp_path / "policy.safetensors")
 
 
 def test_an_evaluator_answers_the_canonical_conditions(tmp_path):
@@ -190,8 +191,8 @@ def test_an_evaluator_answers_the_canonical_conditions(tmp_path):
         actor = make(MT50, "canonical", evaluator=lw.StateQueryEvaluator(plans, width=8, depth=1))
         assert actor.evaluator.plans.fingerprint == actor.plans.fingerprint
     state = make_state(make(MT50)).exclude("qaf", "qaf_plan")
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    loaded = lw.load_actor(tmp_path / "policy.zip", text_encoder=refuse)
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    loaded = lw.load_actor(tmp_path / "policy.safetensors", text_encoder=refuse)
     assert torch.equal(loaded(state.clone())["action"], actor(state.clone())["action"])
     mine = actor.with_plans({"coffee-pull": MINE})
     assert mine.evaluator.plans.fingerprint == mine.plans.fingerprint

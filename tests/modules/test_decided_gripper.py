@@ -104,8 +104,8 @@ def test_the_effort_is_where_the_layout_has_it():
 
 def test_it_is_kept_in_a_file_and_a_distribution_refuses_it(tmp_path):
     actor = KINDS["plans"](decided_gripper=True).eval()
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    assert lw.load_actor(tmp_path / "policy.zip")(make_state())["action"][:, 3].abs().eq(1.0).all()
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    assert lw.load_actor(tmp_path / "policy.safetensors")(make_state())["action"][:, 3].abs().eq(1.0).all()
     assert not actor.stochastic().decided_gripper
     assert actor.with_plans(lw.load_plans("MT50")).decided_gripper
     with pytest.raises(ValueError, match="decided_gripper must be false with a distribution, which draws any effort"):

@@ -72,8 +72,8 @@ def test_saved_and_loaded_it_does_the_same(tmp_path):
     plain = ActorEnsemble([lw.DescriptorConditionedActor(SEEN, **SMALL) for _ in range(2)])
     others = ActorEnsemble([lw.PlanConditionedActor(PLANS, roles=True, features="none", **SMALL) for _ in range(2)])
     actor = DemonstratedActor(plain, others).eval()
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    loaded, state = lw.load_actor(tmp_path / "policy.zip"), make_state(actor)
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    loaded, state = lw.load_actor(tmp_path / "policy.safetensors"), make_state(actor)
     assert isinstance(loaded, DemonstratedActor)
     assert not loaded.training
     assert torch.equal(loaded(state.clone())["action"], actor(state.clone())["action"])

@@ -114,11 +114,11 @@ def test_imitation_reaches_it_through_the_softmax():
 
 def test_a_policy_with_it_is_made_again_from_its_file(tmp_path):
     actor = lw.PlanConditionedActor(PLANS, evaluator=make(), width=8, text_encoder=letters).eval()
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    again = lw.load_actor(tmp_path / "policy.zip", text_encoder=letters)
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    again = lw.load_actor(tmp_path / "policy.safetensors", text_encoder=letters)
     assert torch.equal(again(states())["action"], actor(states())["action"])
-    lw.training.save_evaluator(actor.evaluator, tmp_path / "evaluator.zip")
-    other = lw.training.load_evaluator(tmp_path / "evaluator.zip", PLANS, text_encoder=letters)
+    lw.training.save_evaluator(actor.evaluator, tmp_path / "evaluator.safetensors")
+    other = lw.training.load_evaluator(tmp_path / "evaluator.safetensors", PLANS, text_encoder=letters)
     assert torch.equal(other(states())["qaf_logits"], actor.evaluator(states())["qaf_logits"])
 
 

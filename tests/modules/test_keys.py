@@ -76,8 +76,8 @@ def test_keys_travel_with_the_policy(tmp_path):
         in_keys=["state", ("words", "task"), ("words", "qaf")], out_keys=["action", ("why", "weights"), "latent"]
     )
     actor = make("plan", **keys)
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    loaded = lw.load_actor(tmp_path / "policy.zip")
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    loaded = lw.load_actor(tmp_path / "policy.safetensors")
     assert (loaded.in_keys, loaded.out_keys) == (actor.in_keys, actor.out_keys)
     queries = actor.transform()
     assert (queries.in_keys, queries.out_keys) == (
@@ -234,11 +234,11 @@ def test_new_names_are_saved_or_refused(make_one, tmp_path):
     actor = make_one()
     actor.out_keys = [("other", key) for key in actor.out_keys]
     if isinstance(actor, lw.ScriptedSkillActor):
-        with pytest.raises(ValueError, match="in_keys or out_keys were changed later: give them where it is made"):
-            lw.save_actor(actor, tmp_path / "policy.zip")
+        with pytest.raises(ValueError, match="in_keys or out_keys were changed later: pass them to its constructor"):
+            lw.save_actor(actor, tmp_path / "policy.safetensors")
     else:
-        lw.save_actor(actor, tmp_path / "policy.zip")
-        assert lw.load_actor(tmp_path / "policy.zip").out_keys == actor.out_keys
+        lw.save_actor(actor, tmp_path / "policy.safetensors")
+        assert lw.load_actor(tmp_path / "policy.safetensors").out_keys == actor.out_keys
 
 
 def test_every_forward_of_ours_is_called_so():

@@ -53,7 +53,7 @@ def saved(actor, path, **options):
 @pytest.mark.parametrize("distribution", [None, "normal"])
 def test_it_is_kept_in_a_file(own, tmp_path, distribution):
     actor = ConditionedActor(own(["push", "reach"], size=3, feature_noise=0.0), width=8, distribution=distribution)
-    again = saved(actor, tmp_path / "policy.zip")
+    again = saved(actor, tmp_path / "policy.safetensors")
     assert (again.tasks, again.config, again.encoder.config) == (actor.tasks, actor.config, actor.encoder.config)
     state = states() | {"task_id": torch.full((4,), lw.task_id("push"))}
     assert torch.equal(actor(**state), again(**state)) if distribution is None else actor(**state)[0].shape == (4, 4)
@@ -89,7 +89,7 @@ def test_the_name_of_its_class_is_a_method_with_its_options(own):
 @pytest.mark.parametrize("make", [PlanEncoder, DescriptorEncoder])
 def test_ours_make_actors_too(tmp_path, make):
     actor = ConditionedActor(make(PLANS, feature_noise=0.1), width=8).eval()
-    again = saved(actor, tmp_path / "policy.zip")
+    again = saved(actor, tmp_path / "policy.safetensors")
     state = states() | ({"qaf": torch.zeros(4, 6, dtype=torch.bool)} if make is PlanEncoder else {})
     ours, found = actor(**state), again(**state)
     assert torch.equal(ours[0] if make is PlanEncoder else ours, found[0] if make is PlanEncoder else found)
@@ -103,10 +103,12 @@ def test_its_own_tasks_and_texts_travel(tmp_path):
         return torch.ones(len(texts), TEXT_DIMENSION)
 
     actor = ConditionedActor(DescriptorEncoder([task], text_encoder=encode), width=8)
-    again = saved(actor, tmp_path / "policy.zip", text_encoder=encode)
+    again = saved(actor, tmp_path / "policy.safetensors", text_encoder=encode)
     assert again.definition("touch").description == "Touch the puck."
     with pytest.raises(ValueError, match="text_encoder"):
-        lw.load_actor(tmp_path / "policy.zip", text_encoder=lambda texts: torch.zeros(len(texts), TEXT_DIMENSION))
+        lw.load_actor(
+            tmp_path / "policy.safetensors", text_encoder=lambda texts: torch.zeros(len(texts), TEXT_DIMENSION)
+        )
 
 
 def test_what_is_no_encoder_and_options_of_one_are_refused():

@@ -84,8 +84,8 @@ def test_a_policy_that_gets_nowhere_comes_to_its_reserve():
 
 def test_it_is_saved_and_loaded(tmp_path):
     actor = make(MT10, reserve=True)
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    loaded = lw.load_actor(tmp_path / "policy.zip")
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    loaded = lw.load_actor(tmp_path / "policy.safetensors")
     state = states(actor, 1, "push")
     assert torch.equal(loaded(state.clone())["action"], actor(state.clone())["action"])
 

@@ -227,8 +227,8 @@ def test_training_takes_contacts_and_they_go_with_the_policy(tmp_path):
     contact = actor.encoder.roles.contact
     row = PlanTables(MT10).index.row("drawer-open")
     assert contact[row].any()
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    loaded = lw.load_actor(tmp_path / "policy.zip").encoder.roles
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    loaded = lw.load_actor(tmp_path / "policy.safetensors").encoder.roles
     assert torch.equal(loaded.contact, contact)
     assert loaded.demonstrated.tolist() == [task == "drawer-open" for task in MT10]
     wider = actor.with_plans(ZERO_SHOT).encoder.roles

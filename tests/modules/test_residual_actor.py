@@ -9,7 +9,7 @@ import torch
 
 import lw_torchrl as lw
 from lw_torchrl.modules import make_policy
-from lw_torchrl.training.files import check_can_be_saved
+from lw_torchrl.training.checkpoint import check_can_be_saved
 
 PLANS = lw.load_plans("MT10")
 SMALL = {"width": 16, "depth": 1}
@@ -83,8 +83,8 @@ def test_only_the_correction_is_trained():
 def test_it_is_saved_and_loaded(method, tmp_path):
     actor = disturb(lw.ResidualActor(make_base(method), scale=0.5, width=(16, 8)))
     check_can_be_saved(actor)
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    again = lw.load_actor(tmp_path / "policy.zip")
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    again = lw.load_actor(tmp_path / "policy.safetensors")
     assert isinstance(again, lw.ResidualActor)
     assert json.dumps(again.describe()) == json.dumps(actor.describe())
     seen = state(actor)

@@ -13,7 +13,7 @@ from tensordict import TensorDict
 import lw_torchrl as lw
 from lw_torchrl.modules import make_policy
 from lw_torchrl.modules.residual_actor import weight_in_force
-from lw_torchrl.training.files import check_can_be_saved
+from lw_torchrl.training.checkpoint import check_can_be_saved
 
 PLANS = lw.load_plans("MT10")
 SMALL = {"width": 16, "depth": 1}
@@ -136,8 +136,8 @@ def test_an_evaluators_weights_count():
 def test_it_is_saved_and_loaded(tmp_path):
     actor = make_actor().eval()
     check_can_be_saved(actor)
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    again = lw.load_actor(tmp_path / "policy.zip").eval()
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    again = lw.load_actor(tmp_path / "policy.safetensors").eval()
     assert again.steps == {"pick-place": [1, 3], "push": [0]}
     assert json.dumps(again.describe()) == json.dumps(actor.describe())
     assert again.out_keys == ["action", "skill_weights", "action_corrected"]

@@ -142,8 +142,8 @@ def test_with_plans_shares_the_network_alone():
 
 def test_saved_and_loaded_with_the_policy_to_the_bit(tmp_path):
     actor = make_actor(answers="tanh")
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    loaded = lw.load_actor(tmp_path / "policy.zip", text_encoder=letters)
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    loaded = lw.load_actor(tmp_path / "policy.safetensors", text_encoder=letters)
     assert loaded.config["answers"] == "tanh"
     for key in actor.out_keys:
         assert torch.equal(loaded(states())[key], actor(states())[key]), key
@@ -161,8 +161,8 @@ def test_scripted_skills_act_on_its_answers(tmp_path):
     for key in ("action", "skill_weights"):
         assert torch.equal(found[key], by_truth[key])
     assert found["skill_weights"][:, 1:].any()
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    assert torch.equal(lw.load_actor(tmp_path / "policy.zip")(states())["action"], found["action"])
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    assert torch.equal(lw.load_actor(tmp_path / "policy.safetensors")(states())["action"], found["action"])
     other = actor.with_plans(lw.Plans([PLANS["push"]]))
     assert other.evaluator.network.predicates.weight is evaluator.network.predicates.weight
     assert lw.ScriptedSkillActor(plans).with_evaluator(evaluator)(states())["action"].equal(found["action"])

@@ -107,8 +107,8 @@ def test_features_have_no_noise_that_would_change_the_likelihood():
 @by_distribution
 def test_it_is_saved_and_loaded_like_any(kind, distribution, tmp_path):
     actor = make(kind, distribution, init_std=0.7)
-    lw.save_actor(actor, tmp_path / "policy.zip")
-    loaded = lw.load_actor(tmp_path / "policy.zip")
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    loaded = lw.load_actor(tmp_path / "policy.safetensors")
     state = make_state()
     out, ours = loaded(state.clone()), actor.eval()(state.clone())
     assert all(torch.equal(out[key], ours[key]) for key in actor.out_keys)

@@ -118,8 +118,8 @@ def test_actors_give_nine_numbers(features, env, tmp_path):
         state = env.reset()
         state = state if actor.plans is None else actor.transform()(state)
         assert actor.eval()(state.clone())["action"].shape == (4, 9)
-        lw.save_actor(actor, tmp_path / "actor.zip")
-        again = lw.load_actor(tmp_path / "actor.zip", text_encoder=letters).eval()
+        lw.save_actor(actor, tmp_path / "actor.safetensors")
+        again = lw.load_actor(tmp_path / "actor.safetensors", text_encoder=letters).eval()
         assert again.layout == KITCHEN
         assert torch.equal(again(state.clone())["action"], actor(state.clone())["action"])
 
@@ -240,9 +240,9 @@ def test_chance_acts_in_it_and_explores(tmp_path):
 
 @pytest.mark.slow
 def test_the_command_line_evaluates_and_records_it(tmp_path, capsys):
-    lw.save_actor(lw.PlanConditionedActor(PLANS, width=8), tmp_path / "kitchen.zip")
+    lw.save_actor(lw.PlanConditionedActor(PLANS, width=8), tmp_path / "kitchen.safetensors")
     where = ["--suite", f"{__name__}:SUITE", "--episodes", "1", "--max-steps", "3", "--out", str(tmp_path / "out")]
-    main(["evaluate", str(tmp_path / "kitchen.zip"), *where])
+    main(["evaluate", str(tmp_path / "kitchen.safetensors"), *where])
     assert "kitchen/slide-cabinet" in capsys.readouterr().out
     chunks = list(RrdReader(tmp_path / "out" / "rollout.rrd").stream())
     assert "panda0_link7" in places_of_bodies(chunks, r"/kitchen\/slide-cabinet-0/scene")

@@ -98,8 +98,8 @@ def test_a_policy_is_trained_saved_evaluated_and_recorded(demos, tmp_path):
     )
     config = lw.BehavioralCloningConfig(steps=300, batch_size=60, learning_rate=1e-2)
     lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()
-    lw.save_actor(actor, tmp_path / "toy.zip")
-    again = lw.load_actor(tmp_path / "toy.zip")
+    lw.save_actor(actor, tmp_path / "toy.safetensors")
+    again = lw.load_actor(tmp_path / "toy.safetensors")
     run = {"tasks": "toy", "suite": SUITE, "episodes_per_task": 4, "seed": 1_000, "progress": False}
     result = lw.evaluate(again, **run)
     assert result.mean_success > 0.7
@@ -180,8 +180,8 @@ def test_what_does_not_carry_over_is_named():
 def test_a_transferred_policy_is_saved(tmp_path):
     trained = lw.PlanConditionedActor(lw.load_plans("MT10"), features="opening", roles=True, **SMALL).eval()
     moved = TransferredActor(trained, SUITE.plans, speed=1.5).eval()
-    lw.save_actor(moved, tmp_path / "moved.zip")
-    again = lw.load_actor(tmp_path / "moved.zip").eval()
+    lw.save_actor(moved, tmp_path / "moved.safetensors")
+    again = lw.load_actor(tmp_path / "moved.safetensors").eval()
     env = lw.LanguageWorldEnv("toy", suite=SUITE)
     state = again.transform()(env.reset())
     assert torch.equal(again(state.clone())["action"], moved(state.clone())["action"])

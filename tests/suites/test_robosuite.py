@@ -66,10 +66,10 @@ def test_plans_with_scripted_skills_succeed(task, suite):
 
 def test_the_example_runs_a_policy_of_meta_world(example, tmp_path):
     actor = lw.PlanConditionedActor(lw.load_plans("MT10"), roles=True, features="opening", width=8)
-    lw.save_actor(actor, tmp_path / "policy.zip")
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
     options = ["--episodes", "1", "--steps", "5", "--arms", "Panda", "IIWA"]
     done = subprocess.run(
-        [sys.executable, str(EXAMPLES / "suite_robosuite.py"), str(tmp_path / "policy.zip"), *options],
+        [sys.executable, str(EXAMPLES / "suite_robosuite.py"), str(tmp_path / "policy.safetensors"), *options],
         env=dict(os.environ),
         capture_output=True,
         text=True,

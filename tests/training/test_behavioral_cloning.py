@@ -107,7 +107,7 @@ def test_any_module_that_writes_an_action_can_be_trained(demos, tmp_path):
 
     assert make_trainer(demos, None, actor=make()).train() < 1.0
     with pytest.raises(TypeError, match="actor must be a Policy to be kept in a file"):
-        make_trainer(demos, tmp_path / "c.zip", actor=make())
+        make_trainer(demos, tmp_path / "c.safetensors", actor=make())
 
 
 def test_the_seed_fixes_the_training(demos, undisturbed):
@@ -170,14 +170,14 @@ def test_nan_in_the_demonstrations_is_reported(demos):
 
 
 def test_nan_leaves_weights_and_checkpoint_as_they_were(demos, tmp_path):
-    trainer = make_trainer(demos, tmp_path / "checkpoint.zip")
+    trainer = make_trainer(demos, tmp_path / "checkpoint.safetensors")
     before = {name: value.clone() for name, value in trainer.actor.state_dict().items()}
     real = trainer.replay.sample
     trainer.replay.sample = lambda size: real(size).apply(lambda x: x * torch.nan if x.is_floating_point() else x)
     with pytest.raises(ValueError, match=r"NaN|finite"):
         trainer.train()
     assert all(torch.equal(value, before[name]) for name, value in trainer.actor.state_dict().items())
-    assert not (tmp_path / "checkpoint.zip").exists()
+    assert not (tmp_path / "checkpoint.safetensors").exists()
 
 
 def test_a_batch_the_tasks_do_not_divide_is_refused(demos):

@@ -48,12 +48,12 @@ def test_training_moves_the_evaluator_and_goes_on_to_the_bit(root, tmp_path):
     whole.train()
     assert not torch.equal(start["network.trunk.0.weight"], whole.actor.evaluator.network.trunk[0].weight)
     with pytest.raises(KeyboardInterrupt):
-        tuned(root, 0.5, path=tmp_path / "p.zip", stop_at=7).train()
-    again = tuned(root, 0.5, path=tmp_path / "p.zip")
+        tuned(root, 0.5, path=tmp_path / "p.safetensors", stop_at=7).train()
+    again = tuned(root, 0.5, path=tmp_path / "p.safetensors")
     assert again.steps == 5
     again.train()
     assert_same(everything(again), everything(whole))
-    loaded = lw.load_actor(tmp_path / "p.zip")
+    loaded = lw.load_actor(tmp_path / "p.safetensors")
     rows = whole.replay[:].select("observation", "task_id")
     assert torch.equal(loaded(rows.clone())["action"], whole.actor.eval()(rows.clone())["action"])
 

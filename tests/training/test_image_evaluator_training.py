@@ -51,13 +51,13 @@ def everything(trainer):
 
 
 def test_training_that_was_stopped_goes_on_bit_for_bit(replay, tmp_path):
-    whole = make_trainer(replay, tmp_path / "whole.zip")
+    whole = make_trainer(replay, tmp_path / "whole.safetensors")
     whole.train()
-    begun = make_trainer(replay, tmp_path / "begun.zip")
+    begun = make_trainer(replay, tmp_path / "begun.safetensors")
     for _ in range(4):
         begun.step()
     begun.save()
-    resumed = make_trainer(replay, tmp_path / "begun.zip", seed=5)
+    resumed = make_trainer(replay, tmp_path / "begun.safetensors", seed=5)
     assert resumed.steps == 4
     resumed.train()
     found, expected = everything(resumed), everything(whole)
@@ -79,11 +79,11 @@ def test_a_policy_that_sees_is_tuned_and_goes_on_bit_for_bit(replay, tmp_path):
         trainer.save() if stop else trainer.train()
         return lw.load_actor(path).state_dict()
 
-    whole = train(tmp_path / "whole.zip")
-    begun = train(tmp_path / "begun.zip", stop=4)
+    whole = train(tmp_path / "whole.safetensors")
+    begun = train(tmp_path / "begun.safetensors", stop=4)
     eye = next(name for name in whole if "encoder.evaluator.network.key" in name)
     assert not torch.equal(begun[eye], whole[eye])
-    resumed = train(tmp_path / "begun.zip")
+    resumed = train(tmp_path / "begun.safetensors")
     for name, value in whole.items():
         assert torch.equal(resumed[name], value), name
 

@@ -54,9 +54,9 @@ def weights(trainer):
 def test_it_ends_after_the_step_and_carries_on(demos, tmp_path):
     handler = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
-        make(demos, tmp_path / "c.zip", times=1).train()
+        make(demos, tmp_path / "c.safetensors", times=1).train()
     assert signal.getsignal(signal.SIGINT) is handler
-    resumed = make(demos, tmp_path / "c.zip")
+    resumed = make(demos, tmp_path / "c.safetensors")
     assert resumed.steps == 6
     resumed.train()
     whole = make(demos, None)
@@ -65,19 +65,19 @@ def test_it_ends_after_the_step_and_carries_on(demos, tmp_path):
 
 
 def test_the_second_time_it_ends_at_once(demos, tmp_path):
-    trainer = make(demos, tmp_path / "c.zip", times=2)
+    trainer = make(demos, tmp_path / "c.safetensors", times=2)
     handler = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         trainer.train()
     assert signal.getsignal(signal.SIGINT) is handler
     assert trainer.steps == 5
-    assert not (tmp_path / "c.zip").exists()
+    assert not (tmp_path / "c.safetensors").exists()
 
 
 def test_where_it_is_ignored_it_is_ignored(demos, tmp_path):
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        trainer = make(demos, tmp_path / "c.zip", times=1)
+        trainer = make(demos, tmp_path / "c.safetensors", times=1)
         trainer.train()
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
@@ -129,7 +129,7 @@ def interrupted(forks, tmp_path, arguments, runs, owner, method):
 @pytest.mark.parametrize("times", [5, pytest.param(20, marks=pytest.mark.slow)])
 def test_at_random_moments(forks, demos, tmp_path, times):
     """Each run carries on from the one before; none loses a step that it made."""
-    file = tmp_path / "policy.zip"
+    file = tmp_path / "policy.safetensors"
     arguments = ["train", demos, "--out", file, "--steps", 10**6, "--batch-size", 20, "--width", 16, "--depth", 1]
     found = interrupted(forks, tmp_path, arguments, times, "BehavioralCloningTrainer", "step")
     assert [status for status, _ in found] == [130] * times

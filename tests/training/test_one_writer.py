@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import importlib.metadata
-import json
-import zipfile
 
 import pytest
-import small_online
 import torch
-from small_training import PLANS, SMALL, collect_demos, make_actor, make_replay, make_trainer
+from small_training import CONFIG, PLANS, collect_demos, make_actor, make_replay, make_trainer
 
 import lw_torchrl as lw
-from lw_torchrl._tensor_archive import TensorArchive
-from lw_torchrl._versions import package_versions
 from lw_torchrl.training.behavioral_cloning import bc_loss
 
 OFFLINE = lw.OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
@@ -36,89 +31,32 @@ def evaluator(demos, path):
     return lw.training.QueryEvaluatorTrainer(asked, data, EVALUATOR, checkpoint=path, progress=False)
 
 
-def online(demos, path):
-    return small_online.make_online(demos, "td3", path, config=small_online.configure(frames=60))
+TRAINERS = {"cloning": make_trainer, "offline": offline, "evaluator": evaluator}
+FILES = {"offline": ["policy.safetensors"]}
+BOTH = ["policy.safetensors", "policy.training.safetensors"]
 
 
-TRAINERS = {"cloning": make_trainer, "offline": offline, "evaluator": evaluator, "online": online}
-of_all = pytest.mark.parametrize("make", TRAINERS.values(), ids=TRAINERS)
-
-
-@of_all
-def test_another_training_is_refused_while_one_is_at_work(demos, tmp_path, holding, make):
-    path = tmp_path / "policy.zip"
+@pytest.mark.parametrize("name", TRAINERS)
+def test_one_training_at_a_time_writes_a_checkpoint(demos, tmp_path, holding, monkeypatch, name):
+    make, path = TRAINERS[name], tmp_path / "policy.safetensors"
     trainer = make(demos, path)
     release = holding(path)
-    with pytest.raises(ValueError, match=f"checkpoint: another training is at work in '{path}'; let it finish"):
+    with pytest.raises(ValueError, match=f"checkpoint: another training is writing to '{path}'; let it finish"):
         trainer.train()
     assert not path.exists()
     release()
     trainer.train()
-    assert [file.name for file in tmp_path.iterdir()] == ["policy.zip"]
-    trainer.train()
-
-
-@of_all
-def test_what_another_training_wrote_meanwhile_is_not_lost(demos, tmp_path, make):
-    path = tmp_path / "policy.zip"
-    first, second = make(demos, path), make(demos, path)
-    first.train()
-    before = path.read_bytes()
-    with pytest.raises(ValueError, match="was written by another training after this one had begun; begin anew"):
-        second.train()
-    assert path.read_bytes() == before
-    make(demos, path).train()
-    path.unlink()
-    first.train()
-
-
-@of_all
-def test_a_training_goes_on_under_another_torch_with_a_warning(demos, tmp_path, monkeypatch, make):
-    path = tmp_path / "policy.zip"
-    make(demos, path).train()
-    assert TensorArchive(path).description["versions"] == package_versions()
+    assert sorted(file.name for file in tmp_path.iterdir()) == FILES.get(name, BOTH)
+    assert make(demos, path).steps == CONFIG.steps
     real = importlib.metadata.version
     monkeypatch.setattr("lw_torchrl._versions.version", lambda name: "9.9.9" if name == "torch" else real(name))
-    message = r"policy.zip' was written under other versions \(torch .*, now 9.9.9\): the training goes on, but its"
-    with pytest.warns(UserWarning, match=message) as told:
+    with pytest.warns(UserWarning, match=r"under other versions \(torch .*, now 9.9.9\): training continues") as caught:
         make(demos, path)
-    assert len(told) == 1
-    assert told[0].filename != lw.training.envelope.__file__
+    assert len(caught) == 1
 
 
-def test_the_simulator_counts_in_the_environment_alone(demos, tmp_path, monkeypatch):
-    cloned, trained = tmp_path / "cloned.zip", tmp_path / "trained.zip"
-    make_trainer(demos, cloned).train()
-    online(demos, trained).train()
-    real = importlib.metadata.version
-    monkeypatch.setattr("lw_torchrl._versions.version", lambda name: "9.9.9" if name == "mujoco" else real(name))
-    make_trainer(demos, cloned)
-    with (
-        pytest.warns(UserWarning, match="different simulators, mujoco .* for the rows to come"),
-        pytest.warns(UserWarning, match="trained.zip' was written under other versions .mujoco .*, now 9.9.9"),
-    ):
-        online(demos, trained)
-
-
-@of_all
-def test_a_checkpoint_that_says_no_versions_is_gone_on_with(demos, tmp_path, make):
-    path, older = tmp_path / "policy.zip", tmp_path / "older.zip"
-    make(demos, path).train()
-    with zipfile.ZipFile(path) as found, zipfile.ZipFile(older, "w") as written:
-        for name in found.namelist():
-            content = found.read(name)
-            if name == "description.json":
-                described = json.loads(content)
-                del described["versions"]
-                content = json.dumps(described).encode()
-            written.writestr(name, content)
-    make(demos, older)
-    if make is make_trainer:
-        lw.load_actor(older)
-
-
-def test_a_policys_file_says_its_versions(tmp_path):
-    lw.save_actor(lw.PlanConditionedActor(PLANS, **SMALL), tmp_path / "policy.zip")
-    assert TensorArchive(tmp_path / "policy.zip").description["versions"] == package_versions()
-    with pytest.raises(ValueError, match="about must not be named versions"):
-        lw.save_actor(lw.PlanConditionedActor(PLANS, **SMALL), tmp_path / "policy.zip", versions={})
+def test_a_policy_without_a_training_state_is_not_overwritten(demos, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    lw.save_actor(make_actor(), path)
+    with pytest.raises(ValueError, match=r"exists, but not its training state '.*policy\.training\.safetensors'"):
+        make_trainer(demos, path)

@@ -42,7 +42,7 @@ methods = pytest.mark.parametrize("method", LEARNERS)
 def test_it_learns_something_and_can_be_kept(demos, tmp_path, method):
     actor = make_actor()
     before = {name: value.clone() for name, value in actor.state_dict().items()}
-    trainer = make_online(demos, method, actor=actor, checkpoint=tmp_path / "c.zip")
+    trainer = make_online(demos, method, actor=actor, checkpoint=tmp_path / "c.safetensors")
     trainer.train()
     assert [one["frames"] for one in trainer.history] == [60, 120, 180, 240]
     assert all(one["episodes"] >= 4 for one in trainer.history)
@@ -55,7 +55,7 @@ def test_it_learns_something_and_can_be_kept(demos, tmp_path, method):
     assert (trainer.policy is actor) == in_place
     if not in_place:
         assert all(torch.equal(value, before[name]) for name, value in actor.state_dict().items())
-    loaded = lw.load_actor(tmp_path / "c.zip")
+    loaded = lw.load_actor(tmp_path / "c.safetensors")
     assert_same(dict(loaded.state_dict()), dict(trainer.policy.state_dict()))
     assert not trainer.policy.training
 
@@ -85,7 +85,7 @@ def undisturbed(demos):
 )
 def test_stopped_in_a_round_it_ends_with_the_same_bits(demos, undisturbed, tmp_path, method, stops):
     whole = undisturbed(method)
-    path = tmp_path / "checkpoint.zip"
+    path = tmp_path / "checkpoint.safetensors"
     for stop in stops:
         trainer = make_online(demos, method, path)
         learner, rounds = trainer.learner, [trainer.round]
@@ -107,7 +107,7 @@ def test_stopped_in_a_round_it_ends_with_the_same_bits(demos, undisturbed, tmp_p
 
 
 def test_ctrl_c_ends_it_between_steps_with_the_last_rounds_checkpoint(demos, undisturbed, tmp_path):
-    path = tmp_path / "checkpoint.zip"
+    path = tmp_path / "checkpoint.safetensors"
     trainer = make_online(demos, checkpoint=path)
     learn, calls = trainer.learner.learn, []
 
@@ -176,7 +176,16 @@ KILLER = """
 @pytest.mark.slow
 def test_killed_at_any_moment_the_checkpoint_is_whole_and_training_the_same(demos, tmp_path):
     here = str(Path(__file__).parent)
-    command = [sys.executable, "-W", "ignore", "-c", textwrap.dedent(KILLER), str(demos), str(tmp_path / "c.zip"), here]
+    command = [
+        sys.executable,
+        "-W",
+        "ignore",
+        "-c",
+        textwrap.dedent(KILLER),
+        str(demos),
+        str(tmp_path / "c.safetensors"),
+        here,
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) >= 3

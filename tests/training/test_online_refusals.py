@@ -10,7 +10,7 @@ from small_online import CONFIG, PLANS, collect_demos, configure, make_actor, ma
 
 import lw_torchrl as lw
 from lw_torchrl.training.algorithms import PPOConfig, TD3Config
-from lw_torchrl.training.envelope import POLICY
+from lw_torchrl.training.checkpoint import POLICY
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_a_wrong_configuration_is_named(options, message):
 
 
 def test_another_training_is_not_gone_on_with(demos, tmp_path):
-    path = tmp_path / "checkpoint.zip"
+    path = tmp_path / "checkpoint.safetensors"
     make_online(demos, checkpoint=path, config=replace(CONFIG, frames=60)).train()
     short = replace(CONFIG, frames=60)
     for given, message in (
@@ -96,7 +96,7 @@ def test_a_method_reads_its_own_configuration_and_no_others(demos, tmp_path):
 
 
 def test_a_checkpoint_that_lists_what_other_methods_read_is_gone_on_with(demos, tmp_path):
-    path, config = tmp_path / "checkpoint.zip", configure(frames=60)
+    path, config = tmp_path / "checkpoint.safetensors", configure(frames=60)
     trainer = make_online(demos, checkpoint=path, config=config)
     trainer.train()
     said = trainer.described | {"online": {**trainer.described["online"], "beta": 2.0, "gae_lambda": 0.95}}
@@ -106,7 +106,7 @@ def test_a_checkpoint_that_lists_what_other_methods_read_is_gone_on_with(demos, 
 
 @pytest.mark.parametrize("damage", ["round", "learner", "replay", "history", "optimizer", "nan"])
 def test_a_damaged_state_is_refused(demos, tmp_path, damage):
-    path, config = tmp_path / "checkpoint.zip", replace(CONFIG, frames=60)
+    path, config = tmp_path / "checkpoint.safetensors", replace(CONFIG, frames=60)
     trainer = make_online(demos, checkpoint=path, config=config)
     trainer.train()
     state = trainer.state_dict()

@@ -75,7 +75,7 @@ def test_stopped_in_a_round_it_ends_with_the_same_bits(demos, tmp_path):
     steps = {"push": [0, 1], "reach": [0]}
     whole = make_online(demos, "residual", actor=make_residual(steps))
     whole.train()
-    path = tmp_path / "checkpoint.zip"
+    path = tmp_path / "checkpoint.safetensors"
     trainer = make_online(demos, "residual", path, actor=make_residual(steps))
     learner, rounds = trainer.learner, []
 
@@ -98,7 +98,7 @@ def test_stopped_in_a_round_it_ends_with_the_same_bits(demos, tmp_path):
 
 
 def test_a_training_of_another_step_is_not_gone_on_with(demos, tmp_path):
-    path, short = tmp_path / "checkpoint.zip", configure("residual", frames=60)
+    path, short = tmp_path / "checkpoint.safetensors", configure("residual", frames=60)
     make_online(demos, "residual", path, actor=make_residual({"push": [0]}), config=short).train()
     for steps in ({"push": [1]}, {"push": [0, 1]}, {"reach": [0]}):
         with pytest.raises(ValueError, match="its actor differs"):
@@ -124,16 +124,16 @@ HOSTILE = [{"push": [9]}, {"push": [-1]}, {"push": ["0"]}, {"puhs": [0]}, {"push
 
 @pytest.mark.parametrize("steps", HOSTILE, ids=str)
 def test_a_file_that_says_steps_that_are_not_there_is_refused(tmp_path, steps):
-    lw.save_actor(make_residual({"push": [0]}), tmp_path / "good.zip")
-    description, groups = parts(tmp_path / "good.zip")
+    lw.save_actor(make_residual({"push": [0]}), tmp_path / "good.safetensors")
+    description, groups = parts(tmp_path / "good.safetensors")
     description["actor"]["options"]["steps"] = steps
-    rebuild(tmp_path / "c.zip", description, groups)
-    refuses(tmp_path / "c.zip", training=False)
+    rebuild(tmp_path / "c.safetensors", description, groups)
+    refuses(tmp_path / "c.safetensors", training=False)
 
 
 def test_a_file_whose_base_knows_no_plans_has_no_steps(tmp_path):
-    lw.save_actor(lw.ResidualActor(make_actor("dc"), width=16, depth=1), tmp_path / "good.zip")
-    description, groups = parts(tmp_path / "good.zip")
+    lw.save_actor(lw.ResidualActor(make_actor("dc"), width=16, depth=1), tmp_path / "good.safetensors")
+    description, groups = parts(tmp_path / "good.safetensors")
     description["actor"]["options"]["steps"] = {"push": [0]}
-    rebuild(tmp_path / "c.zip", description, groups)
-    refuses(tmp_path / "c.zip", training=False)
+    rebuild(tmp_path / "c.safetensors", description, groups)
+    refuses(tmp_path / "c.safetensors", training=False)

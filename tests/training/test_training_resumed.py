@@ -18,7 +18,7 @@ from lw_torchrl.transforms import RandomYaw
 
 @pytest.mark.parametrize("stops", [[5], [7], [11], [6, 6], [3, 8, 11]])
 def test_stopped_anywhere_and_started_again_it_ends_with_the_same_bits(demos, undisturbed, tmp_path, stops):
-    path = tmp_path / "runs" / "checkpoint.zip"
+    path = tmp_path / "runs" / "checkpoint.safetensors"
     for stop in stops:
         with pytest.raises(KeyboardInterrupt):
             make_trainer(demos, path, stop_at=stop).train()
@@ -38,8 +38,8 @@ def test_what_a_transform_draws_hangs_on_the_seed_and_resumes_too(demos, tmp_pat
     whole = trainer(1)
     whole.train()
     with pytest.raises(KeyboardInterrupt):
-        trainer(2, tmp_path / "c.zip", stop_at=7).train()
-    resumed = trainer(3, tmp_path / "c.zip")
+        trainer(2, tmp_path / "c.safetensors", stop_at=7).train()
+    resumed = trainer(3, tmp_path / "c.safetensors")
     resumed.train()
     assert_same(flat(resumed.actor.state_dict()), flat(whole.actor.state_dict()))
     unturned = make_trainer(demos)
@@ -51,7 +51,7 @@ def test_what_a_transform_draws_hangs_on_the_seed_and_resumes_too(demos, tmp_pat
 def test_torchrls_samplers_resume_too(demos, tmp_path, sampler):
     whole = make_trainer(demos, sampler=sampler())
     whole.train()
-    path = tmp_path / "checkpoint.zip"
+    path = tmp_path / "checkpoint.safetensors"
     with pytest.raises(KeyboardInterrupt):
         make_trainer(demos, path, sampler=sampler(), stop_at=8).train()
     resumed = make_trainer(demos, path, actor=make_actor(99), sampler=sampler())
@@ -62,14 +62,14 @@ def test_torchrls_samplers_resume_too(demos, tmp_path, sampler):
 
 def test_a_learning_rate_that_is_an_integer_resumes_too(demos, tmp_path):
     config = BehavioralCloningConfig(steps=12, batch_size=8, checkpoint_every=5, learning_rate=1)
-    path = tmp_path / "checkpoint.zip"
+    path = tmp_path / "checkpoint.safetensors"
     with pytest.raises(KeyboardInterrupt):
         make_trainer(demos, path, config=config, stop_at=7).train()
     assert make_trainer(demos, path, config=config).steps == 5
 
 
 def test_a_finished_training_does_nothing_twice(demos, undisturbed, tmp_path):
-    path = tmp_path / "checkpoint.zip"
+    path = tmp_path / "checkpoint.safetensors"
     make_trainer(demos, path).train()
     content = path.read_bytes()
     again = make_trainer(demos, path, actor=make_actor(99), stop_at=CONFIG.steps)
@@ -78,20 +78,34 @@ def test_a_finished_training_does_nothing_twice(demos, undisturbed, tmp_path):
     assert_same(everything(again), undisturbed)
 
 
-def test_checkpoints_come_in_their_time_and_leave_one_file(demos, tmp_path, monkeypatch):
+def test_a_policy_that_was_not_written_before_a_kill_is_written_by_the_resumed_training(demos, tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    make_trainer(demos, path).train(until=5)
+    older = path.read_bytes()
+    make_trainer(demos, path).train()
+    newer = path.read_bytes()
+    path.write_bytes(older)
+    make_trainer(demos, path).train()
+    assert path.read_bytes() == newer != older
+
+
+def test_checkpoints_come_in_their_time_and_leave_two_files(demos, tmp_path, monkeypatch):
     saved = []
     save = BehavioralCloningTrainer.save
     monkeypatch.setattr(BehavioralCloningTrainer, "save", lambda self: (saved.append(self.steps), save(self)))
-    make_trainer(demos, tmp_path / "checkpoint.zip").train()
+    make_trainer(demos, tmp_path / "checkpoint.safetensors").train()
     assert saved == [5, 10, 12]
-    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint.zip"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "checkpoint.safetensors",
+        "checkpoint.training.safetensors",
+    ]
 
 
 def test_trained_in_parts_it_ends_the_same(demos, undisturbed, tmp_path):
-    trainer = make_trainer(demos, tmp_path / "checkpoint.zip")
+    trainer = make_trainer(demos, tmp_path / "checkpoint.safetensors")
     trainer.train(until=4)
     assert (trainer.steps, trainer.actor.training) == (4, False)
-    assert make_trainer(demos, tmp_path / "checkpoint.zip").steps == 4
+    assert make_trainer(demos, tmp_path / "checkpoint.safetensors").steps == 4
     assert math.isnan(trainer.train(until=3))
     trainer.train(until=7)
     trainer.train()
@@ -113,7 +127,7 @@ def test_without_a_checkpoint_nothing_is_written(demos, tmp_path, monkeypatch):
 @pytest.mark.parametrize("kept", [True, False])
 def test_weights_that_the_last_step_spoils_are_not_saved(demos, tmp_path, kept):
     """No loss is taken after it that would tell."""
-    path = tmp_path / "checkpoint.zip" if kept else None
+    path = tmp_path / "checkpoint.safetensors" if kept else None
     config = BehavioralCloningConfig(steps=1, batch_size=8, optimizer="sgd", learning_rate=1e30, weight_decay=1e10)
     with pytest.raises(ValueError, match=r"weights: .* must be finite, .* after step 1: the learning rate is too high"):
         make_trainer(demos, path, config=config).train()
@@ -164,19 +178,19 @@ KILLER = """
 
 
 def test_killed_at_any_moment_the_checkpoint_is_whole_and_training_the_same(demos, tmp_path):
-    path = tmp_path / "checkpoint.zip"
+    path = tmp_path / "checkpoint.safetensors"
     command = [sys.executable, "-W", "ignore", "-c", textwrap.dedent(KILLER), str(demos), str(path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) >= 3
 
 
-@pytest.mark.parametrize("failing", ["zipfile.ZipFile.writestr", "os.replace"])
+@pytest.mark.parametrize("failing", ["pathlib.Path.write_bytes", "os.replace"])
 def test_a_disk_that_fills_while_saving_leaves_the_old_checkpoint(demos, tmp_path, monkeypatch, failing):
-    path = tmp_path / "checkpoint.zip"
+    path = tmp_path / "checkpoint.safetensors"
     with pytest.raises(KeyboardInterrupt):
         make_trainer(demos, path, stop_at=6).train()
-    content = path.read_bytes()
+    files = {file: file.read_bytes() for file in tmp_path.iterdir()}
 
     def full(*_, **__):
         raise OSError(28, "No space left on device")
@@ -186,6 +200,5 @@ def test_a_disk_that_fills_while_saving_leaves_the_old_checkpoint(demos, tmp_pat
     with pytest.raises(OSError, match="No space left"):
         resumed.save()
     monkeypatch.undo()
-    assert path.read_bytes() == content
-    assert [found.name for found in tmp_path.iterdir()] == ["checkpoint.zip"]
+    assert {file: file.read_bytes() for file in tmp_path.iterdir()} == files
     assert make_trainer(demos, path).steps == 5

@@ -70,8 +70,8 @@ def test_every_method_learns_and_is_evaluated_once(out, method, actor, critic, m
     run = tiny(method, actor, critic)
     result = execute_run(run, PLANS, out, progress=False)
     assert {*result.success_once} == {*TASK_SETS["two"]}
-    assert lw.load_actor(out / run.folder / "policy.zip").tasks == TASK_SETS["two"]
-    assert not (out / run.folder / "checkpoint.zip").exists()
+    assert lw.load_actor(out / run.folder / "policy.safetensors").tasks == TASK_SETS["two"]
+    assert not (out / run.folder / "checkpoint.safetensors").exists()
     monkeypatch.setattr(OfflineRun, "learn", None)
     assert execute_run(run, PLANS, out, progress=False).episodes == result.episodes
 
@@ -107,7 +107,7 @@ def test_stopped_anywhere_a_run_ends_with_the_same_policy(out, tmp_path, monkeyp
             execute_run(run, PLANS, tmp_path, progress=False)
     monkeypatch.setattr(lw.OfflineTrainer, "step", real)
     assert execute_run(run, PLANS, tmp_path, progress=False).success_once == expected.success_once
-    ours, theirs = (lw.load_actor(root / run.folder / "policy.zip").state_dict() for root in (tmp_path, out))
+    ours, theirs = (lw.load_actor(root / run.folder / "policy.safetensors").state_dict() for root in (tmp_path, out))
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
 

@@ -25,7 +25,7 @@ from benchmarks.paper.imitation import SCRIPTED, ImitationRun
 from benchmarks.paper.recipes import PRESETS, SETTINGS, Member
 from benchmarks.paper.runs import load_result
 from lw_torchrl.modules.registry import make_policy
-from lw_torchrl.training.files import demonstration_seeds
+from lw_torchrl.training.checkpoint import demonstration_seeds
 
 RUNS = [
     *(a_run(method) for method in ("pcbc", "dc", "one-hot", SCRIPTED)),
@@ -34,7 +34,9 @@ RUNS = [
     a_run(preset=WATCHED),
 ]
 by_name = pytest.mark.parametrize("run", RUNS, ids=lambda run: f"{run.setting.name} {run.preset.name} {run.method}")
-by_setting = pytest.mark.parametrize(("setting", "file"), [(TINY, "policy.zip"), (TINY_ONE_SHOT, "models/push.zip")])
+by_setting = pytest.mark.parametrize(
+    ("setting", "file"), [(TINY, "policy.safetensors"), (TINY_ONE_SHOT, "models/push.safetensors")]
+)
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +134,7 @@ def test_actors_of_descriptions_act_in_demonstrated_tasks(tmp_path):
     turned = replace(OTHER, any_yaw=False, plan_yaw=10.0, tilt=0.5)
     run = a_run(preset=replace(PRESET, name="seen", members=(turned, turned), demonstrated=(MEMBER,)))
     execute(run, tmp_path)
-    policy = lw.load_actor(tmp_path / run.folder / "policy.zip")
+    policy = lw.load_actor(tmp_path / run.folder / "policy.safetensors")
     assert isinstance(policy, lw.modules.DemonstratedActor)
     assert isinstance(policy.others, lw.modules.ActorEnsemble)
     assert (policy.demonstrated.tasks, len(policy.tasks)) == (("reach",), 50)
@@ -144,7 +146,7 @@ def test_a_preset_can_put_an_evaluator_into_the_policy(tmp_path):
     training = replace(PRESET.training, steps=2, qaf_anchor=1.0)
     run = a_run(preset=replace(PRESET, name="evaluator", members=(member,), training=training))
     execute(run, tmp_path)
-    policy = lw.load_actor(tmp_path / run.folder / "policy.zip")
+    policy = lw.load_actor(tmp_path / run.folder / "policy.safetensors")
     assert policy.evaluator.config["width"] == 16
     assert "qaf" not in policy.in_keys
 

@@ -52,7 +52,7 @@ def test_every_loss_is_that_of_separate_training(demos, kind):
 
 def test_it_resumes_from_its_checkpoint_and_writes_the_weights_back(demos, tmp_path):
     config = lw.BehavioralCloningConfig(steps=20, batch_size=30, checkpoint_every=10)
-    whole, path = stack(demos, config=config), tmp_path / "checkpoint.zip"
+    whole, path = stack(demos, config=config), tmp_path / "checkpoint.safetensors"
     losses = torch.stack([whole.step() for _ in range(20)])
     first = stack(demos, config=config, checkpoint=path)
     for _ in range(10):

@@ -17,7 +17,6 @@ from torchrl.record.loggers import Logger
 import lw_torchrl as lw
 from lw_torchrl.data.replay_checks import check_minibatches
 from lw_torchrl.training import OfflineConfig, OfflineTrainer, fit_normalization
-from lw_torchrl.training.file_checks import tensors_of
 from lw_torchrl.training.offline import sum_of_losses
 
 CONFIG = OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
@@ -105,6 +104,10 @@ def make_trainer(demos, name, checkpoint=None, *, seed=0, config=CONFIG, stop_at
     return trainer
 
 
+def tensors_of(loss):
+    return {**dict(loss.named_parameters()), **dict(loss.named_buffers())}
+
+
 def everything(trainer):
     return flat(
         {
@@ -122,7 +125,7 @@ def everything(trainer):
 def test_stopped_and_started_again_it_ends_with_the_same_bits(demos, tmp_path, name):
     undisturbed = make_trainer(demos, name)
     undisturbed.train()
-    path = tmp_path / "checkpoint.zip"
+    path = tmp_path / "checkpoint.safetensors"
     for stop in (7, 11):
         with pytest.raises(KeyboardInterrupt):
             make_trainer(demos, name, path, stop_at=stop).train()
@@ -275,7 +278,7 @@ def test_what_the_loss_gives_is_logged_as_means_of_a_hundred_steps(demos):
 
 @pytest.fixture(scope="module")
 def checkpoint(demos, tmp_path_factory):
-    path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.zip"
+    path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.safetensors"
     make_trainer(demos, "value", path).train()
     return path
 
@@ -321,20 +324,16 @@ def test_a_checkpoint_of_other_plans_is_refused(demos, checkpoint):
         OfflineTrainer(loss, make_replay(demos, others), CONFIG, checkpoint=checkpoint, progress=False)
 
 
-@pytest.mark.parametrize("content", [b"", b"no archive", None])
-def test_a_file_that_is_no_checkpoint_is_refused(demos, checkpoint, tmp_path, content):
-    path = tmp_path / "checkpoint.zip"
-    said = "is damaged or none of ours"
-    if content is None:
-        lw.save_actor(Networks(0.0, "cpu").actor(), path)
-    else:
-        path.write_bytes(content)
-    with pytest.raises(ValueError, match="It is a policy's, give a loss's training's" if content is None else said):
+def test_a_file_of_another_kind_is_refused(demos, checkpoint, tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    lw.save_actor(Networks(0.0, "cpu").actor(), path)
+    with pytest.raises(ValueError, match=r"must be a training state of version 1, got format 'lw_torchrl\.actor'"):
         make_trainer(demos, "value", path)
     whole = checkpoint.read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ValueError, match=said):
-        make_trainer(demos, "value", path)
+    for content in (b"", b"words", whole[: len(whole) // 2]):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"is damaged or not a \.safetensors file"):
+            make_trainer(demos, "value", path)
 
 
 def test_a_buffer_of_other_plans_is_refused(demos):
@@ -375,7 +374,7 @@ def test_priorities_that_nothing_would_change_are_refused(demos):
 
 
 def test_a_loss_that_is_no_number_stops_the_training(demos, tmp_path):
-    path = tmp_path / "checkpoint.zip"
+    path = tmp_path / "checkpoint.safetensors"
     trainer = make_trainer(demos, "value", path)
     with torch.no_grad():
         next(trainer.loss.parameters()).fill_(float("inf"))

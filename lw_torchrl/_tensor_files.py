@@ -1,0 +1,101 @@
+"""Write and read tensors with a JSON description as one .safetensors file, without pickling."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from lw_torchrl._files import AnyPath, parse_json, replacing
+from lw_torchrl._versions import package_versions
+
+SUFFIX = ".safetensors"
+_METADATA = "lw_torchrl"  # the metadata of a .safetensors file are texts by name; under this name is our JSON
+_STATE = "state/"  # begins the names of a state's tensors
+
+
+def write_tensors(
+    path: AnyPath, description: Mapping[str, Any], tensors: Mapping[str, Tensor], state: Any = None
+) -> None:
+    """Write tensors and their description, whole or not at all.
+
+    Args:
+        path: the file.
+        description: as JSON; the ``versions`` of packages are added.
+        tensors: by name.
+        state: nested numbers, texts and tensors, which :func:`pop_state` restores.
+    """
+    tensors, described = dict(tensors), {"versions": package_versions(), **description}
+    if state is not None:
+        described["state"] = _split(state, tensors)
+    text = json.dumps(described, separators=(",", ":"), allow_nan=False)
+    parse_json(text.encode())  # raises if two names are the same text
+    copies = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
+    content = save(copies, metadata={_METADATA: text})
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def read_tensors(path: AnyPath) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return the description and the tensors of a file; raise :class:`ValueError` if it is damaged or another file."""
+    if Path(path).is_dir():
+        raise ValueError("it is a folder")
+    Path(path).open("rb").close()  # safetensors' own error does not name a missing file
+    try:
+        with safe_open(path, framework="pt") as file:
+            description = parse_json((file.metadata() or {})[_METADATA].encode())
+            return description, {name: file.get_tensor(name).clone() for name in file.keys()}
+    except KeyError:
+        raise ValueError("it is a .safetensors file, but was not written by lw_torchrl") from None
+    except SafetensorError as error:
+        raise ValueError(f"it is damaged or not a .safetensors file: {error}") from error
+
+
+def pop_state(description: dict[str, Any], tensors: dict[str, Tensor]) -> Any:
+    """Take the state out of a file's description and tensors, and return it."""
+    try:
+        state = _join(description.pop("state"), tensors)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"it holds no state, or a damaged one ({type(error).__name__}: {error})") from error
+    for name in [name for name in tensors if name.startswith(_STATE)]:
+        del tensors[name]
+    return state
+
+
+def _split(state: Any, tensors: dict[str, Tensor]) -> Any:
+    """Return JSON for a nested state, whose tensors are added to ``tensors``."""
+    if isinstance(state, Tensor):
+        name = f"{_STATE}{len(tensors)}"
+        tensors[name] = state
+        return {"tensor": name}
+    if isinstance(state, TensorDictBase):
+        device = None if state.device is None else str(state.device)
+        return {"tensordict": [list(state.batch_size), device, _split(state.to_dict(), tensors)]}
+    if isinstance(state, Mapping):  # keys may be numbers, which JSON does not have
+        return {"dict": [[_split(key, tensors), _split(value, tensors)] for key, value in state.items()]}
+    if isinstance(state, (list, tuple)):
+        return {type(state).__name__: [_split(value, tensors) for value in state]}
+    if state is None or isinstance(state, (bool, int, float, str)):
+        return state
+    raise TypeError(f"a state holds {type(state).__name__}, which cannot be saved without pickling")
+
+
+def _join(tree: Any, tensors: Mapping[str, Tensor]) -> Any:
+    """Return the state that :func:`_split` took apart."""
+    if not isinstance(tree, dict):
+        return tree
+    ((kind, value),) = tree.items()
+    if kind == "tensor":
+        return tensors[value]
+    if kind == "tensordict":
+        shape, device, entries = value
+        return TensorDict(_join(entries, tensors), shape, device=device)
+    if kind == "dict":
+        return {_join(key, tensors): _join(entry, tensors) for key, entry in value}
+    return {"list": list, "tuple": tuple}[kind](_join(entry, tensors) for entry in value)
