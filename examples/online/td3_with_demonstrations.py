@@ -53,7 +53,7 @@ class Args:
 
 class PlanNoise(TensorDictModuleBase):
     """Add exploration noise that grows from ``noise`` to ``stuck_noise`` where the plan makes no progress: no condition
-    has changed its truth value for longer than in any demonstration. The gripper's noise stays small, to keep grasps."""
+    has changed its truth value for longer than in any demonstration. The gripper's noise stays small, for grasps."""
 
     in_keys, out_keys = ["action", "qaf", "is_init"], ["action"]
 

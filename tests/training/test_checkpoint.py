@@ -25,7 +25,6 @@ from lw_torchrl.modules import (
     ActorEnsemble,
     DescriptorConditionedActor,
     PlanConditionedActor,
-    ResidualActor,
     ScriptedSkillActor,
     StateQueryEvaluator,
 )
@@ -160,7 +159,6 @@ NOT_SHIPPED = {
         [replace(TASKS["reach"], description="Bring the hand over to the red spot.")], **SMALL
     ),
     "an ensemble": lambda: ActorEnsemble([own_words(), own_words()]),
-    "a residual": lambda: ResidualActor(own_words()),
     "an evaluator's plan": lambda: own_words(StateQueryEvaluator(own_plans(), structure=False, width=8, depth=1)),
 }
 

@@ -7,7 +7,6 @@ import json
 import zipfile
 
 import pytest
-import small_online
 import torch
 from small_training import PLANS, SMALL, collect_demos, make_actor, make_replay, make_trainer
 
@@ -36,11 +35,7 @@ def evaluator(demos, path):
     return lw.training.QueryEvaluatorTrainer(asked, data, EVALUATOR, checkpoint=path, progress=False)
 
 
-def online(demos, path):
-    return small_online.make_online(demos, "td3", path, config=small_online.configure(frames=60))
-
-
-TRAINERS = {"cloning": make_trainer, "offline": offline, "evaluator": evaluator, "online": online}
+TRAINERS = {"cloning": make_trainer, "offline": offline, "evaluator": evaluator}
 of_all = pytest.mark.parametrize("make", TRAINERS.values(), ids=TRAINERS)
 
 
@@ -84,20 +79,6 @@ def test_a_training_goes_on_under_another_torch_with_a_warning(demos, tmp_path, 
         make(demos, path)
     assert len(told) == 1
     assert told[0].filename != lw.training.envelope.__file__
-
-
-def test_the_simulator_counts_in_the_environment_alone(demos, tmp_path, monkeypatch):
-    cloned, trained = tmp_path / "cloned.zip", tmp_path / "trained.zip"
-    make_trainer(demos, cloned).train()
-    online(demos, trained).train()
-    real = importlib.metadata.version
-    monkeypatch.setattr("lw_torchrl._versions.version", lambda name: "9.9.9" if name == "mujoco" else real(name))
-    make_trainer(demos, cloned)
-    with (
-        pytest.warns(UserWarning, match="different simulators, mujoco .* for the rows to come"),
-        pytest.warns(UserWarning, match="trained.zip' was written under other versions .mujoco .*, now 9.9.9"),
-    ):
-        online(demos, trained)
 
 
 @of_all
