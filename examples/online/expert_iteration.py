@@ -52,13 +52,11 @@ class PlanNoise(TensorDictModuleBase):
 
     def __init__(self, args: Args, demonstrations: TensorDictBase) -> None:
         super().__init__()
-        self.args, self.calls = args, 0
+        self.args, self.calls, self.truth, self.unchanged = args, 0, torch.tensor(False), torch.tensor(0.0)
         state = torch.cat([demonstrations["collector", "traj_ids"].unsqueeze(-1), demonstrations["qaf"].long()], -1)
         self.patience = int(state.unique_consecutive(dim=0, return_counts=True)[1].max())
 
     def forward(self, data: TensorDictBase) -> TensorDictBase:
-        if self.calls == 0:
-            self.truth, self.unchanged = data["qaf"], torch.zeros(len(data))
         if self.calls % self.args.noise_hold == 0:
             self.draw = torch.randn_like(data["action"])
         self.calls += 1
@@ -74,9 +72,8 @@ def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     folder = args.out / f"{args.task}-seed{args.seed}"
     demos = folder / "demonstrations"
-    lw.collect_demonstrations(
-        args.task, episodes_per_task=args.demonstrations, root=demos, seed=args.seed, redraw_failures=True
-    )
+    options = {"episodes_per_task": args.demonstrations, "seed": args.seed, "redraw_failures": True}
+    lw.collect_demonstrations(args.task, root=demos, **options)
 
     # The start: behavioral cloning of the demonstrations.
     plans = lw.Plans([lw.load_plans("MT50")[args.task]])
@@ -141,4 +138,7 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    try:
+        main(tyro.cli(Args))
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None

@@ -55,9 +55,8 @@ def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     folder = args.out / f"{args.task}-seed{args.seed}"
     demos = folder / "demonstrations"
-    lw.collect_demonstrations(
-        args.task, episodes_per_task=args.demonstrations, root=demos, seed=args.seed, redraw_failures=True
-    )
+    options = {"episodes_per_task": args.demonstrations, "seed": args.seed, "redraw_failures": True}
+    lw.collect_demonstrations(args.task, root=demos, **options)
 
     # The start: behavioral cloning of the demonstrations.
     plans = lw.Plans([lw.load_plans("MT50")[args.task]])
@@ -80,9 +79,8 @@ def main(args: Args) -> None:
     loss = lw.objectives.DemonstratedSACLoss(actor, critic, loss_function="l1", **options)
     loss.make_value_estimator(gamma=args.gamma)
     targets = SoftUpdate(loss, eps=0.995)
-    parameters = [p for p in loss.actor_network_params.values(True, True) if p.requires_grad]
-    actor_optimizer = torch.optim.AdamW(parameters, lr=args.actor_lr)
-    critic_optimizer = torch.optim.AdamW(loss.qvalue_network_params.values(True, True), lr=args.critic_lr)
+    actor_optimizer = torch.optim.AdamW(loss.actor_network_params.parameters(), lr=args.actor_lr)
+    critic_optimizer = torch.optim.AdamW(loss.qvalue_network_params.parameters(), lr=args.critic_lr)
     alpha_optimizer = torch.optim.AdamW([loss.log_alpha], lr=args.actor_lr)
 
     episodes = {"max_steps": args.max_steps, "terminate_on_success": True, "seed": 20_000 + args.seed}
@@ -128,4 +126,7 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    try:
+        main(tyro.cli(Args))
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None

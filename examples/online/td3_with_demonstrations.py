@@ -59,13 +59,11 @@ class PlanNoise(TensorDictModuleBase):
 
     def __init__(self, args: Args, demonstrations: TensorDictBase) -> None:
         super().__init__()
-        self.args, self.calls = args, 0
+        self.args, self.calls, self.truth, self.unchanged = args, 0, torch.tensor(False), torch.tensor(0.0)
         state = torch.cat([demonstrations["collector", "traj_ids"].unsqueeze(-1), demonstrations["qaf"].long()], -1)
         self.patience = int(state.unique_consecutive(dim=0, return_counts=True)[1].max())
 
     def forward(self, data: TensorDictBase) -> TensorDictBase:
-        if self.calls == 0:
-            self.truth, self.unchanged = data["qaf"], torch.zeros(len(data))
         if self.calls % self.args.noise_hold == 0:
             self.draw = torch.randn_like(data["action"])
         self.calls += 1
@@ -87,9 +85,8 @@ def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     folder = args.out / f"{args.task}-seed{args.seed}"
     demos = folder / "demonstrations"
-    lw.collect_demonstrations(
-        args.task, episodes_per_task=args.demonstrations, root=demos, seed=args.seed, redraw_failures=True
-    )
+    options = {"episodes_per_task": args.demonstrations, "seed": args.seed, "redraw_failures": True}
+    lw.collect_demonstrations(args.task, root=demos, **options)
 
     # The start: behavioral cloning of the demonstrations.
     plans = lw.Plans([lw.load_plans("MT50")[args.task]])
@@ -112,9 +109,8 @@ def main(args: Args) -> None:
     loss = lw.objectives.DemonstratedTD3Loss(actor, critic, bounds=(-1.0, 1.0), loss_function="l1", **options)
     loss.make_value_estimator(gamma=args.gamma)
     targets = SoftUpdate(loss, eps=0.995)
-    parameters = [p for p in loss.actor_network_params.values(True, True) if p.requires_grad]
-    actor_optimizer = torch.optim.AdamW(parameters, lr=args.actor_lr)
-    critic_optimizer = torch.optim.AdamW(loss.qvalue_network_params.values(True, True), lr=args.critic_lr)
+    actor_optimizer = torch.optim.AdamW(loss.actor_network_params.parameters(), lr=args.actor_lr)
+    critic_optimizer = torch.optim.AdamW(loss.qvalue_network_params.parameters(), lr=args.critic_lr)
 
     episodes = {"max_steps": args.max_steps, "terminate_on_success": True, "seed": 20_000 + args.seed}
     env = lw.LanguageWorldEnv(args.task, num_envs=args.num_envs, reward="dense", **episodes)
@@ -157,4 +153,7 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    try:
+        main(tyro.cli(Args))
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
