@@ -114,7 +114,7 @@ def main(args: Args) -> None:
         if successful.any():
             replay.extend(rows[successful])
         due = int(max(0, frames - args.learning_starts) * args.utd)
-        if len(replay) == len(demonstrations):
+        if len(replay) == len(demonstrations):  # no success yet to learn from
             step = due
         while step < due and not stop.is_set():
             bc_loss = loss(replay.sample())["loss_bc"]

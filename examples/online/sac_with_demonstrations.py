@@ -95,7 +95,7 @@ def main(args: Args) -> None:
     stop = threading.Event()  # Ctrl-C ends training between two gradient steps
     handler = signal.signal(signal.SIGINT, lambda *_: stop.set())
     frames = ended = succeeded = step = 0
-    for batch_number, rows in enumerate(collector, 1):
+    for iteration, rows in enumerate(collector, 1):
         replay.extend(rows)
         frames += rows.numel()
         ended += int(rows["next", "done"].sum())
@@ -109,7 +109,7 @@ def main(args: Args) -> None:
             minimize(losses["loss_qvalue"], critic_optimizer)
             targets.step()
             step += 1
-        if batch_number % 50 == 0 or frames >= args.frames:
+        if iteration % 50 == 0 or frames >= args.frames:
             print(f"step {frames:6}/{args.frames}: {succeeded} of {ended} episodes succeeded", flush=True)
             ended = succeeded = 0
         if stop.is_set():
