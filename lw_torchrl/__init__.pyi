@@ -49,7 +49,6 @@ from lw_torchrl.modules import PlanConditionedQValue as PlanConditionedQValue
 from lw_torchrl.modules import PlanConditionedValue as PlanConditionedValue
 from lw_torchrl.modules import Policy as Policy
 from lw_torchrl.modules import QueryEvaluator as QueryEvaluator
-from lw_torchrl.modules import ResidualActor as ResidualActor
 from lw_torchrl.modules import ScriptedSkillActor as ScriptedSkillActor
 from lw_torchrl.modules import StateQueryEvaluator as StateQueryEvaluator
 from lw_torchrl.planners import FilePlanner as FilePlanner
@@ -61,8 +60,6 @@ from lw_torchrl.training import BehavioralCloningConfig as BehavioralCloningConf
 from lw_torchrl.training import BehavioralCloningTrainer as BehavioralCloningTrainer
 from lw_torchrl.training import OfflineConfig as OfflineConfig
 from lw_torchrl.training import OfflineTrainer as OfflineTrainer
-from lw_torchrl.training import OnlineConfig as OnlineConfig
-from lw_torchrl.training import OnlineTrainer as OnlineTrainer
 from lw_torchrl.training import load_actor as load_actor
 from lw_torchrl.training import save_actor as save_actor
 from lw_torchrl.transforms import CorruptQAF as CorruptQAF

@@ -9,8 +9,6 @@ from torch import Tensor, nn
 import lw_torchrl as lw
 from lw_torchrl.language.relations import RELATIONS, Comparison
 from lw_torchrl.modules import ENCODERS, EVALUATORS, METHODS, POLICIES, Encoder, Encoding, Method
-from lw_torchrl.training import LEARNERS
-from lw_torchrl.training.algorithms import Learner, NoiseConfig, adamw
 
 
 class Blind(lw.Policy):
@@ -33,27 +31,12 @@ class Words(Encoder):
         return rows
 
 
-@dataclass(frozen=True, kw_only=True)
-class CopyConfig(NoiseConfig):
-    learning_rate: float = 3e-4
-
-
-class CopyLearner(Learner):
-    config_type = CopyConfig
-
-    def make(self, critic: Any) -> None:
-        self.loss = self.policy
-        self.optimizers["actor"] = adamw(self.policy.parameters(), self.config.learning_rate)
-
-
 POLICIES["Blind"] = Blind
 EVALUATORS["Flat"] = Flat
 ENCODERS["Numbers"] = "my_module:Numbers"
-LEARNERS["copy"] = CopyLearner
 METHODS["mine"] = Method("Blind")
 RELATIONS["far from"] = (Comparison("xyz", ">", 0.3),)
 POLICIES["Linear"] = nn.Linear  # planted
-LEARNERS["copies"] = CopyConfig  # planted
 RELATIONS["near to"] = Comparison("xyz", "<", 0.3)  # planted
 plans = lw.load_plans("MT10")
 actor = lw.PlanConditionedActor(plans, width=64, evaluator=Flat(plans))

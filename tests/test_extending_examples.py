@@ -16,22 +16,20 @@ from lw_torchrl.cli.main import main
 from lw_torchrl.language.relations import RELATIONS
 from lw_torchrl.modules import ENCODERS, EVALUATORS
 from lw_torchrl.suites import SUITES
-from lw_torchrl.training import LEARNERS
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "examples" / "extending"
 FILES = sorted(FOLDER.glob("my_*.py"))
-TABLES = (ENCODERS, EVALUATORS, LEARNERS, RELATIONS, SUITES, lw.PLAN_FORMATS)
+TABLES = (ENCODERS, EVALUATORS, RELATIONS, SUITES, lw.PLAN_FORMATS)
 SAYS = {
     "my_method.py": ("trained to step 3", "reach"),
     "my_evaluator.py": ("trained to step 3", "window-open"),
     "my_relation.py": ("reach.plan: 2 steps, valid", "is far from"),
     "my_format.py": ("condition -> skill", "no step: Good luck!"),
-    "my_algorithm.py": ("reward-weighted", "start"),
     "my_suite.py": ("ok   desk/hover", "trained to step 3"),
 }
-FASTER = {"--steps": 3, "--frames": 100, "--episodes": 1}
-MORE = {"train": ("--batch-size", "20"), "online": ("--episodes", "1")}
+FASTER = {"--steps": 3, "--episodes": 1}
+MORE = {"train": ("--batch-size", "20")}
 
 
 def commands(path):

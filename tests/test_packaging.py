@@ -132,7 +132,7 @@ def test_mypy_finds_a_user_s_mistakes_outside_the_checkout(tmp_path):
     for name in ("planted_errors.py", "planted_in_extensions.py"):
         lines = Path(shutil.copy(Path(__file__).with_name(name), tmp_path)).read_text("utf-8").splitlines()
         planted[name] = [number for number, line in enumerate(lines, 1) if line.endswith("# planted")]
-        assert len(lines) >= 60
+        assert len(lines) >= 40
     done = subprocess.run(
         [sys.executable, "-m", "mypy", "--strict", "--config-file=", "--no-error-summary", *planted],
         cwd=tmp_path,

@@ -13,7 +13,6 @@ from lw_torchrl._registry import Registry, is_function
 from lw_torchrl.language.relations import RELATIONS, STATES, Comparison
 from lw_torchrl.modules import ENCODERS, EVALUATORS, METHODS, POLICIES, make_policy
 from lw_torchrl.suites import SUITES
-from lw_torchrl.training import LEARNERS
 
 MODULE = """
 import torch
@@ -21,7 +20,6 @@ import lw_torchrl as lw
 from dataclasses import replace
 from lw_torchrl.language.relations import Comparison
 from lw_torchrl.modules import DescriptorEncoder
-from lw_torchrl.training.algorithms import TD3Learner
 
 class Unseeing(lw.Policy):
     def __init__(self, tasks, width=8):
@@ -46,9 +44,6 @@ class Guess(lw.QueryEvaluator):
 class Shouted(DescriptorEncoder):
     pass
 
-class Patient(TD3Learner):
-    pass
-
 FAR = (Comparison("xyz", ">", 0.3),)
 LOUD = replace(lw.PLAN_FORMATS["basic_py"], extension="txt")
 
@@ -64,8 +59,6 @@ NoClass = my_plugin:FAR
 Guess = my_plugin:Guess
 [lw_torchrl.encoders]
 Shouted = my_plugin:Shouted
-[lw_torchrl.algorithms]
-patient = my_plugin:Patient
 [lw_torchrl.relations]
 far from = my_plugin:FAR
 [lw_torchrl.formats]
@@ -73,7 +66,7 @@ loud = my_plugin:LOUD
 [lw_torchrl.suites]
 again = my_plugin:make_suite
 """
-REGISTRIES = (POLICIES, EVALUATORS, ENCODERS, LEARNERS, RELATIONS, STATES, lw.PLAN_FORMATS, SUITES, METHODS)
+REGISTRIES = (POLICIES, EVALUATORS, ENCODERS, RELATIONS, STATES, lw.PLAN_FORMATS, SUITES, METHODS)
 
 
 @pytest.fixture
@@ -99,7 +92,6 @@ def test_plugins_are_listed_without_import_and_loaded_by_name(plugin):
     assert len(POLICIES) == len([*POLICIES])
     assert "my_plugin" not in sys.modules
     assert POLICIES["Unseeing"].__name__ == "Unseeing"
-    assert LEARNERS["patient"].config_type is LEARNERS["td3"].config_type
     assert lw.PLAN_FORMATS["loud"].extension == "txt"
     assert lw.suites.load_suite("again").tasks.keys() == lw.TASKS.keys()
     assert issubclass(EVALUATORS["Guess"], lw.QueryEvaluator)

@@ -7,7 +7,7 @@ from lw_torchrl.evaluation.evaluator_score import EvaluatorScore, score_evaluato
 from lw_torchrl.evaluation.failure_records import CAUSES, Failure, MendedEpisode
 from lw_torchrl.evaluation.figures import plot_failures, plot_sorted_tasks, plot_success
 from lw_torchrl.evaluation.hub import from_pretrained, push_to_hub, save_pretrained
-from lw_torchrl.evaluation.plan_use import PlanUse, StuckStep, stuck_steps, stuck_table, weakest_step
+from lw_torchrl.evaluation.plan_use import PlanUse
 from lw_torchrl.evaluation.protocol import evaluate
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.evaluation.statistics import (
@@ -22,8 +22,8 @@ from lw_torchrl.evaluation.summary import Summary, TaskSummary, summarize, summa
 
 __all__ = [
     "CAUSES", "EpisodeResult", "Estimate", "EvaluationResult", "EvaluatorScore", "Failure", "MendedEpisode", "PlanUse",
-    "StuckStep", "Summary", "TaskSummary", "attribute_failures", "count_solved", "evaluate", "from_pretrained",
+    "Summary", "TaskSummary", "attribute_failures", "count_solved", "evaluate", "from_pretrained",
     "interquartile_mean", "mean_difference", "mean_rate", "plot_failures", "plot_sorted_tasks", "plot_success",
-    "policy_card", "probability_of_improvement", "push_to_hub", "save_pretrained", "score_evaluator", "stuck_steps",
-    "stuck_table", "summarize", "summarize_rates", "weakest_step",
+    "policy_card", "probability_of_improvement", "push_to_hub", "save_pretrained", "score_evaluator",
+    "summarize", "summarize_rates",
 ]  # fmt: skip

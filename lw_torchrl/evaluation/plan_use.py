@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any, NamedTuple
@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 from torchrl.envs import TransformedEnv
 
-from lw_torchrl._checks import check_choice, checked
 from lw_torchrl.envs.episodes import FinishedEpisode, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import AnyPlans, as_plans
@@ -139,75 +138,3 @@ def expert_use(
         use(finished)
     env.close()
     return use.tasks()
-
-
-@dataclass(frozen=True)
-class StuckStep:
-    """A step of a plan, counted from 0: of the task's ``failed`` episodes, in how many it was the one in charge in the
-    last 50 steps, ``stuck``, and the last of the plan's steps that was in charge for a while, ``furthest``."""
-
-    task: str
-    step: int
-    condition: str
-    skill: str
-    stuck: int
-    furthest: int
-    failed: int
-
-
-@checked
-def stuck_steps(use: PlanUse) -> list[StuckStep]:
-    """Every step of the plans of the tasks that were seen, in their order.
-
-    Example:
-        >>> import lw_torchrl as lw
-        >>> plans = lw.load_plans("MT10")
-        >>> use = PlanUse(plans)
-        >>> run = dict(tasks="push", episodes_per_task=2, seed=1_000, max_steps=60, on_episode=use)
-        >>> _ = lw.evaluate(lw.PlanConditionedActor(plans), also_record=["qaf", "skill_weights"], **run)
-        >>> [(step.skill, step.stuck) for step in stuck_steps(use)][0]
-        ('place the gripper above the puck', 2)
-    """
-    return [
-        StuckStep(task, k, str(step.condition), step.skill, found.stuck[k], found.furthest[k], found.failed)
-        for task, found in use.tasks().items()
-        for k, step in enumerate(use.plans[task].steps)
-    ]
-
-
-@checked
-def weakest_step(use: PlanUse, task: str | None = None) -> StuckStep:
-    """The step that most failed episodes came to and not beyond, the first of them if there are several.
-
-    It is not the step in which they ended: a puck that is dropped lies there again, and the gripper ends above it, in
-    the first step, which is sound. Plans are written in the order in which their steps come.
-
-    Args:
-        use: what evaluated episodes told; :class:`ValueError` if none failed.
-        task: whose step, of those that were seen; None for any.
-    """
-    found = stuck_steps(use)
-    if task is not None:
-        check_choice("task", task, use.tasks())
-        found = [step for step in found if step.task == task]
-    weakest = max(found, key=lambda step: step.furthest, default=None)
-    if weakest is None or not weakest.failed:
-        raise ValueError("use must hold failed episodes for a step to be the weakest, none failed")
-    return weakest
-
-
-@checked
-def stuck_table(steps: Sequence[StuckStep]) -> str:
-    """A line for each step, counted from 1: how many failed episodes ended in it, and how many came no further.
-
-    Example:
-        >>> print(stuck_table([StuckStep("reach", 0, "the gripper is open", "close the gripper", 3, 5, 8)]))
-        task   step  ended here  no further  skill              while
-        reach     1      3 of 8      5 of 8  close the gripper  the gripper is open
-    """
-    rows = [("task", "step", "ended here", "no further", "skill", "while")]
-    for s in steps:
-        counts = f"{s.stuck} of {s.failed}", f"{s.furthest} of {s.failed}"
-        rows.append((s.task, str(s.step + 1), *counts, s.skill, s.condition))
-    task, skill = (max(len(row[column]) for row in rows) for column in (0, 4))
-    return "\n".join(f"{a:{task}}  {b:>4}  {c:>10}  {d:>10}  {e:{skill}}  {f}" for a, b, c, d, e, f in rows)

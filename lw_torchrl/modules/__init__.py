@@ -14,7 +14,6 @@ from lw_torchrl.modules.policy import Encoder, Encoding, Policy
 from lw_torchrl.modules.query_evaluator import EVALUATORS, QueryEvaluator
 from lw_torchrl.modules.registry import ENCODERS, METHODS, POLICIES, Method, make_policy
 from lw_torchrl.modules.relative_positions import PlanFocus
-from lw_torchrl.modules.residual_actor import ResidualActor
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
 
@@ -23,6 +22,6 @@ __all__ = [
     "DemonstratedActor", "DescriptorConditionedActor", "DescriptorEncoder", "Encoder", "Encoding",
     "ImageQueryEvaluator", "Method", "ObservationFeatures", "PlanAttention", "PlanConditionedActor",
     "PlanConditionedQValue", "PlanConditionedValue", "PlanEncoder", "PlanFocus", "Policy", "QValue", "QueryEvaluator",
-    "ResidualActor", "ScriptedSkillActor", "StateQueryEvaluator", "TransferredActor", "Value", "make_policy",
+    "ScriptedSkillActor", "StateQueryEvaluator", "TransferredActor", "Value", "make_policy",
     "plan_actor_value",
 ]  # fmt: skip

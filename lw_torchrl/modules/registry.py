@@ -23,7 +23,6 @@ POLICIES = Registry(
         "DemonstratedActor": "lw_torchrl.modules.composed_actors:DemonstratedActor",
         "DescriptorConditionedActor": "lw_torchrl.modules.descriptor_conditioned_actor:DescriptorConditionedActor",
         "PlanConditionedActor": "lw_torchrl.modules.plan_conditioned_actor:PlanConditionedActor",
-        "ResidualActor": "lw_torchrl.modules.residual_actor:ResidualActor",
         "ScriptedSkillActor": "lw_torchrl.modules.scripted_skill_actor:ScriptedSkillActor",
         "TransferredActor": "lw_torchrl.modules.composed_actors:TransferredActor",
     },

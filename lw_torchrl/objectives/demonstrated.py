@@ -1,4 +1,4 @@
-"""Actor-critic losses with imitation, of those rows of a minibatch alone that are demonstrations."""
+"""Actor-critic losses whose actor also imitates the demonstrations in a minibatch."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from lw_torchrl.objectives.reduction import Reduction, let_go, priority_weight
 
 
 def imitation(action: Tensor, demonstrated: Tensor, is_demonstration: Tensor) -> Tensor:
-    """The squared distance of (B, A) float32 actions to the demonstrated ones, (B,) float32: 0 in rows that are no
-    demonstrations, and scaled so that its mean over all rows is the mean over demonstrations."""
+    """Return the squared distance of (B, A) float32 actions to the demonstrated ones, (B,) float32: 0 for others,
+    and scaled so that the mean over all rows is the mean over demonstrations."""
     rows = is_demonstration.reshape(action.shape[:-1])
     distance = (action - demonstrated).square().mean(-1) * rows
     return distance * (rows.numel() / rows.sum().clamp(min=1))
@@ -34,7 +34,7 @@ else:
 
 
 class _ImitatesDemonstrations(_Loss):
-    _fixed: Mapping[str, Any] = {}  # options that are not the user's
+    _fixed: Mapping[str, Any] = {}  # options that users cannot set
     in_keys: list[NestedKey]
 
     @checked
@@ -48,11 +48,11 @@ class _ImitatesDemonstrations(_Loss):
         **options: Any,
     ) -> None:
         if "alpha" in self._fixed and "alpha" in options:
-            raise ValueError("alpha is 1 here: give bc_weight, the weight of the imitation")
+            raise ValueError("alpha is fixed to 1; use bc_weight, the weight of the imitation")
         spec = options.get("action_spec")
-        if spec is not None and not isinstance(spec, Composite) and len(spec.shape) > 1:  # actions of as many rows
-            got = f"one of shape {tuple(spec.shape)}: take env.action_spec_unbatched"
-            raise ValueError(f"action_spec must be of one row, got {got}")
+        if spec is not None and not isinstance(spec, Composite) and len(spec.shape) > 1:
+            got = f"shape {tuple(spec.shape)}; use env.action_spec_unbatched"
+            raise ValueError(f"action_spec must have no batch dimension, got {got}")
         critics = qvalue_network if isinstance(qvalue_network, list) else [qvalue_network]
         if not critics or not all(isinstance(critic, TensorDictModuleBase) for critic in critics):
             raise TypeError(f"qvalue_network must be a TensorDictModule, or a list, got {shown(qvalue_network)}")
@@ -67,38 +67,38 @@ class _ImitatesDemonstrations(_Loss):
 
     def _imitation(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         key = self.tensor_keys.is_demonstration
-        if (found := tensordict.get(key, None)) is None:
+        if (is_demonstration := tensordict.get(key, None)) is None:
             raise ValueError(
-                f"the batch lacks {key!r}, which says which rows to imitate: a LanguageWorldExperienceReplay "
-                "writes it, and a GrowingStorage; in a buffer of your own set it, (B,) bool, or name it by set_keys"
+                f"the batch lacks {key!r}, which marks the rows to imitate: LanguageWorldExperienceReplay and "
+                "GrowingStorage write it; in another buffer add it, (B,) bool, or set its name with set_keys"
             )
-        if found.dtype != torch.bool:
-            raise ValueError(f"{key!r} must be torch.bool, true of demonstrations, got {found.dtype}")
-        return imitation(action, tensordict.get(self.tensor_keys.action), found)
+        if is_demonstration.dtype != torch.bool:
+            raise ValueError(f"{key!r} must be torch.bool, true for demonstrations, got {is_demonstration.dtype}")
+        return imitation(action, tensordict.get(self.tensor_keys.action), is_demonstration)
 
 
 class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
-    """TD3 on a collector's rows and demonstrations alike, whose actor also imitates the demonstrations.
+    """TD3 loss on demonstrations and collected rows; the actor also imitates the demonstrations.
 
     The actor's loss is -Q / mean(abs(Q)) over all rows, where Q is the mean of the critics, plus ``bc_weight`` times
-    the mean squared distance to ``action`` over the rows of which ``is_demonstration`` is true: those of the datasets
-    of a :class:`~lw_torchrl.LanguageWorldExperienceReplay`, not what it was extended with. The critics' loss is TD3's.
+    the mean squared distance to ``action`` over the rows where ``is_demonstration`` is true: the rows of the datasets
+    of a :class:`~lw_torchrl.LanguageWorldExperienceReplay`, not those it was extended with. The critics' loss is TD3's.
 
-    Reads what TD3 reads, and ``is_demonstration`` (B,) bool; writes what :class:`torchrl.objectives.TD3BCLoss` does:
-    ``loss_actor`` and ``loss_qvalue``, () float32 each, and, detached, ``bc_loss`` (), without its weight, ``lmbd`` (),
-    what Q is divided by inverted, ``state_action_value_actor`` (B,), ``pred_value`` (E, B), ``target_value`` and
+    Reads what TD3 reads, and ``is_demonstration`` (B,) bool. Writes what :class:`torchrl.objectives.TD3BCLoss` writes:
+    ``loss_actor`` and ``loss_qvalue``, () float32 each, and, detached, the unweighted ``bc_loss`` (), ``lmbd`` (),
+    which is 1 / mean(abs(Q)), ``state_action_value_actor`` (B,), ``pred_value`` (E, B), ``target_value`` and
     ``next_state_value`` (B,).
 
     Args:
-        actor_network: without a distribution.
-        qvalue_network: of which ``num_qvalue_nets`` copies are made.
-        bc_weight: of the imitation.
-        **options: of :class:`torchrl.objectives.TD3BCLoss`, but for ``alpha``, which is 1: ``bounds`` or
+        actor_network: a deterministic actor.
+        qvalue_network: the critic, copied ``num_qvalue_nets`` times.
+        bc_weight: weight of the imitation.
+        **options: those of :class:`torchrl.objectives.TD3BCLoss` except ``alpha``, which is 1: ``bounds`` or
             ``action_spec``, ``num_qvalue_nets``, ``policy_noise``, ...
 
     Raises:
-        ValueError: ``bc_weight`` is negative or no number; another ``reduction``; ``action_spec`` is of several rows;
-            at call time, rows without ``is_demonstration``.
+        ValueError: ``bc_weight`` is negative or not finite; an unknown ``reduction``; ``action_spec`` has a batch
+            dimension; at call time, rows without ``is_demonstration``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -122,7 +122,7 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
     _fixed = {"alpha": 1.0}
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
-        """The actor's loss, () float32, and what is told of it, detached."""
+        """Return the actor's loss, () float32, and detached values to log."""
         seen = tensordict.select(*self.actor_network.in_keys, strict=False)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             seen = self.actor_network(seen)
@@ -135,34 +135,35 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
         return loss, {"state_action_value_actor": value.detach(), "bc_loss": bc.mean().detach(), "lmbd": scale}
 
     def _judged(self, seen: TensorDictBase) -> Tensor:
-        """What each critic says of the rows, (E, B), without a gradient for the critics."""
+        """Return the value that each critic gives the rows, (E, B), without a gradient for the critics."""
 
         def judge(rows: TensorDictBase, params: TensorDictBase) -> Tensor:
             with params.to_module(self.qvalue_network, preserve_module_state=False):
                 return self.qvalue_network(rows).get(self.tensor_keys.state_action_value)
 
         number, params = self.num_qvalue_nets, self.qvalue_network_params.detach()
-        asked = seen.select(*self.qvalue_network.in_keys, strict=False).expand(number, *seen.batch_size)
+        rows = seen.select(*self.qvalue_network.in_keys, strict=False).expand(number, *seen.batch_size)
         if self.deactivate_vmap:
-            return torch.stack([judge(asked[one], params[one]) for one in range(number)]).squeeze(-1)
-        return torch.vmap(judge, randomness=self.vmap_randomness)(asked, params).squeeze(-1)
+            return torch.stack([judge(rows[k], params[k]) for k in range(number)]).squeeze(-1)
+        return torch.vmap(judge, randomness=self.vmap_randomness)(rows, params).squeeze(-1)
 
 
 class DemonstratedSACLoss(_ImitatesDemonstrations, SACLoss):
-    """SAC on a collector's rows and demonstrations alike, whose actor also imitates the demonstrations.
+    """SAC loss on demonstrations and collected rows; the actor also imitates the demonstrations.
 
-    The actor's loss is SAC's over all rows, plus ``bc_weight`` times the imitation of :class:`DemonstratedTD3Loss`, by
-    the distribution's mode. It is a distance and no likelihood, since half of the demonstrated actions have a component
-    at ±1, where that of a TanhNormal explodes. Errors are as there.
+    The actor's loss is SAC's over all rows, plus ``bc_weight`` times the imitation loss of
+    :class:`DemonstratedTD3Loss`, computed on the distribution's mode. It is a distance instead of a likelihood because
+    half of the demonstrated actions have a component at ±1, where the likelihood of a TanhNormal explodes. Raises the
+    same errors.
 
-    Reads what SAC reads, and ``is_demonstration`` (B,) bool; writes what :class:`torchrl.objectives.SACLoss` does:
+    Reads what SAC reads, and ``is_demonstration`` (B,) bool. Writes what :class:`torchrl.objectives.SACLoss` writes:
     ``loss_actor``, ``loss_qvalue``, ``loss_alpha``, ``alpha`` and ``entropy``, () float32 each.
 
     Args:
-        actor_network: with a distribution, ``actor.stochastic()`` say.
-        qvalue_network: of which ``num_qvalue_nets`` copies are made.
-        bc_weight: of the imitation; values are not divided by their size.
-        **options: of :class:`torchrl.objectives.SACLoss`.
+        actor_network: a stochastic actor, for example ``actor.stochastic()``.
+        qvalue_network: the critic, copied ``num_qvalue_nets`` times.
+        bc_weight: weight of the imitation; Q is not normalised.
+        **options: those of :class:`torchrl.objectives.SACLoss`.
 
     Example:
         >>> import lw_torchrl as lw
@@ -183,7 +184,7 @@ class DemonstratedSACLoss(_ImitatesDemonstrations, SACLoss):
     default_keys = _AcceptedKeys
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """As :meth:`DemonstratedTD3Loss.actor_loss`."""
+        """Return the actor's loss, () float32, and detached values to log."""
         loss, metadata = super().actor_loss(tensordict)
         with (
             set_exploration_type(ExplorationType.DETERMINISTIC),

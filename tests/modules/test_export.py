@@ -16,20 +16,12 @@ PLANS = lw.load_plans("MT10")
 SMALL = dict(width=16, depth=1)
 
 
-def moved(residual):
-    """One that corrects already."""
-    torch.nn.init.normal_(residual.network[-1].weight)
-    return residual
-
-
 ACTORS = {
     "plan": lambda: lw.PlanConditionedActor(PLANS, **SMALL),
     "focus": lambda: lw.PlanConditionedActor(PLANS, focus=True, **SMALL),
     "stochastic": lambda: lw.PlanConditionedActor(PLANS, distribution="tanh_normal", **SMALL),
     "description": lambda: lw.DescriptorConditionedActor("MT10", **SMALL),
     "scripted": lambda: lw.ScriptedSkillActor(PLANS),
-    "residual": lambda: moved(lw.ResidualActor(lw.PlanConditionedActor(PLANS, **SMALL), **SMALL)),
-    "steps": lambda: moved(lw.ResidualActor(lw.PlanConditionedActor(PLANS, **SMALL), steps={"push": [0, 2]}, **SMALL)),
     "ensemble": lambda: lw.modules.ActorEnsemble([lw.PlanConditionedActor(PLANS, **SMALL) for _ in range(2)]),
 }
 

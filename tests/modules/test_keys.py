@@ -124,8 +124,6 @@ MODULES = {
     "scripted": lambda: lw.ScriptedSkillActor(PLANS),
     "expert": lambda: lw.ExpertActor("MT10"),
     "ensemble": lambda: lw.modules.ActorEnsemble([plan_actor(), plan_actor()]),
-    "residual": lambda: lw.ResidualActor(plan_actor(), **networks),
-    "residual of steps": lambda: lw.ResidualActor(plan_actor(), steps={"push": [0]}, **networks),
     "plan encoder": lambda: PlanEncoder(PLANS),
     "description encoder": lambda: DescriptorEncoder("MT10"),
     "value": lambda: Value(PlanEncoder(PLANS), ensemble=2, **networks),

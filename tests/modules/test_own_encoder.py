@@ -23,7 +23,6 @@ from lw_torchrl.modules import (
     QValue,
     make_policy,
 )  # fmt: skip
-from lw_torchrl.training.algorithms.learner import encoder_like
 
 FOLDER = Path(__file__).parent.parent.parent / "examples" / "extending"
 PLANS = lw.load_plans("MT10")
@@ -68,14 +67,8 @@ def test_a_trained_one_gets_a_distribution_without_noise(own):
     assert torch.allclose(actor(**state), drawn(**state)[0], atol=1e-6)
 
 
-def test_a_critic_sees_what_it_sees(own):
-    actor = ConditionedActor(own(PLANS, feature_noise=0.3), width=8)
-    actor.fit_normalization(torch.rand(50, 39))
-    encoder = encoder_like(actor)
-    assert type(encoder) is own
-    assert encoder.features.noise == 0.0
-    assert torch.equal(encoder.features.mean, actor.encoder.features.mean)
-    assert QValue(encoder)(**states(), action=torch.zeros(4, 4)).shape == (4, 1)
+def test_a_critic_is_built_on_it(own):
+    assert QValue(own(PLANS))(**states(), action=torch.zeros(4, 4)).shape == (4, 1)
 
 
 def test_the_name_of_its_class_is_a_method_with_its_options(own):

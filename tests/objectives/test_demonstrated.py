@@ -135,16 +135,14 @@ def test_imitation_is_of_demonstrated_rows_alone():
 
 
 @pytest.mark.parametrize("kind", [lw.objectives.DemonstratedTD3Loss, lw.objectives.DemonstratedSACLoss])
-def test_what_says_which_rows_are_demonstrations_is_named_where_it_is_missing(kind):
+def test_missing_is_demonstration_is_named(kind):
     loss, batch = make(kind)[0], make_batch()
     batch["is_target"] = batch.pop("is_demonstration")  # of co-learning, which is another thing
-    with pytest.raises(
-        ValueError, match=r"the batch lacks 'is_demonstration', .*: a LanguageWorldExperienceReplay writes"
-    ):
+    with pytest.raises(ValueError, match=r"the batch lacks 'is_demonstration', .*: LanguageWorldExperienceReplay and"):
         loss(batch)
     batch["is_demonstration"] = torch.zeros(24)
     with pytest.raises(
-        ValueError, match=r"'is_demonstration' must be torch.bool, true of demonstrations, got torch.float"
+        ValueError, match=r"'is_demonstration' must be torch.bool, true for demonstrations, got torch.float"
     ):
         loss(batch)
 
@@ -187,7 +185,7 @@ def test_an_action_spec_of_several_rows_is_refused():
     for kind in (lw.objectives.DemonstratedTD3Loss, lw.objectives.DemonstratedSACLoss):
         actor, critic = make_actor("plan"), QValue(make_encoder("plan"), **SMALL)
         with pytest.raises(
-            ValueError, match=r"action_spec must be of one row, got one of shape \(4, 4\): take env.action"
+            ValueError, match=r"action_spec must have no batch dimension, got shape \(4, 4\); use env.action"
         ):
             kind(actor, critic, action_spec=env.action_spec)
     assert make(lw.objectives.DemonstratedSACLoss, action_spec=env.action_spec_unbatched)[0].target_entropy == -4

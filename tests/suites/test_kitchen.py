@@ -16,8 +16,6 @@ from lw_torchrl.cli.main import main
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.record.rollouts import run_recorded
 from lw_torchrl.suites import check_suite
-from lw_torchrl.training.algorithms import TD3Config
-from lw_torchrl.training.online import Exploration
 
 pytest.importorskip("gymnasium_robotics")
 from gymnasium_robotics.envs.franka_kitchen.kitchen_env import OBS_ELEMENT_GOALS, OBS_ELEMENT_INDICES, KitchenEnv
@@ -225,7 +223,7 @@ def test_a_recording_shows_the_kitchen_as_it_moved(tmp_path):
     assert abs(z) < 0.02  # on the counter, which is our z = 0
 
 
-def test_chance_acts_in_it_and_explores(tmp_path):
+def test_chance_acts_in_it(tmp_path):
     made = lw.collect_demonstrations(
         "kitchen", suite=SUITE, policy="random", episodes_per_task=1, max_steps=4, redraw_failures=False,
         root=tmp_path / "random", progress=False,
@@ -233,9 +231,6 @@ def test_chance_acts_in_it_and_explores(tmp_path):
     rows = lw.LanguageWorldExperienceReplay(made.root, label="executed")[:]
     assert rows["action"].shape == (8, 9)
     assert rows["action"].abs().amax(0).min() > 0
-    noise = Exploration(TD3Config(rows=4, exploration=0.5), 0, KITCHEN)
-    noise.draw()
-    assert noise.noise(rows[:4]).abs().min() > 0
 
 
 @pytest.mark.slow

@@ -17,7 +17,6 @@ from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.modules import ActorEnsemble, TransferredActor
 from lw_torchrl.record.verdict import action_names
 from lw_torchrl.suites import SUITES, Suite, check_suite, find_suite, load_suite
-from lw_torchrl.training.algorithms import PPOConfig, TD3Config
 
 SUITE = make_toy_suite()
 FEATURES = ["raw", "differences", "relative", "both"]
@@ -340,24 +339,6 @@ def test_losses_train_offline_with_the_layout_s_statistics(make_loss, demos):
     trainer = lw.OfflineTrainer(loss, replay, lw.OfflineConfig(steps=2, batch_size=8), progress=False)
     trainer.train()
     assert all(math.isfinite(one) for one in trainer.last.values())
-
-
-@pytest.mark.parametrize(("config", "distribution"), [(TD3Config, None), (PPOConfig, "tanh_normal")])
-def test_a_policy_trains_online(config, distribution, demos):
-    actor = lw.PlanConditionedActor(SUITE.plans, distribution=distribution, **SMALL)
-    replay = lw.LanguageWorldExperienceReplay(
-        demos.root,
-        label="executed",
-        terminate_on_success=True,
-        grow=1_000,
-        sampler=lw.CoLearningSampler("grown"),
-        transform=lw.QAFTransform(SUITE.plans),
-    )
-    run = config(frames=20, rows=2, max_steps=5, batch_size=8)
-    method = config.__name__.removesuffix("Config").lower()
-    trainer = lw.OnlineTrainer(actor, replay, run, method=method, tasks="toy", suite=SUITE, progress=False)
-    trainer.train()
-    assert trainer.history[-1]["frames"] == 20
 
 
 @pytest.mark.parametrize(

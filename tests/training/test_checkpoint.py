@@ -19,7 +19,7 @@ from lw_torchrl._tensor_files import read_tensors, write_tensors
 from lw_torchrl._versions import package_versions
 from lw_torchrl.language import text
 from lw_torchrl.language.skills import load_skills
-from lw_torchrl.modules import ActorEnsemble, ResidualActor
+from lw_torchrl.modules import ActorEnsemble
 from lw_torchrl.training import save_evaluator
 from lw_torchrl.training.checkpoint import read_description
 
@@ -117,7 +117,6 @@ NOT_SHIPPED = {
         [replace(lw.TASKS["reach"], description="Bring the hand over to the red spot.")], **SMALL
     ),
     "an ensemble": lambda: ActorEnsemble([own_words(), own_words()]),
-    "a residual": lambda: ResidualActor(own_words()),
 }
 
 
