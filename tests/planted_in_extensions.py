@@ -1,8 +1,5 @@
 """What a user adds to the tables, typed, with four mistakes: mypy --strict finds them (test_packaging.py)."""
 
-from dataclasses import dataclass
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 

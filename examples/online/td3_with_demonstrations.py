@@ -144,8 +144,8 @@ def main(args: Args) -> None:
     collector.shutdown()
     signal.signal(signal.SIGINT, handler)
 
-    lw.save_actor(actor, folder / "policy.zip")
-    print(f"saved {folder / 'policy.zip'}")
+    lw.save_actor(actor, folder / "policy.safetensors")
+    print(f"saved {folder / 'policy.safetensors'}")
     if not stop.is_set():
         options = {"episodes_per_task": args.episodes, "seed": 10_000 + args.seed, "stop_at_success": True}
         result = lw.evaluate(actor, tasks=args.task, **options)
