@@ -6,7 +6,7 @@ import warnings
 from dataclasses import replace
 
 import pytest
-import test_offline as offline
+import test_offline_trainer as offline
 import torch
 from pretend_device import COPIES, MODULE, PRETEND, WAITS
 from small_training import CONFIG, PLANS, SMALL, assert_same, collect_demos, flat, make_actor
