@@ -19,7 +19,6 @@ from lw_torchrl.data.rewards import STEPS, check_n_steps
 
 TRAJECTORY, REWARD, DONE = ("collector", "traj_ids"), ("next", "reward"), ("next", "done")
 DEMONSTRATION = "is_demonstration"  # true of a dataset's rows, false of those that a buffer was extended with
-_MAX_RUNS = 4  # runs of one part in a batch, for each part, up to which they are read one after another
 
 
 def column_name(key: NestedKey) -> str:
@@ -176,28 +175,16 @@ class JoinedStorage(Storage):
         """The columns of rows counted over all parts, a fresh tensor each."""
         if self.num_parts == 1:
             return {key: self._columns[key][0].index_select(0, rows) for key in keys}
-        part = torch.bucketize(rows, self._ends, right=True)
-        back = None
-        cuts = (part[1:] != part[:-1]).nonzero().flatten().tolist()
-        if len(cuts) >= _MAX_RUNS * self.num_parts:  # too scattered to read run by run: part by part, then back
-            part, order = part.sort(stable=True)
-            back = torch.empty_like(order)
-            back[order] = torch.arange(len(order))
-            rows = rows[order]
-            cuts = (part[1:] != part[:-1]).nonzero().flatten().tolist()
-        bounds = [0, *(cut + 1 for cut in cuts), len(rows)]
-        firsts = self._bounds()
-        runs = []
-        for start, stop in pairwise(bounds):
-            number = int(part[start]) if stop > start else 0
-            runs.append((number, rows[start:stop] - firsts[number]))
-        found = {}
+        part, order = torch.bucketize(rows, self._ends, right=True).sort(stable=True)  # read part by part, then back
+        starts = torch.tensor(self._bounds()[:-1])
+        places = (rows[order] - starts[part]).split(part.bincount(minlength=self.num_parts).tolist())
+        back = torch.empty_like(order)
+        back[order] = torch.arange(len(order))
+        columns = {}
         for key in keys:
-            leaves = self._columns[key]
-            read = [leaves[number].index_select(0, local) for number, local in runs]
-            joined = read[0] if len(read) == 1 else torch.cat(read)
-            found[key] = joined if back is None else joined.index_select(0, back)
-        return found
+            read = [leaf.index_select(0, own) for leaf, own in zip(self._columns[key], places, strict=True)]
+            columns[key] = torch.cat(read).index_select(0, back)
+        return columns
 
     def get(self, index: Any) -> TensorDict:
         """The rows at an int, a slice, a list, a mask or a tensor of indices of any shape, as fresh tensors."""

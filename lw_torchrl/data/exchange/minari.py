@@ -1,9 +1,9 @@
 """Minari's datasets, written and read by Minari itself.
 
 data/main_data.hdf5    a group for each episode: observations (T + 1, 39), actions (T, 4), rewards, the dense ones,
-                       terminations and truncations (T,), infos/... (T + 1, ...): success and reward_sparse tell of the
-                       step before, and are zero in the first row; the others of the step after, and zero in the last
-data/metadata.json     Minari's description, and the metadata of a dataset of ours
+                       terminations and truncations (T,), infos/... (T + 1, ...): success and reward_sparse belong to
+                       the step before, and are zero in the first row; the others to the step after, zero in the last
+data/metadata.json     Minari's description, and the metadata of our dataset
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ _OF_STEP = {*NAMES["success"], *NAMES["reward_sparse"], *NAMES["reward_dense"]}
 
 
 def _infos(table: Table, start: int, end: int) -> dict[str, Array]:
-    """The other columns of an episode, a row longer; the next observations only where they are not the next rows."""
-    found = {}
+    """The other columns of an episode, a row longer; next observations only if they differ from the next rows."""
+    infos = {}
     observation, after = (table.columns[name][start:end] for name in ("observation", "next_observation"))
     for name in (*_AFTER, *_BEFORE):
         column = table.columns.get(name)
         if column is None or (name == "next_observation" and observation[1:].tobytes() == after[:-1].tobytes()):
             continue
         empty, part = np.zeros_like(column[:1]), column[start:end]
-        found[name] = np.concatenate([empty, part] if name in _AFTER else [part, empty])
-    return found
+        infos[name] = np.concatenate([empty, part] if name in _AFTER else [part, empty])
+    return infos
 
 
 def write(table: Table, folder: Path, bar: Progress) -> None:
-    """Write a table as a dataset; its id is the name of its folder, and -v0 where that has no version."""
+    """Write a table as a dataset. Its id is the name of its folder, with -v0 if that has no version."""
     if shutil.disk_usage(folder).free < 2 * sum(column.nbytes for column in table.columns.values()):
         # A write that fails inside HDF5 leaves the file open, and the process crashes when it ends.
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
@@ -79,8 +79,8 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
     name = re.sub(r"[^-\w]", "-", re.sub(r"^\.|\.[0-9a-f]{16}\.tmp$", "", folder.name))
     about = "Demonstrations of tasks whose descriptions and plans are in the episodes' metadata."
     versioned = name if re.search(r"-v\d+$", name) else f"{name}-v0"
-    told = {"dataset_id": versioned, "minari_version": minari.__version__, "description": about}
-    storage.update_metadata({**told, ABOUT: json.dumps(table.about)})
+    metadata = {"dataset_id": versioned, "minari_version": minari.__version__, "description": about}
+    storage.update_metadata({**metadata, ABOUT: json.dumps(table.about)})
 
 
 def _flat(name: str, value: Any) -> dict[str, Array]:
@@ -93,16 +93,16 @@ def _flat(name: str, value: Any) -> dict[str, Array]:
 def _columns(episode: Mapping[str, Any]) -> dict[str, Array]:
     """The columns of an episode's rows."""
     steps = len(episode["rewards"])
-    found = {name: np.asarray(episode[name]) for name in ("rewards", "terminations", "truncations")}
-    found |= _flat("actions", episode["actions"])
+    columns = {name: np.asarray(episode[name]) for name in ("rewards", "terminations", "truncations")}
+    columns |= _flat("actions", episode["actions"])
     for name, values in _flat("observations", episode["observations"]).items():
-        found[name] = values[:-1]
+        columns[name] = values[:-1]
         if name in NAMES["observation"]:
-            found["next_observations"] = values[1:]
+            columns["next_observations"] = values[1:]
     for name, values in _flat("infos", episode["infos"] or {}).items():
         if len(values) == steps + 1 and values.dtype.kind in "biuf":
-            found[name] = values[1:] if name in _OF_STEP else values[:-1]
-    return found
+            columns[name] = values[1:] if name in _OF_STEP else values[:-1]
+    return columns
 
 
 def read(source: Path) -> Table:
