@@ -144,7 +144,7 @@ def _trained(described: Mapping[str, Any], shown: set[str]) -> list[str]:
 
 def _success(result: EvaluationResult | None) -> list[str]:
     if result is None:
-        return ["Not measured. `lw-torchrl evaluate` writes a result, and `lw-torchrl card --result` puts it here."]
+        return ["Not measured. `lw-torchrl evaluate` writes a result, and `lw-torchrl info --result` puts it here."]
     config, ends = result.config, result.success_at_end
     solved, runs = sum(one.success for one in result.episodes), len(result.episodes)
     least, most = wilson_interval(solved, runs)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from commands import check_documented, document, fails, run
+from commands import document, fails, run
 from pictures import why_no_pictures
 
 import lw_torchrl as lw
@@ -27,8 +27,8 @@ def trained(demos, tmp_path_factory):
     replay = lw.LanguageWorldExperienceReplay(demos, transform=lw.QAFTransform(plans), sampler=lw.TaskBalancedSampler())
     actor = lw.PlanConditionedActor(plans, width=8, depth=1)
     config = lw.BehavioralCloningConfig(steps=5, batch_size=8)
-    lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=path / "policy.zip", progress=False).train()
-    lw.training.save_evaluator(lw.StateQueryEvaluator(plans, width=8), path / "evaluator.zip")
+    lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=path / "policy.safetensors", progress=False).train()
+    lw.training.save_evaluator(lw.StateQueryEvaluator(plans, width=8), path / "evaluator.safetensors")
     return path
 
 
@@ -37,10 +37,9 @@ def weights(path, part="head"):
 
 
 def test_a_new_one_is_trained_with_the_policy(capsys, demos, tmp_path):
-    out = tmp_path / "policy.zip"
-    args = "train", demos, "--out", out, "--evaluator", "new", "--qaf-anchor", 1, *SMALL, *NET
-    run(capsys, *args)
-    check_documented("train", document(capsys, *args))
+    out = tmp_path / "policy.safetensors"
+    args = "train", demos, "--out", out, "--evaluator", "StateQueryEvaluator", "--qaf-anchor", 1, *SMALL, *NET
+    assert document(capsys, *args)["steps"] == 4
     actor = lw.load_actor(out)
     assert isinstance(actor.evaluator, lw.StateQueryEvaluator)
     assert actor.config["answers"] == "tanh"
@@ -48,55 +47,39 @@ def test_a_new_one_is_trained_with_the_policy(capsys, demos, tmp_path):
 
 
 def test_a_trained_policy_is_tuned_with_one(capsys, demos, trained, tmp_path):
-    out = tmp_path / "tuned.zip"
-    args = ["--begin", trained / "policy.zip", "--evaluator", trained / "evaluator.zip", "--learning-rate", 0.0]
+    out = tmp_path / "tuned.safetensors"
+    args = [
+        "--begin",
+        trained / "policy.safetensors",
+        "--evaluator",
+        trained / "evaluator.safetensors",
+        "--learning-rate",
+        0.0,
+    ]
     run(capsys, "train", demos, "--out", out, *args, *SMALL)
     actor = lw.load_actor(out)
     assert actor.config["answers"] == "hard"
-    before, after = weights(trained / "policy.zip"), weights(out)
+    before, after = weights(trained / "policy.safetensors"), weights(out)
     assert before.keys() == after.keys()
     for name, value in before.items():
         assert torch.equal(after[name], value), name
-    features = lw.load_actor(trained / "policy.zip").encoder.features.state_dict()
+    features = lw.load_actor(trained / "policy.safetensors").encoder.features.state_dict()
     assert all(torch.equal(actor.encoder.features.state_dict()[name], value) for name, value in features.items())
-    again = tmp_path / "again.zip"
+    again = tmp_path / "again.safetensors"
     run(capsys, "train", demos, "--out", again, "--begin", out, "--qaf-anchor", 0.1, *SMALL)
     moved, kept = lw.load_actor(again).evaluator.state_dict(), actor.evaluator.state_dict()
     assert any(not torch.equal(moved[name], kept[name]) for name in kept)
 
 
-def test_what_makes_no_sense_is_refused(capsys, demos, trained, tmp_path):
-    out = ["--out", tmp_path / "x.zip"]
-    assert "--evaluator new knows nothing" in fails(capsys, "train", demos, *out, "--evaluator", "new")
-    assert "--answers is of an evaluator" in fails(capsys, "train", demos, *out, "--answers", "hard")
-    assert "--qaf-anchor is of an evaluator" in fails(capsys, "train", demos, *out, "--qaf-anchor", 1)
-    file = ["--evaluator", trained / "evaluator.zip"]
-    assert "--method dc does not" in fails(capsys, "train", demos, *out, *file, "--method", "dc")
-    begin = ["--begin", trained / "policy.zip"]
-    assert "--width is that of the policy" in fails(capsys, "train", demos, *out, *begin, "--width", 64)
-    assert "no file" in fails(capsys, "train", demos, *out, "--evaluator", tmp_path / "none.zip")
-    lw.save_actor(lw.DescriptorConditionedActor(["reach"], width=8), tmp_path / "dc.zip")
-    refused = fails(capsys, "train", demos, *out, "--begin", tmp_path / "dc.zip", *file)
-    assert "--evaluator is for one policy with plans, --begin names a DescriptorConditionedActor" in refused
-    assert "qaf_anchor is for a policy with an evaluator" in fails(
-        capsys, "train", demos, *out, *begin, "--qaf-anchor", 1
-    ).replace("--qaf-anchor", "qaf_anchor")
-    assert not (tmp_path / "x.zip").exists()
-
-
-def test_what_cannot_be_begun_with_is_named(capsys, demos, trained, tmp_path):
-    out = ["--out", tmp_path / "x.zip"]
-    missing = fails(capsys, "train", demos, *out, "--begin", tmp_path / "none.zip")
-    assert "error: --begin: no file" in missing
-    evaluator = fails(capsys, "train", demos, *out, "--begin", trained / "evaluator.zip")
-    assert "error: --begin: " in evaluator
-    assert "is of format 'lw_torchrl.evaluator'" in evaluator
-    policy = trained / "policy.zip"
-    before = policy.read_bytes()
-    same = fails(capsys, "train", demos, "--out", policy, "--begin", policy, *SMALL)
-    assert "--out must be another file than --begin" in same
-    assert "delete" not in same
-    assert policy.read_bytes() == before
+def test_an_evaluator_that_does_not_fit_is_named(capsys, demos, trained, tmp_path):
+    out = ["--out", tmp_path / "x.safetensors", *SMALL]
+    file = ["--evaluator", trained / "evaluator.safetensors"]
+    assert "no file" in fails(capsys, "train", demos, *out, "--evaluator", tmp_path / "none.safetensors")
+    assert "no file" in fails(capsys, "train", demos, *out, "--begin", tmp_path / "none.safetensors")
+    lw.save_actor(lw.DescriptorConditionedActor(["reach"], width=8), tmp_path / "dc.safetensors")
+    error = fails(capsys, "train", demos, *out, "--begin", tmp_path / "dc.safetensors", *file)
+    assert "--evaluator requires a PlanConditionedActor, --begin is a DescriptorConditionedActor" in error
+    assert not (tmp_path / "x.safetensors").exists()
 
 
 @pytest.mark.slow
@@ -110,7 +93,7 @@ def test_cameras(capsys, demos, tmp_path):
     plans = lw.load_plans("MT50")
     lw.save_plans({"reach": plans["reach"]}, tmp_path / "plans")
     reach = next((tmp_path / "plans").iterdir())
-    policy = ["train", demos, "--out", tmp_path / "seeing.zip", "--plans", reach, *SMALL, *NET]
-    run(capsys, *policy, "--evaluator", out / "evaluator.zip")
-    found = run(capsys, "evaluate", tmp_path / "seeing.zip", "--tasks", "reach", "--episodes", 1)
+    policy = ["train", demos, "--out", tmp_path / "seeing.safetensors", "--plans", reach, *SMALL, *NET]
+    run(capsys, *policy, "--evaluator", out / "evaluator.safetensors")
+    found = run(capsys, "evaluate", tmp_path / "seeing.safetensors", "--tasks", "reach", "--episodes", 1)
     assert "reach" in found
