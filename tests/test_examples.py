@@ -108,7 +108,7 @@ def test_a_policy_trains_online(tmp_path, name):
     done = run(f"online/{name}.py", tmp_path, *task, *training, *warm_up)
     assert "step   2000/2000: " in done.stdout
     assert "button-press-topdown: success " in done.stdout
-    policy = lw.load_actor(tmp_path / "out" / "button-press-topdown-seed0" / "policy.zip")
+    policy = lw.load_actor(tmp_path / "out" / "button-press-topdown-seed0" / "policy.safetensors")
     assert policy.tasks == ("button-press-topdown",)
 
 

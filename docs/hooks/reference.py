@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from lw_torchrl.cli.main import COMMANDS, GROUPS
+from lw_torchrl.cli.main import COMMANDS
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.relations import PREDICATES, PUBLISHED, STATES, Comparison
 from lw_torchrl.language.tasks import MT10, TASKS, Task
@@ -37,13 +37,12 @@ def room_page(room: str) -> str:
 
 def commands() -> str:
     """What ``--help`` says of each command."""
-    names = [(name, *inner) for name in COMMANDS for inner in ([(), *((one,) for one in GROUPS.get(name, ()))])]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NO_COLOR": "1"}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NO_COLOR": "1", "COLUMNS": "100"}
     parts = ["# Commands", "", "What `lw-torchrl COMMAND --help` says. [Exit status, pipes and JSON](cli.md)", ""]
-    for name in names:
-        line = [sys.executable, "-m", "lw_torchrl", *name, "--help"]
+    for name in COMMANDS:
+        line = [sys.executable, "-m", "lw_torchrl", *name.split(), "--help"]
         told = subprocess.run(line, env=environment, capture_output=True, text=True, check=True).stdout
-        parts += [f"## {' '.join(name)}", "", "``` {.text .wrap}", told.strip(), "```", ""]
+        parts += [f"## {name}", "", "``` {.text .wrap}", told.strip(), "```", ""]
     return "\n".join(parts)
 
 

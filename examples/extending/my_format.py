@@ -1,7 +1,7 @@
 """A plan format of your own: how plans are written, asked of a language model, and read from its answer.
 
 lw-torchrl plan prompt drawer-open --format arrows --import my_format
-lw-torchrl plan check answer.txt --task drawer-open --format arrows --import my_format
+lw-torchrl plan read answer.txt --task drawer-open --format arrows --import my_format
 """
 
 import lw_torchrl as lw

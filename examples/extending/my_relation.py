@@ -2,7 +2,7 @@
 
 lw-torchrl query reach "Is the gripper far from the reach target?" --import my_relation
 lw-torchrl check reach.plan --import my_relation
-lw-torchrl scripted reach --plans reach.plan --episodes 2 --import my_relation
+lw-torchrl evaluate scripted --tasks reach --plans reach.plan --episodes 2 --import my_relation
 """
 
 from lw_torchrl.language.relations import RELATIONS, Comparison

@@ -1,12 +1,13 @@
-"""``lw-torchrl collect`` makes datasets; ``lw-torchrl data show`` says what they hold, and whether they are whole."""
+"""``lw-torchrl collect`` and ``data``: make, summarise and convert datasets."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from dataclasses import dataclass
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from statistics import median, quantiles
-from textwrap import TextWrapper
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from tyro.conf import Positional, arg
@@ -14,198 +15,161 @@ from tyro.conf import Positional, arg
 import lw_torchrl as lw
 from lw_torchrl._checks import counted
 from lw_torchrl.cli import options
+from lw_torchrl.cli.acting import is_object, policy_name, read_object
 from lw_torchrl.cli.output import Columns, Output, Row
+from lw_torchrl.language.tasks import TASKS
 
 if TYPE_CHECKING:
-    from lw_torchrl.data.behaviours import Behaviour
-    from lw_torchrl.data.dataset import Demonstrations, EpisodeInfo
-    from lw_torchrl.language.layout import Layout
+    from lw_torchrl.data.dataset import Demonstrations
 
 
 class _Episode(NamedTuple):
+    task: str
     behaviour: str
-    info: EpisodeInfo
-    earned: float  # the dense return
+    length: int
+    first_success: int | None
+    dense_return: float
 
 
-def collect(
-    tasks: Positional[Annotated[tuple[str, ...], arg(metavar="TASKS ...")]],  # MT10, MT50, or names of tasks
-    /,
-    out: Path,  # the dataset's folder
-    episodes: int = 10,  # kept for each task
-    seed: int = 0,  # evaluate on another one
-    noise: tuple[float, ...] = (0.0,),  # standard deviations of the execution noise, used in turn, one per episode
-    noise_hold: int = 10,  # steps for which each draw of the noise is kept; a longer one leads further from the path
-    gripper_noise: float = 0.2,  # factor of the noise on the gripper, which makes grasps fail
-    redraw_failures: bool = False,  # keep successful episodes only
-    policy: str = "expert",
-    behaviour: str | None = None,  # the label of its episodes; by default the name of who acts, or of the policy's file
-    task_file: options.TaskFile = None,
-    suite: options.SuiteName = None,
-    num_envs: int | None = None,  # environments stepped together; the dataset does not depend on it
-    json: options.Json = False,
-) -> Output:
-    """Collect demonstrations of the scripted experts, or of others. If it is stopped, the same command resumes it.
+@dataclass(kw_only=True)
+class Collect:
+    """Collect demonstrations of each task. If it is stopped, the same command resumes it.
 
     Example: lw-torchrl collect MT10 --out demos/mt10 --noise 0 0.1 0.2 --redraw-failures
-
-    Args:
-        policy: who acts: expert, Meta-World's scripts or the suite's own; scripted, plans with scripted skills;
-            spoilt-60 or spoilt-30, the same in so many of 100 pieces of an episode; wrong, any skill of the plan;
-            random; or a policy's file, of `lw-torchrl train`.
     """
-    options.check_folder("--out", out)
-    there = ", which was there already" if (out / "metadata.json").is_file() else ""
-    options.check_actor("policy", policy)
-    elsewhere = options.read_suite(suite, tasks)
-    chosen = options.simulated("tasks", options.one_or_many(tasks), options.read_tasks(task_file, tasks), elsewhere)
-    acts: Any = policy
-    if policy not in options.ACTORS:
-        options.use_one_thread()
-        acts, behaviour = lw.load_actor(policy), behaviour or Path(policy).stem
-    how: dict[str, Any] = {"policy": acts, "behaviour": behaviour, "redraw_failures": redraw_failures, "seed": seed}
-    how |= {"noise_scale": noise, "noise_hold": noise_hold, "gripper_noise_factor": gripper_noise, "suite": elsewhere}
-    made = lw.data.collect_demonstrations(chosen, episodes_per_task=episodes, root=out, num_envs=num_envs, **how)
-    rates, runs = made.success_rate, made.attempts
-    rows = [{"task": task, "success": rate, "episodes_run": runs[task]} for task, rate in rates.items()]
-    columns: Columns = {"task": "task", "success": lambda row: f"{row['success']:.2f}", "episodes run": "episodes_run"}
-    output = Output(json).table("tasks", rows, columns).show("dataset", made.root)
-    return output.show("steps", made.num_steps, f"{counted(made.num_steps, 'step')} in {made.root}{there}")
+
+    tasks: options.TaskNames
+    out: Path  # folder of the dataset
+    episodes: int = 10  # episodes kept for each task
+    seed: int = 0  # random seed (use a different one for evaluation)
+    noise: tuple[float, ...] = (0.0,)  # standard deviations of the execution noise, used in turn, one per episode
+    noise_hold: int = 10  # steps for which each noise value is held; longer leads the robot further off its path
+    gripper_noise: float = 0.2  # factor on the noise of the gripper; a high one makes grasps fail
+    redraw_failures: bool = False  # keep only successful episodes
+    policy: options.Who = "expert"
+    behaviour: str | None = None  # label of the episodes; None for the policy's name
+    task_file: options.TaskFile = None
+    suite: options.SuiteName = None
+    num_envs: int | None = None  # environments stepped together; does not change the dataset
+    json: options.Json = False
+
+    def run(self) -> Output:
+        from lw_torchrl.data.behaviours import BEHAVIOURS
+
+        suite = options.read_suite(self.suite, self.tasks)
+        tasks = options.select_tasks(self.tasks, options.read_tasks(self.task_file, self.tasks), suite)
+        policy: Any = self.policy
+        behaviour = self.behaviour
+        if policy not in BEHAVIOURS:
+            options.use_one_thread()
+            policy = read_object(policy) if is_object(policy) else lw.load_actor(policy)
+            behaviour = behaviour or policy_name(self.policy)
+        noise = {"noise_scale": self.noise, "noise_hold": self.noise_hold, "gripper_noise_factor": self.gripper_noise}
+        run: dict[str, Any] = {"seed": self.seed, "num_envs": self.num_envs, "suite": suite, **noise}
+        run |= {"policy": policy, "behaviour": behaviour, "redraw_failures": self.redraw_failures}
+        dataset = lw.collect_demonstrations(tasks, episodes_per_task=self.episodes, root=self.out, **run)
+        runs = dataset.attempts
+        rates = dataset.success_rate.items()
+        rows = [{"task": task, "success": rate, "episodes_run": runs[task]} for task, rate in rates]
+        output = Output(self.json).table("tasks", rows, {**_SUCCESS, "episodes run": "episodes_run"})
+        return _show_dataset(output, dataset)
 
 
-def data() -> None:
-    """Datasets: what they hold, and how others read them and theirs are read."""
+_SUCCESS: Columns = {"task": "task", "success": lambda row: f"{row['success']:.2f}"}
 
 
-def show(
-    folders: Positional[Annotated[tuple[Path, ...], arg(metavar="FOLDERS ...")]],  # of `lw-torchrl collect`
-    /,
-    check: bool = False,  # also read them through against their checksums
-    json: options.Json = False,
-) -> Output:
-    """Show what datasets hold: who acted, in what, how often it succeeded, what it earned. Several are a mixture.
+def _show_dataset(output: Output, dataset: Demonstrations) -> Output:
+    output.show("dataset", dataset.root)
+    return output.show("steps", dataset.num_steps, f"{counted(dataset.num_steps, 'step')} in {dataset.root}")
+
+
+@dataclass(kw_only=True)
+class Show:
+    """Summarise datasets: collection policy, success rate, return. Several are read as a mixture.
 
     Example: lw-torchrl data show demos/mt10 demos/spoilt --check
     """
-    if not folders:
-        raise ValueError("folders must name at least one dataset")
-    for folder in folders:
-        options.check_dataset("folders", folder)
-    from lw_torchrl.data.dataset import read_metadata
-    from lw_torchrl.data.replay_checks import check_behaviours
-    from lw_torchrl.data.selection import returns_of
 
-    output = Output(json)
-    parts = [read_metadata(folder) for folder in folders]
-    check_behaviours(parts)
-    told: list[_Episode] = []
-    for part in parts:
-        earned = returns_of(part, part, "dense", None)[:, 0].tolist()
-        told += [_Episode(part.config.behaviour, *pair) for pair in zip(part.episodes, earned, strict=True)]
-        if not json:
-            print("\n".join(_about(part)) + "\n")
-    described = [
-        {"folder": part.root, "bytes": _size(part), "behaviour": part.config.behaviour, "config": part.config.to_json()}
-        | {"attempts": part.attempts, "versions": part.versions}
-        for part in parts
-    ]
-    output.show("datasets", described)
-    every = [] if json else [_row("all", told)]
-    _table(output, "task", told, lambda one: one.info.task, [] if len(parts) > 1 else every)
-    if len(parts) > 1:
-        if not json:
-            print()
-        _table(output, "behaviour", told, lambda one: one.behaviour, every)
-    output.show("all", _row("all", told))
-    if check:
-        _check(output, parts)
-    return output
+    folders: Positional[Annotated[tuple[Path, ...], arg(metavar="FOLDERS")]]  # datasets of `lw-torchrl collect`
+    check: bool = False  # also compare all rows with their checksums
+    json: options.Json = False
+
+    def run(self) -> Output:
+        from lw_torchrl.data.dataset import read_metadata
+        from lw_torchrl.data.replay_checks import check_behaviours
+        from lw_torchrl.data.selection import returns_of
+
+        parts = [read_metadata(folder) for folder in self.folders]
+        check_behaviours(parts)
+        output, episodes = Output(self.json), []
+        for part in parts:
+            returns = returns_of(part, part, "dense", None)[:, 0].tolist()
+            for info, total in zip(part.episodes, returns, strict=True):
+                episodes.append(_Episode(info.task, part.config.behaviour, info.length, info.first_success, total))
+            print(_describe(part))
+        described = [{"folder": part.root, "bytes": _size(part), "config": part.config.to_json()} for part in parts]
+        output.show("datasets", described)
+        for group in ("task", "behaviour")[: len(parts)]:
+            key = attrgetter(group)
+            rows = [_summary(label, [*some]) for label, some in groupby(sorted(episodes, key=key), key)]
+            last = group == "behaviour" or len(parts) == 1
+            output.table(f"{group}s", rows + [_summary("all", episodes)] * (last and not self.json), _columns(group))
+        output.show("all", _summary("all", episodes))
+        if self.check:
+            _check(output, parts)
+        return output
+
+
+def _describe(part: Demonstrations) -> str:
+    config = part.config
+    noise = ", ".join(f"{scale:g}" for scale in config.noise_scale)
+    if any(config.noise_scale):
+        noise += f"; held for {counted(config.noise_hold, 'step')}, on the gripper x{config.gripper_noise_factor:g}"
+    redrawn = sum(part.attempts.values()) - len(part.episodes)
+    episodes = f"{config.episodes_per_task} of each task, seed {config.seed}, at most {config.max_steps} steps"
+    lines = {
+        "dataset": f"{part.root}: {_size(part) / 1e6:.3g} MB",
+        "behaviour": f"{config.behaviour} ({config.policy.kind}), in {config.layout.name}",
+        "tasks": ", ".join(config.tasks) if len(config.tasks) <= 10 else counted(len(config.tasks), "task"),
+        "episodes": episodes + (f"; {counted(redrawn, 'failure')} drawn again" if config.redraw_failures else ""),
+        "noise": noise,
+        "made with": ", ".join(f"{name} {version}" for name, version in part.versions.items()),
+    }
+    return "".join(f"{name:10} {line}\n" for name, line in lines.items())
 
 
 def _size(part: Demonstrations) -> int:
     return sum(path.stat().st_size for path in part.root.rglob("*") if path.is_file())
 
 
-def _about(part: Demonstrations) -> list[str]:
-    """What a dataset's metadata say of it, in lines."""
-    from lw_torchrl.data.dataset import FORMAT_VERSION
-
-    how = part.config
-    noise = "none"
-    if any(how.noise_scale):
-        scales = ", ".join(f"{scale:g}" for scale in how.noise_scale)
-        noise = f"{scales}; held for {counted(how.noise_hold, 'step')}, on the gripper x{how.gripper_noise_factor:g}"
-    asked = f"{how.episodes_per_task} of each task, of at most {counted(how.max_steps, 'step')}, seed {how.seed}"
-    redrawn = sum(part.attempts.values()) - len(part.episodes)
-    lines = {
-        "dataset": f"{part.root}: {_bytes(_size(part))}, format version {FORMAT_VERSION}",
-        "behaviour": f"{how.behaviour}: {_acted(how.policy, how.layout)}",
-        "tasks": ", ".join(how.tasks) if len(how.tasks) <= 10 else counted(len(how.tasks), "task"),
-        "episodes": asked + (f"; {counted(redrawn, 'failure')} drawn again" if how.redraw_failures else ""),
-        "noise": noise,
-        "made with": ", ".join(f"{name}\N{NO-BREAK SPACE}{version}" for name, version in part.versions.items()),
-    }
-    fit = TextWrapper(120, subsequent_indent=" " * 11, break_long_words=False, break_on_hyphens=False)
-    return [fit.fill(f"{name:10} {line}").replace("\N{NO-BREAK SPACE}", " ") for name, line in lines.items()]
-
-
-def _acted(who: Behaviour, layout: Layout) -> str:
-    if who.kind == "expert":
-        return "Meta-World's scripts" if layout.name == "metaworld" else f"the expert of {layout.name}"
-    if who.kind in ("policy", "imported"):
-        return f"a policy, fingerprint {who.fingerprint}" if who.kind == "policy" else "others, imported"
-    pieces = f"{who.shortest} to {who.longest} steps"
-    other = {"skill": "any skill of the plan", "action": "one action"}[who.otherwise]
-    if who.right == 0.0:
-        return f"{other} for {pieces}, after another"
-    plans = f"plans (fingerprint {str(who.fingerprint)[:16]}) with scripted skills"
-    return plans if who.right == 1.0 else f"{plans} in {who.right:.3g} of pieces of {pieces}, else {other}"
-
-
-def _bytes(size: float) -> str:
-    for unit in ("B", "kB", "MB"):
-        if size < 1000:
-            return f"{size:.3g} {unit}"
-        size /= 1000
-    return f"{size:.3g} GB"
-
-
-def _table(
-    output: Output, name: str, told: list[_Episode], of: Callable[[_Episode], str], ending: list[dict[str, Any]]
-) -> None:
-    """A row for each task or behaviour, and a last one; each is called ``label``."""
-
+def _columns(label: str) -> Columns:
     def first(row: Row) -> str:
-        when = row["first_success"]
-        return "never" if when is None else f"{when['median']:.0f} ({when['min']}..{when['max']})"
+        steps = row["first_success"]
+        return "never" if steps is None else f"{steps['median']:.0f} ({steps['min']}..{steps['max']})"
 
-    output.table(
-        f"{name}s",
-        [_row(label, [*episodes]) for label, episodes in groupby(sorted(told, key=of), of)] + ending,
-        {
-            name: "label",
-            "episodes": "episodes",
-            "steps": "steps",
-            "success": lambda row: f"{row['success']:.2f}",
-            "first success": first,
-            "dense return": lambda row: f"{row['dense_return']['mean']:.1f}",
-            "quartiles": lambda row: " ".join(f"{one:.1f}" for one in row["dense_return"]["quartiles"]),
-        },
-    )
+    return {
+        label: "label",
+        "episodes": "episodes",
+        "steps": "steps",
+        "success": lambda row: f"{row['success']:.2f}",
+        "first success": first,
+        "dense return": lambda row: f"{row['dense_return']['mean']:.1f}",
+        "quartiles": lambda row: " ".join(f"{one:.1f}" for one in row["dense_return"]["quartiles"]),
+    }
 
 
-def _row(label: str, episodes: list[_Episode]) -> dict[str, Any]:
-    first = [one.info.first_success for one in episodes if one.info.first_success is not None]
-    earned = [one.earned for one in episodes]
+def _summary(label: str, episodes: list[_Episode]) -> dict[str, Any]:
+    first = [one.first_success for one in episodes if one.first_success is not None]
+    returns = [one.dense_return for one in episodes]
     return {
         "label": label,
         "episodes": len(episodes),
-        "steps": sum(one.info.length for one in episodes),
+        "steps": sum(one.length for one in episodes),
         "success": len(first) / len(episodes),
         "first_success": {"median": median(first), "min": min(first), "max": max(first)} if first else None,
         "dense_return": {
-            "mean": sum(earned) / len(earned),
-            "quartiles": quantiles(earned, n=4, method="inclusive") if len(earned) > 1 else earned * 3,
+            "mean": sum(returns) / len(returns),
+            "quartiles": quantiles(returns, n=4, method="inclusive") if len(returns) > 1 else returns * 3,
         },
     }
 
@@ -217,8 +181,59 @@ def _check(output: Output, parts: list[Demonstrations]) -> None:
     for part in parts:
         if broken := len(part.episodes) - len(whole_episodes(part, progress=True)):
             damaged.append({"folder": part.root, "episodes": broken})
-            share = f"{broken} of {counted(len(part.episodes), 'episode')} differ from their checksums"
-            mend = "delete the folder and collect the dataset again"
-            output.fault = output.fault or f"{str(part.root)!r} is damaged: {share}; {mend}"
-    sound = f"\nchecked: all rows of {counted(len(parts), 'dataset')} are as they were written"
-    output.show("damaged", damaged, None if damaged else sound)
+            number = f"{broken} of {counted(len(part.episodes), 'episode')} differ from their checksums"
+            output.fault = f"{str(part.root)!r} is damaged: {number}; delete the folder and collect it again"
+    output.show("damaged", damaged, None if damaged else "\nchecked: all rows match their checksums")
+
+
+@dataclass(kw_only=True)
+class Export:
+    """Convert a dataset to another library's format. `lw-torchrl data import` restores it, bit for bit.
+
+    Example: lw-torchrl data export demos/mt10 --to lerobot --out lerobot/mt10
+    """
+
+    folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]  # dataset of `lw-torchrl collect`
+    to: str  # format: lerobot (version 3) or minari
+    out: Path  # folder to write, new or empty
+    plans: tuple[str, ...] = ()  # plans whose conditions are stored with each row, if not the suite's
+    suite: options.SuiteName = None
+    json: options.Json = False
+
+    def run(self) -> Output:
+        suite = options.read_suite(self.suite)
+        plans = options.read_plans(self.plans, TASKS if suite is None else suite.tasks) if self.plans else None
+        out = lw.export_dataset(self.folder, self.to, self.out, suite=suite, plans=plans)  # type: ignore[arg-type]
+        files = [path for path in out.rglob("*") if path.is_file()]
+        size = sum(path.stat().st_size for path in files)
+        output = Output(self.json).show("out", out).show("format", self.to).show("files", len(files))
+        return output.show("bytes", size, f"{counted(len(files), 'file')}, {size / 1e6:.1f} MB, in {out}")
+
+
+@dataclass(kw_only=True)
+class Import:
+    """Convert another library's dataset of a suite's tasks to ours. It prints which columns the source lacks.
+
+    Example: lw-torchrl data import lerobot/mt10 --out demos/mt10
+    """
+
+    source: Positional[Annotated[Path, arg(metavar="SOURCE")]]  # LeRobot or Minari folder, or robomimic HDF5 file
+    out: Path  # folder of the dataset, new or empty
+    format: str | None = None  # format of the source; None recognises it by its files
+    task: str | None = None  # task of all episodes, if the source does not name it
+    suite: options.SuiteName = None
+    behaviour: str = "imported"  # label of the episodes
+    episodes: int | None = None  # import only the first N episodes of each task; None imports all
+    json: options.Json = False
+
+    def run(self) -> Output:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            about: dict[str, Any] = {"format": self.format, "task": self.task, "behaviour": self.behaviour}
+            suite = options.read_suite(self.suite) or "metaworld"
+            dataset = lw.import_dataset(self.source, self.out, suite=suite, episodes_per_task=self.episodes, **about)
+        rows = [{"task": task, "success": rate} for task, rate in dataset.success_rate.items()]
+        output = Output(self.json).table("tasks", rows, _SUCCESS)
+        lacking = [str(one.message) for one in caught if str(one.message).startswith("source: ")]
+        output.show("lacking", lacking, "\n".join(lacking) or None)
+        return _show_dataset(output, dataset)

@@ -8,7 +8,6 @@ from typing import Any
 
 import lw_torchrl as lw
 from lw_torchrl.cli import options
-from lw_torchrl.cli.output import Output
 from lw_torchrl.language.tasks import MT10
 
 RECORDED = ("drawer-open", "window-open")
@@ -35,20 +34,21 @@ class DemoConfig:
 QUICK = DemoConfig(tasks=RECORDED, demonstrations_per_task=4, training_steps=800, batch_size=100, episodes_per_task=5)
 
 
-def demo(out: Path | None = None, quick: bool = False, json: options.Json = False) -> Output:
-    """Train a plan-conditioned policy on MT10 and show it: demonstrations, training, evaluation, a recording.
+@dataclass(kw_only=True)
+class Demo:
+    """Train a plan-conditioned policy on MT10, evaluate it and record an episode, in some minutes on two cores.
 
-    Takes some minutes on two cores. If it is stopped, the same command resumes it.
+    If it is stopped, the same command resumes it.
 
-    Args:
-        out: folder for results.json, success.png, rollout.rrd, checkpoint.safetensors and config.json; runs/demo, or
-            runs/demo-quick with --quick.
-        quick: two tasks and little training, in under a minute; not a measure of anything.
+    Example: lw-torchrl demo --quick
     """
-    folder = options.check_folder("--out", out or Path("runs/demo-quick" if quick else "runs/demo"))
-    options.use_one_thread()
-    result = run_demo(folder, QUICK if quick else DemoConfig())
-    return Output(json).result(result) if json else Output(json)  # run_demo has printed the table
+
+    out: Path | None = None  # folder of everything it writes; by default runs/demo, or runs/demo-quick with --quick
+    quick: bool = False  # two tasks and little training, in under a minute; its success rate means nothing
+
+    def run(self) -> None:
+        options.use_one_thread()
+        run_demo(self.out or Path("runs/demo-quick" if self.quick else "runs/demo"), QUICK if self.quick else DemoConfig())
 
 
 def run_demo(out: Path, config: DemoConfig) -> lw.EvaluationResult:

@@ -1,189 +1,119 @@
-"""The command line, ``lw-torchrl``: each command is a function, and its docstring the help text.
+"""The command line, ``lw-torchrl``: parses ``--import``, finds the command and reports errors.
 
-What an argument is, a comment beside it says, or the docstring if it takes more words. A command returns what it
-found, an :class:`~lw_torchrl.cli.output.Output`, where it has ``--json``.
+A command is a dataclass: its docstring and the comments beside its fields are the help text, and ``run`` does the work.
 """
 
-import os
-import signal
-import sys
-import threading
-from collections import UserDict
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, redirect_stdout
-from importlib import import_module
-from keyword import iskeyword
-from types import FrameType
-from typing import Any, NoReturn
+from __future__ import annotations
 
-import tyro
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import nullcontext, redirect_stdout
+from importlib import import_module
 
 from lw_torchrl import __version__
-from lw_torchrl._checks import nearest, shown
-from lw_torchrl.cli.faults import TRACEBACK, in_users_module, is_ours
-from lw_torchrl.cli.output import Output, complain, nobody_reads, sound_streams
-from lw_torchrl.cli.parsing import document, import_modules, in_its_words, parse, unpadded
+from lw_torchrl._checks import nearest
 
+# Name to group, class and summary. Classes are named, not imported, so that `lw-torchrl --help` loads no torch.
+COMMANDS = {
+    "collect": ("Data", "data:Collect", "Collect demonstrations of scripted experts, skills or a policy"),
+    "data show": ("Data", "data:Show", "Summarise datasets: collection policy, success rate, return"),
+    "data export": ("Data", "data:Export", "Convert a dataset to another library's format"),
+    "data import": ("Data", "data:Import", "Convert another library's dataset to ours"),
+    "train": ("Training", "train:Train", "Train a policy on demonstrations"),
+    "train-evaluator": ("Training", "train:TrainEvaluator", "Train a network that answers conditions"),
+    "evaluate": ("Evaluation", "evaluate:Evaluate", "Evaluate a policy, the experts or scripted skills"),
+    "record": ("Evaluation", "record:Record", "Record episodes as a rerun file"),
+    "view": ("Evaluation", "record:View", "Open recordings in the rerun viewer"),
+    "tasks": ("Language", "language:Tasks", "List tasks, or show one: objects, queries, plan, skills"),
+    "query": ("Language", "language:Ask", "Answer a query in a state of a task"),
+    "plan prompt": ("Language", "plan:Prompt", "Print the prompt that asks a language model for a plan"),
+    "plan generate": ("Language", "plan:Generate", "Ask a language model for plans"),
+    "plan read": ("Language", "plan:Read", "Show how a free-form plan is parsed, with a confidence score"),
+    "plan repair": ("Language", "plan:Repair", "Ask a language model to repair the plans that fail"),
+    "demo": ("Other", "demo:Demo", "Train, evaluate and record a policy on MT10 in a few minutes"),
+    "check": ("Other", "check:Check", "Validate a file of plans, skills or tasks, or a suite"),
+    "info": ("Other", "check:Info", "Describe a policy file, a dataset or a recording"),
+}
+_MORE = """`lw-torchrl COMMAND --help` explains a command. Every command accepts --import MODULE, which first
+imports your Python module, for example one that registers a suite or a policy class
+(docs/extending.md). Commands that print a table accept --json. --version prints the version.
 
-class Commands(UserDict[str, Any]):
-    """Commands by name. One that is given by its module's name is imported when it is asked for: words take longer to
-    load than all else here."""
-
-    def __getitem__(self, name: str) -> Any:
-        found = super().__getitem__(name)
-        if isinstance(found, str):
-            function = name.replace("-", "_") + "_" * iskeyword(name)
-            found = self[name] = getattr(import_module(f"lw_torchrl.cli.{found}"), function)
-        return found
-
-
-COMMANDS = Commands(
-    {
-        "demo": "demo",
-        "collect": "data",
-        "data": "data",
-        "train": "train",
-        "train-evaluator": "train",
-        "evaluate": "evaluate",
-        "card": "evaluate",
-        "record": "record",
-        "view": "record",
-        "query": "language",
-        "scripted": "evaluate",
-        "tasks": "language",
-        "queries": "language",
-        "skills": "language",
-        "plans": "language",
-        "plan": "plan",
-        "check": "check",
-    }
-)
-_OF_PLAN = dict(prompt="plan", generate="plan_models", read="plan", check="plan")
-_OF_PLAN |= dict(repair="plan_models")
-_OF_DATA = {"show": "data", "export": "exchange", "import": "exchange"}
-GROUPS = {"plan": Commands(_OF_PLAN), "data": Commands(_OF_DATA)}
-"""Commands that have commands of their own."""
-ABOUT = """Language-World with TorchRL: policies carried by plans in English. --version tells which.
-
---import MODULE, beside any command, imports a module of yours first, which may add suites, relations, formats, policies
-or evaluators of your own to their tables (docs/extending.md).
-
-Exit status: 0, done; 1, a bug of ours, with a traceback; 2, an error that you can fix, in one line on the standard
-error, which names the line of a module of yours if it is there (LW_TORCHRL_TRACEBACK=1 shows the traceback); 130,
-stopped by Ctrl-C; 141, nobody reads the output. What prints a table prints JSON with --json."""
-
-_RESUMABLE = {"demo", "collect", "train", "train-evaluator", "plan generate", "plan repair"}
+Exit status: 0: done; 1: a bug, with a traceback; 2: an error that you can fix, in one line
+(LW_TORCHRL_TRACEBACK=1 adds the traceback); 130: stopped by Ctrl-C; 141: broken pipe."""
+_USER_ERRORS = (ValueError, OSError, ImportError, RuntimeError)
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Run the command line; an error a user can mend is one line and exit status 2, Ctrl-C is 130."""
-    given = sys.argv[1:] if args is None else list(args)
-    interrupts: list[int] = []
-    with sound_streams(), _noting(interrupts):
-        try:
-            _run(given)
-        except KeyboardInterrupt:
-            _stop(given)
-        except SystemExit as ended:  # of a module of yours: what was asked for is not done
-            if (message := in_users_module(ended)) is None:
-                raise
-            message += "; a module of yours must not end the program"
-            if os.environ.get(TRACEBACK):
-                raise RuntimeError(message) from ended
-            complain(f"lw-torchrl: error: {message}")
-            sys.exit(2)
-        except Exception as error:
-            if interrupts:  # raised within a library, Ctrl-C may surface as something else
-                _stop(given)
-            if os.environ.get(TRACEBACK) or (isinstance(error, BrokenPipeError) and nobody_reads()):
-                raise
-            if (message := in_users_module(error)) is not None:
-                message += f"; {TRACEBACK}=1 shows the traceback"
-            elif not isinstance(error, (ValueError, TypeError, OSError, ImportError, RuntimeError)):
-                raise
-            else:
-                message = str(error)
-                _, args, table = _group(given)
-                if is_ours(error) and args and args[0] in table:
-                    message = in_its_words(args[0], table[args[0]], message)
-            complain(f"lw-torchrl: error: {message}")
-            sys.exit(2)
+    """Run the command line; ends with :class:`SystemExit` unless the exit status is 0."""
+    try:
+        _run(list(sys.argv[1:] if args is None else args))
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else the interpreter complains as it exits
+        sys.exit(141)
+    except KeyboardInterrupt:
+        _exit("stopped; most commands resume if you run them again", 130)
+    except Exception as error:
+        if os.environ.get("LW_TORCHRL_TRACEBACK") or not isinstance(error, _USER_ERRORS):
+            raise
+        _exit(f"error: {error}", 2)
 
 
-def _run(given: Sequence[str]) -> None:
-    for arg in given:  # its name could be written to no file of ours
-        if any("\ud800" <= character <= "\udfff" for character in arg):
-            raise ValueError(f"the argument {arg!a} is no text in the encoding {sys.getfilesystemencoding()}")
-    given = import_modules(given)
-    if list(given) == ["--version"]:
+def _exit(message: str, status: int) -> None:
+    print(f"lw-torchrl: {message}", file=sys.stderr)
+    sys.exit(status)
+
+
+def _run(args: list[str]) -> None:
+    args = _import_modules(args)
+    if args == ["--version"]:
         print(f"lw-torchrl {__version__}")
         return
-    group, args, table = _group(given)
-    prog = f"lw-torchrl {group}".strip()
-    try:
-        if args and (args[0] in ("-h", "--help") or args[0].startswith("--tyro-")):
-            about = COMMANDS[group].__doc__ if group else ABOUT
-            with unpadded():
-                for command in table.values():
-                    document(command)
-                tyro.extras.subcommand_cli_from_dict(dict(table), prog=prog, description=about, args=args)
-        else:
-            name = _command(prog, args, table)
-            command = parse(f"{prog} {name}", table[name], args[1:])
-            # With --json a command's document is all that goes to the standard output.
-            with redirect_stdout(sys.stderr) if command.keywords.get("json") else nullcontext():
-                output = command()
-            if isinstance(output, Output):
-                if output.as_json:
-                    print(output.document())
-                if output.fault:
-                    raise ValueError(output.fault)
-    finally:
-        sys.stdout.flush()
-
-
-def _group(given: Sequence[str]) -> tuple[str, list[str], Commands]:
-    """The command that has commands of its own, if that is given; what follows it; the commands to choose from."""
-    group = given[0] if given and given[0] in GROUPS else ""
-    return group, [*given[1:]] if group else [*given], GROUPS.get(group, COMMANDS)
-
-
-def _command(prog: str, args: Sequence[str], table: Commands) -> str:
-    """The name of the command that is given; else :class:`ValueError` with the nearest."""
-    known = ", ".join(table)
-    if not args or args[0].startswith("-"):
-        got = f", got {shown(args[0])}" if args else ""
-        raise ValueError(f"a command must come first, one of {known}{got}; `{prog} --help` says what each does")
-    if args[0] not in table:
-        inner = {name: f"{group} {name}" for group, names in GROUPS.items() for name in names}
-        known_as = inner | {name: name for name in table}
-        close = nearest(args[0], known_as, n=1)
-        hint = f"; did you mean {known_as[close[0]]!r}?" if close else ";"
-        raise ValueError(f"there is no command {shown(args[0])}{hint} `{prog} --help` lists them: {known}")
-    return args[0]
-
-
-@contextmanager
-def _noting(interrupts: list[int]) -> Iterator[None]:
-    """Within the block Ctrl-C also leaves a note."""
-    before = signal.getsignal(signal.SIGINT) if threading.current_thread() is threading.main_thread() else None
-    if before is not signal.default_int_handler:
-        yield
+    name = " ".join(args[:2]) if " ".join(args[:2]) in COMMANDS else " ".join(args[:1])
+    inner = {other: command for other, command in COMMANDS.items() if other.startswith(f"{name} ")}
+    if not name or name.startswith("-") or (inner and args[1:] in ([], ["-h"], ["--help"])):
+        if name not in ("", "-h", "--help") and not inner:
+            raise ValueError(f"the command must come first, got {name!r}; `lw-torchrl --help` lists the commands")
+        print(_overview(inner or COMMANDS))
         return
+    if name not in COMMANDS:
+        close = nearest(" ".join(args[:2]) if inner else name, inner or COMMANDS, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise ValueError(f"there is no command {' '.join(args[: 1 + bool(inner)])!r}{hint} (see `lw-torchrl --help`)")
+    import tyro
 
-    def note(number: int, frame: FrameType | None) -> None:
-        interrupts.append(number)
-        signal.default_int_handler(number, frame)
+    module, _, attribute = COMMANDS[name][1].partition(":")
+    kind = getattr(import_module(f"lw_torchrl.cli.{module}"), attribute)
+    markers = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
+    command = tyro.cli(kind, prog=f"lw-torchrl {name}", args=args[1 + (" " in name) :], config=markers)
+    # With --json the document is all that goes to the standard output.
+    with redirect_stdout(sys.stderr) if getattr(command, "json", False) else nullcontext():
+        output = command.run()
+    if output is not None:
+        output.finish()
 
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+
+def _overview(commands: dict[str, tuple[str, str, str]]) -> str:
+    width = max(map(len, commands))
+    lines = ["usage: lw-torchrl COMMAND [ARGUMENTS]", "", "Train and evaluate plan-conditioned robot policies."]
+    for title in dict.fromkeys(group for group, _, _ in commands.values()):
+        rows = [(name, summary) for name, (group, _, summary) in commands.items() if group == title]
+        lines += ["", f"{title}:", *(f"  {name:{width}}  {summary}" for name, summary in rows)]
+    return "\n".join([*lines, "", _MORE])
 
 
-def _stop(given: Sequence[str]) -> NoReturn:
-    named = {" ".join(given[:1]), " ".join(given[:2])}
-    resumed = "; the same command carries on from here" if named & _RESUMABLE else ""
-    complain(f"\nlw-torchrl: stopped{resumed}")
-    sys.exit(130)
+def _import_modules(args: list[str]) -> list[str]:
+    """Import the module of each ``--import MODULE`` and return the other arguments."""
+    rest, words = [], iter(args)
+    for word in words:
+        if word == "--import" or word.startswith("--import="):
+            if "" not in sys.path:
+                sys.path.insert(0, "")  # the working folder comes first
+            name = next(words, "") if word == "--import" else word.removeprefix("--import=")
+            if not name:
+                raise ValueError("--import requires the name of a Python module")
+            import_module(name)
+        else:
+            rest.append(word)
+    return rest

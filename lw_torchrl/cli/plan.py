@@ -1,160 +1,257 @@
-"""``lw-torchrl plan``: plans from language models, one command for each thing to do with them."""
+"""``lw-torchrl plan``: plans of language models, from the prompt to the repair."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
+import lw_torchrl as lw
 from lw_torchrl._checks import check_choice, counted
 from lw_torchrl._files import read_text
 from lw_torchrl.cli import options
-from lw_torchrl.cli.output import Columns, Output
+from lw_torchrl.cli.output import Columns, Output, Row
 from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.plans import PlanError, Plans
 from lw_torchrl.language.tasks import Task, check_task
+from lw_torchrl.suites.suite import load_suite
+
+_FORMATS = "basic, chain or goal, followed by _py, _py_md or _md"
+_ASKED = (
+    "model base_url constrain free_skills vocabulary temperature max_tokens seed name concurrency retries timeout cache"
+)
+_SOURCES = f"{options.PLANS}, a suite, or answers of `plan generate`, FORMAT/TASK-ATTEMPT.py"
+Format = Annotated[str, arg(help=f"plan format: {_FORMATS}")]
 
 
-def prompt(
-    task: Positional[Annotated[str, arg(metavar="TASK")]],  # the task that a plan is wanted for
-    /,
-    format: str = "chain_py",  # how plans are written: basic, chain or goal, then _py, _py_md or _md
-    vocabulary: bool = False,  # also say which things the task has, and what can be asked of them
-    plans: options.PlanSources = ("MT10",),  # of the examples
-    task_file: options.TaskFile = None,
-) -> None:
-    """Print the text that asks a language model for a plan: plans of three other tasks, then the task.
+@dataclass(kw_only=True)
+class Prompt:
+    """Print the prompt that asks a language model for a plan: the plans of three other tasks, then the task.
 
     Example: lw-torchrl plan prompt drawer-open --format chain_py
     """
-    from lw_torchrl.planners.prompts import plan_prompt
 
-    known = options.read_tasks(task_file, (task,))
-    found = plan_prompt(task, format, plans=options.read_plans(plans, known), vocabulary=vocabulary, tasks=known)
-    print(found, end="")
+    task: options.TaskName
+    format: Format = "chain_py"
+    vocabulary: bool = False  # also list the objects of the task and the supported queries
+    plans: Annotated[options.PlanSources, arg(help=f"plans of the examples: {options.PLANS}")] = ("MT10",)
+    task_file: options.TaskFile = None
 
+    def run(self) -> None:
+        from lw_torchrl.planners.prompts import plan_prompt
 
-def _answer(
-    file: Path, task: str | None, format: str | None, task_file: Path | None
-) -> tuple[str, str, str, Mapping[str, Task]]:
-    """The text of an answer, the task that it is for, how it is written, and the tasks that are known."""
-    if not file.is_file():
-        raise FileNotFoundError(f"file: there is no file {str(file)!r}")
-    known = options.read_tasks(task_file, () if task is None else (task,))
-    if task is None:
-        task = re.sub(r"-\d+$", "", file.stem)
-        if task not in known:
-            raise ValueError(f"--task must be given, since the file's name, {file.name!r}, names no task")
-    if format is None:
-        format = "basic_py" if file.suffix == ".plan" else file.absolute().parent.name
-        if format not in PLAN_FORMATS:
-            raise ValueError(f"--format must be given, one of {', '.join(PLAN_FORMATS)}: the file's folder is none")
-    check_task(task, known)
-    check_choice("format", format, PLAN_FORMATS)
-    return read_text(file, ValueError), task, format, known
+        known = options.read_tasks(self.task_file, (self.task,))
+        plans = options.read_plans(self.plans, known)
+        print(plan_prompt(self.task, self.format, plans=plans, vocabulary=self.vocabulary, tasks=known), end="")
 
 
-def read(
-    source: Positional[Annotated[str, arg(metavar="FILE")]],
-    /,
-    task: str | None = None,  # of an answer; by default as the file's name says
-    format: str | None = None,  # of an answer; by default as the file's folder says
-    task_file: options.TaskFile = None,
-    json: options.Json = False,
-) -> Output:
-    """Show what policies with roles see of a plan: what became of each step, and how far the plan is trusted.
+@dataclass(kw_only=True)
+class _Model:
+    """Options of the commands that ask a language model."""
 
-    Trust is the share of usual states of the plan's motion in which the plan, as written, does what the motion needs.
-    Below 0.75, or if it moves a thing without closing the gripper around it, or pulls what is no handle, the plan is
-    completed: its motion, things and directions stay, and its conditions are ours. A plan that
-    says no motion becomes the default plan: grasp the first thing and move it to the goal.
+    tasks: options.TaskNames
+    model: str  # the model's name at the server
+    base_url: str | None = None  # the server's address; None for OPENAI_BASE_URL, or else OpenAI's
+    attempts: int = 1  # answers to each prompt
+    constrain: bool = False  # force answers to follow a JSON schema, so that every plan can be carried out
+    free_skills: bool = False  # with --constrain, allow skills in any words instead of only scripted ones
+    vocabulary: bool = False  # also list the objects of the task and the supported queries in prompts
+    temperature: float | None = None  # sampling temperature; None for the server's
+    max_tokens: int = 1024  # maximum tokens per answer (reasoning models need more)
+    seed: int | None = None  # seed of the first attempt; attempt k uses SEED + k; None sends none
+    name: str | None = None  # folder name for the answers; None for the model's name
+    plans: Annotated[options.PlanSources, arg(help=f"plans of the prompts' examples: {options.PLANS}")] = ("MT10",)
+    skill_file: options.SkillFile = None
+    task_file: options.TaskFile = None
+    concurrency: int = 4  # number of simultaneous requests
+    retries: int = 6  # retries of a request after a rate limit or a server error, with growing waits
+    timeout: float = 300.0  # seconds for one request, until the end of its answer
+    cache: Path = Path("runs/answers")  # folder that caches all answers
+    out: Path = Path("runs/plans")  # folder for the answers: OUT/NAME/FORMAT/TASK-ATTEMPT.py or .md
+    json: options.Json = False
+
+    def planner(self) -> tuple[lw.OpenAIPlanner, list[Task], Mapping[str, Task]]:
+        """Return the model, the selected tasks and all tasks."""
+        known = options.read_tasks(self.task_file, self.tasks)
+        asked = {name: getattr(self, name) for name in _ASKED.split()}
+        skills = options.read_skills(self.skill_file, known) if self.skill_file else None
+        planner = lw.OpenAIPlanner(skills=skills, plans=options.read_plans(self.plans, known), **asked)
+        return planner, [known[name] for name in options.select_tasks(self.tasks, known)], known
+
+
+@dataclass(kw_only=True)
+class Generate(_Model):
+    """Ask a language model for plans, and report how many of its answers are valid.
+
+    The model runs behind an OpenAI-compatible server: OpenAI's own, vLLM (http://127.0.0.1:8000/v1), Ollama
+    (http://127.0.0.1:11434/v1) or llama.cpp's (http://127.0.0.1:8080/v1). The key is read from OPENAI_API_KEY; a local
+    server needs none. Answers are cached: the same command only asks what is missing.
+
+    Example: lw-torchrl plan generate MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --attempts 4
+    """
+
+    format: Annotated[tuple[str, ...], arg(help=f'plan formats: {_FORMATS}; or "all"')] = ("chain_py",)
+
+    def run(self) -> Output:
+        planner, tasks, _ = self.planner()
+        formats = [*PLAN_FORMATS] if self.format == ("all",) else self.format
+        for format in formats:
+            check_choice("--format", format, PLAN_FORMATS)
+        rows, notes, tokens = [], [], 0
+        for format in formats:
+            answers = planner.plans(tasks, format=format, attempts=self.attempts, out=self.out)
+            tokens += answers.tokens.total
+            notes += [note for answer in answers for note in answer.notes]
+            for task in dict.fromkeys(answer.task for answer in answers):
+                some = [answer for answer in answers if answer.task == task]
+                rows.append({"task": task, "format": format, **_counts(some)})
+        output = Output(self.json)
+        title = f"{planner.model} at {planner.address}"
+        output.table("answers", rows, {key.replace("_", " "): key for row in rows[:1] for key in row}, title)
+        output.notes(notes)
+        output.show("tokens", tokens)
+        folder = self.out / planner.name
+        return output.show("folder", folder, f"{tokens} tokens; written to {folder}")
+
+
+def _counts(answers: Sequence[lw.planners.Answer]) -> dict[str, int]:
+    plans = [answer.decoded for answer in answers if answer.decoded.plan is not None]
+    return {
+        "answers": len(answers),
+        "plans": len(plans),
+        "all_scripted": sum(decoded.all_scripted for decoded in plans),
+        "asked_now": sum(not answer.cached for answer in answers),
+        "tokens_read": sum(answer.tokens.prompt for answer in answers),
+        "tokens_written": sum(answer.tokens.completion for answer in answers),
+    }
+
+
+@dataclass(kw_only=True)
+class Repair(_Model):
+    """Run a model's plans by scripted skills, report what failed to the model, and ask again.
+
+    The report names the step where the robot got stuck, conditions that never held, distances that stayed too large,
+    and text that could not be parsed. The answers of round k are kept in OUT/NAME-roundk. If it is stopped, the same
+    command resumes it.
+
+    Example: lw-torchrl plan repair MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --rounds 3
+    """
+
+    format: Format = "chain_py"
+    rounds: int = 3  # maximum number of repair rounds
+    enough: float = 0.8  # success rate above which a plan is not repaired
+    episodes: int = 10  # episodes of each plan
+    episode_seed: int = 0  # random seed of the episodes (use a different one for evaluation)
+
+    def run(self) -> Output:
+        planner, tasks, known = self.planner()
+        check_choice("--format", self.format, PLAN_FORMATS)
+        from lw_torchrl.planners.repairing import repair_plans
+
+        options.use_one_thread()
+        first = planner.plans(tasks, format=self.format, attempts=self.attempts, out=self.out, recorded=True)
+        how: dict[str, Any] = {"rounds": self.rounds, "enough": self.enough, "episodes": self.episodes}
+        repairs = repair_plans(planner, first, tasks=known, out=self.out, seed=self.episode_seed, **how)
+        rows = [
+            {"task": one.answers[0].task, "attempt": one.answers[0].attempt, "success": [c.success for c in one.checks]}
+            for one in repairs
+        ]
+
+        def after(number: int) -> Callable[[Row], str]:
+            return lambda row: f"{row['success'][number]:.0%}" if number < len(row["success"]) else ""
+
+        rounds = {f"round {k}" if k else "first": after(k) for k in range(self.rounds + 1)}
+        columns: Columns = {"task": "task", "attempt": "attempt", **rounds}
+        output = Output(self.json)
+        output.table("plans", rows, columns, f"success by scripted skills, {planner.model} in {self.format}")
+        output.notes(note for one in repairs for answer in one.answers for note in answer.notes)
+        asked = sum(not answer.cached for answer in first)
+        print(f"{counted(len(first), 'first answer')}, {asked} asked now")
+        done = max(len(one.checks) for one in repairs) - 1
+        folders = [self.out / planner.name, *(self.out / f"{planner.name}-round{k}" for k in range(1, done + 1))]
+        return output.show("folders", folders, f"written to {', '.join(map(str, folders))}")
+
+
+@dataclass(kw_only=True)
+class Read:
+    """Show, step by step, how free-form plans are parsed, with a confidence score; --out writes them as .plan files.
+
+    The confidence is the fraction of typical states of the plan's motion in which the plan, as written, does the right
+    thing. A plan below 0.75 is completed: it keeps its motion and objects, and gets standard conditions. A plan without
+    any motion becomes the fallback plan: grasp the first object and move it to the goal.
 
     Example: lw-torchrl plan read my-plans/coffee-pull.plan
 
-    Args:
-        source: a .plan file, a folder of them, a .json file of pairs, "MT10", "MT50" or a suite; or a language model's
-            answer, FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it.
+    Example: lw-torchrl plan read runs/plans/llama3.1/chain_py/*.py --out my-plans
     """
-    from lw_torchrl.language.canonical import canonical_plan
 
-    file = Path(source)
-    if file.is_file() and file.suffix not in (".plan", ".json"):
+    sources: Positional[Annotated[tuple[str, ...], arg(metavar="SOURCES", help=_SOURCES)]]
+    task: str | None = None  # show only this task; of an answer, None reads it from the file name
+    format: str | None = None  # plan format of an answer; None reads it from the folder name
+    out: Path | None = None  # folder for the plans as written, one .plan file a task: the most trusted, for --plans
+    task_file: options.TaskFile = None
+    json: options.Json = False
+
+    def run(self) -> Output:
+        from lw_torchrl.language.canonical import canonical_plan, most_trusted
+
+        written = [plan for source in self.sources for plan in self._plans(source)]
+        plans, steps = [canonical_plan(plan) for plan in written], []
+        for plan in plans:
+            source = f"{plan.source}, confidence {plan.trust:.2f}"
+            steps += [{"task": plan.written.task, "source": source, **note} for note in plan.notes()]
+        columns: Columns = {
+            "task": "task",
+            "plan": "source",
+            "as written": lambda row: row["written"] or "(added)",
+            "parsed as": lambda row: row["skill"] or "(dropped: cannot be parsed)",
+            "if": lambda row: row["condition"] or "",
+            "confidence": lambda row: f"{row['sure']:.1f}" if row["written"] else "",
+            "seen": "seen",
+        }
+        output = Output(self.json).table("read", steps, columns, counted(len(plans), "plan"))
+        rows = [{"task": plan.written.task, "source": plan.source, "trust": plan.trust} for plan in plans]
+        output.show("plans", rows)
+        if self.out is not None:
+            tasks = dict.fromkeys(plan.task for plan in written)
+            best = [most_trusted(plan for plan in written if plan.task == task) for task in tasks]
+            output.show("files", lw.save_plans(Plans(best), self.out), f"{counted(len(best), 'plan')} in {self.out}")
+        return output
+
+    def _plans(self, source: str) -> list[lw.ConditionalPlan]:
+        file = Path(source)
+        if file.is_file() and file.suffix not in (".plan", ".json"):
+            return self._decoded(file)
+        if file.exists() or source in ("MT10", "MT50"):
+            known = options.tasks_of_plans(file, self.task, self.task_file)
+            plans = options.read_plans([source], known)
+        else:
+            suite = load_suite(source)
+            known, plans = suite.tasks, Plans(suite.plans or {})
+        if self.task is None:
+            return list(plans.values())
+        check_task(self.task, known)
+        plans.require([self.task])
+        return [plans[self.task]]
+
+    def _decoded(self, file: Path) -> list[lw.ConditionalPlan]:
+        """Return the plan of a language model's answer; none if several are read and this one has none."""
         from lw_torchrl.language.plan_decoding import decode_plan
 
-        text, task, format, known = _answer(file, task, format, task_file)
-        decoded = decode_plan(text, task, format, tasks=known)
-        if decoded.plan is None:
-            raise ValueError(f"{source}: no plan can be read, {decoded.reason}")
-        plans = [decoded.plan]
-    else:
-        named = not file.exists() and source not in options.SETS and options.is_suite(source)
-        suite = options.read_suite(source) if named else None
-        files = sorted(file.glob("*.plan")) if file.is_dir() else [file]
-        known = options.tasks_of(files, task_file) if task is None else options.read_tasks(task_file, (task,))
-        if task is not None:
-            check_task(task, known if suite is None else suite.tasks)
-        found = options.read_plans([source], known, option="FILE") if suite is None else Plans(suite.plans or {})
-        plans = [plan for plan in found.values() if task in (None, plan.task)]
-        if not plans:
-            raise ValueError(f"--task {task}: {source} has no plan for it")
-    output, rows, steps = Output(json), [], []
-    for one in map(canonical_plan, plans):
-        name, notes = one.written.task, one.notes()
-        rows.append({"task": name, "source": one.source, "trust": one.trust})
-        steps += [{"task": name, "source": f"{one.source}, trust {one.trust:.2f}", **note} for note in notes]
-    columns: Columns = {
-        "task": "task",
-        "plan": "source",
-        "as written": lambda row: row["written"] or "(lacking)",
-        "read as": lambda row: row["skill"] or "(left out: it cannot be read)",
-        "if": lambda row: row["condition"] or "",
-        "sure": lambda row: f"{row['sure']:.1f}" if row["written"] else "",
-        "seen": "seen",
-    }
-    output.table("read", steps, columns, counted(len(rows), "plan"))
-    return output.show("plans", rows)
-
-
-def check(
-    file: Positional[options.File],
-    /,
-    task: str | None = None,  # the task it is for; by default as the file's name says
-    format: str | None = None,  # how it is written; by default as the file's folder says, or basic_py for a .plan file
-    episodes: int = 5,  # of the expert, and of the plan by scripted skills; conditions are answered in their states
-    seed: int = 0,  # of these
-    skill_file: options.SkillFile = None,
-    task_file: options.TaskFile = None,
-    json: options.Json = False,
-) -> Output:
-    """Say how a plan was read, where its conditions hold, and which steps never fire.
-
-    Example: lw-torchrl plan check runs/plans/llama3.1/chain_py/push-0.py
-
-    Args:
-        file: an answer FORMAT/TASK-ATTEMPT.EXT, as plan generate writes it, or a .plan file TASK.plan; any text with
-            --task and --format.
-    """
-    text, task, format, known = _answer(file, task, format, task_file)
-    skills = options.read_skills(skill_file, known) if skill_file else None
-    from lw_torchrl.planners.repairing import check_plan
-
-    options.use_one_thread()
-    found = check_plan(text, task, format, episodes=episodes, seed=seed, skills=skills, tasks=known)
-    steps = [step for step in found.decoded.steps if not step.dropped]
-    rows = [
-        {"condition": str(step.condition), "skill": step.written_skill, "scripted": step.scripted}
-        | {"expert": None if found.expert is None else found.expert.true[k]}
-        | {"own": None if found.own is None else found.own.true[k]}
-        | {"chosen": None if found.own is None else found.own.chosen[k], "never": k in found.never}
-        for k, step in enumerate(steps)
-    ]
-    output = Output(json).show("task", found.task, str(found)).show("reason", found.decoded.reason or None)
-    output.show("notes", [*map(str, found.decoded.notes)]).show("steps", rows)
-    return output.show("success", None if found.own is None else found.success)
-
-
-def plan() -> None:
-    """Plans from language models: the prompt, asking a model, and checking and repairing what it wrote."""
+        task, format = self.task or re.sub(r"-\d+$", "", file.stem), self.format or file.absolute().parent.name
+        known = options.read_tasks(self.task_file, (task,) if self.task else ())
+        if task not in known and self.task is None:
+            raise ValueError(f"--task is required: the file name {file.name!r} is not a task ({task!r})")
+        if format not in PLAN_FORMATS and self.format is None:
+            raise ValueError(f"--format is required, one of {', '.join(PLAN_FORMATS)}: {format!r} is not one")
+        decoded = decode_plan(read_text(file, ValueError), task, format, tasks=known)
+        if decoded.plan is None and len(self.sources) == 1:
+            raise PlanError(f"{file}: no plan can be read, {decoded.reason}")
+        notes = decoded.notes if decoded.plan is not None else [f"no plan can be read, {decoded.reason}"]
+        for note in notes:
+            print(f"{file}: {note}")
+        return [] if decoded.plan is None else [decoded.plan]

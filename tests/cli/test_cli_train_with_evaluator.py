@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from commands import check_documented, document, fails, run
+from commands import document, fails, run
 from pictures import why_no_pictures
 
 import lw_torchrl as lw
@@ -38,9 +38,8 @@ def weights(path, part="head"):
 
 def test_a_new_one_is_trained_with_the_policy(capsys, demos, tmp_path):
     out = tmp_path / "policy.safetensors"
-    args = "train", demos, "--out", out, "--evaluator", "new", "--qaf-anchor", 1, *SMALL, *NET
-    run(capsys, *args)
-    check_documented("train", document(capsys, *args))
+    args = "train", demos, "--out", out, "--evaluator", "StateQueryEvaluator", "--qaf-anchor", 1, *SMALL, *NET
+    assert document(capsys, *args)["steps"] == 4
     actor = lw.load_actor(out)
     assert isinstance(actor.evaluator, lw.StateQueryEvaluator)
     assert actor.config["answers"] == "tanh"
@@ -72,38 +71,15 @@ def test_a_trained_policy_is_tuned_with_one(capsys, demos, trained, tmp_path):
     assert any(not torch.equal(moved[name], kept[name]) for name in kept)
 
 
-def test_what_makes_no_sense_is_refused(capsys, demos, trained, tmp_path):
-    out = ["--out", tmp_path / "x.safetensors"]
-    assert "--evaluator new knows nothing" in fails(capsys, "train", demos, *out, "--evaluator", "new")
-    assert "--answers is of an evaluator" in fails(capsys, "train", demos, *out, "--answers", "hard")
-    assert "--qaf-anchor is of an evaluator" in fails(capsys, "train", demos, *out, "--qaf-anchor", 1)
+def test_an_evaluator_that_does_not_fit_is_named(capsys, demos, trained, tmp_path):
+    out = ["--out", tmp_path / "x.safetensors", *SMALL]
     file = ["--evaluator", trained / "evaluator.safetensors"]
-    assert "--method dc does not" in fails(capsys, "train", demos, *out, *file, "--method", "dc")
-    begin = ["--begin", trained / "policy.safetensors"]
-    assert "--width is that of the policy" in fails(capsys, "train", demos, *out, *begin, "--width", 64)
     assert "no file" in fails(capsys, "train", demos, *out, "--evaluator", tmp_path / "none.safetensors")
+    assert "no file" in fails(capsys, "train", demos, *out, "--begin", tmp_path / "none.safetensors")
     lw.save_actor(lw.DescriptorConditionedActor(["reach"], width=8), tmp_path / "dc.safetensors")
-    refused = fails(capsys, "train", demos, *out, "--begin", tmp_path / "dc.safetensors", *file)
-    assert "--evaluator is for one policy with plans, --begin names a DescriptorConditionedActor" in refused
-    assert "qaf_anchor is for a policy with an evaluator" in fails(
-        capsys, "train", demos, *out, *begin, "--qaf-anchor", 1
-    ).replace("--qaf-anchor", "qaf_anchor")
+    error = fails(capsys, "train", demos, *out, "--begin", tmp_path / "dc.safetensors", *file)
+    assert "--evaluator requires a PlanConditionedActor, --begin is a DescriptorConditionedActor" in error
     assert not (tmp_path / "x.safetensors").exists()
-
-
-def test_what_cannot_be_begun_with_is_named(capsys, demos, trained, tmp_path):
-    out = ["--out", tmp_path / "x.safetensors"]
-    missing = fails(capsys, "train", demos, *out, "--begin", tmp_path / "none.safetensors")
-    assert "error: --begin: no file" in missing
-    evaluator = fails(capsys, "train", demos, *out, "--begin", trained / "evaluator.safetensors")
-    assert "error: --begin: " in evaluator
-    assert "is of format 'lw_torchrl.evaluator'" in evaluator
-    policy = trained / "policy.safetensors"
-    before = policy.read_bytes()
-    same = fails(capsys, "train", demos, "--out", policy, "--begin", policy, *SMALL)
-    assert "--out must be another file than --begin" in same
-    assert "delete" not in same
-    assert policy.read_bytes() == before
 
 
 @pytest.mark.slow

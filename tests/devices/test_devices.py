@@ -86,11 +86,11 @@ def test_without_a_gpu_there_is_the_cpu(demos, tmp_path):
     [
         (
             ["train", "DEMOS", "--out", "p.safetensors", "--device", "cuda"],
-            "--device must be one of 'cpu', 'auto' here",
+            "device must be one of 'cpu', 'auto' here",
         ),
         (
             ["train", "DEMOS", "--out", "p.safetensors", "--device", "gpu"],
-            "--device must be one of 'cpu', 'cuda', 'cuda:0', 'mps', 'auto'",
+            "device must be one of 'cpu', 'cuda', 'cuda:0', 'mps', 'auto'",
         ),
     ],
 )

@@ -1,0 +1,121 @@
+"""The command line as a whole: help pages, exit codes, ``--import``, pipes."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from importlib.metadata import entry_points
+
+import pytest
+from commands import fails, run
+
+import lw_torchrl
+import lw_torchrl.cli.main as cli
+from lw_torchrl.cli.main import COMMANDS, main
+
+
+def test_the_package_installs_the_command():
+    (script,) = entry_points(group="console_scripts", name="lw-torchrl")
+    assert script.load() is main
+
+
+def test_help_lists_the_commands_in_groups(capsys):
+    printed = run(capsys, "--help")
+    assert run(capsys) == printed
+    assert [line[:-1] for line in printed.splitlines() if re.fullmatch(r"[A-Z]\w+:", line)] == [
+        "Data", "Training", "Evaluation", "Language", "Other"
+    ]  # fmt: skip
+    assert all(f"  {name} " in printed and summary in printed for name, (_, _, summary) in COMMANDS.items())
+    assert len({name.split()[0] for name in COMMANDS}) <= 13
+    assert max(map(len, printed.splitlines())) <= 100
+    assert "plan read" in (inner := run(capsys, "plan", "--help"))
+    assert "collect" not in inner
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_command_explains_itself_with_an_example(capsys, command):
+    with pytest.raises(SystemExit) as caught:
+        main([*command.split(), "--help"])
+    assert caught.value.code == 0
+    printed = capsys.readouterr().out
+    assert f"Example: lw-torchrl {command} " in printed
+    assert f"usage: lw-torchrl {command} " in printed
+
+
+def test_help_loads_nothing_heavy(python):
+    program = """
+import sys
+from lw_torchrl.cli.main import main
+for command in ([], ["train"], ["evaluate"]):
+    try:
+        main([*command, "--help"])
+    except SystemExit:
+        pass
+print([name for name in ("torch", "numpy", "torchrl", "mujoco", "rich") if name in sys.modules])
+"""
+    assert python(program).stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["evalute"], "there is no command 'evalute'; did you mean 'evaluate'?"),
+        (["data", "shwo"], "there is no command 'data shwo'; did you mean 'data show'?"),
+        (["--seed", "1", "train"], "the command must come first, got '--seed'"),
+        (["tasks", "raech"], "did you mean 'reach'"),
+        (["tasks", "--import", "no_such_module"], "No module named 'no_such_module'"),
+        (["evaluate", "nowhere.safetensors"], "no file 'nowhere.safetensors'"),
+        (["collect", "reach", "--out", "OUT", "--episodes", "0"], "must be at least 1, got 0"),
+        (["train", "nowhere", "--out", "OUT"], "nowhere"),
+        (["view", "nowhere.rrd"], "nowhere.rrd"),
+        (["check", "nowhere.plan"], "no file, folder or suite 'nowhere.plan'"),
+    ],
+)
+def test_an_error_is_one_line_and_status_2(capsys, tmp_path, monkeypatch, args, message):
+    monkeypatch.chdir(tmp_path)
+    error = fails(capsys, *args)
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_an_unknown_option_names_the_nearest(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["collect", "reach", "--out", "x", "--epsodes", "3"])
+    assert caught.value.code == 2
+    assert "--episodes INT" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "status"), [(KeyboardInterrupt(), 130), (ValueError("no"), 2), (KeyError("x"), None)]
+)
+def test_the_exit_status_says_what_happened(capsys, monkeypatch, error, status):
+    def failing(args):
+        raise error
+
+    monkeypatch.setattr(cli, "_run", failing)
+    with pytest.raises(SystemExit if status else KeyError) as caught:
+        main([])
+    assert status is None or caught.value.code == status
+    monkeypatch.setenv("LW_TORCHRL_TRACEBACK", "1")
+    with pytest.raises(SystemExit if status == 130 else type(error)):
+        main([])
+
+
+def test_a_closed_pipe_and_the_version():
+    for command in ("--help", "tasks", "tasks --json"):
+        script = f"'{sys.executable}' -m lw_torchrl {command} | true; exit ${{PIPESTATUS[0]}}"
+        done = subprocess.run(["bash", "-c", script], capture_output=True, timeout=120)
+        assert (done.returncode, done.stderr) == (141, b"")
+    version = subprocess.run([sys.executable, "-m", "lw_torchrl", "--version"], capture_output=True, timeout=120)
+    assert version.stdout.decode() == f"lw-torchrl {lw_torchrl.__version__}\n"
+
+
+def test_import_runs_a_module_first(capsys, tmp_path, monkeypatch):
+    (tmp_path / "my_words.py").write_text("print('imported')\n")
+    monkeypatch.chdir(tmp_path)
+    assert run(capsys, "tasks", "--import", "my_words", "reach").startswith("imported\n")
+    sys.modules.pop("my_words")
+    main(["--import=my_words", "tasks", "reach", "--json"])
+    assert json.loads(capsys.readouterr().out.removeprefix("imported\n"))["task"]["task"] == "reach"

@@ -1,0 +1,218 @@
+"""``lw-torchrl train``, ``evaluate``, ``info`` and ``demo``: what they print and write, and that they resume."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from dataclasses import replace
+
+import pytest
+from commands import document, fails, run
+
+import lw_torchrl as lw
+from lw_torchrl.cli.demo import QUICK
+from lw_torchrl.cli.main import main
+
+TINY = ("--steps", "30", "--batch-size", "20", "--width", "16", "--depth", "1")
+SHORT = ("--episodes", 1, "--max-steps", 5)
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory):
+    root = tmp_path_factory.mktemp("cli") / "demos"
+    main(["collect", "push", "reach", "--out", str(root), "--episodes", "1", "--noise", "0", "0.1"])
+    return root
+
+
+@pytest.fixture(scope="module")
+def policy(demos, tmp_path_factory):
+    path = tmp_path_factory.mktemp("cli") / "policy.safetensors"
+    main(["train", str(demos), "--out", str(path), *TINY])
+    return path
+
+
+def test_train_writes_a_policy_and_resumes(capsys, demos, policy):
+    actor = lw.load_actor(policy)
+    assert isinstance(actor, lw.PlanConditionedActor)
+    assert (actor.config["width"], actor.config["depth"]) == (16, 1)
+    content = policy.read_bytes()
+    assert f"trained to step 30: {policy}" in run(capsys, "train", demos, "--out", policy, *TINY)
+    assert document(capsys, "train", demos, "--out", policy, *TINY)["loss"] is None
+    fails(capsys, "train", demos, "--out", policy, *TINY[:-2], "--depth", 2)
+    fails(capsys, "train", demos, "--out", policy, *TINY, "--seed", 1)
+    assert policy.read_bytes() == content
+
+
+def test_train_requires_a_plan_and_demonstrations_of_every_task(capsys, tmp_path, demos):
+    lw.save_plans({"push": lw.load_plans("MT10")["push"]}, tmp_path / "plans")
+    out = ("--out", tmp_path / "p.safetensors")
+    assert "plans lack reach" in fails(capsys, "train", demos, *out, "--plans", tmp_path / "plans", *TINY)
+    assert "no demonstrations of door-open" in fails(capsys, "train", demos, *out, "--tasks", "reach", "door-open")
+    assert not out[1].exists()
+
+
+def test_train_logs_and_fine_tunes(capsys, tmp_path, demos, policy):
+    out = tmp_path / "tuned.safetensors"
+    options = ("--begin", policy, "--tasks", "push", "--steps", 2, "--batch-size", 8, "--logger", "csv")
+    run(capsys, "train", demos, "--out", out, *options)
+    assert lw.load_actor(out).config == lw.load_actor(policy).config
+    assert list((tmp_path / "logs").rglob("*.csv"))
+    assert "must be a different file" in fails(capsys, "train", demos, "--out", policy, "--begin", policy)
+    assert "leave them out" in fails(capsys, "train", demos, "--out", out, "--begin", policy, "--width", 8)
+
+
+def test_the_baseline_is_trained_and_evaluated(capsys, demos, tmp_path):
+    path = tmp_path / "baseline.safetensors"
+    run(capsys, "train", demos, "--out", path, "--method", "dc", *TINY)
+    assert isinstance(lw.load_actor(path), lw.DescriptorConditionedActor)
+    assert [row["task"] for row in document(capsys, "evaluate", path, *SHORT)["tasks"]] == ["push", "reach"]
+    error = fails(capsys, "evaluate", path, "--attribute", *SHORT)
+    assert "attribute" in error
+
+
+def test_evaluate_writes_result_figure_and_recording(capsys, policy, tmp_path):
+    out = tmp_path / "runs"
+    args = ("evaluate", policy, "--tasks", "push", "reach", "--episodes", 1, "--seed", 7, "--max-steps", 60)
+    printed = run(capsys, *args, "--attribute", "--reference", "MT10", "--out", out)
+    names = {"results.json", "success.png", "failures.png", "rollout.rrd"}
+    assert {path.name for path in out.iterdir() if path.name[0] != "."} == names
+    result = lw.EvaluationResult.load(out / "results.json")
+    assert (result.config["seed"], result.config["episodes_per_task"], result.config["noise_scale"]) == (7, 1, 0.1)
+    assert result.table() in printed
+    assert result.failure_table() in printed
+    origin = json.loads((out / "results.json").read_text())["origin"]
+    assert origin["checkpoint"]["path"] == str(policy)
+    actor = lw.load_actor(policy)
+    again = lw.evaluate(actor, tasks=["push", "reach"], episodes_per_task=1, seed=7, max_steps=60, progress=False)
+    assert again.episodes == result.episodes
+
+
+def test_evaluate_runs_the_tasks_of_the_training(capsys, policy, tmp_path):
+    printed = run(capsys, "evaluate", policy, *SHORT)
+    assert printed.startswith("evaluating 2 tasks of the policy's 10; choose others by --tasks\n")
+    assert [line.split()[0] for line in printed.splitlines()[2:]] == ["push", "reach", "mean"]
+    found = document(capsys, "evaluate", policy, "--plans", "MT10", *SHORT, "--attribute")
+    assert len(found["tasks"]) == len(found["failures"]) == 10
+    assert found["config"]["max_steps"] == 5
+    assert "plans lack sweep-into" in fails(capsys, "evaluate", policy, "--tasks", "sweep-into")
+    assert "is the seed of the demonstrations" in fails(capsys, "evaluate", policy, "--seed", 0)
+
+
+def test_experts_and_scripted_plans_are_evaluated(capsys, tmp_path):
+    found = document(capsys, "evaluate", "expert", "--tasks", "reach", "--episodes", 2, "--stop-at-success")
+    assert found["mean_success"] == 1.0
+    out = tmp_path / "scripted"
+    args = ("scripted", "--tasks", "reach", "push", "--episodes", 2, "--noise", 0, "--out", out)
+    printed = run(capsys, "evaluate", *args)
+    assert "push: success 1.00\n    true " in printed
+    assert "close the gripper around the puck" in printed
+    assert lw.EvaluationResult.load(out / "results.json").success_once == {"push": 1.0, "reach": 1.0}
+    use = json.loads((out / "plan_use.json").read_text())
+    assert len(use["push"]["chosen"]) == len(lw.load_plans("MT10")["push"].steps)
+    (reach,) = document(capsys, "evaluate", "scripted", "--tasks", "reach", *SHORT, "--select", "mix")["tasks"]
+    assert [*reach["steps"][0]] == ["skill", "true", "chosen", "stuck"]
+    assert document(capsys, "evaluate", "wrong", "--tasks", "push", *SHORT)["mean_success"] == 0.0
+
+
+def test_a_policy_in_python_is_evaluated(capsys, tmp_path, monkeypatch):
+    (tmp_path / "my_policies.py").write_text(
+        "import lw_torchrl as lw\npolicy = lw.ScriptedSkillActor(lw.load_plans('MT10'))\nnumber = 3\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    options = ("--tasks", "reach", "--episodes", 1, "--stop-at-success")
+    assert document(capsys, "evaluate", "my_policies:policy", *options)["mean_success"] == 1.0
+    assert "must map a TensorDict to a TensorDict" in fails(capsys, "evaluate", "my_policies:number")
+    assert "must be like my_module:name" in fails(capsys, "evaluate", "my_policies:nothing")
+
+
+def test_info_describes_policies_datasets_and_recordings(capsys, demos, policy, tmp_path):
+    shipped = document(capsys, "info", "few-shot-mt50")
+    assert "Below 0.8" in shipped["card"]
+    assert "was shown demonstrations of 2" in run(capsys, "info", policy)
+    assert "behaviour  noisy" in run(capsys, "info", demos)
+    run(capsys, "record", "reach", "--max-steps", 5, "--out", tmp_path / "a.rrd")
+    assert document(capsys, "info", tmp_path / "a.rrd")["episodes"] == [{"episode": "reach-0", "steps": 5}]
+
+
+# ---- demo
+
+
+def kill_when(forks, ready, timeout=120):
+    deadline = time.monotonic() + timeout
+    while not ready():
+        assert forks.running(0.02), forks.end()
+        assert time.monotonic() < deadline
+    forks.send(signal.SIGKILL)
+    assert forks.end().status == -signal.SIGKILL
+
+
+@pytest.mark.slow
+def test_the_quick_demo_killed_twice_ends_and_then_does_nothing_twice(forks, tmp_path):
+    config, out = replace(QUICK, training_steps=200, episodes_per_task=2), tmp_path / "demo"
+    shorter = f"""
+from dataclasses import replace
+from lw_torchrl.cli import demo
+demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episodes_per_task={config.episodes_per_task})
+"""
+    demonstrations = out / "demonstrations"
+    demo = ("demo", "--quick", "--out", out)
+    forks.start(*demo, before=shorter)
+    kill_when(forks, lambda: len(list(demonstrations.glob(".partial/*.npz"))) >= 2)
+    assert not (demonstrations / "metadata.json").exists()
+    forks.start(*demo, before=shorter)
+    kill_when(forks, (out / "checkpoint.safetensors").exists)
+    assert not (out / "results.json").exists()
+
+    forks.start(*demo, before=shorter)
+    status, printed, errors = forks.end()
+    assert status == 0, errors
+    assert {path.name for path in out.iterdir() if path.name[0] != "."} == {
+        "config.json",
+        "demonstrations",
+        "checkpoint.safetensors",
+        "results.json",
+        "success.png",
+        "rollout.rrd",
+    }
+    assert json.loads((out / "config.json").read_text()) == json.loads(json.dumps(vars(config)))
+    result = lw.EvaluationResult.load(out / "results.json")
+    assert result.config["tasks"] == list(config.tasks)
+    assert result.config["episodes_per_task"] == config.episodes_per_task
+    assert result.config["noise_scale"] == 0.1
+    assert result.config["seed"] != config.demonstration_seed
+    assert result.table() in printed
+    assert (out / "success.png").read_bytes()[-8:-4] == b"IEND"
+    assert (out / "rollout.rrd").read_bytes().startswith(b"RRF")
+    actor = lw.load_actor(out / "checkpoint.safetensors")
+    plans = lw.load_plans("MT10")
+    assert actor.plans == plans
+    for task in config.tasks:
+        (line,) = [line for line in printed.splitlines() if line.strip().startswith(f"{task}: ")]
+        assert any(f"{step.skill} (" in line for step in plans[task].steps)
+    assert f"lw-torchrl view {out / 'rollout.rrd'}" in printed
+
+    kept = [
+        "checkpoint.safetensors",
+        "results.json",
+        "config.json",
+        "demonstrations/metadata.json",
+        "demonstrations/data/action.memmap",
+    ]
+    before = {name: (out / name).stat().st_mtime_ns for name in kept}
+    forks.start(*demo, before=shorter)
+    status, again, errors = forks.end()
+    assert status == 0, errors
+    assert {name: (out / name).stat().st_mtime_ns for name in kept} == before
+    assert again == printed
+
+
+def test_a_demo_of_another_configuration_is_not_overwritten(capsys, tmp_path):
+    (tmp_path / "config.json").write_text(json.dumps({**vars(QUICK), "training_steps": 7}))
+    before = (tmp_path / "config.json").read_bytes()
+    with pytest.raises(SystemExit) as caught:
+        main(["demo", "--quick", "--out", str(tmp_path)])
+    assert caught.value.code == 2
+    assert "holds a demo with another configuration" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
+    assert (tmp_path / "config.json").read_bytes() == before
