@@ -82,7 +82,7 @@ def export_dataset(
     there = find_suite(demonstrations.config.tasks, suite)
     target = _new_folder(out)
     metadata = read_json(demonstrations.root / METADATA, "root: the metadata")
-    table = table_of(demonstrations, metadata, there.tasks, there.plans if plans is None else as_plans(plans))
+    table = table_of(demonstrations, metadata, there, there.plans if plans is None else as_plans(plans))
     with replacing_folder(target) as folder, Progress("exporting", table.rows, "row") as bar, _format(format) as module:
         module.write(table, folder, bar)
     return target

@@ -37,7 +37,7 @@ def _columns(table: Table) -> dict[str, Array]:
     frame = np.concatenate([np.arange(length) for length in table.lengths])
     descriptions = [*table.words]
     return {_NAMES.get(name, name): column for name, column in table.columns.items()} | {
-        "timestamp": (frame / video.FPS).astype(np.float32),
+        "timestamp": (frame / table.fps).astype(np.float32),
         "frame_index": frame,
         "episode_index": table.of_rows(range(len(table.lengths))),
         "index": np.arange(table.rows),
@@ -88,8 +88,8 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
             statistics[name] = {kind: value.tolist() for kind, value in video.combined(each).items()}
     assert table.demonstrations is not None
     for key, pictures in video.existing_pictures(table.demonstrations).items():
-        features[key] = video.feature_of(pictures)
-        places, each = video.write_videos(table.demonstrations, pictures, folder, key)
+        features[key] = video.feature_of(pictures, table.fps)
+        places, each = video.write_videos(table.demonstrations, pictures, folder, key, table.fps)
         episodes |= {f"videos/{key}/{name}": column for name, column in places.items()}
         episodes |= {f"stats/{key}/{kind}": [one[kind].tolist() for one in each] for kind in each[0]}
         statistics[key] = {kind: value.tolist() for kind, value in video.combined(each).items()}
@@ -105,7 +105,7 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
         "chunks_size": _FILES,
         "data_files_size_in_mb": _FILE_MB,
         "video_files_size_in_mb": 200,
-        "fps": video.FPS,
+        "fps": table.fps,
         "splits": {"train": f"0:{len(lengths)}"},
         "data_path": _DATA,
         "video_path": video.PATH if any(one["dtype"] == "video" for one in features.values()) else None,

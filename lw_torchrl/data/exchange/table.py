@@ -14,7 +14,8 @@ import torch
 from lw_torchrl.data.dataset import DatasetError, Demonstrations
 from lw_torchrl.data.memory_map import load_rows, verify
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.language.tasks import Tasks, task_id
+from lw_torchrl.language.tasks import task_id
+from lw_torchrl.suites.suite import Suite
 from lw_torchrl.transforms.qaf import plan_program
 
 Array = np.ndarray[Any, Any]
@@ -76,7 +77,7 @@ class Table:
         tasks: the task of each episode, by name or in the file's words; "" if the file does not say.
         words, plans: task to its description and to its plan's text.
         about: the metadata of the exported dataset; None for other people's files.
-        demonstrations: the dataset that is exported.
+        demonstrations, fps: the dataset that is exported, and its steps per second.
     """
 
     columns: Mapping[str, Array]
@@ -86,6 +87,7 @@ class Table:
     plans: Mapping[str, str] = field(default_factory=dict)
     about: Mapping[str, Any] | None = None
     demonstrations: Demonstrations | None = None
+    fps: int = 80
 
     @property
     def rows(self) -> int:
@@ -100,7 +102,7 @@ class Table:
         return np.repeat(np.asarray(values), self.lengths)
 
 
-def table_of(dataset: Demonstrations, metadata: Mapping[str, Any], tasks: Tasks, plans: Plans | None) -> Table:
+def table_of(dataset: Demonstrations, metadata: Mapping[str, Any], suite: Suite, plans: Plans | None) -> Table:
     """The checked rows of a dataset, with the truth of the conditions of its tasks' plans."""
     verify(dataset, dataset.episodes)
     rows = load_rows(dataset)
@@ -113,10 +115,11 @@ def table_of(dataset: Demonstrations, metadata: Mapping[str, Any], tasks: Tasks,
         columns,
         tuple(episode.length for episode in dataset.episodes),
         tuple(episode.task for episode in dataset.episodes),
-        {name: tasks[name].description for name in dataset.config.tasks},
+        {name: suite.tasks[name].description for name in dataset.config.tasks},
         {name: str(plan).rstrip() for name, plan in texts.items()},
         metadata,
         dataset,
+        round(1 / suite.step_time),
     )
     if texts:
         columns[HOLDS] = _holds(table, Plans(texts))

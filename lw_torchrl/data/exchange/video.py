@@ -13,7 +13,6 @@ from lw_torchrl.data.dataset import Demonstrations
 from lw_torchrl.data.exchange.table import Array
 from lw_torchrl.data.pictures import Pictures
 
-FPS = 80  # Meta-World's control steps, and so pictures, a second
 PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _TOGETHER = 100  # episodes in a file
 _FOLDER = re.compile(r"(.+)-(\d+)x(\d+)-every(\d+)")
@@ -34,11 +33,11 @@ def _format(pictures: Pictures) -> str:
     return "yuv444p" if any(size % 2 for size in pictures.shape[:2]) else "yuv420p"
 
 
-def feature_of(pictures: Pictures) -> dict[str, Any]:
+def feature_of(pictures: Pictures, fps: int) -> dict[str, Any]:
     """The entry of a video in LeRobot's info.json."""
     height, width, _ = pictures.shape
     info = {"video.height": height, "video.width": width, "video.codec": "h264", "video.pix_fmt": _format(pictures)}
-    info |= {"video.is_depth_map": False, "video.fps": FPS, "video.channels": 3, "has_audio": False}
+    info |= {"video.is_depth_map": False, "video.fps": fps, "video.channels": 3, "has_audio": False}
     return {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": info}
 
 
@@ -60,7 +59,7 @@ def combined(parts: list[dict[str, Array]]) -> dict[str, Array]:
 
 
 def write_videos(
-    demonstrations: Demonstrations, pictures: Pictures, folder: Path, key: str
+    demonstrations: Demonstrations, pictures: Pictures, folder: Path, key: str, fps: int
 ) -> tuple[dict[str, list[Any]], list[dict[str, Array]]]:
     """Write a picture for each row; rows between two rendered pictures show the earlier one. Return where each episode
     is, and the statistics of its pixels, from 0 to 1, (3, 1, 1)."""
@@ -76,7 +75,7 @@ def write_videos(
             path.parent.mkdir(parents=True, exist_ok=True)
             frame = 0
             with av.open(str(path), "w") as container:
-                stream = container.add_stream("libx264", rate=FPS, options={"crf": "18", "g": "2", "bf": "0"})
+                stream = container.add_stream("libx264", rate=fps, options={"crf": "18", "g": "2", "bf": "0"})
                 stream.height, stream.width, stream.pix_fmt = *pictures.shape[:2], _format(pictures)
                 for episode in demonstrations.episodes[number : number + _TOGETHER]:
                     images = pictures.read(demonstrations.root, episode).numpy()
@@ -86,7 +85,7 @@ def write_videos(
                     each.append(
                         {kind: one if kind == "count" else one.reshape(3, 1, 1) for kind, one in values.items()}
                     )
-                    times = frame / FPS, (frame + episode.length) / FPS
+                    times = frame / fps, (frame + episode.length) / fps
                     for name, value in zip(names, (chunk, file, *times), strict=True):
                         places[name].append(value)
                     frame += episode.length
