@@ -21,8 +21,7 @@ needs_no_gpu = pytest.mark.skipif(torch.accelerator.is_available(), reason="need
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("which", ["not slow", "slow"])
-def test_on_a_pretend_device_nobody_waits(which):
+def test_on_a_pretend_device_nobody_waits():
     paths = [str(HERE), *(str(HERE.parent / room) for room in ("training", "objectives")), *sys.path]
     done = subprocess.run(
         [
@@ -32,8 +31,6 @@ def test_on_a_pretend_device_nobody_waits(which):
             "-q",
             "-p",
             "no:cacheprovider",
-            "-m",
-            which,
             str(HERE / "on_a_pretend_device.py"),
         ],
         cwd=HERE.parent.parent,
