@@ -48,7 +48,9 @@ class Demo:
 
     def run(self) -> None:
         options.use_one_thread()
-        run_demo(self.out or Path("runs/demo-quick" if self.quick else "runs/demo"), QUICK if self.quick else DemoConfig())
+        run_demo(
+            self.out or Path("runs/demo-quick" if self.quick else "runs/demo"), QUICK if self.quick else DemoConfig()
+        )
 
 
 def run_demo(out: Path, config: DemoConfig) -> lw.EvaluationResult:

@@ -153,10 +153,11 @@ def test_a_preset_can_put_an_evaluator_into_the_policy(tmp_path):
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_recipe_loads_and_makes_its_policies(name):
-    """Options of a recipe that no longer exist would raise here."""
     for setting, preset in PRESETS[name].items():
         assert SETTINGS[setting].targets is None or preset.target is not None
         for member in (*preset.members, *preset.demonstrated):
+            options = {**member.actor, **member.plan_actor}
+            assert imitation._Trained(member, "pcbc").options == options, "an option that no longer exists is ignored"
             for method in ("pcbc", "dc"):
                 make_policy(method, lw.load_plans("MT10"), **imitation._Trained(member, method).options)
         assert ImitationRun(SETTINGS[setting], "pcbc", 0, preset).describe(PLANS)["training"]
