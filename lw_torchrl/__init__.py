@@ -24,18 +24,7 @@ def __getattr__(name: str) -> object:
     if name in _ROOM_OF:
         found = globals()[name] = getattr(import_module(_ROOM_OF[name]), name)
         return found
-    for room, names in _moved().items():
-        if name in names:
-            place = room.replace("lw_torchrl", "lw", 1)
-            raise AttributeError(f"lw.{name} is now {place}.{name} (from {room} import {name})")
     raise AttributeError(f"module 'lw_torchrl' has no attribute {name!r}")
-
-
-def _moved() -> dict[str, list[str]]:
-    """The names that were here in 0.2.0, by room."""
-    import tomllib
-
-    return tomllib.loads(Path(__file__).with_name("moved.toml").read_text("utf-8"))
 
 
 def __dir__() -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import ctypes.util
-import importlib
 import pkgutil
 import re
 import sys
@@ -128,16 +127,6 @@ def test_the_top_level_is_small_and_each_of_its_names_is_shown():
     shown += [file.read_text("utf-8") for file in root.glob("examples/*.py")]
     used = set(re.findall(r"\blw\.(\w+)", "\n".join(shown)))
     assert not {*lw_torchrl.__all__} - used
-
-
-def test_a_name_that_left_the_top_level_says_where_it_is():
-    for room, names in lw_torchrl._moved().items():
-        for name in names:
-            assert name not in lw_torchrl.__all__
-            assert hasattr(importlib.import_module(room), name), f"{room} has no {name}"
-            said = rf"lw\.{name} is now lw{room.removeprefix('lw_torchrl')}\.{name} \(from {room} import {name}\)"
-            with pytest.raises(AttributeError, match=said):
-                getattr(lw_torchrl, name)
 
 
 def test_names_rooms_and_what_is_neither():
