@@ -194,8 +194,9 @@ def _go_to(client: Any, openings: dict[str, Opening]) -> None:
             layout = client.get_blueprint(store_id=recording.store_id).blueprint
             root = f"/container/{layout['/viewport']['ViewportBlueprint']['root_container']}"
             container = layout[root]["ContainerBlueprint"]
-            container["active_tab"] = container["contents"][tab]
-            client.set_blueprint(layout, store_id=recording.store_id)
+            if isinstance(container["contents"], list):  # else there is only one tab
+                container["active_tab"] = container["contents"][tab]
+                client.set_blueprint(layout, store_id=recording.store_id)
         name = name or recording.current_timeline
         timeline = next((timeline for timeline in recording.timelines if timeline.name == name), None)
         if timeline is not None and timeline.end is not None:

@@ -135,6 +135,14 @@ def test_a_tab_is_brought_to_the_front(tmp_path, seen, episode, view):
     assert seen["cursors"] == [0]
 
 
+def test_the_only_tab_may_be_named(tmp_path, seen):
+    with RerunLogger(tmp_path / "a.rrd") as logger:
+        logger.log_scalar("loss/bc", 1.0)
+    with needing_a_driver():
+        open_viewer(tmp_path / "a.rrd", episode="Metrics")
+    assert seen["views"] == {"loss"}
+
+
 def test_the_rest_of_a_cut_recording_is_shown(tmp_path, seen):
     content = write(tmp_path / "a.rrd", steps=400).read_bytes()
     (tmp_path / "a.rrd").write_bytes(content[: int(0.9 * len(content))])
