@@ -264,7 +264,7 @@ class Training:
             if self.part is not None:
                 write_file(self.checkpoint, self.part, self.described, tensors)
 
-    def resume(self, packages: Sequence[str] = LIBRARIES) -> bool:
+    def resume(self) -> bool:
         """Resume from the checkpoint and return True, if there is one."""
         if self.state_file is None or not self.state_file.exists():
             if self.checkpoint is not None and self.checkpoint.exists():
@@ -283,7 +283,7 @@ class Training:
                 "same minibatches, but results will not be bit-identical to an uninterrupted run",
                 stacklevel=3,
             )
-        warn_of_other_versions(self.state_file, description["versions"], packages)
+        warn_of_other_versions(self.state_file, description["versions"], LIBRARIES)
         try:
             state = pop_state(description, stored)
             copy_tensors(stored, self.contents())
