@@ -101,7 +101,7 @@ def test_all_names_together_load_little_that_torchrl_does_not(python):
     assert found.returncode == 0, found.stderr
     assert {"lw_torchrl", "safetensors"} <= {*found.stdout.split()}
     loaded = {name for name in found.stdout.split() if not name.startswith("_cython_")}  # rapidfuzz's own
-    assert loaded <= {"farama_notifications", "gymnasium", "lw_torchrl", "rapidfuzz", "safetensors"}
+    assert loaded <= {"beartype", "farama_notifications", "gymnasium", "lw_torchrl", "rapidfuzz", "safetensors"}
 
 
 def test_the_package_alone_and_words_load_no_torchrl(python):
