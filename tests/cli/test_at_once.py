@@ -28,7 +28,7 @@ def test_of_two_trainings_into_one_file_one_is_refused(tmp_path):
     assert sorted(one.returncode for one in both) == [0, 2], errors
     (winner,) = (seed for seed, one in enumerate(both) if one.returncode == 0)
     assert read_description(out)["training"]["seed"] == winner
-    said = ("another training is at work in", "was written by another training", "is of another configuration")
+    said = ("another training is writing to", "was written by another training", "is of another configuration")
     assert any(one in errors[1 - winner] for one in said), errors
     assert [path.name for path in tmp_path.iterdir() if path.name[0] == "."] == []
 
@@ -39,5 +39,5 @@ def test_a_demo_is_refused_where_another_one_is_at_work(tmp_path, holding, capsy
     holding(tmp_path / "demo", folder=True)
     with pytest.raises(SystemExit):
         main(["demo", "--quick", "--out", str(tmp_path / "demo")])
-    assert f"out: another process is at work in '{tmp_path / 'demo'}'; let it finish" in capsys.readouterr().err
+    assert f"another process is writing to '{tmp_path / 'demo'}'; let it finish" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "demo").iterdir()] == [".lock"]

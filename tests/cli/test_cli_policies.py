@@ -128,8 +128,8 @@ def test_a_policy_in_python_is_evaluated(capsys, tmp_path, monkeypatch):
 
 def test_info_describes_policies_datasets_and_recordings(capsys, demos, policy, tmp_path):
     shipped = document(capsys, "info", "few-shot-mt50")
-    assert "Below 0.8" in shipped["card"]
-    assert "was shown demonstrations of 2" in run(capsys, "info", policy)
+    assert "below 0.8" in shipped["card"]
+    assert "tasks: push, reach" in run(capsys, "info", policy)
     assert "behaviour  noisy" in run(capsys, "info", demos)
     run(capsys, "record", "reach", "--max-steps", 5, "--out", tmp_path / "a.rrd")
     assert document(capsys, "info", tmp_path / "a.rrd")["episodes"] == [{"episode": "reach-0", "steps": 5}]
@@ -171,6 +171,7 @@ demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episode
         "config.json",
         "demonstrations",
         "checkpoint.safetensors",
+        "checkpoint.training.safetensors",
         "results.json",
         "success.png",
         "rollout.rrd",
