@@ -14,9 +14,6 @@ from reprlib import Repr
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
-from beartype import BeartypeConf, FrozenDict
-from beartype.door import is_bearable
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -169,7 +166,13 @@ def _check_of(annotation: Any) -> Check | None:
     return _PLAIN.get(annotation) or _check_of_class(annotation)
 
 
-_LENIENT = BeartypeConf(hint_overrides=FrozenDict({float: Real, int: Integral}))
+@functools.cache
+def _matcher() -> Callable[[object, Any], bool]:
+    """Return beartype's check of a value, which takes numbers of other libraries too. Importing it takes 0.1 s."""
+    from beartype import BeartypeConf, FrozenDict
+    from beartype.door import is_bearable
+
+    return functools.partial(is_bearable, conf=BeartypeConf(hint_overrides=FrozenDict({float: Real, int: Integral})))
 
 
 def _check_of_class(annotation: Any) -> Check | None:
@@ -181,7 +184,7 @@ def _check_of_class(annotation: Any) -> Check | None:
         return None
 
     def check(argument: str, given: Any) -> None:
-        if not is_bearable(given, annotation, conf=_LENIENT):
+        if not _matcher()(given, annotation):
             kind = (
                 f"the class {given.__name__}" if isinstance(given, type) else f"{shown(given)} ({type(given).__name__})"
             )
