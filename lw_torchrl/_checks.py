@@ -298,7 +298,8 @@ def _checks_of_fields(kind: Any) -> dict[str, Check]:
     for base in reversed(kind.__mro__):
         names = getattr(sys.modules.get(base.__module__), "__dict__", {})
         checks |= _checks_of(inspect.get_annotations(base), names)
-    return {field.name: checks[field.name] for field in fields(kind) if field.name in checks}
+    # A field whose default is of another class is filled in by its __post_init__, which also checks it.
+    return {one.name: checks[one.name] for one in fields(kind) if one.name in checks and one.default is not None}
 
 
 _SHOWN = Repr()
