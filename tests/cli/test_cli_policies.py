@@ -193,8 +193,8 @@ demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episode
         assert any(f"{step.skill} (" in line for step in plans[task].steps)
     assert f"lw-torchrl view {out / 'rollout.rrd'}" in printed
 
+    policy = (out / "checkpoint.safetensors").read_bytes()
     kept = [
-        "checkpoint.safetensors",
         "results.json",
         "config.json",
         "demonstrations/metadata.json",
@@ -205,6 +205,7 @@ demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episode
     status, again, errors = forks.end()
     assert status == 0, errors
     assert {name: (out / name).stat().st_mtime_ns for name in kept} == before
+    assert (out / "checkpoint.safetensors").read_bytes() == policy
     assert again == printed
 
 
