@@ -148,7 +148,7 @@ Probability = Annotated[float, check_probability]  # from 0 to 1.
 _PLAIN: dict[Any, Check] = {bool: check_flag, int: check_int, float: _check_real, str: check_text}
 
 
-def _check_of(annotation: Any) -> Check | None:
+def _check_of(annotation: Any, classes: bool = True) -> Check | None:
     """Return the check of an annotation: a flag, number, text, path, choice or range, or None; others have none."""
     origin, inside = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
@@ -156,14 +156,17 @@ def _check_of(annotation: Any) -> Check | None:
     if origin is Literal:
         return functools.partial(check_choice, allowed=inside)
     if origin in (Union, UnionType):
-        others = {part for part in inside if part is not NoneType}
-        check = check_path if others == {str, os.PathLike[str]} else _check_of(*others) if len(others) == 1 else None
-        if len(others) > 1 and check is None:
-            return _check_of_class(annotation)
+        first, *more = {part for part in inside if part is not NoneType}
+        if {first, *more} == {str, os.PathLike[str]}:
+            check: Check | None = check_path
+        elif more:
+            return _check_of_class(annotation) if classes else None
+        else:
+            check = _check_of(first, classes)
         if check is not None and NoneType in inside:
             return lambda argument, given: None if given is None else check(argument, given)
         return check
-    return _PLAIN.get(annotation) or _check_of_class(annotation)
+    return _PLAIN.get(annotation) or (_check_of_class(annotation) if classes else None)
 
 
 @functools.cache
@@ -211,12 +214,12 @@ def _words(annotation: Any) -> str:
     return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"
 
 
-def _checks_of(annotations: Mapping[str, Any], names: dict[str, Any]) -> dict[str, Check]:
+def _checks_of(annotations: Mapping[str, Any], names: dict[str, Any], classes: bool = True) -> dict[str, Check]:
     """Return the checks of annotations, by name; ``names`` are those of the module that they stand in."""
     checks = {}
     for name, annotation in annotations.items():
         with suppress(NameError, AttributeError, TypeError):  # imported only for type checkers
-            checks[name] = _check_of(eval(annotation, names) if isinstance(annotation, str) else annotation)
+            checks[name] = _check_of(eval(annotation, names) if isinstance(annotation, str) else annotation, classes)
     return {name: check for name, check in checks.items() if check is not None}
 
 
@@ -297,9 +300,9 @@ def _checks_of_fields(kind: Any) -> dict[str, Check]:
     checks: dict[str, Check] = {}
     for base in reversed(kind.__mro__):
         names = getattr(sys.modules.get(base.__module__), "__dict__", {})
-        checks |= _checks_of(inspect.get_annotations(base), names)
-    # A field whose default is of another class is filled in by its __post_init__, which also checks it.
-    return {one.name: checks[one.name] for one in fields(kind) if one.name in checks and one.default is not None}
+        # Without classes: a __post_init__ converts some fields, PlanStep's condition from a text for one.
+        checks |= _checks_of(inspect.get_annotations(base), names, classes=False)
+    return {field.name: checks[field.name] for field in fields(kind) if field.name in checks}
 
 
 _SHOWN = Repr()
