@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from lw_torchrl._checks import checked, differences, shown
+from lw_torchrl._checks import checked, differences
 from lw_torchrl._files import AnyPath, flush, locked, read_json, write_json
 from lw_torchrl._versions import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import dataset
@@ -22,7 +22,7 @@ from lw_torchrl.data.behaviours import Behaviour, behaviour_of
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations, write_metadata
 from lw_torchrl.data.memory_map import describe_episode, verify, write_rows
 from lw_torchrl.data.missing_episodes import EpisodeFiles, run_missing_episodes
-from lw_torchrl.language.tasks import Task, task_id
+from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
@@ -157,15 +157,9 @@ def collect_demonstrations(
         >>> demos.num_steps, demos.success_rate
         (80, {'reach': 1.0})
     """
-    try:
-        tasks = listed_tasks(tasks)
-        if own := [one for one in ([tasks] if isinstance(tasks, Task) else tasks) if isinstance(one, Task)]:
-            raise TypeError(f"task must be a task's name, got {shown(own[0])} (Task)")
-        found_suite = find_suite(tasks, suite)
-        names = tuple(found_suite.named_tasks(tasks))
-    except TypeError as error:
-        why = "Meta-World's experts demonstrate its own 50 tasks; docs/training.md shows demonstrations in others"
-        raise TypeError(f"{error}. {why}") from error
+    tasks = listed_tasks(tasks)
+    found_suite = find_suite(tasks, suite)
+    names = tuple(found_suite.named_tasks(tasks))
     actor = None if isinstance(policy, (str, Behaviour)) else policy
     if isinstance(actor, Policy) and (unknown := [task for task in names if task not in actor.tasks]):
         raise ValueError(f"tasks must be among the policy's, it was not made for {', '.join(unknown)}")
@@ -195,5 +189,6 @@ def collect_demonstrations(
             versions, files = _begin(folder, config), EpisodeFiles(partial)
             kept = run_missing_episodes(config, actor, files, num_envs, found_suite, progress)
             _assemble(folder, config, versions, files, kept)
-        shutil.rmtree(partial, ignore_errors=True)
+        for left in (partial, *folder.glob(".metadata.*.tmp.json")):  # a killed process may have left the latter
+            shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
     return dataset.read_metadata(folder)

@@ -143,7 +143,8 @@ class LanguageWorldExperienceReplay(RestorableReplay):
             raise ValueError("device: a growing buffer is on the CPU; leave it out, trainers move each minibatch")
         joined = not isinstance(root, (str, os.PathLike))
         self.roots = tuple(map(Path, root)) if joined else (Path(root),)  # type: ignore[arg-type]
-        if not self.roots or len({folder.resolve() for folder in self.roots}) < len(self.roots):
+        twice = episodes is None and len({folder.resolve() for folder in self.roots}) < len(self.roots)
+        if not self.roots or twice:
             raise ValueError(f"root must be a folder, or a list that names each folder once, got {root}")
         choices = _choices(episodes, len(self.roots), joined)
         whole = [read_metadata(folder) for folder in self.roots]

@@ -22,6 +22,9 @@ from lw_torchrl.language.tasks import task_id
 TASKS = ("push", "reach")
 STEPS = 34
 BEHAVIOURS = {name: behaviour_of(name, TASKS) for name in ("expert", "random", "wrong")}
+CONFIGS = {
+    (each, name): CollectConfig(TASKS, each, 0, policy=BEHAVIOURS[name]) for each in range(5)[1:] for name in BEHAVIOURS
+}
 
 
 # ---- against an oracle
@@ -33,7 +36,7 @@ def joined(draw):
     parts, returns = [], []
     for number in range(draw(st.integers(1, 3))):
         each = draw(st.integers(1, 4))
-        config = CollectConfig(TASKS, each, 0, policy=BEHAVIOURS[draw(st.sampled_from(list(BEHAVIOURS)))])
+        config = CONFIGS[each, draw(st.sampled_from(list(BEHAVIOURS)))]
         episodes, found = [], []
         for task in TASKS:
             for index in range(each):
