@@ -245,7 +245,7 @@ def test_a_policy_trained_on_such_data_says_which_seeds_it_saw(tmp_path, made, c
         assert demonstration_seeds(path) == seeds
         assert demonstrated_tasks(path) == tasks
         for seed in seeds:
-            assert "--seed must differ from the demonstrations' seed" in fails(capsys, "evaluate", path, "--seed", seed)
+            assert "is the seed of the demonstrations" in fails(capsys, "evaluate", path, "--seed", seed)
 
 
 def test_a_behaviour_comes_back_from_its_json():
