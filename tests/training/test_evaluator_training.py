@@ -196,7 +196,7 @@ def test_what_is_no_evaluators_file_is_refused(tmp_path):
 
     with pytest.raises(ValueError, match=r"cannot be kept in a file.*'Mine' is not known here"):
         lw.training.save_evaluator(Mine(PLANS), path)
-    with pytest.raises(TypeError, match="must be a QueryEvaluator to be kept"):
+    with pytest.raises(TypeError, match="evaluator must be a QueryEvaluator"):
         lw.training.save_evaluator(torch.nn.Linear(1, 1), path)
 
 
@@ -227,7 +227,7 @@ def test_what_cannot_be_is_named(replay):
     with pytest.raises(ValueError, match="tasks must have all tasks of the rows"):
         lw.training.LabelledQueries(replay, SMALL, [lw.TASKS["reach"]])
     data = lw.training.LabelledQueries(replay, SMALL)
-    with pytest.raises(TypeError, match="must be of class StateQueryEvaluator, got QueryEvaluator"):
+    with pytest.raises(TypeError, match="evaluator must be a ClauseEvaluator, got QueryEvaluator"):
         lw.training.QueryEvaluatorTrainer(lw.QueryEvaluator(PLANS), data)
     with pytest.raises(ValueError, match="must hold out states, queries or tasks"):
         score_evaluator(
