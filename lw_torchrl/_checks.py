@@ -292,9 +292,7 @@ def check_fields(instance: Any, inside: str = "") -> None:
     """Check the plain fields of a dataclass as :func:`checked` does arguments; errors begin with ``inside``."""
     kind: Any = type(instance)
     for name, check in _checks_of_fields(kind).items():
-        value = getattr(instance, name)
-        if value is not None or kind.__dataclass_fields__[name].default is not None:  # its own default is allowed
-            check(inside + name, value)
+        check(inside + name, getattr(instance, name))
 
 
 @functools.cache
