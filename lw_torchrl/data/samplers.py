@@ -23,16 +23,16 @@ from lw_torchrl.data.storage import JoinedStorage, to_device_of
 _FILE = "sampler.safetensors"
 
 
-def column(storage: Storage, key: NestedKey) -> Tensor:
-    """One column of all rows of a storage, row-major if of several dimensions, on the CPU."""
+def column(storage: Storage, key: NestedKey, rows: Tensor | None = None) -> Tensor:
+    """One column of some rows of a storage, by default all, row-major if of several dimensions, on the CPU."""
     if isinstance(storage, JoinedStorage):
-        return storage.column(key).cpu()
-    rows = storage.get(slice(0, len(storage)))
-    each = [row.get(key, None) for row in rows] if isinstance(rows, list) else [rows.get(key, None)]
+        return storage.column(key, rows).cpu()
+    data = storage.get(slice(0, len(storage)))
+    each = [row.get(key, None) for row in data] if isinstance(data, list) else [data.get(key, None)]
     if any(one is None for one in each):
         raise KeyError(f"the storage has no column {key!r}, by which rows are to be grouped")
-    whole = torch.stack(each) if isinstance(rows, list) else each[0]
-    return whole.flatten(0, storage.ndim - 1).cpu()
+    whole = (torch.stack(each) if isinstance(data, list) else each[0]).flatten(0, storage.ndim - 1)
+    return (whole if rows is None else whole[rows.to(whole.device)]).cpu()
 
 
 def nearest_sizes(batch_size: int, unit: int) -> str:
@@ -53,7 +53,8 @@ class GroupSampler(Sampler):
     A subclass gives the group of each row (:meth:`_label`) and the number of rows of each group in a batch
     (:meth:`_shares`). A batch holds the groups one after another. If a group's pass ends within a batch, the rest comes
     from the next pass, in a new order. For a storage of several dimensions (``ndim=2``) an index is a tuple of tensors.
-    When rows are written, all rows are grouped again and all passes begin again.
+    A row that is written takes a random place in the rest of its group's pass. All rows are grouped again, and all
+    passes begin again, if a group comes or goes, or if a subclass cannot tell the group of single rows (:meth:`_keys`).
     """
 
     ran_out = False  # whether the last batch ended an epoch: a pass over the group that takes the most batches
@@ -67,6 +68,8 @@ class GroupSampler(Sampler):
         self._length = 0  # rows that are grouped; 0 to group again
         # The rows, group after group, each in the order of its pass; the size of each group, and its rows drawn so far.
         self._order, self._size, self._cursor = none, none, none
+        self._known: Tensor | None = None  # the key of each group's rows
+        self._written: list[Tensor] = []  # rows written since the last batch
         self.ran_out = False
         self._restored = False
         self._laid_out: tuple[int, Tensor, Tensor, Tensor] | None = None  # see _layout
@@ -79,6 +82,10 @@ class GroupSampler(Sampler):
     def _shares(self, batch_size: int) -> Tensor:
         """The rows of each group in a batch: (G,) int64, at least 1; ValueError for a size that cannot be exact."""
 
+    def _keys(self, storage: Storage, rows: Tensor) -> Tensor | None:
+        """The key of each row's group, (n,) int64; None if that takes a look at all rows."""
+        return None
+
     def _covered(self, storage: Storage) -> int:
         """The number of first rows that are grouped."""
         return len(storage) if storage.ndim == 1 else storage.shape.numel()
@@ -89,8 +96,44 @@ class GroupSampler(Sampler):
         self._order, self._size = order[int((label < 0).sum()) :], label[label >= 0].bincount()
         self._cursor = torch.zeros_like(self._size)
         self._length, self._laid_out, self._restored = self._covered(storage), None, False
+        self._written, self._known = [], self._keys_of_groups(storage)
         for group in range(len(self._size)):
             self._shuffle(group)
+
+    def _keys_of_groups(self, storage: Storage) -> Tensor | None:
+        keys = self._keys(storage, self._order[self._start()]) if storage.ndim == 1 else None
+        return None if keys is None else keys.reshape(-1).cpu()
+
+    def _move_written(self, storage: Storage) -> bool:
+        """Move the rows that were written to the passes of their groups; False if all rows must be grouped again."""
+        if self._known is None or not self._written:
+            return False
+        rows, length = torch.cat(self._written).unique(), self._covered(storage)
+        if rows[0] < 0 or rows[-1] >= length or int((rows >= self._length).sum()) != length - self._length:
+            return False
+        keys = self._keys(storage, rows)
+        assert keys is not None
+        same = keys.reshape(-1, 1).cpu() == self._known
+        if not same.any(1).all():
+            return False
+        label, moved = same.int().argmax(1), torch.zeros(length, dtype=torch.bool)
+        moved[rows] = True
+        passes, cursors = [], []
+        orders = self._order.split(self._size.tolist())
+        for group, (order, cursor) in enumerate(zip(orders, self._cursor.tolist(), strict=True)):
+            stays = ~moved[order]
+            drawn, left = order[:cursor][stays[:cursor]], order[cursor:][stays[cursor:]]
+            left = torch.cat([left, rows[label == group]])
+            if not len(left):  # the pass has ended
+                drawn, left = left, drawn
+            passes.append(torch.cat([drawn, left[torch.randperm(len(left), generator=self._rng)]]))
+            cursors.append(len(drawn))
+        size = torch.tensor([len(order) for order in passes])
+        if not size.all():
+            return False
+        self._order, self._size, self._cursor = torch.cat(passes), size, torch.tensor(cursors)
+        self._length, self._written = length, []
+        return True
 
     def _start(self) -> Tensor:
         return self._size.cumsum(0) - self._size
@@ -137,7 +180,7 @@ class GroupSampler(Sampler):
             raise ValueError("storage must hold at least one row, got an empty one")
         if self._restored and self._length:
             self._check_restored(storage)
-        if self._covered(storage) != self._length:
+        if (self._written or self._covered(storage) != self._length) and not self._move_written(storage):
             self._group(storage)
         shares, group, place = self._layout(batch_size)
         at = (self._start() + self._cursor)[group].add_(place).clamp_(max=len(self._order) - 1)
@@ -157,37 +200,52 @@ class GroupSampler(Sampler):
         return (index if storage.ndim == 1 else torch.unravel_index(index, storage.shape)), {}
 
     def add(self, index: Any, *, storage: Storage | None = None) -> None:
-        """Note that rows were written, perhaps by another buffer of the same storage: they are grouped again."""
-        self._length = 0
+        """Note that rows were written, perhaps by another buffer of the same storage."""
+        self._written.append(torch.as_tensor(index, device="cpu").reshape(-1))
 
     extend = mark_update = add
 
     def state_dict(self) -> dict[str, Any]:
-        """The rows in the order of their passes, and how far each group's pass has come."""
-        if not self._length:
-            none = torch.empty(0, dtype=torch.int64)
-            passes = {"order": none, "size": none, "cursor": none}
-        else:
-            passes = {name: getattr(self, f"_{name}").clone() for name in ("order", "size", "cursor")}
-        return {**passes, "length": torch.tensor(self._length), "ran_out": torch.tensor(self.ran_out)}
+        """The rows in the order of their passes, how far each pass has come, and rows written since the last batch."""
+        none = torch.empty(0, dtype=torch.int64)
+        begun = self._length > 0 and not (self._written and self._known is None)  # otherwise all are grouped again
+        order, size, cursor = (self._order, self._size, self._cursor) if begun else (none, none, none)
+        return {
+            "order": order.clone(),
+            "size": size.clone(),
+            "cursor": cursor.clone(),
+            "known": self._known.clone() if begun and self._known is not None else none,
+            "written": torch.cat(self._written) if begun and self._written else none,
+            "length": torch.tensor(self._length if begun else 0),
+            "ran_out": torch.tensor(self.ran_out),
+        }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state; ValueError if it is not a sampler's, or at the next sample if it is of other rows."""
-        names = ("order", "size", "cursor", "length", "ran_out")
+        names = ("order", "size", "cursor", "known", "written", "length", "ran_out")
         if missing := [name for name in names if not isinstance(state_dict.get(name), Tensor)]:
             raise ValueError(f"state_dict must hold {', '.join(names)}; it lacks {', '.join(missing)}")
-        order, size, cursor, length, ran_out = (state_dict[name].cpu().clone() for name in names)
+        order, size, cursor, known, written, length, ran_out = (state_dict[name].cpu().clone() for name in names)
         if len(order) != int(size.sum()) or size.shape != cursor.shape or bool((cursor >= size).any()):
             raise ValueError("state_dict must hold the passes of a sampler: rows, and a place in each pass")
         self._order, self._size, self._cursor = order, size, cursor
+        self._known, self._written = known if len(known) else None, [written] if len(written) else []
         self._length, self.ran_out = int(length), bool(ran_out)
         self._laid_out, self._restored = None, True
 
     def _check_restored(self, storage: Storage) -> None:
-        """Raise unless a restored state is of the storage's rows."""
-        label, groups = self._label(storage).cpu(), torch.repeat_interleave(self._size)
-        if (length := self._covered(storage)) != self._length:
+        """Raise unless a restored state is of the storage's rows; with rows written since, all may be grouped again."""
+        groups, length = torch.repeat_interleave(self._size), self._covered(storage)
+        if self._written:
+            old = ~torch.isin(self._order, torch.cat(self._written)) & (self._order < length)
+            keys = None if self._known is None else self._keys(storage, self._order[old])
+            if keys is None or self._known is None or not torch.equal(keys.reshape(-1).cpu(), self._known[groups[old]]):
+                self._length, self._written = 0, []
+            self._restored = False
+            return
+        if length != self._length:
             raise ValueError(f"state_dict must be of the storage's {length} rows, got one of {self._length}")
+        label = self._label(storage).cpu()
         rows = (label >= 0).nonzero().flatten()
         if not torch.equal(self._order.sort().values, rows) or not torch.equal(label[self._order], groups):
             raise ValueError("state_dict must be of the storage's rows, got one whose groups differ")
@@ -206,8 +264,9 @@ class GroupSampler(Sampler):
 class TaskBalancedSampler(GroupSampler):
     """Exactly equal numbers from every task; within a task every row comes once before any comes again.
 
-    When rows are written to the buffer, all passes begin again. The sampler draws from the replay buffer's generator,
-    so ``ReplayBuffer(..., generator=...)`` fixes the batches; its state is saved with the buffer's. An epoch is a pass
+    The buffer may grow: a new row takes a random place in the rest of its task's pass, and an overwritten one leaves
+    it. When a task comes or goes, all passes begin again. The sampler draws from the replay buffer's generator, so
+    ``ReplayBuffer(..., generator=...)`` fixes the batches; its state is saved with the buffer's. An epoch is a pass
     over the largest task. The storage's entry ``task_key`` holds the task.
 
     Raises:
@@ -232,6 +291,9 @@ class TaskBalancedSampler(GroupSampler):
 
     def _label(self, storage: Storage) -> Tensor:
         return torch.unique(column(storage, self.task_key).reshape(-1), return_inverse=True)[1]
+
+    def _keys(self, storage: Storage, rows: Tensor) -> Tensor:
+        return column(storage, self.task_key, rows)
 
     def _shares(self, batch_size: int) -> Tensor:
         groups = len(self._size)

@@ -174,6 +174,32 @@ def test_the_task_key_can_be_another():
     assert replay.sample()["kind"].bincount().tolist() == [0, 0, 0, 2, 0, 2]
 
 
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 12), st.integers(0, 4)), min_size=1, max_size=12), seeds)
+def test_in_a_ring_that_is_written_to_no_row_comes_twice_in_a_pass(rounds, seed):
+    """The rows of a task that were not drawn yet come before those that were, whatever is written in between."""
+    replay = make_replay(make_rows([9, 9]), 4, seed, capacity=30)
+    value, drawn_now = 18, {3: set(), 5: set()}  # values that are in the ring and were drawn in the task's pass
+    for count, batches in rounds:
+        for _ in range(batches):
+            batch = replay.sample()
+            stored = replay[:]
+            for task, seen in drawn_now.items():
+                there = set(stored["row"][stored["task_id"] == task].tolist())
+                seen &= there
+                if seen == there:
+                    seen.clear()
+                for row in batch["row"][batch["task_id"] == task].tolist():
+                    assert row in there
+                    assert row not in seen
+                    seen.add(row)
+                    if seen == there:
+                        seen.clear()
+        task = torch.tensor([(3, 5)[number % 2] for number in range(count)])
+        replay.extend(TensorDict({"task_id": task, "row": torch.arange(value, value + count)}, [count]))
+        value += count
+
+
 def make_grid(steps, *tasks):
     """A batch as a collector gives it: an environment a task, by steps."""
     task = torch.tensor(tasks)[:, None].expand(-1, steps)
