@@ -1,7 +1,6 @@
 """Train a policy with plain PyTorch on an exported dataset: LeRobot's parquet files, a network and a loop.
 
-python examples/plain_pytorch.py             # drawer-open, reach and window-open, under a minute
-python examples/plain_pytorch.py --steps 50  # only to see it run
+python examples/plain_pytorch.py  # drawer-open, reach and window-open, under a minute; --steps 50 to see it run
 """
 
 import argparse
@@ -44,13 +43,10 @@ def exported_rows(root: str, demonstrations: int) -> TensorDataset:
     table = pq.read_table(out / "data")
     episode, success = (table.column(name).to_numpy() for name in ("episode_index", "next.success"))
     used = np.zeros(len(table), dtype=bool)
-    for number in range(episode[-1] + 1):
-        rows = np.flatnonzero(episode == number)
+    for rows in (np.flatnonzero(episode == number) for number in range(episode[-1] + 1)):
         used[rows[: success[rows].argmax() + 21]] = True
-    numbers = [
-        table.column(name).combine_chunks().flatten().to_numpy() for name in ("observation.state", "expert_action")
-    ]
-    observation, action = (torch.tensor(flat.reshape(len(table), -1)[used]) for flat in numbers)
+    columns = (table.column(name).combine_chunks() for name in ("observation.state", "expert_action"))
+    observation, action = (torch.tensor(one.flatten().to_numpy().reshape(len(table), -1)[used]) for one in columns)
     task = torch.tensor([lw.task_id(names[index]) for index in table.column("task_index").to_numpy()[used]])
     return TensorDataset(observation, task, action)
 

@@ -1,5 +1,4 @@
-"""A suite of one's own: robosuite's Lift, Stack and Door with any of its arms, and Meta-World's policies in it.
-
+"""Your own suite: robosuite's Lift, Stack and Door with any of its arms, and Meta-World's policies in it.
 python examples/suite_robosuite.py check --arms Panda Sawyer                 # measure what the suite says of itself
 python examples/suite_robosuite.py expert --arms Panda --task stack --seed 7 # scripted skills
 python examples/suite_robosuite.py POLICY --arms Panda Sawyer --task lift --episodes 50 --seed 3000
@@ -120,10 +119,9 @@ class Engine:
 
 def make_suite(arm: str = "Panda") -> Suite:
     """The tasks with one of robosuite's arms, and a Panda's gripper."""
-    words = {"plans": lw.load_plans(WORDS, tasks=TASKS), "skills": lw.load_skills(WORDS / "skills.toml", tasks=TASKS)}
-    return Suite(
-        "robosuite", LAYOUT, TASKS, lambda rows, **how: Engine(rows, arm, **how), max_steps=300, step_time=0.05, **words
-    )
+    how = dict(plans=lw.load_plans(WORDS, tasks=TASKS), skills=lw.load_skills(WORDS / "skills.toml", tasks=TASKS))
+    engine = lambda rows, **options: Engine(rows, arm, **options)  # noqa: E731
+    return Suite("robosuite", LAYOUT, TASKS, engine, max_steps=300, step_time=0.05, **how)
 
 
 def main() -> None:

@@ -72,9 +72,7 @@ def main() -> None:
     LogScalar(("next", "success"), "success", include_std=False).register(trainer)
     trainer.train()
     print("mean reward of each update:", *(f"{reward:.2f}" for reward in trainer._log_dict["reward"]))
-    lw.save_actor(
-        actor, "runs/torchrl_trainer/policy.safetensors"
-    )  # Trainer's own files hold no plans, nor how to make it
+    lw.save_actor(actor, "runs/torchrl_trainer/policy.safetensors")  # Trainer's own files do not hold the plans
     print(lw.evaluate(actor, tasks=TASK, episodes_per_task=5, seed=1_000, progress=False).table())
 
 

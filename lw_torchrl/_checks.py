@@ -3,6 +3,7 @@
 import functools
 import inspect
 import math
+import operator
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -180,11 +181,18 @@ def _matcher() -> Callable[[object, Any], bool]:
 
 def _check_of_class(annotation: Any) -> Check | None:
     """Return the check of a class, function or collection; None for what cannot be checked."""
-    origin = get_origin(annotation) or annotation
+    origin, inside = get_origin(annotation) or annotation, get_args(annotation)
     if getattr(origin, "_is_protocol", False):
         return _check_of_class(Callable) if "__call__" in vars(origin) else None
-    if annotation in (Any, object, inspect.Parameter.empty) or isinstance(annotation, TypeVar):
+    names_are_checked_inside = any(get_origin(part) is Literal for part in inside)
+    if (
+        annotation in (Any, object, inspect.Parameter.empty)
+        or isinstance(annotation, TypeVar)
+        or names_are_checked_inside
+    ):
         return None
+    if any(not isinstance(part, type) or part.__name__ == "NestedKey" for part in inside):
+        annotation = _without_contents(annotation)  # the function itself checks more than a class of what is inside
 
     def check(argument: str, given: Any) -> None:
         if not _matcher()(given, annotation):
@@ -194,6 +202,14 @@ def _check_of_class(annotation: Any) -> Check | None:
             raise TypeError(f"{argument} must be {_words(annotation)}, got {kind}")
 
     return check
+
+
+def _without_contents(annotation: Any) -> Any:
+    """Return an annotation that says nothing of what collections hold and functions take."""
+    origin, inside = get_origin(annotation), get_args(annotation)
+    if origin in (Union, UnionType):
+        return functools.reduce(operator.or_, map(_without_contents, inside))
+    return _without_contents(inside[0]) if origin is Annotated else origin or annotation
 
 
 def _words(annotation: Any) -> str:

@@ -20,8 +20,25 @@ import lw_torchrl as lw
 from lw_torchrl._checks import check_fields, check_positive, check_probability, check_scale
 from lw_torchrl.evaluation import summarize
 
-PUBLIC = {name: import_module(room) for name, room in lw._ROOM_OF.items()}  # at the top level, or in 0.2.0
-PUBLIC |= {name: import_module(room) for room, names in lw._moved().items() for name in names}
+PUBLIC = {name: import_module(room) for name, room in lw._ROOM_OF.items()}
+MORE = {
+    "data": ("Behaviour", "add_pictures", "load_pictures"),
+    "language.plans": ("PlanStep",),
+    "language.nearest": ("nearest_query", "nearest_skill"),
+    "language.tasks": ("resolve_tasks",),
+    "modules": ("ActorEnsemble", "ImageQueryEvaluator", "plan_actor_value"),
+    "objectives": (
+        "AdvantageWeightedLoss", "DemonstratedSACLoss", "DemonstratedTD3Loss", "ExpectileValueLoss",
+        "standardize_by_task",
+    ),
+    "record": ("RolloutRecorder",),
+    "training": (
+        "ImageQueryEvaluatorConfig", "ImageQueryEvaluatorTrainer", "LabelledQueries", "QueryEvaluatorConfig",
+        "QueryEvaluatorTrainer", "load_evaluator", "save_evaluator",
+    ),
+    "transforms": ("CameraTransform", "EnvState"),
+}  # fmt: skip
+PUBLIC |= {name: import_module(f"lw_torchrl.{room}") for room, names in MORE.items() for name in names}
 PUBLIC |= {name: lw.modules for name in ("Value", "QValue", "PlanEncoder")}
 NOT_MADE_BY_USERS = {"DecodedPlan", "DecodedStep", "PlannerError", "PlanError", "QueryError", "Planner", "Policy"}
 WRONG: dict[str, list[Any]] = {

@@ -18,7 +18,7 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import Writer
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import Count, Natural, checked
+from lw_torchrl._checks import Count, Natural, check_path, checked
 from lw_torchrl._devices import CPU, check_device
 from lw_torchrl._files import AnyPath
 from lw_torchrl.data import replay_checks, selection
@@ -142,7 +142,10 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         if grow is not None and where != CPU:
             raise ValueError("device: a growing buffer is on the CPU; leave it out, trainers move each minibatch")
         joined = not isinstance(root, (str, os.PathLike))
-        self.roots = tuple(map(Path, root)) if joined else (Path(root),)  # type: ignore[arg-type]
+        folders: Sequence[AnyPath] = root if joined else [root]  # type: ignore[assignment, list-item]
+        for folder in folders:
+            check_path("root", folder)
+        self.roots = tuple(map(Path, folders))
         twice = episodes is None and len({folder.resolve() for folder in self.roots}) < len(self.roots)
         if not self.roots or twice:
             raise ValueError(f"root must be a folder, or a list that names each folder once, got {root}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._checks import check_fields, check_int, check_probability, shown, unknown_name
+from lw_torchrl._checks import check_fields, check_int, check_probability, check_text, shown, unknown_name
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations, EpisodeInfo
 from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.data.rewards import REWARDS, RewardName
@@ -49,7 +49,13 @@ class EpisodeFilter:
             if (part := getattr(self, name)) is not None and not check_probability(f"keep: {name}", part):
                 raise ValueError(f"keep: {name} must be above 0, got 0")
         if self.behaviours is not None:
+            if isinstance(self.behaviours, str) or not isinstance(self.behaviours, Iterable):
+                raise TypeError(f"keep: behaviours must be a list of labels, got {self.behaviours!r}")
             object.__setattr__(self, "behaviours", tuple(self.behaviours))
+            for label in self.behaviours:
+                check_text("keep: behaviours", label)
+            if not self.behaviours:
+                raise ValueError("keep: behaviours must hold at least one label, got none")
 
     def choose(self, parts: Sequence[Demonstrations], returns: Sequence[Tensor]) -> list[Demonstrations]:
         """The parts with the episodes that are kept, by the return and the rows of each, (E, 2) float64 a part."""

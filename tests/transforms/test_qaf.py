@@ -215,8 +215,8 @@ def test_more_plans_than_tasks_are_welcome(few_plans):
     ("plans", "error", "message"),
     [
         ({}, lw.PlanError, "at least one plan"),
-        (None, TypeError, "plans must map task names to ConditionalPlan, got NoneType"),
-        ("MT10", TypeError, "plans must map task names to ConditionalPlan, got str"),
+        (None, TypeError, "plans must be a Plans or a mapping, got None"),
+        ("MT10", TypeError, "plans must be a Plans or a mapping, got .MT10"),
         (
             {"reach": "move to the goal"},
             TypeError,
