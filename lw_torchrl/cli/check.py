@@ -144,7 +144,7 @@ class Info:
         if self.path.suffix == ".rrd":
             return _show_recording(output, self.path)
         measured = None if self.result is None else lw.EvaluationResult.load(self.result)
-        card = str(lw.evaluation.policy_card(self.path, measured))
+        card = lw.evaluation.describe_policy(self.path, measured)
         return output.show("card", card, card)
 
 

@@ -2,7 +2,7 @@
 
 import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.evaluation.attribution import attribute_failures
-from lw_torchrl.evaluation.card import policy_card
+from lw_torchrl.evaluation.card import describe_policy, policy_card
 from lw_torchrl.evaluation.evaluator_score import EvaluatorScore, score_evaluator
 from lw_torchrl.evaluation.failure_records import CAUSES, Failure, MendedEpisode
 from lw_torchrl.evaluation.figures import plot_failures, plot_sorted_tasks, plot_success
@@ -22,7 +22,7 @@ from lw_torchrl.evaluation.summary import Summary, TaskSummary, summarize, summa
 
 __all__ = [
     "CAUSES", "EpisodeResult", "Estimate", "EvaluationResult", "EvaluatorScore", "Failure", "MendedEpisode", "PlanUse",
-    "Summary", "TaskSummary", "attribute_failures", "count_solved", "evaluate", "from_pretrained",
+    "Summary", "TaskSummary", "attribute_failures", "count_solved", "describe_policy", "evaluate", "from_pretrained",
     "interquartile_mean", "mean_difference", "mean_rate", "plot_failures", "plot_sorted_tasks", "plot_success",
     "policy_card", "probability_of_improvement", "push_to_hub", "save_pretrained", "score_evaluator",
     "summarize", "summarize_rates",

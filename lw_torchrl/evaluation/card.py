@@ -57,10 +57,45 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
 
     Source: ``huggingface_hub.ModelCard``; Mitchell et al., 'Model Cards for Model Reporting'.
     """
+    text, measured = describe_policy(policy, result, repo=repo), _measured(policy, result)
+    metadata = hub().ModelCardData(
+        library_name="lw_torchrl", pipeline_tag="robotics", tags=_TAGS, model_name=Path(policy).stem
+    )
+    if measured is not None:
+        metadata.eval_results = [
+            hub().EvalResult(
+                task_type="robotics",
+                dataset_type="meta-world",
+                dataset_name=counted(len(measured.success_once), "task"),
+                metric_type="success_rate",
+                metric_name="mean success",
+                metric_value=round(measured.mean_success, 3),
+            )
+        ]
+    card: ModelCard = hub().ModelCard(f"---\n{metadata.to_yaml()}\n---\n\n{text}")
+    return card
+
+
+def _measured(policy: AnyPath, result: EvaluationResult | None) -> EvaluationResult | None:
+    """Return the given result, or a shipped policy's own."""
+    shipped = shipped_policy(policy)
+    return EvaluationResult.load(shipped.with_suffix(".json")) if result is None and shipped is not None else result
+
+
+@checked
+def describe_policy(policy: AnyPath, result: EvaluationResult | None = None, *, repo: str = "") -> str:
+    """Describe a policy in Markdown: training data, success rates, limits, how to load and cite it.
+
+    Args:
+        policy, result, repo: as for :func:`policy_card`, with its errors; no extra is needed.
+
+    Example:
+        >>> describe_policy("few-shot-mt50").splitlines()[0]
+        '# few-shot-mt50'
+    """
     description, demonstrated = read_description(policy), demonstrated_tasks(policy)
     tasks = _tasks(description["actor"])
-    if result is None and (shipped := shipped_policy(policy)) is not None:
-        result = EvaluationResult.load(shipped.with_suffix(".json"))
+    result = _measured(policy, result)
     if result is not None and tasks and (unknown := set(result.config["tasks"]) - tasks):
         raise ValueError(f"result must be of the policy's tasks, it does not know {', '.join(sorted(unknown))}")
     limits = [f"- {counted(len(tasks - demonstrated), 'task')} had no demonstrations."] * bool(tasks - demonstrated)
@@ -68,7 +103,7 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
     if weak := [f"{task} ({rate:.2f})" for task, rate in rates.items() if rate is not None and rate < 0.8]:
         limits.append(f"- Success below 0.8: {', '.join(weak)}.")
     texts = files("lw_torchrl.evaluation") / "data"
-    body = Template((texts / "card.md").read_text("utf-8")).substitute(
+    return Template((texts / "card.md").read_text("utf-8")).substitute(
         name=Path(policy).stem,
         kind=_kind(description["actor"]),
         tasks=counted(len(tasks), "task"),
@@ -79,21 +114,6 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
         load=f"lw.from_pretrained({repo!r})" if repo else f"lw.load_actor({Path(policy).name!r})",
         citation=(texts / "citation.bib").read_text("utf-8").strip(),
     )
-    metadata = hub().ModelCardData(
-        library_name="lw_torchrl", pipeline_tag="robotics", tags=_TAGS, model_name=Path(policy).stem
-    )
-    if result is not None:
-        measured = hub().EvalResult(
-            task_type="robotics",
-            dataset_type="meta-world",
-            dataset_name=counted(len(rates), "task"),
-            metric_type="success_rate",
-            metric_name="mean success",
-            metric_value=round(result.mean_success, 3),
-        )
-        metadata.eval_results = [measured]
-    card: ModelCard = hub().ModelCard(f"---\n{metadata.to_yaml()}\n---\n\n{body}")
-    return card
 
 
 def _tasks(actor: Mapping[str, Any]) -> set[str]:
