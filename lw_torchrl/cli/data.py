@@ -51,9 +51,11 @@ class Collect:
     task_file: options.TaskFile = None
     suite: options.SuiteName = None
     num_envs: int | None = None  # environments stepped together; does not change the dataset
+    device: options.Device = "cpu"
     json: options.Json = False
 
     def run(self) -> Output:
+        from lw_torchrl._devices import place
         from lw_torchrl.data.behaviours import BEHAVIOURS
 
         suite = options.read_suite(self.suite, self.tasks)
@@ -63,6 +65,7 @@ class Collect:
         if policy not in BEHAVIOURS:
             options.use_one_thread()
             policy = read_object(policy) if is_object(policy) else lw.load_actor(policy)
+            place(policy, self.device)
             behaviour = behaviour or policy_name(self.policy)
         noise = {"noise_scale": self.noise, "noise_hold": self.noise_hold, "gripper_noise_factor": self.gripper_noise}
         run: dict[str, Any] = {"seed": self.seed, "num_envs": self.num_envs, "suite": suite, **noise}

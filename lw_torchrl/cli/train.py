@@ -169,6 +169,7 @@ class TrainEvaluator:
     learning_rate: float | None = None  # at the start; a cosine brings it to 0; None for 0.003, with --cameras 0.002
     seed: int = 0  # random seed of episodes, held-out choices, initial weights and minibatches
     num_envs: int | None = None  # environments stepped together; does not change the result
+    device: options.Device = "cpu"
     json: options.Json = False
 
     def run(self) -> Output:
@@ -195,7 +196,8 @@ class TrainEvaluator:
         labelled = lw.training.LabelledQueries(replay, config)
         make = lw.training.ImageQueryEvaluatorTrainer if self.cameras else lw.training.QueryEvaluatorTrainer
         file = self.out / "evaluator.safetensors"
-        loss = make(evaluator, labelled, config, checkpoint=file).train()
+        loss = make(evaluator, labelled, config, checkpoint=file, device=self.device).train()
+        evaluator.cpu()
         output = Output(self.json).show("evaluator", file).show("steps", config.steps)
         trained = "" if loss != loss else f", loss {loss:.4f}"  # nan: nothing was left to train
         output.show("loss", loss, f"trained to step {config.steps}{trained}")

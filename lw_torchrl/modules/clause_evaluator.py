@@ -38,6 +38,9 @@ class Clauses(NamedTuple):
         """Of (G,) clauses those of these numbers, (...) int64."""
         return Clauses(*(table[which] for table in self[:7]))
 
+    def to(self, device: torch.device) -> Clauses:
+        return Clauses(*(table.to(device, non_blocking=True) for table in self))
+
 
 def conjunction(logits: Tensor, mask: Tensor) -> Tensor:
     """The logit (...) of all of some statements, of logits (..., K) of size 30 at most, where ``mask`` (..., K) bool is

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._checks import checked, passes_on
+from lw_torchrl._devices import device_of, place
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
@@ -57,8 +58,9 @@ class _StateMinibatches:
 
     def loss(self, step: int, generator: torch.Generator) -> Tensor:
         observation, clauses, truth = self.draw(step, generator)
-        logits = self.evaluator.network(observation, clauses)
-        return nn.functional.binary_cross_entropy_with_logits(logits, truth)
+        device = device_of(self.evaluator)
+        logits = self.evaluator.network(observation.to(device, non_blocking=True), clauses.to(device))
+        return nn.functional.binary_cross_entropy_with_logits(logits, truth.to(device, non_blocking=True))
 
 
 class _PictureMinibatches:
@@ -80,16 +82,17 @@ class _PictureMinibatches:
         return torch.stack([self._task_loss(task, each, generator) for task in range(len(self.asked))]).mean()
 
     def _task_loss(self, task: int, size: int, generator: torch.Generator) -> Tensor:
-        asked, network = self.asked[task], self.evaluator.network
+        asked, network, device = self.asked[task], self.evaluator.network, device_of(self.evaluator)
         coded = self.coded[task]
         rows = torch.randint(len(asked.observation), (size,), generator=generator)
-        pixels, truth = asked.seen("pixels")[rows], asked.truth[rows]
-        weights = self.weights[task].gather(0, truth.long())
-        clauses = coded.pick(torch.arange(len(coded.predicate)).expand(size, -1))
+        pixels, truth = asked.seen("pixels")[rows].to(device), asked.truth[rows].to(device)
+        weights = self.weights[task].to(device).gather(0, truth.long())
+        clauses = coded.pick(torch.arange(len(coded.predicate)).expand(size, -1)).to(device)
         places, _ = network.places(pixels, network.names.weight)
         logits = network.tell(places, clauses)
         which, known, counts = self.positions[task]
-        error = nn.functional.smooth_l1_loss(places[:, which] / 0.05, known[rows] / 0.05, reduction="none")
+        known, counts = known[rows].to(device), counts.to(device)
+        error = nn.functional.smooth_l1_loss(places[:, which.to(device)] / 0.05, known / 0.05, reduction="none")
         placed = (error * counts).sum() / (counts.sum() * size)
         errors = nn.functional.binary_cross_entropy_with_logits(logits, truth.float(), reduction="none")
         return (errors * weights).sum() / weights.sum() + self.config.position_weight * placed
@@ -100,11 +103,11 @@ def _known_positions(asked: Asked, known: tuple[str, ...]) -> tuple[Tensor, Tens
     names = [name for name in asked.task.object_names if name in known]
     positions, openings = asked.task.positions(asked.observation), asked.task.openings
     found, counts = torch.zeros(len(asked.observation), len(names), 4), torch.ones(len(names), 4)
-    for place, name in enumerate(names):
-        found[:, place, :3] = positions[name]
-        counts[place, 3] = name in openings
+    for number, name in enumerate(names):
+        found[:, number, :3] = positions[name]
+        counts[number, 3] = name in openings
         if name in openings:
-            found[:, place, 3] = asked.observation[:, openings[name]]
+            found[:, number, 3] = asked.observation[:, openings[name]]
     return torch.tensor([known.index(name) for name in names], dtype=torch.int64), found, counts
 
 
@@ -130,18 +133,20 @@ def _digest(tensors: Iterable[Tensor]) -> str:
 class QueryEvaluatorTrainer(Training):
     """Trains an evaluator on the answers of the query answering function to all base queries of tasks.
 
-    A minibatch, which hangs on the seed and the step alone, has equally many pairs of a state and a clause of each
+    A minibatch depends only on the seed and the step. It has equally many pairs of a state and a clause of each
     predicate and truth. An evaluator that reads texts is asked half of the clauses negated.
 
     Args:
         evaluator: it is trained in place; its plans do not matter.
         data: what is asked, and what of it is held out.
         config: how to train, the one that the data were made with.
+        device: where to train: "cpu", "cuda", "cuda:1", "mps", or "auto" for a GPU if there is one. The evaluator is
+            moved there; None leaves it where it is.
         checkpoint, logger, progress, title: as of :class:`~lw_torchrl.training.loop.Training`, with its errors;
             :func:`load_evaluator` reads the file.
 
     Raises:
-        TypeError: the evaluator is no :class:`StateQueryEvaluator`.
+        TypeError: the evaluator is not a :class:`StateQueryEvaluator`.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
@@ -166,6 +171,8 @@ class QueryEvaluatorTrainer(Training):
         evaluator: ClauseEvaluator,
         data: LabelledQueries,
         config: QueryEvaluatorConfig | None = None,
+        *,
+        device: str | torch.device | None = None,
         **options: Unpack[TrainingOptions],
     ) -> None:
         if not isinstance(evaluator, self.trains):
@@ -174,6 +181,7 @@ class QueryEvaluatorTrainer(Training):
         options.setdefault("title", "training the evaluator")
         super().__init__(config, [], **options)
         self.evaluator, self.module, self.networks = evaluator, evaluator, [evaluator]
+        self.device = place(evaluator, device)
         if not data.parts["training"]:
             raise ValueError("data must have states and queries to train on, all are held out")
         self._minibatches = type(self).minibatches(evaluator, data.parts["training"], config)
