@@ -37,7 +37,7 @@ STATES_PER_TASK = 40
 
 @dataclass(frozen=True)
 class Arguments:
-    """Check that plans, queries, policies and diagnoses are what they were. Exit status 1 if one differs."""
+    """Check that the results of plans, queries, policies and diagnoses have not changed. Exit status 1 if one has."""
 
     names: tyro.conf.Positional[tuple[Literal["plans", "queries", "actions", "success", "demo", "faults"], ...]] = (
         "plans", "queries", "actions", "success", "demo", "faults",

@@ -150,7 +150,7 @@ _PLAIN: dict[Any, Check] = {bool: check_flag, int: check_int, float: _check_real
 
 
 def _check_of(annotation: Any, classes: bool = True) -> Check | None:
-    """Return the check of an annotation: a flag, number, text, path, choice or range, or None; others have none."""
+    """Return the function that checks values against an annotation, or None if values are not checked."""
     origin, inside = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return inside[1]
@@ -192,7 +192,7 @@ def _check_of_class(annotation: Any) -> Check | None:
     ):
         return None
     if any(not isinstance(part, type) or part.__name__ == "NestedKey" for part in inside):
-        annotation = _without_contents(annotation)  # the function itself checks more than a class of what is inside
+        annotation = _without_contents(annotation)  # the function checks the elements itself
 
     def check(argument: str, given: Any) -> None:
         if not _matcher()(given, annotation):

@@ -22,7 +22,7 @@ _SHIPPED = Path(__file__).with_name("training") / "data"
 
 
 def shipped_policy(name: AnyPath) -> Path | None:
-    """Return the file of a shipped policy, such as "few-shot-mt50"; None if a file has that name or no policy has."""
+    """Return the file of a shipped policy ("few-shot-mt50"); None if there is a file, or no policy, of that name."""
     path = _SHIPPED / f"{name}.safetensors"
     return path if Path(name).name == str(name) and not Path(name).exists() and path.is_file() else None
 

@@ -34,7 +34,7 @@ class Imitation(Schedule):
     experiment: Suppress[str] = "few-shot"
     """The subcommand."""
     out: Path = Path("runs/reproduce")
-    """Folder for all results. Stopped and started again, the command resumes there."""
+    """Folder for all results. If the command is stopped, run it again to resume."""
     methods: tuple[str, ...] | None = None
     """pcbc, dc, one-hot: policies conditioned on plans, descriptions, task numbers. scripted: plans with scripted
     skills. By default all of them, without scripted where --plans is given."""
@@ -44,7 +44,7 @@ class Imitation(Schedule):
     passes: int | None = None
     """With --preset paper, the number of passes over the rows, instead of 500."""
     plans: tuple[str, ...] = ()
-    """Other plans of all 50 tasks: MT50, .plan files, .json files of pairs, folders. The last plan of a task counts."""
+    """Other plans of all 50 tasks: MT50, .plan files, .json files of pairs, folders. The last one of a task is used."""
     device: str = "cpu"
     """Device of the networks: cpu, cuda, cuda:1, mps, or auto."""
 
@@ -53,16 +53,16 @@ class Imitation(Schedule):
 class Offline(Schedule):
     """Learn policies offline from noisy scripted policies, and compare the methods.
 
-    The data are mixtures of episodes per task. B: 20 of plans whose scripts are right in 30 of 100 segments, 20 in 60
-    of 100, 20 in none, and 10 of random actions. W: B without the second. C: 5 clean demonstrations, 20 in none, and
-    10 of random actions.
+    The data are mixtures of episodes of each task. B: 20 episodes of scripted plans that are right in 30 % of segments,
+    20 that are right in 60 %, 20 that are never right, and 10 of random actions. W: B without the 60 % episodes. C: 5
+    clean demonstrations, 20 episodes that are never right, and 10 of random actions.
     """
 
     table: Positional[Literal["methods", "conditioning", "mt10", "quick", "all"]]
     """methods: ten methods in five tasks. conditioning: plans, descriptions or task numbers, for policy and critic.
     mt10: the best method in MT10. quick: two tasks, to try it. all: all but quick."""
     out: Path = Path("runs/offline")
-    """Folder for all results. Stopped and started again, the command resumes there."""
+    """Folder for all results. If the command is stopped, run it again to resume."""
     mixtures: tuple[Literal["B", "W", "C"], ...] = ()
     """Only these mixtures of the table."""
     methods: tuple[str, ...] = ()
@@ -143,7 +143,7 @@ def load_plans(sources: Sequence[str], skills: Literal["own", "MT10"]) -> lw.Pla
 
 
 def _plans_name(source: str) -> str:
-    """The name of plans in a run's folder: their file or folder, with the model's folder of a folder of a format."""
+    """Return the plans' name in a run's folder: the file's or folder's, or MODEL-FORMAT for a model's answers."""
     path = Path(source)
     return f"{path.parent.name}-{path.name}" if path.name in PLAN_FORMATS and path.parent.name else path.stem
 

@@ -60,7 +60,7 @@ class Acting:
         return options.read_plans(self.reference, self.known) if self.reference else None
 
     def policy(self, who: str, tasks: list[str]) -> tuple[Any, Plans | None, Any]:
-        """Return a policy, the plans it shows, and an evaluator to put before it, if it takes none inside."""
+        """Return a policy, the plans to show, and an evaluator to run before it if it cannot contain one."""
         policy, plans = self._policy(who, tasks)
         if self.evaluator is None:
             return policy, plans, None
@@ -129,7 +129,7 @@ def policy_name(who: str) -> str:
 
 
 def read_evaluator(name: str, plans: Plans, text_encoder: str | None = None) -> lw.QueryEvaluator:
-    """Return an evaluator for ``plans``: of a file, of "my_module:evaluator", or new, of a class of EVALUATORS."""
+    """Return an evaluator for ``plans``: from a file or "my_module:evaluator", or a new one of a registered class."""
     encoder = options.read_encoder(text_encoder)
     if Path(name).exists() or not (":" in name or name in lw.modules.EVALUATORS):
         return lw.training.load_evaluator(name, plans, text_encoder=encoder)

@@ -16,14 +16,14 @@ from lw_torchrl.cli.acting import Acting, is_object, policy_name
 from lw_torchrl.cli.output import Output
 from lw_torchrl.language.plans import Plans
 
-_TASKS = "MT10, MT50, a suite, or names of tasks, if not those of --plans or of the demonstrations"
+_TASKS = "MT10, MT50, a suite, or names of tasks; by default those of --plans or of the demonstrations"
 
 
 @dataclass(kw_only=True)
 class Evaluate:
     """Evaluate a policy, and write the success rates, a figure and a recording.
 
-    With --suite, a policy that was trained with another robot acts there, with the plans of that suite.
+    With --suite, a policy that was trained on another robot runs in that suite, with its plans.
 
     Example: lw-torchrl evaluate runs/mt10.safetensors --out runs/mt10
 
@@ -92,7 +92,7 @@ class Evaluate:
 
 
 def _show_use(output: Output, result: lw.EvaluationResult, use: lw.evaluation.PlanUse, plans: Plans) -> None:
-    """Print the result, and of each step of a plan how often it was true, chosen, and where failed episodes ended."""
+    """Print the result and, for each plan step, how often it was true, chosen, or the last one of a failed episode."""
     steps = {}
     for task, used in use.tasks().items():
         columns = zip(plans[task].steps, used.true, used.chosen, used.stuck, strict=True)
@@ -105,7 +105,7 @@ def _show_use(output: Output, result: lw.EvaluationResult, use: lw.evaluation.Pl
 
 
 def _default_tasks(policy: Any, demonstrated: set[str], suite: lw.suites.Suite | None) -> list[str]:
-    """Return the tasks that a policy was shown, or else all it knows, that the suite, or any suite, simulates."""
+    """Return the policy's demonstrated tasks, or all its tasks if none is recorded, that a suite simulates."""
     from lw_torchrl.suites.suite import known_suite
 
     if not isinstance(policy, lw.Policy):

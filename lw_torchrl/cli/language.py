@@ -1,4 +1,4 @@
-"""``lw-torchrl tasks`` and ``query``: what there is to say about tasks, and queries answered in a state."""
+"""``lw-torchrl tasks`` and ``query``: describe tasks, and answer queries in a state."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ TaskFile = Annotated[Path | None, arg(metavar="FILE", help="a .toml file of your
 SkillFile = Annotated[Path | None, arg(metavar="FILE", help="a .toml file of your skills, added to the shipped ones")]
 Encoder = Annotated[str | None, arg(metavar="MODULE:FUNCTION", help=_ENCODER)]
 SuiteName = Annotated[str | None, arg(metavar="SUITE", help=_SUITE)]
-PlanSources = Annotated[tuple[str, ...], arg(metavar="SOURCES", help=f"{PLANS}; the last plan for a task counts")]
+PlanSources = Annotated[tuple[str, ...], arg(metavar="SOURCES", help=f"{PLANS}; for each task the last plan is used")]
 Evaluator = Annotated[str | None, arg(metavar="FILE", help=_EVALUATOR)]
 Device = Annotated[str, arg(help=_DEVICE)]
 
@@ -80,7 +80,7 @@ def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite |
 
 
 def read_tasks(task_file: Path | None, names: Sequence[str] = (), suite: str | None = None) -> Mapping[str, Task]:
-    """Return the tasks of the suite that ``names`` are of, or Meta-World's, with those of --task-file."""
+    """Return the tasks of the suite that ``names`` belong to; for Meta-World, those of --task-file too."""
     if (found := read_suite(suite, names)) is not None:
         return found.tasks
     return TASKS if task_file is None else load_tasks(task_file)
@@ -124,7 +124,7 @@ def read_plans(sources: Sequence[str], tasks: Mapping[str, Task]) -> Plans:
 
 
 def find_plans(sources: Sequence[str], tasks: Mapping[str, Task]) -> dict[str, ConditionalPlan]:
-    """Load plans; where ``tasks`` are of another suite, MT10 and MT50 are the plans of that suite, or none."""
+    """Load plans. If ``tasks`` belong to another suite, MT10 and MT50 stand for its plans, if it has any."""
     if not sources:
         raise ValueError("--plans requires at least one source: MT10, MT50, a file or a folder")
     suite = _suite_of(tasks)

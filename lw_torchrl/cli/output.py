@@ -1,4 +1,4 @@
-"""What a command prints: text and tables, or one JSON document."""
+"""Output of a command: text and tables, or one JSON document."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Output:
         return self
 
     def result(self, result: lw.EvaluationResult, **more: Mapping[str, Any]) -> Output:
-        """Print an evaluation's table, or keep its numbers under "tasks", with more of each task, and its config."""
+        """Print an evaluation's table, or keep its numbers, ``more`` numbers of each task, and its config."""
         rates = ("success_once", "success_at_end", "first_success", "mean_return")
         columns = {name: getattr(result, name) for name in rates} | more
         rows = [{"task": task, **{name: of[task] for name, of in columns.items()}} for task in result.config["tasks"]]

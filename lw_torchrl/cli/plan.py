@@ -190,9 +190,9 @@ class Read:
     """
 
     sources: Positional[Annotated[tuple[str, ...], arg(metavar="SOURCES", help=_SOURCES)]]
-    task: str | None = None  # show only this task; of an answer, None reads it from the file name
+    task: str | None = None  # show only this task; None reads an answer's task from its file name
     format: str | None = None  # plan format of an answer; None reads it from the folder name
-    out: Path | None = None  # folder for the plans as written, one .plan file a task: the most trusted, for --plans
+    out: Path | None = None  # folder for .plan files: for each task the plan with the highest confidence
     task_file: options.TaskFile = None
     json: options.Json = False
 

@@ -45,7 +45,7 @@ class Train:
     evaluator: options.Evaluator = None
     answers: Literal["logit", "tanh", "hard"] | None = None
     """how the evaluator's answers enter the attention (docs/evaluators.md); None for tanh, or with --begin for hard"""
-    qaf_anchor: float = 0.0  # weight of the loss that keeps an evaluator's answers to the exact ones; 1 for a new one
+    qaf_anchor: float = 0.0  # weight of the cross entropy with the exact answers; use 1 for a new evaluator
     steps: int = 8000  # number of minibatches
     batch_size: int = 500  # rows of a minibatch, equally many of each task
     learning_rate: float = 1e-3  # at the start; a cosine brings it to 0
@@ -160,12 +160,12 @@ class TrainEvaluator:
     cameras: Annotated[tuple[str, ...], arg(help=_CAMERAS)] = ()
     picture: int = 64  # with --cameras, height and width of a picture in pixels
     every: int | None = None  # use every N-th state of an episode; None for 1, with --cameras 5
-    held_out_tasks: tuple[str, ...] = ()  # tasks none of whose queries are trained, or the number of tasks to draw
-    held_out_pairs: float = 0.1  # fraction of object pairs none of whose queries are trained
+    held_out_tasks: tuple[str, ...] = ()  # tasks whose queries are not trained on, or how many to draw at random
+    held_out_pairs: float = 0.1  # fraction of object pairs whose queries are excluded from training
     width: int = 128  # units of each hidden layer
     depth: int = 3  # number of hidden layers
     steps: int | None = None  # number of minibatches; None for 6000, with --cameras 4000
-    batch_size: int | None = None  # checks, or with --cameras states, in a minibatch; None for 1024, 48
+    batch_size: int | None = None  # checks in a minibatch (with --cameras: states); None for 1024 (48)
     learning_rate: float | None = None  # at the start; a cosine brings it to 0; None for 0.003, with --cameras 0.002
     seed: int = 0  # random seed of episodes, held-out choices, initial weights and minibatches
     num_envs: int | None = None  # environments stepped together; does not change the result

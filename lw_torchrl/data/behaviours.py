@@ -108,7 +108,7 @@ def segment_plans(tasks: Iterable[str], suite: str | Suite = "metaworld") -> Pla
 def behaviour_of(
     policy: Any, tasks: Iterable[str], name: str | None = None, suite: str | Suite = "metaworld"
 ) -> Behaviour:
-    """The behaviour in these tasks of ``suite`` of an argument ``policy``, perhaps under another name."""
+    """Return the behaviour that the argument ``policy`` stands for in tasks of ``suite``, perhaps renamed."""
     if not isinstance(policy, (str, Behaviour, type)) and callable(policy):
         if name is None:
             raise ValueError("behaviour must name the policy, behaviour='my-policy' for example")

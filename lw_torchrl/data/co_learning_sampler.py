@@ -47,14 +47,14 @@ class CoLearningSampler(GroupSampler):
     then those of the base tasks in the order of their ids, and the column ``is_target`` (B,) bool.
 
     Args:
-        target: "grown"; or a task's name, for all demonstrations of the task, in a storage that joins datasets those of
-            the last dataset that has any.
+        target: "grown"; or a task's name, for all demonstrations of the task. If the storage joins datasets, these are
+            the demonstrations in the last dataset that has any.
         target_fraction: the target's share of a minibatch, between 0 and 1, such as 0.5, 1/3 or Fraction(2, 7).
         task_key: the entry of the storage that holds the task.
 
     Raises:
-        ValueError: at sampling, a batch size that cannot be exact, with the nearest that can; no row of the target or
-            of a base task; "grown" without a growing buffer, or another target with one.
+        ValueError: at sampling, a batch size that cannot be split exactly (the message gives the nearest that can);
+            no row of the target or of a base task; "grown" without a growing buffer, or another target with one.
 
     Example:
         >>> import torch

@@ -29,7 +29,7 @@ from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
 
 def _begin(root: Path, config: CollectConfig) -> dict[str, str]:
-    """Begin or resume a dataset; the versions of packages that it was begun with."""
+    """Begin or resume a dataset; return the versions of packages that it was begun with."""
     path = root / dataset.PARTIAL / "begun.json"
     versions = package_versions()
     if not path.is_file():

@@ -18,7 +18,7 @@ from lw_torchrl.modules.policy import plans_of
 
 
 def check_transform(transform: Any) -> None:
-    """Raise for TorchRL's transforms of rows that are written, which do nothing to samples."""
+    """Raise for TorchRL's transforms that act only on written rows, since they would do nothing to samples."""
     if isinstance(transform, Compose):
         for part in transform:
             check_transform(part)

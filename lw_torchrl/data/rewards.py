@@ -44,8 +44,8 @@ REWARDS: Mapping[RewardName, Reward] = MappingProxyType(
         "dense_cost": Reward("dense", shift=-_MOST, scale=0.01, at_success=0.0),
     }
 )
-"""By name: the success as 0 and 1; Meta-World's own, at most 10; a cost of 0.01 a step, none at success; the difference
-of the dense reward to 10, as a cost of at most about 0.1 a step, none at success. Costs need episodes that end at
+"""By name: the success as 0 and 1; Meta-World's own, at most 10; a cost of 0.01 a step, none at success; (dense
+reward - 10) / 100, a cost of at most about 0.1 a step, none at success. Costs need episodes that end at
 success (``terminate_on_success``): then the best return is 0, and staying short of the goal earns nothing."""
 
 
@@ -66,7 +66,7 @@ STEPS = "steps_to_next_obs"  # TorchRL's name of the column with the steps from 
 
 
 def check_n_steps(n_steps: Any, gamma: Any) -> tuple[int, float]:
-    """Return both; ValueError unless more than one step comes with the discount."""
+    """Return both, with gamma 1 for n_steps=1; raise ValueError if only one of gamma and n_steps > 1 is given."""
     number = check_int("n_steps", n_steps, minimum=1)
     if number == 1:
         if gamma is not None:

@@ -133,7 +133,7 @@ class ChatClient:
         raise PlannerError(f"{self.model!r} at {self.address}, {question}: {self._without_key(what)}.", fatal=fatal)
 
     def _complete(self, request: Mapping[str, Any]) -> tuple[bytes, frozenset[str]]:
-        """Return the body of a reply, and the fallbacks with which the server took the request."""
+        """Return the body of a reply, and the fallbacks with which the server accepted the request."""
         while True:
             fallbacks = self._fallbacks
             try:

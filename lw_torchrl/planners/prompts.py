@@ -181,7 +181,7 @@ def passes(value: Any, schema: Mapping[str, Any]) -> bool:
 
 
 def _clauses(task: Task) -> list[dict[str, Any]]:
-    """Return the base queries: the predicates of each object, and their second objects, so that every choice is one."""
+    """Return schemas for the base queries: for each subject and predicate, only the objects that complete a query."""
     seconds: dict[tuple[str, str], list[str | None]] = {}
     for clause in base_clauses(task, tuple(PREDICATES)):
         predicate = f"not {clause.predicate}" if clause.negated else clause.predicate

@@ -21,7 +21,7 @@ from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.planners.answer_files import CUT_OFF, Answer
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
 
-_GAPS = 3  # at most so many gaps are printed, the longest
+_GAPS = 3  # maximum number of gaps to print, the longest ones
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class Repair:
 
 
 def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
-    """Report to a model how its plan fared; of the answer's ``notes``, only that it was cut off.
+    """Write the report to a model on how its plan fared. Of the answer's ``notes``, only truncation is reported.
 
     Example:
         >>> from lw_torchrl.language.tasks import TASKS
@@ -208,7 +208,7 @@ def repair_plans(
         planner: the planner that wrote the answers.
         answers: its answers, in one format.
         rounds: maximum number of rounds.
-        enough: the success rate from which a plan is not revised.
+        enough: a plan with at least this success rate is not revised.
         episodes, seed: the episodes in which scripted skills carry out each plan. Compare plans with another seed.
         tasks: where tasks' names are looked up.
         out: see :meth:`OpenAIPlanner.revise`; each round is written like the answers of a model of its own.

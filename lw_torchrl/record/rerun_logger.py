@@ -41,7 +41,7 @@ from lw_torchrl.suites.suite import known_suite
 
 BUFFERED_SCALARS = 1024
 SEND_SECONDS, SEND_SHARE = 0.5, 0.01
-"""Buffered numbers are sent after so many seconds, or this share of the time since the logger was made."""
+"""Buffered numbers are sent after SEND_SECONDS or SEND_SHARE of the logger's age, whichever is longer."""
 FLUSH_SECONDS = 5.0
 
 
@@ -218,7 +218,7 @@ class RerunLogger(Logger):
             self._send()
 
     def _place(self, kind: str, name: str, step: int | None) -> tuple[str, list[Any]]:
-        """Give what is logged at a training step a view; return its entity and its time."""
+        """Add a view for a value logged at a training step; return its entity path and its time."""
         path = entity_path(kind, *check_name(name).split("/"))
         self._tabs.add_view(kind, name)
         return path, [rr.TimeColumn(METRIC_TIMELINE, sequence=[self._count(path, step)])]

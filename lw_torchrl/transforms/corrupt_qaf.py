@@ -1,4 +1,4 @@
-"""CorruptQAF: query answers that are taken rarely, come late, or are wrong."""
+"""CorruptQAF: query answers that are updated rarely, delayed or wrong."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class CorruptQAF(EpisodeTransform):
         in_keys: where qaf, task_id and episode are, in this order; qaf is written where it was.
 
     Raises:
-        ValueError: ``qaf`` that is absent, of another shape or dtype, or of other plans, or a replay buffer, whose rows
-            do not tell the steps of their episodes.
+        ValueError: ``qaf`` is missing, has another shape or dtype, or belongs to other plans; or the transform is used
+            in a replay buffer, whose rows do not record the steps of their episodes.
         RuntimeError: a step of an environment that was never reset, or not since ``load_state_dict``.
 
     Example:
@@ -79,7 +79,7 @@ class CorruptQAF(EpisodeTransform):
         self._forget_episodes()
 
     def _forget_episodes(self) -> None:
-        self._places = -(-self.delay // self.every) + 1  # as many answers are waiting to be shown, at most
+        self._places = -(-self.delay // self.every) + 1  # maximum number of answers waiting to be shown
         self._steps: Tensor | None = None  # B int64, of each row's episode
         self._taken: Tensor | None = None  # (B, places, S) bool; the n-th answers are in place n % places
         self._draws = _Draws(self.seed, self._tables, self.plans)

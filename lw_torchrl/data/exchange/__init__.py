@@ -120,7 +120,7 @@ def import_dataset(
         The dataset's description, as :func:`collect_demonstrations` returns it.
 
     Warns:
-        UserWarning: columns are missing; the message says what stands for them.
+        UserWarning: columns are missing; the message names the values that are used instead.
 
     Raises:
         ExchangeError: (a ValueError) ``source`` is damaged, of another format, or lacks observations or actions.

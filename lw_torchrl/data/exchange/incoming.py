@@ -1,4 +1,4 @@
-"""Tables that were read as datasets: an export of ours unchanged, other people's with a warning of what is missing."""
+"""Convert imported tables to datasets: our exports unchanged, others with a warning about missing columns."""
 
 from __future__ import annotations
 
