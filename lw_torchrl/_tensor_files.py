@@ -45,7 +45,8 @@ def write_tensors(
 def read_tensors(path: AnyPath) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return the description and the tensors of a file; raise :class:`ValueError` if it is damaged or another file."""
     if Path(path).is_dir():
-        raise ValueError("it is a folder")
+        inside = ", ".join(file.name for file in sorted(Path(path).glob(f"*{SUFFIX}"))[:3])
+        raise ValueError(f"it is a folder; name a file in it: {inside}" if inside else "it is a folder")
     Path(path).open("rb").close()  # safetensors' own error does not name a missing file
     try:
         with safe_open(path, framework="pt") as file:

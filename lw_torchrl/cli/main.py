@@ -39,7 +39,7 @@ _MORE = """`lw-torchrl COMMAND --help` explains a command. Every command accepts
 imports your Python module, for example one that registers a suite or a policy class
 (docs/extending.md). Commands that print a table accept --json. --version prints the version.
 
-Exit status: 0: done; 1: a bug, with a traceback; 2: an error that you can fix, in one line
+Exit status: 0: done; 1: a bug, with a traceback; 2: an error that you can fix
 (LW_TORCHRL_TRACEBACK=1 adds the traceback); 130: stopped by Ctrl-C; 141: broken pipe."""
 _USER_ERRORS = (ValueError, OSError, ImportError, RuntimeError)
 

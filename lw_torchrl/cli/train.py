@@ -194,6 +194,8 @@ class TrainEvaluator:
                 lw.data.add_pictures(root, **pictures, every=config.every)
             replay.add_column("pixels", lw.data.load_pictures(replay, **pictures, every=config.every))
         labelled = lw.training.LabelledQueries(replay, config)
+        if not any(asked for name, asked in labelled.parts.items() if name != "training"):
+            raise ValueError("nothing is held out to score the evaluator on; collect at least --episodes 2")
         make = lw.training.ImageQueryEvaluatorTrainer if self.cameras else lw.training.QueryEvaluatorTrainer
         file = self.out / "evaluator.safetensors"
         loss = make(evaluator, labelled, config, checkpoint=file, device=self.device).train()
