@@ -104,11 +104,12 @@ def check_path(argument: str, given: Any) -> None:
         raise _wrong_type(argument, "a path", given)
 
 
-def _check_real(argument: str, given: Any) -> None:
+def _check_real(argument: str, given: Any) -> float | None:
     if isinstance(given, bool) or not isinstance(given, Real):
         raise _wrong_type(argument, "a number", given)
     if given != given:
         raise ValueError(f"{argument} must be finite, got nan")
+    return None if isinstance(given, int) else float(given)  # a large integer stays one
 
 
 def check_scale(argument: str, given: Any) -> float:
@@ -267,9 +268,12 @@ def checked(function: Function) -> Function:
             given = signature.bind_partial(*args, **kwargs).arguments
         except TypeError:
             given = {}  # the function itself says which argument is unknown or too many
-        for name, check in checks().items():
-            if name in given:
-                check(name, given[name])
+        plain = {name: check(name, given[name]) for name, check in checks().items() if name in given}
+        plain = {name: value for name, value in plain.items() if _is_other_number(given[name], value)}
+        if plain:
+            bound = signature.bind(*args, **kwargs)
+            bound.arguments.update(plain)
+            return function(*bound.args, **bound.kwargs)
         return function(*args, **kwargs)
 
     return call  # type: ignore[return-value]
@@ -308,7 +312,15 @@ def check_fields(instance: Any, inside: str = "") -> None:
     """Check the plain fields of a dataclass as :func:`checked` does arguments; errors begin with ``inside``."""
     kind: Any = type(instance)
     for name, check in _checks_of_fields(kind).items():
-        check(inside + name, getattr(instance, name))
+        given = getattr(instance, name)
+        value = check(inside + name, given)
+        if _is_other_number(given, value):
+            object.__setattr__(instance, name, value)
+
+
+def _is_other_number(given: Any, value: Any) -> bool:
+    """Return whether ``value`` is Python's number for ``given``, a number of another library, which JSON lacks."""
+    return type(value) in (bool, int, float) and type(given) not in (bool, int, float)
 
 
 @functools.cache

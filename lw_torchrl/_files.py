@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import errno
+import glob
 import json
 import os
 import secrets
 import shutil
 import sys
+import time
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
 AnyPath = str | os.PathLike[str]
+_ABANDONED = 3600.0  # seconds after which a temporary file is the leftover of a killed process
 PATIENCE = 1.0  # seconds that `locked` waits for another writer, which may be about to finish
 
 _SHIPPED = Path(__file__).with_name("training") / "data"
@@ -41,8 +44,12 @@ def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
     If the process is killed, ``path`` is the old or the new file, whole. If the machine stops, that holds only with
     ``sync``, which waits some 10 ms for the disk.
     """
-    target = Path(path)
+    target = Path(os.path.realpath(path))  # a link stays, and its target is replaced
     target.parent.mkdir(parents=True, exist_ok=True)
+    for left in target.parent.glob(f".{glob.escape(target.stem)}.*.tmp{target.suffix}"):  # of a killed process
+        with suppress(OSError):
+            if time.time() - left.stat().st_mtime > _ABANDONED:
+                left.unlink()
     # The suffix stays, because writers choose the format by it.
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(8)}.tmp{target.suffix}")
     try:

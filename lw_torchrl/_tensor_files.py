@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from tensordict import TensorDict, TensorDictBase
@@ -17,6 +19,7 @@ from lw_torchrl._versions import package_versions
 
 SUFFIX = ".safetensors"
 _METADATA = "lw_torchrl"  # the metadata of a .safetensors file are texts by name; under this name is our JSON
+_CHECKSUM = "crc32"
 _STATE = "state/"  # begins the names of a state's tensors
 
 
@@ -37,7 +40,7 @@ def write_tensors(
     text = json.dumps(described, separators=(",", ":"), allow_nan=False)
     parse_json(text.encode())  # raises if two names are the same text
     copies = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
-    content = save(copies, metadata={_METADATA: text})
+    content = save(copies, metadata={_METADATA: text, _CHECKSUM: _checksum(text, copies)})
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
@@ -50,12 +53,25 @@ def read_tensors(path: AnyPath) -> tuple[dict[str, Any], dict[str, Tensor]]:
     Path(path).open("rb").close()  # safetensors' own error does not name a missing file
     try:
         with safe_open(path, framework="pt") as file:
-            description = parse_json((file.metadata() or {})[_METADATA].encode())
-            return description, {name: file.get_tensor(name).clone() for name in file.keys()}
+            metadata = file.metadata() or {}
+            text, stored = metadata[_METADATA], metadata[_CHECKSUM]
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}
     except KeyError:
         raise ValueError("it is a .safetensors file, but was not written by lw_torchrl") from None
     except SafetensorError as error:
         raise ValueError(f"it is damaged or not a .safetensors file: {error}") from error
+    if _checksum(text, tensors) != stored:
+        raise ValueError("it is damaged: its content does not have the checksum that was stored with it")
+    return parse_json(text.encode()), tensors
+
+
+def _checksum(text: str, tensors: Mapping[str, Tensor]) -> str:
+    """Return the CRC-32 of a description and tensors, in the order of their names."""
+    value = zlib.crc32(text.encode())
+    for name in sorted(tensors):
+        content = memoryview(tensors[name].reshape(-1).view(torch.uint8).numpy())  # type: ignore[arg-type]
+        value = zlib.crc32(content, zlib.crc32(name.encode(), value))
+    return f"{value:08x}"
 
 
 def pop_state(description: dict[str, Any], tensors: dict[str, Tensor]) -> Any:

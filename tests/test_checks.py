@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import json
 import math
 from typing import Literal
 
@@ -73,3 +74,15 @@ def test_fields_are_checked_however_their_annotations_are_kept():
     for wrong, name in ((made("3", 0.1, "l1"), "steps"), (made(3, "x", "l1"), "rate"), (made(3, 0.1, "l3"), "kind")):
         with pytest.raises((TypeError, ValueError), match=name):
             check_fields(wrong)
+
+
+def test_numbers_of_numpy_become_plain_ones():
+    """JSON, to which configurations are written, has no others."""
+    config = lw.BehavioralCloningConfig(steps=np.int64(3), learning_rate=np.float32(0.5), normalize=np.bool_(True))
+    assert json.loads(json.dumps(dataclasses.asdict(config)))["steps"] == 3
+
+    @checked
+    def numbers(count: int, scale: float, flag: bool = False) -> tuple[type, ...]:
+        return type(count), type(scale), type(flag)
+
+    assert numbers(np.int64(1), np.float32(0.5), flag=np.bool_(True)) == (int, float, bool)

@@ -90,8 +90,9 @@ def test_the_wheel_works_outside_the_checkout(built, tmp_path):
         return done.stdout
 
     assert ran("-c", "import lw_torchrl; print(lw_torchrl.__file__)").startswith(str(place))
-    told = json.loads(ran("-m", "lw_torchrl", "demo", "--quick", "--json"))
-    assert [row["task"] for row in told["tasks"]] == ["drawer-open", "window-open"]
+    ran("-m", "lw_torchrl", "demo", "--quick")
+    results = json.loads((elsewhere / "runs" / "demo-quick" / "results.json").read_text("utf-8"))
+    assert results["config"]["tasks"] == ["drawer-open", "window-open"]
     assert (elsewhere / "runs" / "demo-quick" / "rollout.rrd").is_file()
 
 
@@ -132,7 +133,7 @@ def test_mypy_finds_a_user_s_mistakes_outside_the_checkout(tmp_path):
     for name in ("planted_errors.py", "planted_in_extensions.py"):
         lines = Path(shutil.copy(Path(__file__).with_name(name), tmp_path)).read_text("utf-8").splitlines()
         planted[name] = [number for number, line in enumerate(lines, 1) if line.endswith("# planted")]
-        assert len(lines) >= 40
+        assert len(planted[name]) >= 3
     done = subprocess.run(
         [sys.executable, "-m", "mypy", "--strict", "--config-file=", "--no-error-summary", *planted],
         cwd=tmp_path,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from numbers import Real
 from pathlib import Path
@@ -99,7 +99,7 @@ def collect_demonstrations(
     policy: str | Behaviour | TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase] = "expert",
     behaviour: str | None = None,
     seed: int = 0,
-    noise_scale: float | Sequence[float] = 0.0,
+    noise_scale: float | Iterable[float] = 0.0,
     noise_hold: int = 1,
     gripper_noise_factor: float = 0.2,
     redraw_failures: bool = False,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -110,7 +110,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
     @checked
     def __init__(
         self,
-        root: AnyPath | Sequence[AnyPath],
+        root: AnyPath | Iterable[AnyPath],
         *,
         episodes: EpisodeChoice | Sequence[EpisodeChoice] = None,
         keep: EpisodeFilter | None = None,
@@ -142,7 +142,7 @@ class LanguageWorldExperienceReplay(RestorableReplay):
         if grow is not None and where != CPU:
             raise ValueError("device: a growing buffer is on the CPU; leave it out, trainers move each minibatch")
         joined = not isinstance(root, (str, os.PathLike))
-        folders: Sequence[AnyPath] = root if joined else [root]  # type: ignore[assignment, list-item]
+        folders: list[AnyPath] = list(root) if joined else [root]  # type: ignore[arg-type, list-item]
         for folder in folders:
             check_path("root", folder)
         self.roots = tuple(map(Path, folders))

@@ -129,7 +129,8 @@ class ChatClient:
                 notes.insert(0, "the schema was sent as json_object, since the server takes no json_schema")
             if not (answering.startswith(self.model) or self.model.startswith(answering)):  # servers append a date
                 notes.insert(0, f"the server says that the model {answering!r} answered, not {self.model!r}")
-            return replace(reply, notes=tuple(notes))
+            clean = {name: self._without_key(getattr(reply, name)) for name in ("text", "refusal")}
+            return replace(reply, notes=tuple(notes), **clean)
         raise PlannerError(f"{self.model!r} at {self.address}, {question}: {self._without_key(what)}.", fatal=fatal)
 
     def _complete(self, request: Mapping[str, Any]) -> tuple[bytes, frozenset[str]]:
@@ -149,12 +150,12 @@ class ChatClient:
     def _explain(self, error: Any) -> tuple[str, bool]:
         """Return the cause of a client's error, with a remedy, and whether it is fatal."""
         tried = f"asked {counted(int(error.request.headers.get('x-stainless-retry-count', 0)) + 1, 'time')}"
-        status, said = getattr(error, "status_code", None), excerpt(_error_text(error))
+        status, said = getattr(error, "status_code", None), excerpt(self._without_key(_error_text(error)))
         if any(isinstance(cause, self._openai.APITimeoutError) for cause in (error, error.__cause__)):
             limit = f"no whole answer within {self._timeout:g} s, {tried}"
             return f"{limit}. Give a longer timeout, or a lower concurrency", False
         if status is None:
-            cause = excerpt(str(error.__cause__ or error)) or type(error.__cause__).__name__
+            cause = excerpt(self._without_key(str(error.__cause__ or error))) or type(error.__cause__).__name__
             proxies = [name for name in _PROXIES if os.environ.get(name) or os.environ.get(name.lower())]
             advice = "Check that the server runs, and that base_url is its address"
             advice += f"; the client also uses {', '.join(proxies)}" if proxies else ""

@@ -122,6 +122,7 @@ class Training:
     optimizer: torch.optim.Optimizer
     schedule: Schedule | None = None
     device = CPU
+    _last_stamp: tuple[int, ...] | None = None  # of the training state's file that was read or written last
 
     @checked
     def __init__(
@@ -245,7 +246,17 @@ class Training:
         bar = Progress(self.title, total, "step", initial=done, show=self.progress)
         lock = nullcontext() if self.checkpoint is None else locked(self.checkpoint, "checkpoint", "training")
         with lock, bar, interrupts_between_steps() as interrupt:
+            if self._stamp() not in (None, self._last_stamp):
+                message = "was written by another training after this one began; start again to resume from it"
+                raise ValueError(f"checkpoint: {str(self.checkpoint)!r} {message}, or choose another file")
             yield bar, interrupt
+
+    def _stamp(self) -> tuple[int, ...] | None:
+        """Return what tells one version of the training state's file from another; None without a file."""
+        if self.state_file is None or not self.state_file.exists():
+            return None
+        status = self.state_file.stat()
+        return status.st_ino, status.st_size, status.st_mtime_ns
 
     @property
     def state_file(self) -> Path | None:
@@ -261,6 +272,7 @@ class Training:
         if self.checkpoint is not None and self.state_file is not None:
             described, tensors = {**self.described, "device": self.device.type}, self.contents()
             write_file(self.state_file, "training", described, tensors, self.state_dict())
+            self._last_stamp = self._stamp()
             if self.part is not None:
                 write_file(self.checkpoint, self.part, self.described, tensors)
 
@@ -274,7 +286,10 @@ class Training:
         for replay in self.replays:
             if isinstance(replay, LanguageWorldExperienceReplay):
                 replay.verify()
-        begin = f"checkpoint: {str(self.state_file)!r}"
+        if self.part is not None and self.checkpoint is not None and self.checkpoint.exists():
+            own = {self.part: self.described[self.part]}
+            check_same_description(self.checkpoint, read_file(self.checkpoint, self.part)[0], own)
+        begin, stamp = f"checkpoint: {str(self.state_file)!r}", self._stamp()
         description, stored = read_file(self.state_file, "training")
         check_same_description(self.state_file, description, self.described)
         if (before := description["device"]) != self.device.type:
@@ -288,6 +303,7 @@ class Training:
             state = pop_state(description, stored)
             copy_tensors(stored, self.contents())
             self.load_state_dict(state)
+            self._last_stamp = stamp
         except (ValueError, KeyError, TypeError, RuntimeError) as error:
             message = f"{begin} does not fit, it is damaged or of another architecture"
             raise ValueError(f"{message} ({short_message(error)})") from error

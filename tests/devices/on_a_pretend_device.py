@@ -142,7 +142,7 @@ def test_rows_that_are_there_want_a_sampler_of_ours(demos):
     rows = make_replay(demos, None)[:].select("observation", "task_id", "qaf", "qaf_plan", "action")
     mine = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows), device=PRETEND))
     mine.extend(rows)
-    with pytest.raises(ValueError, match="replay: a RandomSampler draws on pretend:0, where its rows are"):
+    with pytest.raises(ValueError, match="replay: a RandomSampler draws on pretend:0 with its own generator"):
         lw.BehavioralCloningTrainer(ACTORS["plan"](), mine, CONFIG, progress=False, device="pretend")
     mine = TensorDictReplayBuffer(storage=mine.storage, sampler=lw.TaskBalancedSampler())
     quiet_steps(lw.BehavioralCloningTrainer(ACTORS["plan"](), mine, CONFIG, progress=False, device="pretend"))
@@ -375,7 +375,7 @@ def test_rows_ahead_are_there_too_and_a_buffer_that_grows_is_not(demos):
     for replay in (here, there):
         replay.set_rng(torch.Generator().manual_seed(3))
     assert (there.sample(16).cpu() == here.sample(16)).all()
-    with pytest.raises(ValueError, match="device: a buffer that grows is on the CPU"):
+    with pytest.raises(ValueError, match="device: a growing buffer is on the CPU"):
         lw.LanguageWorldExperienceReplay(demos, label="executed", grow=10, device="pretend")
 
 

@@ -313,3 +313,15 @@ def test_weights_that_do_not_fit_the_description(saved, path, inside, name, valu
     described[name] = value
     write_tensors(path, description, tensors)
     refused(path, f"the actor of .* cannot be made .*{message}")
+
+
+def test_a_flipped_bit_is_found(tmp_path):
+    path = tmp_path / "policy.safetensors"
+    lw.save_actor(lw.PlanConditionedActor(PLANS, **SMALL), path)
+    content = path.read_bytes()
+    for place in range(len(content) // 3, len(content), len(content) // 7):
+        damaged = bytearray(content)
+        damaged[place] ^= 0x10
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match="it is damaged"):
+            lw.load_actor(path)

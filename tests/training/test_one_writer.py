@@ -60,3 +60,16 @@ def test_a_policy_without_a_training_state_is_not_overwritten(demos, tmp_path):
     lw.save_actor(make_actor(), path)
     with pytest.raises(ValueError, match=r"exists, but not its training state '.*policy\.training\.safetensors'"):
         make_trainer(demos, path)
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_what_another_training_wrote_meanwhile_is_kept(demos, tmp_path, name):
+    make, path = TRAINERS[name], tmp_path / "policy.safetensors"
+    first, second = make(demos, path), make(demos, path)
+    first.train()
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    with pytest.raises(ValueError, match="was written by another training after this one began"):
+        second.train()
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+    first.train()
+    make(demos, path).train()

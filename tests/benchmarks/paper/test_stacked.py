@@ -29,7 +29,7 @@ def make(kind, seed):
     torch.manual_seed(seed)
     if kind in ("description", "one-hot"):
         return lw.DescriptorConditionedActor(TASKS, width=32, condition=kind)
-    options = {"focused plan": {"focus": True, "swap_unmentioned": 0.5}, "mixed actions": {"mix": "actions"}}
+    options = {"focused plan": {"focus": True, "swap_unmentioned": 0.5}}
     return lw.PlanConditionedActor(PLANS, width=32, **options.get(kind, {}))
 
 
@@ -38,7 +38,7 @@ def stack(demos, number=2, config=CONFIG, kind="focused plan", checkpoint=None):
     return StackedBehavioralCloning(actors, replays, config, checkpoint=checkpoint, progress=False)
 
 
-@pytest.mark.parametrize("kind", first_fast(["plan", "focused plan", "mixed actions", "description", "one-hot"]))
+@pytest.mark.parametrize("kind", first_fast(["plan", "focused plan", "description", "one-hot"]))
 def test_every_loss_is_that_of_separate_training(demos, kind):
     together = stack(demos, 3, kind=kind)
     losses = torch.stack([together.step() for _ in range(CONFIG.steps)])
