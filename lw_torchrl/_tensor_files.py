@@ -37,10 +37,10 @@ def write_tensors(
     tensors, described = dict(tensors), {"versions": package_versions(), **description}
     if state is not None:
         described["state"] = _split(state, tensors)
-    text = json.dumps(described, separators=(",", ":"), allow_nan=False)
-    parse_json(text.encode())  # raises if two names are the same text
+    parse_json(_text(described).encode())  # raises if two names are the same text
     copies = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
-    content = save(copies, metadata={_METADATA: text, _CHECKSUM: _checksum(text, copies)})
+    described[_CHECKSUM] = _checksum(described, copies)
+    content = save(copies, metadata={_METADATA: _text(described)})
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
@@ -53,21 +53,25 @@ def read_tensors(path: AnyPath) -> tuple[dict[str, Any], dict[str, Tensor]]:
     Path(path).open("rb").close()  # safetensors' own error does not name a missing file
     try:
         with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            text, stored = metadata[_METADATA], metadata[_CHECKSUM]
+            description = parse_json((file.metadata() or {})[_METADATA].encode())
+            stored = description.pop(_CHECKSUM)
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}
     except KeyError:
         raise ValueError("it is a .safetensors file, but was not written by lw_torchrl") from None
     except SafetensorError as error:
         raise ValueError(f"it is damaged or not a .safetensors file: {error}") from error
-    if _checksum(text, tensors) != stored:
+    if _checksum(description, tensors) != stored:
         raise ValueError("it is damaged: its content does not have the checksum that was stored with it")
-    return parse_json(text.encode()), tensors
+    return description, tensors
 
 
-def _checksum(text: str, tensors: Mapping[str, Tensor]) -> str:
+def _text(description: Mapping[str, Any]) -> str:
+    return json.dumps(description, separators=(",", ":"), allow_nan=False)
+
+
+def _checksum(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> str:
     """Return the CRC-32 of a description and tensors, in the order of their names."""
-    value = zlib.crc32(text.encode())
+    value = zlib.crc32(_text(description).encode())
     for name in sorted(tensors):
         content = memoryview(tensors[name].reshape(-1).view(torch.uint8).numpy())  # type: ignore[arg-type]
         value = zlib.crc32(content, zlib.crc32(name.encode(), value))

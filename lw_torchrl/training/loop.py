@@ -286,12 +286,12 @@ class Training:
         for replay in self.replays:
             if isinstance(replay, LanguageWorldExperienceReplay):
                 replay.verify()
-        if self.part is not None and self.checkpoint is not None and self.checkpoint.exists():
-            own = {self.part: self.described[self.part]}
-            check_same_description(self.checkpoint, read_file(self.checkpoint, self.part)[0], own)
         begin, stamp = f"checkpoint: {str(self.state_file)!r}", self._stamp()
         description, stored = read_file(self.state_file, "training")
         check_same_description(self.state_file, description, self.described)
+        if self.part is not None and self.checkpoint is not None and self.checkpoint.exists():
+            own = {self.part: self.described[self.part]}
+            check_same_description(self.checkpoint, read_file(self.checkpoint, self.part)[0], own)
         if (before := description["device"]) != self.device.type:
             warnings.warn(
                 f"{begin} was trained on {before!r} and resumes on {self.device.type!r}: training continues with the "
