@@ -1,4 +1,4 @@
-"""What a user adds to the tables, typed, with four mistakes: mypy --strict finds them (test_packaging.py)."""
+"""What a user adds to the tables, typed, with three mistakes: mypy --strict finds them (test_packaging.py)."""
 
 import torch
 from torch import Tensor, nn
