@@ -46,10 +46,8 @@ def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
     """
     target = Path(os.path.realpath(path))  # a link stays, and its target is replaced
     target.parent.mkdir(parents=True, exist_ok=True)
-    for left in target.parent.glob(f".{glob.escape(target.stem)}.*.tmp{target.suffix}"):  # of a killed process
-        with suppress(OSError):
-            if time.time() - left.stat().st_mtime > _ABANDONED:
-                left.unlink()
+    if sync:  # a folder of many small files, which are not synced, would be listed for each of them
+        _remove_abandoned(target)
     # The suffix stays, because writers choose the format by it.
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(8)}.tmp{target.suffix}")
     try:
@@ -65,6 +63,14 @@ def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
         raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _remove_abandoned(target: Path) -> None:
+    """Remove the temporary files that killed processes left beside a file."""
+    for left in target.parent.glob(f".{glob.escape(target.stem)}.*.tmp{target.suffix}"):
+        with suppress(OSError):
+            if time.time() - left.stat().st_mtime > _ABANDONED:
+                left.unlink()
 
 
 @contextmanager

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import ast
-import dataclasses
 import inspect
 import math
 import re
 from importlib import import_module
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from wrong_values import OF_ONE_NAME, good_calls
 from wrong_values import WRONG as OTHERS
 
 import lw_torchrl as lw
-from lw_torchrl._checks import check_fields, check_positive, check_probability, check_scale
+from lw_torchrl._checks import check_positive, check_probability, check_scale
 from lw_torchrl.evaluation import summarize
 
 PUBLIC = {name: import_module(room) for name, room in lw._ROOM_OF.items()}
@@ -223,17 +222,3 @@ def test_a_gradient_norm_of_zero_would_train_nothing():
 def test_a_misspelt_option_is_named_with_the_nearest(call, message):
     with pytest.raises(TypeError, match=message):
         call()
-
-
-def test_help_shows_the_options_that_are_handed_on():
-    shown = inspect.signature(lw.PlanConditionedActor).parameters
-    assert {"width", "distribution", "roles", "evaluator"} <= {*shown}
-    assert not any(one.kind is one.VAR_KEYWORD for one in shown.values())
-
-
-def test_fields_are_checked_however_their_annotations_are_kept():
-    made = dataclasses.make_dataclass("Made", [("steps", int), ("rate", "float"), ("kind", Literal["l1", "l2"])])
-    check_fields(made(3, 0.1, "l1"))
-    for wrong, name in ((made("3", 0.1, "l1"), "steps"), (made(3, "x", "l1"), "rate"), (made(3, 0.1, "l3"), "kind")):
-        with pytest.raises((TypeError, ValueError), match=name):
-            check_fields(wrong)

@@ -57,7 +57,8 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
 
     Source: ``huggingface_hub.ModelCard``; Mitchell et al., 'Model Cards for Model Reporting'.
     """
-    text, measured = describe_policy(policy, result, repo=repo), _measured(policy, result)
+    measured = _measured(policy, result)
+    text = describe_policy(policy, measured, repo=repo)
     metadata = hub().ModelCardData(
         library_name="lw_torchrl", pipeline_tag="robotics", tags=_TAGS, model_name=Path(policy).stem
     )
