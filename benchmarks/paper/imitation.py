@@ -23,7 +23,7 @@ from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.registry import find_method, make_policy
 from lw_torchrl.training import BehavioralCloningTrainer
 from lw_torchrl.training.checkpoint import check_description, load_actor, save_actor
-from lw_torchrl.training.loop import describe_data
+from lw_torchrl.training.descriptions import describe_data
 from lw_torchrl.transforms import RandomYaw
 
 SCRIPTED = "scripted"

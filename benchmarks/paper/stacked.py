@@ -19,14 +19,8 @@ from lw_torchrl.data.replay_checks import check_replay
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig, make_optimizer
 from lw_torchrl.training.checkpoint import check_can_be_saved, text_vectors
-from lw_torchrl.training.loop import (
-    ReplayState,
-    Training,
-    TrainingOptions,
-    describe_data,
-    describe_replay,
-    make_schedule,
-)
+from lw_torchrl.training.descriptions import describe_data, describe_replay
+from lw_torchrl.training.loop import ReplayState, Training, TrainingOptions, make_schedule
 from lw_torchrl.training.normalization import check_contacts, fit_normalization
 
 

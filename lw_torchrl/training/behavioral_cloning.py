@@ -22,14 +22,8 @@ from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.training.checkpoint import check_can_be_saved
-from lw_torchrl.training.loop import (
-    ReplayState,
-    Training,
-    TrainingOptions,
-    describe_data,
-    describe_replay,
-    make_schedule,
-)
+from lw_torchrl.training.descriptions import describe_data, describe_replay
+from lw_torchrl.training.loop import ReplayState, Training, TrainingOptions, make_schedule
 from lw_torchrl.training.normalization import check_contacts, fit_normalization
 from lw_torchrl.transforms.qaf import plan_program
 

@@ -19,16 +19,8 @@ from torchrl.objectives import LossModule, SoftUpdate
 from lw_torchrl._checks import Count, Positive, Probability, Scale, check_fields, checked, passes_on
 from lw_torchrl.data.replay_checks import check_minibatches
 from lw_torchrl.objectives.reduction import with_n_steps
-from lw_torchrl.training.loop import (
-    READ_EVERY,
-    ReplayState,
-    Training,
-    TrainingOptions,
-    describe_data,
-    describe_replay,
-    make_schedule,
-    plain_options,
-)
+from lw_torchrl.training.descriptions import describe_data, describe_replay, plain_options
+from lw_torchrl.training.loop import READ_EVERY, ReplayState, Training, TrainingOptions, make_schedule
 from lw_torchrl.training.normalization import fit_untrained
 
 _INSTEAD = {"loss_actor_bc"}  # minimised in place of another entry: in CQL's first steps of the actor
