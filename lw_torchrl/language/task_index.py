@@ -2,34 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any, Generic, TypeVar
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl.language.plans import Plans
-from lw_torchrl.language.tasks import MT50, task_id
 from lw_torchrl.language.value_checks import asserted, plain, readable, waits
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.plans import AnyPlans, Plans
 
 _Kind = tuple[torch.device, torch.dtype, bool]
 _KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
 Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
 
 
+def as_plans(plans: AnyPlans) -> Plans:
+    """Return ``plans``, or make :class:`Plans` of a mapping from task names to plans."""
+    if hasattr(plans, "num_steps"):
+        return plans  # type: ignore[return-value]
+    made: Plans = import_module("lw_torchrl.language.plans").as_plans(plans)  # only then: plans import no tables
+    return made
+
+
 class TaskIndex:
-    """The rows that tasks have in a table, in the order of their ids; two tasks of one id are a ValueError.
+    """The rows that tasks have in a table, in the order of their ids.
+
+    Args:
+        ids: the id of each task, as :attr:`Plans.task_ids`; :class:`ValueError` if two tasks have one id.
 
     Example:
-        >>> index = TaskIndex(["reach", "stack-blocks", "push"])
-        >>> index.tasks, index.rows(torch.tensor([task_id("reach"), task_id("push")]), "tasks without a plan").tolist()
-        (('push', 'reach', 'stack-blocks'), [1, 0])
+        >>> import lw_torchrl as lw
+        >>> index = TaskIndex({task: lw.task_id(task) for task in ("reach", "stack-blocks", "push")})
+        >>> index.tasks, index.rows(torch.tensor([lw.task_id("reach")]), "tasks without a plan").tolist()
+        (('push', 'reach', 'stack-blocks'), [1])
     """
 
-    def __init__(self, tasks: Iterable[str]) -> None:
+    def __init__(self, ids: Mapping[str, int]) -> None:
         names: dict[int, str] = {}
-        for name in tasks:
-            number = task_id(name)
+        for name, number in ids.items():
             if number in names:
                 same = "is given twice" if names[number] == name else f"and {names[number]!r} have the same id"
                 raise ValueError(f"tasks must differ in their ids: {name!r} {same}; choose another name")
@@ -60,7 +73,8 @@ class TaskIndex:
         if kept and not waits(task_id):
             if not torch.equal(found, given):
                 wrong = given[found != given].unique().tolist()[:5]
-                names = (MT50[i] if 0 <= i < len(MT50) else f"{i} (none of the 50)" for i in wrong)
+                known = import_module("lw_torchrl.language.tasks").MT50
+                names = (known[i] if 0 <= i < len(known) else f"{i} (none of the 50)" for i in wrong)
                 raise ValueError(f"task_id names {problem}: {', '.join(names)}")
             return rows
         if asserted(task_id):
@@ -74,19 +88,24 @@ class PlanTables:
     Attributes:
         index: from task ids to rows, T of them.
         mask: (T, S) bool, the steps that there are.
+        turns: (T, 2, S) bool, the plan's own steps, and its fallback steps (its own, if it has no fallback steps).
         skill_index: (T, S) int64, the number of each step's skill in ``plans.skills``; 0 beyond the last step.
         number: (T,) int64, the number of each plan, as in :attr:`Plans.numbers`.
     """
 
     def __init__(self, plans: Plans) -> None:
-        self.index = TaskIndex(plans)
+        self.index = TaskIndex(plans.task_ids)
         self._problem = f"tasks without a plan in {plans!r}"
         self.mask = torch.zeros(len(plans), plans.num_steps, dtype=torch.bool)
+        self.turns = torch.zeros(len(plans), 2, plans.num_steps, dtype=torch.bool)
         self.skill_index = torch.zeros(len(plans), plans.num_steps, dtype=torch.int64)
         skill = {text: number for number, text in enumerate(plans.skills)}
         for row, task in enumerate(self.index.tasks):
             steps = plans[task].steps
             self.mask[row, : len(steps)] = True
+            fallback = torch.tensor([step.role is not None and step.role.fallback for step in steps])
+            self.turns[row, 0, : len(steps)] = ~fallback
+            self.turns[row, 1, : len(steps)] = fallback if fallback.any() else ~fallback
             self.skill_index[row, : len(steps)] = torch.tensor([skill[step.skill] for step in steps])
         numbers = plans.numbers
         self.number = torch.tensor([numbers[task] for task in self.index.tasks])

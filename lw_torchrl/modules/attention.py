@@ -81,6 +81,11 @@ class PlanAttention(TensorDictModuleBase):
         """The keyword arguments that rebuild it."""
         return {"plans": self.plans, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
 
+    @property
+    def truth_keys(self) -> tuple[NestedKey, NestedKey]:
+        """The keys of the conditions' truth and of the task."""
+        return self.in_keys[0], self.in_keys[1]
+
     def with_plans(self, plans: AnyPlans) -> PlanAttention:
         """Return the attention over other plans' steps."""
         other = PlanAttention(plans, out_keys=self.out_keys_source)

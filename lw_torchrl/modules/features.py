@@ -49,6 +49,12 @@ class Features(TensorDictModuleBase):
         self.in_keys, self.out_keys = list(in_keys), as_keys("out_keys", out_keys, ("features",))
         check_apart(self.in_keys, self.out_keys)
 
+    @property
+    def observation_key(self) -> NestedKey:
+        """The key of the observation."""
+        key: NestedKey = self.in_keys[0]
+        return key
+
     def compute(self, tensordict: TensorDictBase) -> Tensor:
         """Return the features (B, F) without noise."""
         raise NotImplementedError(f"{type(self).__name__} must override compute")
@@ -132,9 +138,7 @@ class ObservationFeatures(Features):
         return other.train(self.training)
 
     def _select(self, observation: Tensor) -> Tensor:
-        if observation.shape[-1:] != (self.layout.size,) or not observation.is_floating_point():
-            got = f"{observation.dtype} of shape {tuple(observation.shape)}"
-            raise ValueError(f"observation must be float32 of shape (..., {self.layout.size}), got {got}")
+        check_observation(observation, self.layout)
         check_finite("observation", observation)
         return _KINDS[self.kind](observation, self.layout)
 
@@ -212,6 +216,13 @@ class Concat(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         seen = [part(tensordict.copy()).get(part.out_keys[0]) for part in self.parts]
         return write(tensordict, self, [torch.cat(seen, -1)])
+
+
+def check_observation(observation: Tensor, layout: Layout) -> None:
+    """Raise :class:`ValueError` unless observations are floats (..., D) of a layout."""
+    if observation.shape[-1:] != (layout.size,) or not observation.is_floating_point():
+        got = f"{observation.dtype} of shape {tuple(observation.shape)}"
+        raise ValueError(f"observation must be float32 of shape (..., {layout.size}), got {got}")
 
 
 def relative(observation: Tensor, layout: Layout) -> Tensor:

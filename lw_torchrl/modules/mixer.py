@@ -202,8 +202,10 @@ class ActionMixer(_Mixer):
 
 def _role_vectors(plans: Plans, tables: PlanTables) -> tuple[Tensor, Tensor]:
     """Return the index (T, S) int64 of each step's vector, and the different vectors (K, E) float32."""
+    from lw_torchrl.language.roles import role_vectors
+
     index, different = torch.zeros_like(tables.skill_index), dict[tuple[float, ...], int]()
     for task, plan in sorted(plans.items()):
-        for number, vector in enumerate(plan.role_vectors()):
+        for number, vector in enumerate(role_vectors([step.role for step in plan.steps if step.role is not None])):
             index[tables.index.row(task), number] = different.setdefault(tuple(vector), len(different))
     return index, torch.tensor([*different])

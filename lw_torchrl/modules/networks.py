@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP as TorchRLMLP
 
 from lw_torchrl._checks import check_int
+
+
+Module = TypeVar("Module", bound=nn.Module)
 
 
 class MLP(TorchRLMLP):
@@ -55,3 +59,18 @@ def evaluating(network: nn.Module) -> Iterator[None]:
     finally:
         for module, mode in modes:
             module.training = mode
+
+
+def with_weights_of(own: nn.Module, other: Module) -> Module:
+    """Return the other module, a fresh one, on the parameters and saved buffers of ``own``: training either trains both.
+
+    Raises:
+        RuntimeError: their names or shapes differ.
+    """
+    other.load_state_dict(own.state_dict())
+    for name, module in other.named_modules():
+        mine, passing = own.get_submodule(name), module._non_persistent_buffers_set
+        module._parameters.update(mine._parameters)
+        module._buffers.update({key: kept for key, kept in mine._buffers.items() if key not in passing})
+    other.train(own.training)
+    return other

@@ -14,6 +14,7 @@ from torchrl.data import Bounded, Composite
 
 from lw_torchrl._checks import checked
 from lw_torchrl._keys import as_keys
+from lw_torchrl.language.task_index import as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.attention import PlanAttention
 from lw_torchrl.modules.decoder import Decode, MLPDecoder
@@ -44,6 +45,13 @@ def plan_trunk(
     elif not isinstance(features, TensorDictModuleBase):
         features = TensorDictModule(features, in_keys=["observation"], out_keys=["features"])
     return TensorDictSequential(OrderedDict(attention=attention, mixer=mixer, features=features))
+
+
+def encoding_width(trunk: TensorDictSequential) -> int | None:
+    """Return D + F, how many numbers the trunk's latent and features are; None if its parts do not state it."""
+    latent, features = [*trunk.module.values()][-2:]
+    sizes = getattr(latent, "latent_size", None), getattr(features, "width", None)
+    return None if None in sizes else sum(sizes)
 
 
 class ConditionedActor(TensorDictSequential):
@@ -89,9 +97,8 @@ class ConditionedActor(TensorDictSequential):
     def _as_decoder(self, decoder: nn.Module, trunk: TensorDictSequential) -> TensorDictModuleBase:
         if isinstance(decoder, TensorDictModuleBase):
             return decoder
-        latent, features = trunk.module["mixer" if "mixer" in trunk.module else "latent"], trunk.module["features"]
-        if (width := getattr(features, "width", None)) is not None:
-            materialize(decoder, torch.zeros(1, latent.latent_size + width))
+        if (width := encoding_width(trunk)) is not None:
+            materialize(decoder, torch.zeros(1, width))
         return Decode(decoder, in_keys=trunk.out_keys_source[-2:], out_keys=self._out_names)
 
     @classmethod
@@ -185,7 +192,7 @@ class PlanConditionedActor(ConditionedActor):
         plans: a plan for each task that the policy will see.
         skill_encoder: any module from skill vectors (K, E) to latents (K, D); None for :class:`SkillEncoder`.
         features: any module from an observation to features (B, F), or a TensorDict module with other inputs; None for
-            :class:`ObservationFeatures`. Several are joined by :class:`Concat`.
+            :class:`ObservationFeatures` with noise 0.05. Several are joined by :class:`Concat`.
         decoder: any module from (B, D + F) to the action (B, A), or a TensorDict module; None for :class:`MLPDecoder`.
         text_encoder: a function from n texts to vectors (n, E) float32; None for the shipped sentence encoder.
         in_keys: other names for ``qaf``, ``task_id`` and ``observation``; nested keys are allowed.
@@ -219,5 +226,7 @@ class PlanConditionedActor(ConditionedActor):
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("action",),
     ) -> None:
+        if features is None:
+            features = ObservationFeatures(noise=0.05, layout=as_plans(plans).layout)
         trunk = plan_trunk(plans, skill_encoder=skill_encoder, features=features, text_encoder=text_encoder)
         super().__init__(trunk, decoder, in_keys=in_keys, out_keys=out_keys)
