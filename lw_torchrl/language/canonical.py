@@ -298,3 +298,11 @@ def most_trusted(plans: Iterable[ConditionalPlan]) -> ConditionalPlan:
     if not (listed := list(plans)):
         raise ValueError("plans must be at least one, got none")
     return max(listed, key=worth)
+
+
+def canonical_like(plans: Plans, reference: Plans | None) -> Plans:
+    """Return plans in the form of ``reference``: canonical, with or without fallback, if the reference is."""
+    if reference is None or not reference.has_roles or plans.has_roles:
+        return plans
+    roles = [step.role for plan in reference.values() for step in plan.steps]
+    return canonical_plans(plans, fallback=any(role is not None and role.fallback for role in roles))

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from lw_torchrl.language.plans import AnyPlans
 
 TRUE_LOGIT = 5.0  # a true condition counts 5, a false one -5 (paper, section "Plan Conditioning")
+ACTIVE_WEIGHT = 0.01  # a false step beside a true one has a weight of 1e-4: above this, a step is active
 
 
 def attend(logits: Tensor, mask: Tensor) -> Tensor:

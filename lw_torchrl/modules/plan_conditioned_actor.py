@@ -20,7 +20,7 @@ from lw_torchrl.modules.attention import PlanAttention
 from lw_torchrl.modules.decoder import Decode, MLPDecoder
 from lw_torchrl.modules.features import ObservationFeatures
 from lw_torchrl.modules.mixer import SkillMixer
-from lw_torchrl.modules.networks import materialize
+from lw_torchrl.modules.networks import encoding_width, materialize
 from lw_torchrl.modules.stochastic import DistributionName, StochasticActor
 
 if TYPE_CHECKING:
@@ -45,13 +45,6 @@ def plan_trunk(
     elif not isinstance(features, TensorDictModuleBase):
         features = TensorDictModule(features, in_keys=["observation"], out_keys=["features"])
     return TensorDictSequential(OrderedDict(attention=attention, mixer=mixer, features=features))
-
-
-def encoding_width(trunk: TensorDictSequential) -> int | None:
-    """Return D + F, how many numbers the trunk's latent and features are; None if its parts do not state it."""
-    latent, features = [*trunk.module.values()][-2:]
-    sizes = getattr(latent, "latent_size", None), getattr(features, "width", None)
-    return None if None in sizes else sum(sizes)
 
 
 class ConditionedActor(TensorDictSequential):
@@ -95,10 +88,11 @@ class ConditionedActor(TensorDictSequential):
             self.in_keys = in_keys
 
     def _as_decoder(self, decoder: nn.Module, trunk: TensorDictSequential) -> TensorDictModuleBase:
+        own = isinstance(decoder, Decode) or not isinstance(decoder, TensorDictModuleBase)
+        if own and (width := encoding_width(trunk)) is not None:
+            materialize(getattr(decoder, "network", decoder), torch.zeros(1, width))
         if isinstance(decoder, TensorDictModuleBase):
             return decoder
-        if (width := encoding_width(trunk)) is not None:
-            materialize(decoder, torch.zeros(1, width))
         return Decode(decoder, in_keys=trunk.out_keys_source[-2:], out_keys=self._out_names)
 
     @classmethod

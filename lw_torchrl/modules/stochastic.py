@@ -21,7 +21,7 @@ from lw_torchrl._checks import check_choice, checked
 from lw_torchrl._keys import key_beside
 from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
 from lw_torchrl.modules.features import Features
-from lw_torchrl.modules.networks import materialize
+from lw_torchrl.modules.networks import encoding_width, materialize
 
 DistributionName = Literal["tanh_normal", "normal"]
 DISTRIBUTIONS: dict[str, Any] = {"tanh_normal": TanhNormal, "normal": IndependentNormal}
@@ -62,6 +62,8 @@ class StochasticActor(ProbabilisticTensorDictSequential):
     ) -> None:
         check_choice("distribution", distribution, DISTRIBUTIONS)
         loc, scale = decoder.out_keys
+        if isinstance(decoder, Decode) and (width := encoding_width(trunk)) is not None:
+            materialize(decoder.network, torch.zeros(1, width))
         sampler = ProbabilisticTensorDictModule(
             in_keys={"loc": loc, "scale": scale},
             out_keys=[action],
