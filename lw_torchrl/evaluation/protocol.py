@@ -36,7 +36,9 @@ def actor_plans(actor: Any, plans: AnyPlans | None) -> Plans | None:
     return own or given
 
 
-def named_tasks_of(tasks: TaskList, plans: Plans | None, suite: str | Suite | None = None) -> tuple[Suite, dict[str, Task]]:
+def named_tasks_of(
+    tasks: TaskList, plans: Plans | None, suite: str | Suite | None = None
+) -> tuple[Suite, dict[str, Task]]:
     """The suite, and the tasks by name; a name of the user's own stands for the task that its plan is for."""
     tasks = listed_tasks(tasks)
     found = find_suite(tasks, suite)

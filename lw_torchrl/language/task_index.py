@@ -27,6 +27,11 @@ def as_plans(plans: AnyPlans) -> Plans:
     return made
 
 
+def pick(table: Tensor, rows: Tensor) -> Tensor:
+    """Return ``table[rows]``, also for one row inside of ``vmap``: (T, ...) and (B...) int64 to (B..., ...)."""
+    return table.index_select(0, rows.reshape(-1)).reshape(*rows.shape, *table.shape[1:])
+
+
 class TaskIndex:
     """The rows that tasks have in a table, in the order of their ids.
 

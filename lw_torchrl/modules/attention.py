@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lw_torchrl._checks import checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, key_beside, read, write
-from lw_torchrl.language.task_index import PlanTables, as_plans
+from lw_torchrl.language.task_index import PlanTables, as_plans, pick
 from lw_torchrl.language.value_checks import check_values
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ class PlanAttention(TensorDictModuleBase):
 
     def weights(self, qaf: Tensor, rows: Tensor, turn: Tensor | None = None) -> Tensor:
         """Return the attention (..., S) float32 for truth (..., S), table rows (...) int64 and turns (...) int64."""
-        mask = self.mask[rows, torch.zeros_like(rows) if turn is None else turn % 2]
+        mask = pick(self.mask.flatten(0, 1), 2 * rows if turn is None else 2 * rows + turn % 2)
         if qaf.shape != mask.shape:
             raise ValueError(
                 f"qaf must have shape {tuple(mask.shape)}, one column for each step of the actor's plans, got "

@@ -54,7 +54,7 @@ class ClauseEvaluator(QueryEvaluator):
 
     Reads its view of a state and ``task_id`` (B,) int64; writes ``qaf`` and ``qaf_logits`` as :class:`QueryEvaluator`
     does, -1e4 beyond a plan's last step. A condition's clauses are answered one by one and combined by
-    :func:`conjunction`. A subclass sets ``network``, which maps the views of B states and their clauses (B, C) to logits
+    :func:`conjunction`. A subclass sets ``network``, which maps views of B states and their clauses (B, C) to logits
     (B, C), and ``seen_dims``, the number of dimensions of a view.
 
     Args:

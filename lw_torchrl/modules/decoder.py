@@ -84,7 +84,7 @@ class GaussianDecoder(MLP):
         self.config["init_std"] = init_std
         self._offset = math.log(math.expm1(init_std - LEAST_STD)) if init_std < 20 else init_std
 
-    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         loc, scale = super().forward(*inputs).chunk(2, -1)
         loc = torch.tanh(loc) if self.squash else loc
         return loc, nn.functional.softplus(scale + self._offset) + LEAST_STD

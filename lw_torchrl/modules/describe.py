@@ -55,16 +55,17 @@ def describe(module: nn.Module) -> dict[str, Any]:
 def _encode_module(module: nn.Module, plans: list[Plans], path: str) -> dict[str, Any]:
     kind = type(module)
     if kind in (TensorDictSequential, nn.Sequential):
-        parts = module.module if kind is TensorDictSequential else module
+        parts: Any = module.module if kind is TensorDictSequential else module
         named = isinstance(parts, nn.ModuleDict)
         children = [(name, _encode_module(part, plans, _join(path, name))) for name, part in parts.named_children()]
         return {"class": kind.__name__, "parts": dict(children) if named else [node for _, node in children]}
     if kind is TensorDictModule:
-        inner = _encode_module(module.module, plans, path)
-        keys = {"in_keys": list(module.in_keys), "out_keys": list(module.out_keys_source)}
+        wrapped: Any = module
+        inner = _encode_module(wrapped.module, plans, path)
+        keys = {"in_keys": list(wrapped.in_keys), "out_keys": list(wrapped.out_keys_source)}
         return {"class": "TensorDictModule", "options": {"module": {"module": inner}, **keys}}
     if kind in _NETWORKS:
-        options = {name: getattr(module, name) for name in _NETWORKS[kind]}
+        options: Any = {name: getattr(module, name) for name in _NETWORKS[kind]}
         if kind is nn.Linear:
             options["bias"] = module.bias is not None
         name = f"torch.nn:{kind.__name__}"

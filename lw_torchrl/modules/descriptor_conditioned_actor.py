@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
-from lw_torchrl.language.task_index import TaskIndex
+from lw_torchrl.language.task_index import TaskIndex, pick
 from lw_torchrl.language.tasks import MT50, Task, named_tasks, one_layout, task_id
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.features import ObservationFeatures
@@ -90,7 +90,7 @@ class TaskLatent(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         (given,) = read(tensordict, self.in_keys)
         rows = self.index.rows(given, "tasks this actor was not made for")
-        return write(tensordict, self, [self.encoder(self.vectors)[: len(self.tasks)][rows]])
+        return write(tensordict, self, [pick(self.encoder(self.vectors)[: len(self.tasks)], rows)])
 
 
 class DescriptorConditionedActor(ConditionedActor):

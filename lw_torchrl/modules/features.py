@@ -15,10 +15,10 @@ from torchrl.objectives import add_random_module
 
 from lw_torchrl._checks import check_choice, check_scale, checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
+from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.value_checks import check_finite
 
 if TYPE_CHECKING:
-    from lw_torchrl.language.layout import Layout
     from lw_torchrl.language.plans import AnyPlans
 
 Kind = Literal["raw", "differences", "relative", "opening", "none", "both"]
@@ -41,9 +41,7 @@ class Features(TensorDictModuleBase):
 
     width: int
 
-    def __init__(
-        self, noise: float, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey] | None = None
-    ) -> None:
+    def __init__(self, noise: float, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey] | None = None) -> None:
         super().__init__()
         self.noise = check_scale("noise", noise)
         self.in_keys, self.out_keys = list(in_keys), as_keys("out_keys", out_keys, ("features",))
@@ -106,10 +104,9 @@ class ObservationFeatures(Features):
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__(noise, as_keys("in_keys", in_keys, ("observation",)), out_keys)
-        if layout is None:
-            from lw_torchrl.language.layout import METAWORLD as layout
-        self.layout, self.kind = layout, check_choice("kind", kind, _KINDS)
-        self.width = _KINDS[kind](torch.zeros(layout.size), layout).shape[-1]
+        self.layout: Layout = METAWORLD if layout is None else layout
+        self.kind = check_choice("kind", kind, _KINDS)
+        self.width = _KINDS[kind](torch.zeros(self.layout.size), self.layout).shape[-1]
         self.register_buffer("mean", torch.zeros(self.width))
         self.register_buffer("std", torch.ones(self.width))
 

@@ -198,7 +198,12 @@ class ImageQueryEvaluator(ClauseEvaluator):
 def _num_features(encoder: nn.Module, name: str, height: int, width: int) -> int:
     """Return F, the number of features that an encoder returns."""
     features = encoder(torch.zeros(1, 3, height, width))
-    if not isinstance(features, Tensor) or features.dim() != 4 or len(features) != 1 or not features.is_floating_point():
+    if (
+        not isinstance(features, Tensor)
+        or features.dim() != 4
+        or len(features) != 1
+        or not features.is_floating_point()
+    ):
         got = tuple(features.shape) if isinstance(features, Tensor) else type(features).__name__
         raise ValueError(f"encoder {name!r} must give a map of features (n, F, h, w), got {got}")
     return features.shape[1]

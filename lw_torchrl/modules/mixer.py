@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
-from lw_torchrl.language.task_index import PlanTables, as_plans
+from lw_torchrl.language.task_index import PlanTables, as_plans, pick
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.networks import MLP, evaluating, materialize
 
@@ -80,7 +80,7 @@ class _Mixer(TensorDictModuleBase):
     def per_skill(self, weights: Tensor, task_id: Tensor, latents: Tensor) -> Tensor:
         """Sum attention over steps (..., S) to attention over the K different skills, (..., K)."""
         zeros = weights.new_zeros((*weights.shape[:-1], len(latents)))
-        return zeros.scatter_add(-1, self.index[self.tables.rows(task_id)], weights).to(latents.dtype)
+        return zeros.scatter_add(-1, pick(self.index, self.tables.rows(task_id)), weights).to(latents.dtype)
 
 
 class SkillMixer(_Mixer):

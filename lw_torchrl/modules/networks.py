@@ -13,7 +13,6 @@ from torchrl.modules import MLP as TorchRLMLP
 
 from lw_torchrl._checks import check_int
 
-
 Module = TypeVar("Module", bound=nn.Module)
 
 
@@ -53,8 +52,8 @@ def materialize(module: nn.Module, *inputs: Tensor) -> None:
 def encoding_width(trunk: TensorDictSequential) -> int | None:
     """Return D + F, how many numbers the trunk's latent and features are; None if its parts do not state it."""
     latent, features = [*trunk.module.values()][-2:]
-    sizes = getattr(latent, "latent_size", None), getattr(features, "width", None)
-    return None if None in sizes else sum(sizes)
+    size, width = getattr(latent, "latent_size", None), getattr(features, "width", None)
+    return None if size is None or width is None else size + width
 
 
 @contextmanager
@@ -70,7 +69,7 @@ def evaluating(network: nn.Module) -> Iterator[None]:
 
 
 def with_weights_of(own: nn.Module, other: Module) -> Module:
-    """Return the other module, a fresh one, on the parameters and saved buffers of ``own``: training either trains both.
+    """Return the other module, a fresh one, on the weights and saved buffers of ``own``: training either trains both.
 
     Raises:
         RuntimeError: their names or shapes differ.

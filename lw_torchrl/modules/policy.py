@@ -38,10 +38,9 @@ def tasks_of(actor: Any) -> tuple[str, ...] | None:
 
 def layout_of(actor: Any) -> Layout:
     """Return the layout of an actor's observations: its own ``layout``, that of its plans, or Meta-World's."""
-    if (layout := getattr(actor, "layout", None)) is not None:
-        return layout  # type: ignore[no-any-return]
-    plans = plans_of(actor)
-    return plans.layout if plans is not None else _first(actor, "layout") or METAWORLD
+    own, plans = getattr(actor, "layout", None), plans_of(actor)
+    layout: Layout = own or (plans.layout if plans is not None else _first(actor, "layout")) or METAWORLD
+    return layout
 
 
 def draws(actor: Any) -> bool:

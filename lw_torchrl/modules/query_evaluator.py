@@ -66,7 +66,8 @@ class QueryEvaluator(TensorDictModuleBase):
     @property
     def answers(self) -> Answers:
         """Whether ``qaf`` is "soft" or "hard"; it can be set."""
-        return self.config.get("answers", "soft")  # type: ignore[no-any-return]
+        answers: Answers = self.config["answers"]
+        return answers
 
     @answers.setter
     def answers(self, answers: Answers) -> None:

@@ -17,7 +17,8 @@ Method = Callable[..., TensorDictModuleBase]
 def _check_method(name: str, entry: Any) -> Method:
     if not callable(entry):
         raise TypeError(f"method {name!r} must be a function of plans, got {entry!r:.80}")
-    return entry  # type: ignore[no-any-return]
+    method: Method = entry
+    return method
 
 
 METHODS: Registry[Method] = Registry(

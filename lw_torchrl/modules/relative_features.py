@@ -15,9 +15,9 @@ from lw_torchrl._checks import checked
 from lw_torchrl._keys import as_keys, read
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, coordinate_indices
-from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, as_plans
 from lw_torchrl.language.roles import VECTORS, StepRole
-from lw_torchrl.language.task_index import PlanTables
+from lw_torchrl.language.task_index import PlanTables, pick
 from lw_torchrl.language.things import GOAL, role_object
 from lw_torchrl.modules.attention import PlanAttention
 from lw_torchrl.modules.features import Features, squash
@@ -101,10 +101,10 @@ class _RelativePositions(Features):
     def of_steps(self, observation: Tensor, rows: Tensor) -> Tensor:
         """Return the relative positions of each step, (..., S, P, 3) in metres."""
         known = torch.cat((observation, self.constants.expand(*observation.shape[:-1], -1)), -1)
-        begin, end = self.begin[rows], self.end[rows]  # (..., S, P, 3)
+        begin, end = pick(self.begin, rows), pick(self.end, rows)  # (..., S, P, 3)
         flat = (*begin.shape[: rows.ndim], -1)
         found = (known.gather(-1, end.reshape(flat)) - known.gather(-1, begin.reshape(flat))).reshape(begin.shape)
-        return found + self.offset[rows]
+        return found + pick(self.offset, rows)
 
     def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         observation, weights, task_id = read(tensordict, self.in_keys)
@@ -248,7 +248,7 @@ class RoleFeatures(_RelativePositions):
         self._sharing = WeakSet([self])
 
     def with_plans(self, plans: AnyPlans) -> RoleFeatures:
-        """Return the features of other plans, with the contacts of the same tasks, now and whenever either is fitted."""
+        """Return the features of other plans; the same tasks share contacts, now and whenever either is fitted."""
         other: RoleFeatures = super().with_plans(plans)
         other._sharing = self._sharing
         other._sharing.add(other)
@@ -292,8 +292,8 @@ class RoleFeatures(_RelativePositions):
     def of_steps(self, observation: Tensor, rows: Tensor) -> Tensor:
         """Return the relative positions of each step; targets are contacts, and what is carried is lifted first."""
         found = super().of_steps(observation, rows)
-        found = found + (self.at_contact[rows][..., None] * self.contact[rows].unsqueeze(-2)).unsqueeze(-2)
-        lifts = (self.lifts[rows] & ~self.demonstrated[rows].unsqueeze(-1))[..., None, None]
+        found = found + (pick(self.at_contact, rows)[..., None] * pick(self.contact, rows).unsqueeze(-2)).unsqueeze(-2)
+        lifts = (pick(self.lifts, rows) & ~pick(self.demonstrated, rows).unsqueeze(-1))[..., None, None]
         beside, height = found[..., :2], found[..., 2:]
         far = beside.norm(dim=-1, keepdim=True)
         height = height + lifts * _LIFTED * ((far - 0.03) / 0.04).clamp(0.0, 1.0)
@@ -305,7 +305,7 @@ class RoleFeatures(_RelativePositions):
         if yaw is not None:
             observation = turn_observation(observation, -yaw, self.layout)
         ahead = self.ahead.of_steps(observation, rows).squeeze(-2)
-        each = self.direction[rows] + ahead / ahead.norm(dim=-1, keepdim=True).clamp(min=0.02)
+        each = pick(self.direction, rows) + ahead / ahead.norm(dim=-1, keepdim=True).clamp(min=0.02)
         found = (weights.unsqueeze(-1) * each).sum(-2)
         return found if yaw is None else turn_vectors(found, yaw)
 

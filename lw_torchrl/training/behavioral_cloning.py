@@ -101,7 +101,7 @@ class EvaluatorAnchor:
     def __call__(self, batch: TensorDictBase) -> Tensor:
         """() float32, of a minibatch with ``observation``, ``task_id`` and what the evaluator reads."""
         task = batch.get("task_id")
-        logits = self.evaluator.answers(*(batch.get(key) for key in self.evaluator.in_keys))
+        logits = self.evaluator.logits(*(batch.get(key) for key in self.evaluator.in_keys))
         truth = self.program(batch.get("observation"), task).to(logits.dtype)
         steps = self.tables.mask.to(task.device)[self.tables.rows(task)]
         return nn.functional.binary_cross_entropy_with_logits(logits[steps], truth[steps])

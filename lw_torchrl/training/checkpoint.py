@@ -54,9 +54,7 @@ def save_actor(actor: TensorDictModuleBase, path: AnyPath, **about: Any) -> None
 
 
 @checked
-def load_actor(
-    path: AnyPath, *, text_encoder: TextEncoder | None = None, parts: Sequence[type[nn.Module]] = ()
-) -> Any:
+def load_actor(path: AnyPath, *, text_encoder: TextEncoder | None = None, parts: Sequence[type[nn.Module]] = ()) -> Any:
     """Load a policy with its plans and weights, in eval mode.
 
     Args:

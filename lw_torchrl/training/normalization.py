@@ -24,7 +24,7 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
     Each row counts as often as :class:`CoLearningSampler` draws it: a target's few rows would not count otherwise.
 
     Args:
-        target: a :class:`PlanConditionedActor`, a critic, a module with :class:`ObservationFeatures` in it, or a loss of such.
+        target: an actor, a critic, any module with :class:`Features` in it, or a loss of such.
         replay: rows of ``observation`` (D,) float32.
 
     Raises:
@@ -64,7 +64,7 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
     for features, of in _held(target, ObservationFeatures):
         kind = features.kind, features.layout
         if kind not in known:
-            known[kind] = ObservationFeatures(features.kind, layout=features.layout).to(observation.device)
+            known[kind] = ObservationFeatures(features.kind, layout=features.layout)
             known[kind].fit(rows.cpu(), weights)
         with torch.no_grad():
             of("mean").copy_(known[kind].mean)
