@@ -18,7 +18,7 @@ from benchmarks import ablations, faults, truth
 from benchmarks.finding_points import PADS, find_points
 from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
-from lw_torchrl.language.canonical import read_canonical
+from lw_torchrl.language.canonical_steps import read_canonical
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.modules.relative_positions import PlanRoles
 

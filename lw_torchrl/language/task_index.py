@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any, Generic, TypeVar
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl.language.plans import Plans
-from lw_torchrl.language.tasks import MT50, task_id
 from lw_torchrl.language.value_checks import asserted, plain, readable, waits
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.plans import AnyPlans, Plans
 
 _Kind = tuple[torch.device, torch.dtype, bool]
 _KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
@@ -18,21 +19,22 @@ Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
 
 
 class TaskIndex:
-    """The rows that tasks have in a table, in the order of their ids; two tasks of one id are a ValueError.
+    """The rows that tasks have in a table, in the order of their ids.
+
+    Args:
+        task_ids: task name to id, as :attr:`Plans.task_ids`; two tasks of one id are a ValueError.
 
     Example:
-        >>> index = TaskIndex(["reach", "stack-blocks", "push"])
-        >>> index.tasks, index.rows(torch.tensor([task_id("reach"), task_id("push")]), "tasks without a plan").tolist()
+        >>> index = TaskIndex({"reach": 35, "stack-blocks": 650718257, "push": 32})
+        >>> index.tasks, index.rows(torch.tensor([35, 32]), "tasks without a plan").tolist()
         (('push', 'reach', 'stack-blocks'), [1, 0])
     """
 
-    def __init__(self, tasks: Iterable[str]) -> None:
+    def __init__(self, task_ids: Mapping[str, int]) -> None:
         names: dict[int, str] = {}
-        for name in tasks:
-            number = task_id(name)
+        for name, number in task_ids.items():
             if number in names:
-                same = "is given twice" if names[number] == name else f"and {names[number]!r} have the same id"
-                raise ValueError(f"tasks must differ in their ids: {name!r} {same}; choose another name")
+                raise ValueError(f"tasks {names[number]!r} and {name!r} have the same id; choose another name")
             names[number] = name
         self.tasks = tuple(names[number] for number in sorted(names))
         self._ids = torch.tensor([*sorted(names), -1])  # -1 is no task's, for ids beyond the last
@@ -59,13 +61,27 @@ class TaskIndex:
         found = ids.index_select(0, rows.reshape(-1)).reshape(rows.shape)
         if kept and not waits(task_id):
             if not torch.equal(found, given):
-                wrong = given[found != given].unique().tolist()[:5]
-                names = (MT50[i] if 0 <= i < len(MT50) else f"{i} (none of the 50)" for i in wrong)
-                raise ValueError(f"task_id names {problem}: {', '.join(names)}")
+                raise _unknown_ids(given[found != given].unique().tolist()[:5], problem)
             return rows
         if asserted(task_id):
             torch._assert_async((found == given).all(), f"task_id names {problem}")
         return torch.where(found == given, rows, len(self.tasks))
+
+
+def _unknown_ids(ids: list[int], problem: str) -> ValueError:
+    from lw_torchrl.language.tasks import MT50  # here: only the message needs the names of other tasks
+
+    names = (MT50[i] if 0 <= i < len(MT50) else f"{i} (none of the 50)" for i in ids)
+    return ValueError(f"task_id names {problem}: {', '.join(names)}")
+
+
+def as_plans(plans: AnyPlans) -> Plans:
+    """As :func:`lw_torchrl.language.plans.as_plans`, which is only imported where ``plans`` are not yet Plans."""
+    if isinstance(plans, Mapping) and hasattr(plans, "task_ids"):
+        return plans  # type: ignore[return-value]
+    from lw_torchrl.language import plans as library
+
+    return library.as_plans(plans)
 
 
 class PlanTables:
@@ -74,19 +90,24 @@ class PlanTables:
     Attributes:
         index: from task ids to rows, T of them.
         mask: (T, S) bool, the steps that there are.
+        turns: (T, 2, S) bool, the plan's own steps, and its fallback steps (its own, if it has no fallback steps).
         skill_index: (T, S) int64, the number of each step's skill in ``plans.skills``; 0 beyond the last step.
         number: (T,) int64, the number of each plan, as in :attr:`Plans.numbers`.
     """
 
     def __init__(self, plans: Plans) -> None:
-        self.index = TaskIndex(plans)
+        self.index = TaskIndex(plans.task_ids)
         self._problem = f"tasks without a plan in {plans!r}"
         self.mask = torch.zeros(len(plans), plans.num_steps, dtype=torch.bool)
+        self.turns = torch.zeros(len(plans), 2, plans.num_steps, dtype=torch.bool)
         self.skill_index = torch.zeros(len(plans), plans.num_steps, dtype=torch.int64)
         skill = {text: number for number, text in enumerate(plans.skills)}
         for row, task in enumerate(self.index.tasks):
             steps = plans[task].steps
             self.mask[row, : len(steps)] = True
+            fallback = torch.tensor([step.role is not None and step.role.fallback for step in steps])
+            self.turns[row, 0, : len(steps)] = ~fallback
+            self.turns[row, 1, : len(steps)] = fallback if fallback.any() else ~fallback
             self.skill_index[row, : len(steps)] = torch.tensor([skill[step.skill] for step in steps])
         numbers = plans.numbers
         self.number = torch.tensor([numbers[task] for task in self.index.tasks])

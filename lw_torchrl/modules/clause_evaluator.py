@@ -79,7 +79,7 @@ class ClauseEvaluator(QueryEvaluator):
         self.predicates = _different("predicates", sorted(PREDICATES) if predicates is None else predicates)
         self.names = () if names is None else _different("names", names)
         self.config = {"predicates": list(self.predicates)}
-        index = TaskIndex(plans)
+        index = TaskIndex(plans.task_ids)
         tables = _plan_clauses(plans, index.tasks, self.predicates, self.names)
         self.tables: TaskTables[Clauses] = TaskTables(index, tables, f"tasks without a plan in {plans!r}")
 

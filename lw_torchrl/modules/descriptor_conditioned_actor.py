@@ -14,7 +14,7 @@ from lw_torchrl._checks import checked, passes_on
 from lw_torchrl._keys import as_keys, check_apart
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.task_index import TaskIndex
-from lw_torchrl.language.tasks import MT50, Task, named_tasks, one_layout
+from lw_torchrl.language.tasks import MT50, Task, named_tasks, one_layout, task_ids
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.conditioned_actor import ConditionedActor
 from lw_torchrl.modules.networks import text_to_latent, unit_scale
@@ -69,7 +69,7 @@ class DescriptorEncoder(Encoder):
         self.text_encoder = text_encoder
         own = (lambda texts: torch.eye(len(texts))) if text_encoder is None and condition == "one-hot" else text_encoder
         found = encoded([task.description for task in self.definitions.values()], own)
-        self.index = TaskIndex(self.tasks)
+        self.index = TaskIndex(task_ids(self.tasks))
         order = [self.tasks.index(task) for task in self.index.tasks]
         # A product of another number of rows rounds differently: whatever the tasks, there are 50 or more.
         fill = found.new_zeros(max(0, len(MT50) - len(order)), found.shape[1])

@@ -13,8 +13,8 @@ from torch import Tensor
 from torchrl.envs import Compose, Transform
 
 from lw_torchrl._checks import check_probability, checked
-from lw_torchrl.language.canonical import RULES, read_canonical, with_reserve
-from lw_torchrl.language.canonical_steps import CanonicalPlan, step_vectors
+from lw_torchrl.language.canonical import RULES
+from lw_torchrl.language.canonical_steps import CanonicalPlan, read_canonical, step_vectors, with_reserve
 from lw_torchrl.language.layout import METAWORLD, Layout, places
 from lw_torchrl.language.plans import AnyPlans, Plans, PlanStep, as_plans
 from lw_torchrl.language.task_index import PlanTables

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from lw_torchrl._checks import check_scale
 from lw_torchrl.language.canonical_steps import VECTORS, CanonicalPlan
 from lw_torchrl.language.layout import places
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject, coordinate_indices
+from lw_torchrl.language.named_objects import GOAL, GRIPPER, NamedObject, coordinate_indices
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.language.things import GOAL, role_object
+from lw_torchrl.language.task_objects import role_object
 from lw_torchrl.modules.observation_features import squash
 from lw_torchrl.transforms.random_yaw import turn_observation, turn_vectors
 
