@@ -224,7 +224,7 @@ def _coming(each: ParsedStep, purpose: ParsedStep | None) -> tuple[Verb, Manner,
 
 def _compared_point(step: PlanStep, task: Task, name: str) -> str | None:
     """Return the point on an object that a step's condition compares with the gripper; None if there is none."""
-    near = compared_with_gripper(step)
+    near = sorted(compared_with_gripper(step), key=task.object_names.index)
     points = (other for other in near if any(role_object(task, other).offset) and same_object(task, other, name))
     return next(points, None)
 
