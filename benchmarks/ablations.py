@@ -23,8 +23,8 @@ from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import count_solved
 from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.named_objects import NamedObject
+from lw_torchrl.language.task_objects import role_object
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.language.things import role_object
 
 Setting = Literal["few-shot", "zero-shot"]
 FULL: Mapping[str, Preset] = PRESETS["strong"]

@@ -19,7 +19,7 @@ from benchmarks.finding_points import find_points
 from lw_torchrl._files import read_json, write_json, write_text
 from lw_torchrl.evaluation.statistics import mean_difference, mean_rate, wilson_interval
 from lw_torchrl.evaluation.summary import markdown_table
-from lw_torchrl.language.canonical import default_plan, most_trusted, read_canonical
+from lw_torchrl.language.canonical import canonical_plan, fallback_plan, most_confident
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.training import load_evaluator
 
@@ -88,7 +88,7 @@ def main(arguments: Arguments) -> None:
                 actor = policy.with_plans(Plans([plans[task] for task in tasks]))
                 how["evaluator"] = load_evaluator(required(arguments.evaluator, "evaluator"), actor.plans).eval()
             result = lw.evaluate(actor, tasks=tasks, seed=fixes, stop_at_success=True, **how)
-            trust = {} if plans is None else {task: read_canonical(plans[task]).trust for task in tasks}
+            trust = {} if plans is None else {task: canonical_plan(plans[task]).confidence for task in tasks}
             found[key] = {"row": row, "seed": seed, "success": result.success_once, "trust": trust}
             write_json(file, found)
             print(f"{key}: {result.mean_success:.3f}", flush=True)
@@ -110,7 +110,7 @@ def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans |
         elif row == "no-roles":
             yield row, row, Plans([OURS[task] for task in outside])
         elif row == "default":
-            yield row, "pcbc", Plans([default_plan(NATURAL[task]).plan for task in outside])
+            yield row, "pcbc", Plans([fallback_plan(task) for task in outside])
         elif row in ("ours", "natural", "evaluator"):
             yield row, "pcbc", Plans([(OURS if row == "ours" else NATURAL)[task] for task in outside])
         elif row == "own-words":  # whole plans of writers who saw the tasks, their things' names and the query language
@@ -125,7 +125,7 @@ def rows_of(arguments: Arguments, seed: int) -> Iterator[tuple[str, str, Plans |
             for points, tasks in {"no points": bare, "points of shapes": find_points(outside)}.items():
                 written = lw.load_plans(required(arguments.palm2, "palm2"), tasks=lw.TASKS | tasks)
                 yield f"palm2, {points}", "pcbc", Plans([written[task] for task in outside])
-                yield f"default, {points}", "pcbc", Plans([default_plan(written[task]).plan for task in outside])
+                yield f"default, {points}", "pcbc", Plans([fallback_plan(written[task].definition) for task in outside])
         elif row == "models":
             for name, plans in of_models(required(arguments.answers, "answers"), seed):
                 yield name, "pcbc", plans
@@ -158,10 +158,10 @@ def of_models(file: Path, seed: int) -> Iterator[tuple[str, Plans]]:
         drawn = random.Random(f"{model} {form} {seed}")
         blind = {task: drawn.choice(plans) for task, plans in sorted(tasks.items())}
         read = {task: [plan for plan in plans if plan is not None] for task, plans in tasks.items()}
-        best = {task: most_trusted(plans) if plans else None for task, plans in read.items()}
+        best = {task: most_confident(plans) if plans else None for task, plans in read.items()}
         for how, chosen in (("one drawn", blind), ("most trusted of five", best)):
             # A model that wrote nothing readable leaves the policy with the default plan.
-            plans = [plan or default_plan(NATURAL[task]).plan for task, plan in chosen.items()]
+            plans = [plan or fallback_plan(task) for task, plan in chosen.items()]
             yield f"{model}, {form}, {how}", Plans(plans)
 
 

@@ -22,7 +22,7 @@ from tensordict import TensorDict
 
 import lw_torchrl as lw
 from benchmarks.any_plans import DEVELOPMENT, TEST
-from lw_torchrl.language.canonical import read_canonical
+from lw_torchrl.language.canonical import explain_canonical
 
 DATA = Path(__file__).parent / "data" / "goldens"
 OWN_WORDS = Path(__file__).parent / "data" / "own_words.json"
@@ -65,9 +65,13 @@ def canonical_forms(args: Arguments) -> Any:
 
 
 def _form(plan: lw.ConditionalPlan) -> list[str]:
-    canonical = read_canonical(plan)
-    steps = [f"{step.condition} -> {step.skill} ({step.manner}, {step.sure:g})" for step in canonical.steps]
-    return [f"{canonical.source}, {canonical.trust:.4f}", *steps]
+    report = explain_canonical(plan)
+    steps = []
+    for step in report.plan.steps:
+        assert step.role is not None
+        steps.append(f"{step.condition} -> {step.skill} ({step.role.manner}, {step.role.confidence:g})")
+    source = "default" if report.source == "fallback" else report.source  # as the goldens name it
+    return [f"{source}, {report.plan.confidence:.4f}", *steps]
 
 
 def check_plans(args: Arguments) -> Iterator[tuple[str, bool]]:

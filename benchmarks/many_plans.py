@@ -19,6 +19,7 @@ from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import TaskIndex
+from lw_torchrl.language.tasks import task_ids
 from lw_torchrl.suites.suite import Suite, find_suite
 
 _PLACE = "place"
@@ -100,7 +101,7 @@ class _PlanOfRow(nn.Module):
     ) -> None:
         super().__init__()
         self.episodes, self.seed, self.random = episodes, seed, choose == "random"
-        self._index = TaskIndex(plans)
+        self._index = TaskIndex(task_ids(plans))
         conditions: dict[Any, list[Any]] = {}
         texts: dict[Any, list[str]] = {}
         first: dict[str, int] = {}

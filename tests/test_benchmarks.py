@@ -19,7 +19,7 @@ from benchmarks import ablations, faults, truth
 from benchmarks.finding_points import PADS, find_points
 from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
-from lw_torchrl.language.canonical import read_canonical
+from lw_torchrl.language.canonical_steps import read_canonical
 from lw_torchrl.language.task_index import PlanTables
 
 ROOT = Path(__file__).parent.parent

@@ -18,6 +18,7 @@ from lw_torchrl.envs import EngineStep
 from lw_torchrl.language.relations import RELATIONS, Comparison
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import TaskIndex
+from lw_torchrl.language.tasks import task_ids
 from lw_torchrl.modules import EVALUATORS, METHODS, POLICIES, Method, ObservationFeatures, make_policy
 from lw_torchrl.modules.networks import ActionHead
 from lw_torchrl.record.rollouts import run_recorded, write_recording
@@ -70,7 +71,7 @@ class LearnedTaskActor(lw.Policy):
         super().__init__()
         self.tasks, self.config = tuple(tasks), {"size": size, "width": width}
         self.in_keys, self.out_keys = ["observation", "task_id"], ["action"]
-        self.index = TaskIndex(self.tasks)
+        self.index = TaskIndex(task_ids(self.tasks))
         self.vectors = nn.Embedding(len(self.tasks), size)
         self.features = ObservationFeatures()
         self.head = ActionHead(size + self.features.width, width, 1)

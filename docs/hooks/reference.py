@@ -19,7 +19,8 @@ ROOT = Path(__file__).parents[2]
 NAMES = re.findall(r"^from (\S+) import (\S+) as", (ROOT / "lw_torchrl/__init__.pyi").read_text("utf-8"), re.MULTILINE)
 ROOMS = [name for module, name in NAMES if module == "lw_torchrl"]
 WORDS = (
-    "tasks queries relations query_program plans plan_files formats plan_decoding canonical skills nearest text layout"
+    "tasks queries relations query_program plans plan_files formats plan_decoding canonical roles skills nearest "
+    "text layout"
 )
 """The modules of ``language``, whose room names nothing itself."""
 

@@ -8,7 +8,7 @@ lw-torchrl evaluate policy.safetensors --episodes 2 --import my_method
 from torch import nn
 
 from lw_torchrl.language.task_index import TaskIndex
-from lw_torchrl.language.tasks import named_tasks, one_layout
+from lw_torchrl.language.tasks import named_tasks, one_layout, task_ids
 from lw_torchrl.modules import ENCODERS, Encoder, Encoding, ObservationFeatures
 
 
@@ -19,7 +19,7 @@ class TaskVectors(Encoder):
         self.tasks, self.layout = tuple(self.definitions), one_layout(self.definitions.values())
         self.config = {"size": size, "feature_noise": feature_noise}  # makes it again, from a policy's file
         self.in_keys, self.out_keys = ["observation", "task_id"], ["encoding"]
-        self.index = TaskIndex(self.tasks)
+        self.index = TaskIndex(task_ids(self.tasks))
         self.features = ObservationFeatures("differences", feature_noise, self.layout)  # (B, 39) float32 -> (B, F)
         self.vectors = nn.Embedding(len(self.tasks), size)
         self.latent_size = size

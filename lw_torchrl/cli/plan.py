@@ -197,28 +197,31 @@ class Read:
     json: options.Json = False
 
     def run(self) -> Output:
-        from lw_torchrl.language.canonical import most_trusted, read_canonical
+        from lw_torchrl.language.canonical import explain_canonical, most_confident
 
         written = [plan for source in self.sources for plan in self._plans(source)]
-        plans, steps = [read_canonical(plan) for plan in written], []
-        for plan in plans:
-            source = f"{plan.source}, confidence {plan.trust:.2f}"
-            steps += [{"task": plan.written.task, "source": source, **note} for note in plan.notes()]
+        reports, steps = [explain_canonical(plan) for plan in written], []
+        for report in reports:
+            source = f"{report.source}, confidence {report.plan.confidence:.2f}"
+            steps += [{"task": report.written.task, "source": source, **note} for note in report.notes()]
         columns: Columns = {
             "task": "task",
             "plan": "source",
             "as written": lambda row: row["written"] or "(added)",
             "parsed as": lambda row: row["skill"] or "(dropped: cannot be parsed)",
             "if": lambda row: row["condition"] or "",
-            "confidence": lambda row: f"{row['sure']:.1f}" if row["written"] else "",
+            "confidence": lambda row: f"{row['confidence']:.1f}" if row["written"] else "",
             "seen": "seen",
         }
-        output = Output(self.json).table("read", steps, columns, counted(len(plans), "plan"))
-        rows = [{"task": plan.written.task, "source": plan.source, "trust": plan.trust} for plan in plans]
+        output = Output(self.json).table("read", steps, columns, counted(len(reports), "plan"))
+        rows = [
+            {"task": report.written.task, "source": report.source, "confidence": report.plan.confidence}
+            for report in reports
+        ]
         output.show("plans", rows)
         if self.out is not None:
             tasks = dict.fromkeys(plan.task for plan in written)
-            best = [most_trusted(plan for plan in written if plan.task == task) for task in tasks]
+            best = [most_confident(plan for plan in written if plan.task == task) for task in tasks]
             output.show("files", lw.save_plans(Plans(best), self.out), f"{counted(len(best), 'plan')} in {self.out}")
         return output
 

@@ -1,26 +1,74 @@
-"""canonical_plan: from a plan in anyone's words to what policies see of it, completed where it says too little."""
+"""canonical_plan: read a free-form plan as verbs, objects and targets, and complete it where it says too little."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 from lw_torchrl._checks import checked
-from lw_torchrl.language.canonical_steps import CanonicalPlan, CanonicalStep, motion_of
+from lw_torchrl.language.coverage import coverage
 from lw_torchrl.language.named_objects import GOAL, GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep, as_plans
-from lw_torchrl.language.queries import Query, check_query
-from lw_torchrl.language.roles import BY_HAND, VECTORS, Direction, Manner, Verb
-from lw_torchrl.language.tasks import Task
-from lw_torchrl.language.things import first_thing, is_goal, point_on, role_object, same_thing, thing_of, things
-from lw_torchrl.language.usual_states import covered
-from lw_torchrl.language.wording import Reading, compared_with_gripper, read_steps
+from lw_torchrl.language.queries import Clause, Query
+from lw_torchrl.language.roles import BY_HAND, VECTORS, Direction, Manner, StepRole, Verb, motion_of
+from lw_torchrl.language.step_parser import ParsedStep, compared_with_gripper, parse_steps
+from lw_torchrl.language.task_objects import (
+    first_object,
+    is_goal,
+    object_of,
+    point_on,
+    role_object,
+    same_object,
+    whole_objects,
+)
+from lw_torchrl.language.tasks import Task, get_task
 
 RULES = 2
 """The version of the rules by which plans are read, which a policy's file keeps; raised when they change."""
-TRUSTED = 0.75
-"""A plan keeps its own conditions if in this share of usual states it does what its motion needs."""
+MIN_CONFIDENCE = 0.75
+"""A plan of at least this confidence keeps its own conditions."""
+Source = Literal["plan", "completed", "fallback"]
+_SOURCES = {"plan": "its own steps", "completed": "completed", "fallback": "replaced by the fallback plan"}
+
+
+@dataclass(frozen=True)
+class CanonicalReport:
+    """How :func:`canonical_plan` read a plan.
+
+    Attributes:
+        written: the plan as it was given.
+        plan: its canonical form.
+        source: "plan", the plan's own steps; "completed", its motion, objects and direction with standard conditions,
+            where its own do not cover the typical states; "fallback", the fallback plan, where it has no motion.
+        read: the plan's own steps as they were read, also where ``plan`` has others.
+        left_out: the skills that could not be read.
+    """
+
+    written: ConditionalPlan
+    plan: ConditionalPlan
+    source: Source
+    read: tuple[PlanStep, ...]
+    left_out: tuple[str, ...]
+
+    def notes(self) -> list[dict[str, Any]]:
+        """The result of each step as written, then the steps that replace them, if any, as JSON.
+
+        The keys are ``written``, None for a step that the plan lacked; ``skill``, ``verb``, ``moved``, ``target`` and
+        ``condition``, None for what was left out; ``confidence``; and ``seen``, whether policies see the step.
+        """
+        own = self.source == "plan"
+        notes = [_note(step, own) for step in self.read]
+        notes += [] if own else [_note(step, True) for step in self.plan.steps]
+        nothing = dict.fromkeys(("skill", "verb", "moved", "target", "condition"))
+        return notes + [{"written": skill, **nothing, "confidence": 0.0, "seen": False} for skill in self.left_out]
+
+
+def _note(step: PlanStep, seen: bool) -> dict[str, Any]:
+    role = _role(step)
+    names = {"skill": step.skill, "verb": role.verb, "moved": role.moved, "target": role.target}
+    about = {"condition": str(step.condition), "confidence": role.confidence, "seen": seen}
+    return {"written": role.written or None, **names, **about}
 
 
 @checked
@@ -29,9 +77,9 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
 
     Each step gets a verb, an object that is moved, a target and a direction (:class:`StepRole`), from its words, its
     conditions and the task's objects alone. Where the hand acts on an object that has a named point, the point stands
-    for it. A plan whose conditions leave usual states out, or that closes the gripper around nothing, keeps its motion,
-    objects and direction, and gets standard conditions. A plan without any motion becomes the fallback plan: grasp the
-    first object and move it to the goal. A plan whose steps have roles already is not read again.
+    for it. A plan whose conditions leave typical states out, or that closes the gripper around nothing, keeps its
+    motion, objects and direction, and gets standard conditions. A plan without any motion becomes
+    :func:`fallback_plan`. A plan whose steps have roles already is not read again.
 
     Args:
         plan: a plan in any words.
@@ -51,14 +99,14 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
 
     Source: ours; the paper encodes a skill's words as they are.
     """
-    if not all(step.role for step in plan.steps):
-        plan = read_canonical(plan).plan
-    if not fallback or any(step.role.fallback for step in plan.steps if step.role):
+    if any(step.role is None for step in plan.steps):
+        plan = explain_canonical(plan).plan
+    if not fallback or any(_role(step).fallback for step in plan.steps):
         return plan
-    other = default_plan(plan).plan.steps
+    other = fallback_plan(plan.definition).steps
     if [(step.condition, step.skill) for step in plan.steps] == [(step.condition, step.skill) for step in other]:
         return plan
-    steps = [replace(step, reason="fallback", role=replace(step.role, fallback=True)) for step in other if step.role]
+    steps = [replace(step, reason="fallback", role=replace(_role(step), fallback=True)) for step in other]
     return replace(plan, steps=(*plan.steps, *steps))
 
 
@@ -69,105 +117,130 @@ def canonical_plans(plans: AnyPlans, fallback: bool = False) -> Plans:
 
 
 @checked
-def read_canonical(plan: ConditionalPlan) -> CanonicalPlan:
-    read = read_steps(plan)
-    left_out = tuple(step.skill for step, one in zip(plan.steps, read, strict=True) if one is None)
-    steps = _steps(plan, read)
-    trust = _trust(plan.definition, steps)
-    if trust >= TRUSTED and _is_complete(steps):
-        return CanonicalPlan(plan, steps, trust, "plan", steps, left_out)
-    last = motion_of(steps)
-    if last is None:
-        return replace(default_plan(plan), trust=trust, read=steps, left_out=left_out)
-    completed = _template(plan.definition, steps, last)
-    return CanonicalPlan(plan, completed, trust, "completed", steps, left_out)
+def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
+    """Report how :func:`canonical_plan` reads a plan, step by step.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> written = [("gripper is open", "place the gripper above the mug"), ("gripper is closed", "ponder")]
+        >>> report = explain_canonical(lw.ConditionalPlan.from_pairs("coffee-push", written))
+        >>> report.source, report.plan.confidence, report.left_out
+        ('fallback', 0.0, ('ponder',))
+    """
+    task, parsed = plan.definition, parse_steps(plan)
+    read = _with_roles(plan, parsed)
+    confidence, last = _confidence(task, read), motion_of([_role(step) for step in read])
+    source: Source
+    left_out = tuple(step.skill for step, reading in zip(plan.steps, parsed, strict=True) if reading is None)
+    if confidence >= MIN_CONFIDENCE and _is_complete(read):
+        source, steps = "plan", read
+    elif last is not None:
+        source, steps = "completed", _completed(task, read, last)
+    else:
+        source, steps = "fallback", fallback_plan(task).steps
+    seen = []
+    for number, step in enumerate(steps):
+        written = _role(step).written
+        reasons = [f"confidence {confidence:.2f}, {_SOURCES[source]}"] if number == 0 else []
+        reasons += [f"as written: {written}"] if written and written != step.skill else []
+        seen.append(replace(step, reason="; ".join(reasons)))
+    canonical = ConditionalPlan(plan.task, tuple(seen), task, confidence)
+    return CanonicalReport(plan, canonical, source, read, left_out)
 
 
-def default_plan(plan: ConditionalPlan) -> CanonicalPlan:
-    """The plan that is the same for all tasks: grasp the first thing and move it to the goal; without a thing, move the
-    gripper there. ``plan`` says the task, and no more."""
-    task = plan.definition
-    thing = first_thing(task)
-    if thing is None:
-        named = things(task)
-        goal = next((name for name in named if is_goal(task, name)), None)
-        near = check_query(f"the gripper is near the {goal or named[0]}", task)
-        target = GOAL if goal else named[0]
-        steps = [CanonicalStep(_negated(near), "reach", GRIPPER, target, "reach")]
-        steps.append(CanonicalStep(near, "hold", GRIPPER, target, "reach"))
-        return CanonicalPlan(plan, tuple(steps), 0.0, "default")
-    last = CanonicalStep(check_query("the gripper is closed", task), "move", thing, GOAL, "grasp", sure=0.0)
-    return CanonicalPlan(plan, _template(task, (), last), 0.0, "default")
+def fallback_plan(task: str | Task) -> ConditionalPlan:
+    """Return the generic plan for a task: grasp the first object and move it to the goal.
+
+    In a task without an object the gripper moves to the goal.
+    """
+    task = get_task(task)
+    held = first_object(task)
+    if held is not None:
+        return ConditionalPlan(
+            task.name, _completed(task, (), StepRole("move", held, GOAL, "grasp", confidence=0.0)), task
+        )
+    named = whole_objects(task)
+    goal = next((name for name in named if is_goal(task, name)), None)
+    near, target = _gripper_is("near", goal or named[0]), GOAL if goal else named[0]
+    steps = (
+        _step(_negated(near), StepRole("reach", GRIPPER, target, "reach")),
+        _step(near, StepRole("hold", GRIPPER, target, "reach")),
+    )
+    return ConditionalPlan(task.name, steps, task)
 
 
-def with_reserve(plan: CanonicalPlan) -> CanonicalPlan:
-    """The same plan with :func:`default_plan` in reserve, unless that is what it is."""
-    return plan if plan.source == "default" else replace(plan, reserve=default_plan(plan.written).steps)
+def _role(step: PlanStep) -> StepRole:
+    assert step.role is not None
+    return step.role
+
+
+def _step(condition: Query, role: StepRole) -> PlanStep:
+    return PlanStep(condition, role.skill, role=role)
+
+
+def _gripper_is(predicate: str, name: str | None = None) -> Query:
+    return Query((Clause(GRIPPER, predicate, name),))
 
 
 def _negated(query: Query) -> Query:
     return Query(tuple(replace(clause, negated=not clause.negated) for clause in query.clauses))
 
 
-def _steps(plan: ConditionalPlan, read: Sequence[Reading | None]) -> tuple[CanonicalStep, ...]:
-    """The readings as steps that know what they are done for."""
+def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> tuple[PlanStep, ...]:
+    """Return the steps that could be read, with the purpose that each has in the plan."""
     task = plan.definition
-    told = [(step, one) for step, one in zip(plan.steps, read, strict=True) if one and one.moved and one.target]
-    grasping = any(one.verb == "close" or one.verb in ("carry", "move") for _, one in told)
-    first = first_thing(task)
+    pairs = [(step, each) for step, each in zip(plan.steps, parsed, strict=True) if each and each.moved and each.target]
+    read = [each for _, each in pairs]
+    grasping = any(each.verb in ("close", "carry", "move") for each in read)
+    first = first_object(task)
     steps = []
-    for number, (step, one) in enumerate(told):
-        verb, direction = one.verb, one.direction
-        purpose = _purpose([other for _, other in told[number:]] + [other for _, other in told[:number][::-1]])
-        manner = _manner(one)
+    for number, (step, each) in enumerate(pairs):
+        verb, manner, direction = each.verb, _manner(each), each.direction
+        # The next step, or else the last before, that moves something.
+        purpose = next((other for other in (*read[number:], *read[:number][::-1]) if other.verb not in BY_HAND), None)
         if verb in BY_HAND:
-            verb, manner, direction = _coming(one, purpose if not grasping else None)
-        target, moved = str(one.target), str(one.moved)
-        if moved == GRIPPER and first is not None and same_thing(task, target, first):
+            verb, manner, direction = _coming(each, purpose if not grasping else None)
+        target, moved = str(each.target), str(each.moved)
+        if moved == GRIPPER and first is not None and same_object(task, target, first):
             target = _compared_point(step, task, target) or point_on(task, target)
-        condition = _at_points(step.condition, task)
         toward = purpose.toward if direction == "goal" and purpose is not None else None
-        steps.append(CanonicalStep(condition, verb, moved, target, manner, direction, step.skill, one.sure, toward))
+        role = StepRole(verb, moved, target, manner, direction, toward, step.skill, each.confidence)
+        steps.append(_step(_at_points(step.condition, task), role))
     return tuple(_over_walls(steps, task))
 
 
-def _coming(one: Reading, purpose: Reading | None) -> tuple[Verb, Manner, Direction | None]:
-    """How a hand comes, with which verb, manner and direction, for a ``purpose``; None for one that grasps."""
+def _coming(each: ParsedStep, purpose: ParsedStep | None) -> tuple[Verb, Manner, Direction | None]:
+    """Return the verb, manner and direction of a hand that comes for a ``purpose``; None for a plan that grasps."""
+    down = "descend" if each.verb == "beside" else each.verb
     if purpose is None:
-        return ("descend" if one.verb == "beside" else one.verb), "grasp", None
+        return down, "grasp", None
     manner = _manner(purpose)
     if manner == "push":
-        return ("beside" if one.verb == "descend" else one.verb), manner, purpose.direction
+        return ("beside" if each.verb == "descend" else each.verb), manner, purpose.direction
     if manner == "press":
-        return ("push" if one.verb == "descend" else one.verb), manner, purpose.direction
-    direction = one.direction or (purpose.direction if manner == "pull" else None)
-    return ("descend" if one.verb == "beside" else one.verb), manner, direction
+        return ("push" if each.verb == "descend" else each.verb), manner, purpose.direction
+    return down, manner, each.direction or (purpose.direction if manner == "pull" else None)
 
 
-def _compared_point(step: PlanStep, task: Task, thing: str) -> str | None:
-    """The point on a thing that a step's condition compares with the gripper; None if there is none."""
-    near = compared_with_gripper(step)
-    points = (one for one in near if any(role_object(task, one).offset) and same_thing(task, one, thing))
+def _compared_point(step: PlanStep, task: Task, name: str) -> str | None:
+    """Return the point on an object that a step's condition compares with the gripper; None if there is none."""
+    near = sorted(compared_with_gripper(step), key=task.object_names.index)
+    points = (other for other in near if any(role_object(task, other).offset) and same_object(task, other, name))
     return next(points, None)
 
 
-def _purpose(ahead: Sequence[Reading]) -> Reading | None:
-    """The next step, or else the last before, that moves something."""
-    return next((one for one in ahead if one.verb not in BY_HAND), None)
-
-
-def _manner(one: Reading) -> Manner:
-    if one.verb in ("push", "pull"):
-        return "press" if one.verb == "push" and one.direction == "down" else one.verb
-    return "reach" if one.verb in ("reach", "hold") else "grasp"
+def _manner(each: ParsedStep) -> Manner:
+    if each.verb in ("push", "pull"):
+        return "press" if each.verb == "push" and each.direction == "down" else each.verb
+    return "reach" if each.verb in ("reach", "hold") else "grasp"
 
 
 def _at_points(condition: Query, task: Task) -> Query:
-    """A condition whose clauses about the gripper and the first thing are about where that is touched."""
-    first = first_thing(task)
+    """Return a condition whose clauses about the gripper and the first object are about where that is touched."""
+    first = first_object(task)
 
-    def at(name: str | None) -> Any:
-        return point_on(task, name) if name and name != GRIPPER and first and same_thing(task, name, first) else name
+    def at(name: str) -> str:
+        return point_on(task, name) if name != GRIPPER and first and same_object(task, name, first) else name
 
     return Query(
         tuple(
@@ -179,26 +252,29 @@ def _at_points(condition: Query, task: Task) -> Query:
     )
 
 
-def _over_walls(steps: Sequence[CanonicalStep], task: Task) -> list[CanonicalStep]:
-    """ "lift the puck over the wall", then "move it to the goal", is one way through the air to the goal."""
-    found = list(steps)
+def _over_walls(steps: Sequence[PlanStep], task: Task) -> list[PlanStep]:
+    """Make "lift the puck over the wall", then "move it to the goal", one way through the air to the goal."""
+    direct = list(steps)
     for number, step in enumerate(steps):
-        after = next((one for one in steps[number + 1 :] if one.verb in ("carry", "move")), None)
-        fixed = not any(isinstance(number, int) for number in role_object(task, step.target).position)
-        if step.verb != "carry" or not fixed or after is None or same_thing(task, step.target, after.target):
+        role = _role(step)
+        later = (_role(other) for other in steps[number + 1 :])
+        after = next((other for other in later if other.verb in ("carry", "move")), None)
+        fixed = not any(isinstance(at, int) for at in role_object(task, role.target).position)
+        if role.verb != "carry" or not fixed or after is None or same_object(task, role.target, after.target):
             continue
-        if same_thing(task, step.moved, after.moved):
-            found[number] = replace(step, moved=after.moved, target=after.target)
-    return found
+        if same_object(task, role.moved, after.moved):
+            direct[number] = _step(step.condition, replace(role, moved=after.moved, target=after.target))
+    return direct
 
 
-def _is_complete(steps: Sequence[CanonicalStep]) -> bool:
-    """Whether a plan moves something and, if it grasps, comes to the thing and closes the gripper before."""
-    verbs = [one.verb for one in steps]
+def _is_complete(steps: Sequence[PlanStep]) -> bool:
+    """Return whether a plan moves something and, if it grasps, comes to the object and closes the gripper before."""
+    roles = [_role(step) for step in steps]
+    verbs = [role.verb for role in roles]
     moving = [number for number, verb in enumerate(verbs) if verb in ("carry", "move")]
-    if any(one.verb == "pull" and "handle" not in one.target.split() for one in steps):
+    if any(role.verb == "pull" and "handle" not in role.target.split() for role in roles):
         return False  # a handle can be hooked; anything else is held better in closed fingers
-    if motion_of(steps) is None:
+    if motion_of(roles) is None:
         return False
     if not moving:
         return True
@@ -206,93 +282,92 @@ def _is_complete(steps: Sequence[CanonicalStep]) -> bool:
     return closing < min(moving) and any(verb in ("approach", "descend") for verb in verbs[:closing])
 
 
-def _template(task: Task, steps: Sequence[CanonicalStep], last: CanonicalStep) -> tuple[CanonicalStep, ...]:
-    """The motion of a plan, ``last``, at the thing that the plan names, with conditions that cover the usual states."""
+def _completed(task: Task, steps: Sequence[PlanStep], last: StepRole) -> tuple[PlanStep, ...]:
+    """Return the plan's motion, ``last``, at the object that it names, with standard conditions."""
+    roles = [_role(step) for step in steps]
     if last.manner == "reach":
         return tuple(steps)
-    if any(one.verb == "carry" and (one.moved, one.target) == (last.moved, last.target) for one in steps):
+    if any(role.verb == "carry" and (role.moved, role.target) == (last.moved, last.target) for role in roles):
         last = replace(last, verb="carry")
-    point = _touched(task, steps)
-    above, near, over, level = (
-        check_query(f"the gripper is {relation} the {point}", task)
-        for relation in ("above", "near", "vertically aligned with", "forward aligned with")
-    )
-    opened, closed = (check_query(f"the gripper is {state}", task) for state in ("open", "closed"))
-
-    def by_hand(verb: Verb, manner: Manner, *conditions: Query, way: Direction | None = None) -> CanonicalStep:
-        every = Query(tuple(clause for one in conditions for clause in one.clauses))
-        return CanonicalStep(every, verb, GRIPPER, point, manner, way, sure=0.0)
-
+    point = _touched(task, roles)
+    above, near, over = (_gripper_is(relation, point) for relation in ("above", "near", "vertically aligned with"))
     away = _negated(near)
+
+    def by_hand(verb: Verb, manner: Manner, *conditions: Query, way: Direction | None = None) -> PlanStep:
+        both = Query(tuple(clause for query in conditions for clause in query.clauses))
+        return _step(both, StepRole(verb, GRIPPER, point, manner, way, confidence=0.0))
+
     if last.manner in ("grasp", "pull"):
-        held = thing_of(task, point)
+        held = object_of(task, point)
         if last.verb == "pull":
             way = last.direction if last.direction in VECTORS else None
             last = replace(last, verb="move", manner="grasp", moved=held, target=held if way else GOAL, direction=way)
         elif last.moved == GRIPPER:
             last = replace(last, moved=held)
-        both = Query((*near.clauses, *closed.clauses))
         return (
             by_hand("approach", "grasp", _negated(above), away),
             by_hand("descend", "grasp", above, away),
-            by_hand("close", "grasp", near, opened),
-            replace(last, condition=both),
+            by_hand("close", "grasp", near, _gripper_is("open")),
+            _step(Query((*near.clauses, *_gripper_is("closed").clauses)), last),
         )
-    way = last.direction
+    way, last = last.direction, replace(last, target=point)
     if last.manner == "press":
-        down = by_hand("approach", "press", _negated(over), way=way)
-        return down, replace(last, condition=over, target=point)
+        return by_hand("approach", "press", _negated(over), way=way), _step(over, last)
     if way == "away":
-        return by_hand("beside", "push", _negated(level), way=way), replace(last, condition=level, target=point)
+        level = _gripper_is("forward aligned with", point)
+        return by_hand("beside", "push", _negated(level), way=way), _step(level, last)
     come = by_hand("approach", "push", _negated(over), way=way), by_hand("beside", "push", over, away, way=way)
-    return *come, replace(last, condition=near, target=point)
+    return *come, _step(near, last)
 
 
-def _touched(task: Task, steps: Sequence[CanonicalStep]) -> str:
-    """Where the hand acts: on the thing that it first comes down to, else on the one that it first goes over."""
-    hands = [one for one in steps if one.moved == GRIPPER != one.target and not is_goal(task, one.target)]
-    found = min(hands, key=lambda one: one.verb == "approach", default=None)
-    name = first_thing(task) if found is None else found.target
+def _touched(task: Task, roles: Sequence[StepRole]) -> str:
+    """Return where the hand acts: where it first comes down to, else what it first goes over."""
+    hands = [role for role in roles if role.moved == GRIPPER != role.target and not is_goal(task, role.target)]
+    hand = min(hands, key=lambda role: role.verb == "approach", default=None)
+    name = first_object(task) if hand is None else hand.target
     assert name is not None
     return point_on(task, name)
 
 
-def _has_sides(steps: Sequence[CanonicalStep]) -> bool:
-    """Whether a plan pushes a thing from several sides, and says for each how to come there."""
-    sides = {one.target for one in steps if one.verb == "push"}
-    return len(sides) > 1 and all(any(one.target == side and one.verb in BY_HAND for one in steps) for side in sides)
+def _has_sides(roles: Sequence[StepRole]) -> bool:
+    """Return whether a plan pushes an object from several sides, and says for each how to come there."""
+    sides = {role.target for role in roles if role.verb == "push"}
+    return len(sides) > 1 and all(any(role.target == side and role.verb in BY_HAND for role in roles) for side in sides)
 
 
-def _trust(task: Task, steps: Sequence[CanonicalStep]) -> float:
-    """In which share of usual states of a motion a step is in force, and all that are do what the motion needs."""
-    last = motion_of(steps)
+def _confidence(task: Task, steps: Sequence[PlanStep]) -> float:
+    """Return the fraction of typical states of the plan's motion in which its steps do what the motion needs."""
+    roles = [_role(step) for step in steps]
+    last = motion_of(roles)
     if last is None:
         return 0.0
-    if last.manner == "reach" or _has_sides(steps):
+    if last.manner == "reach" or _has_sides(roles):
         return 1.0
     motion = "pull" if last.verb == "pull" else last.manner
-    return covered(task, _touched(task, steps), motion, [(step.condition, step.verb) for step in steps])
+    return coverage(task, _touched(task, roles), motion, [(step.condition, _role(step).verb) for step in steps])
 
 
 def worth(plan: ConditionalPlan) -> tuple[bool, float, float]:
-    """By what plans for a task compare where nobody can try them: whether it says a motion, its trust, and how sure its
-    steps are on average. The larger tuple is the better plan."""
-    found = read_canonical(plan)
-    sure = sum(step.sure for step in found.read) / (len(found.read) + len(found.left_out))
-    return found.source != "default", found.trust, sure
+    """Return a key to compare plans for a task without trying them; the larger is better.
+
+    It holds whether the plan has a motion, its confidence, and the mean confidence of its steps.
+    """
+    report = explain_canonical(plan)
+    steps = sum(_role(step).confidence for step in report.read) / (len(report.read) + len(report.left_out))
+    return report.source != "fallback", report.plan.confidence or 0.0, steps
 
 
-def most_trusted(plans: Iterable[ConditionalPlan]) -> ConditionalPlan:
-    """Of several plans for a task the one of most :func:`worth`; of equals the first.
+def most_confident(plans: Iterable[ConditionalPlan]) -> ConditionalPlan:
+    """Return the plan with the largest :func:`worth`, the first of equals.
 
     Raises:
-        ValueError: there is none.
+        ValueError: there is no plan.
 
     Example:
         >>> import lw_torchrl as lw
         >>> bad = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "ponder")])
         >>> good = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "put the puck at the goal")])
-        >>> most_trusted([bad, good]) is good
+        >>> most_confident([bad, good]) is good
         True
     """
     if not (listed := list(plans)):

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from rapidfuzz import fuzz, process
 
 from lw_torchrl._checks import check_choice, checked, shown
-from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, check_length, parse_query, read_query
+from lw_torchrl.language.embeddings import sentence_vectors
+from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, check_length, read_query
 from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.skills import WORDS, ScriptedSkill, SkillError, Skills, load_skills, skills_for
 from lw_torchrl.language.tasks import Task, get_task
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 _NEGATIONS = frozenset(("not", "no", "never", "without", "cannot"))
 # Words that do not tell which query is meant.
@@ -36,7 +36,7 @@ class QueryPart(NamedTuple):
     """One clause of a text, the query it was taken for, and how alike they are, in [0, 1]."""
 
     text: str
-    query: str
+    query: Query
     score: float
 
 
@@ -73,7 +73,7 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
     """
     owner = get_task(task)
     if (query := read_query(text, owner)) is not None:
-        return QueryMatch(query, 1.0, tuple(QueryPart(str(clause), str(clause), 1.0) for clause in query.clauses))
+        return QueryMatch(query, 1.0, tuple(QueryPart(str(clause), Query((clause,)), 1.0) for clause in query.clauses))
     split = [" ".join(part.split()) for part in re.split(r"\b(?:and|but)\b", text, flags=re.IGNORECASE)]
     split = [part for part in split if _content(_affirmed(part)[0])] or [" ".join(text.split())]
     check_length(text, split)
@@ -88,24 +88,22 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
                 found = joined._replace(text=part) if joined.score > found.score else found
             known[part, subject] = found
         parts.append(known[part, subject])
-        subject = parse_query(parts[-1].query, owner).clauses[0].subject
-    query = Query(tuple(clause for part in parts for clause in parse_query(part.query, owner).clauses))
+        subject = parts[-1].query.clauses[0].subject
+    query = Query(tuple(clause for part in parts for clause in part.query.clauses))
     return QueryMatch(query, sum(part.score for part in parts) / len(parts), tuple(parts))
 
 
 def _nearest_part(part: str, task: Task, by: str) -> QueryPart:
     if (query := read_query(part, task)) is not None:
-        return QueryPart(part, str(query), 1.0)
+        return QueryPart(part, query, 1.0)
     words, negated = _affirmed(part)
     clauses, contents = _choices(task, tuple(PREDICATES))
     if by == "edit":
         _, similarity, at = process.extractOne(_content(words), contents, scorer=fuzz.ratio)
         score = similarity / 100
     else:
-        from lw_torchrl.language.text import sentence_encoder
-
-        at, score = _nearest_meaning(" ".join(words), tuple(map(str, clauses)), sentence_encoder)
-    return QueryPart(part, str(replace(clauses[at], negated=negated)), score)
+        at, score = _nearest_meaning(" ".join(words), tuple(map(str, clauses)))
+    return QueryPart(part, Query((replace(clauses[at], negated=negated),)), score)
 
 
 def _affirmed(text: str) -> tuple[list[str], bool]:
@@ -126,16 +124,16 @@ def _choices(task: Task, relations: tuple[str, ...]) -> tuple[tuple[Clause, ...]
     return affirmed, tuple(_content(str(clause).split()) for clause in affirmed)
 
 
-def _nearest_meaning(text: str, choices: tuple[str, ...], encode: Callable[[list[str]], Tensor]) -> tuple[int, float]:
-    """The place of the choice that is nearest in meaning, and its cosine similarity, at least 0."""
-    # A surrogate alone is no text that an encoder could read.
-    alike = _vectors(choices, encode) @ encode([text.encode("utf-8", "replace").decode()])[0]
-    return int(alike.argmax()), float(alike.max().clamp(0.0, 1.0))
+def _nearest_meaning(text: str, choices: tuple[str, ...]) -> tuple[int, float]:
+    """Return the index of the choice that is nearest in meaning, and its cosine similarity, at least 0."""
+    # An encoder cannot read a lone surrogate.
+    alike = _vectors(choices) @ sentence_vectors([text.encode("utf-8", "replace").decode()])[0]
+    return int(alike.argmax()), float(alike.max().clip(0.0, 1.0))
 
 
 @lru_cache(maxsize=256)
-def _vectors(texts: tuple[str, ...], encode: Callable[[list[str]], Tensor]) -> Tensor:
-    return encode(list(texts))
+def _vectors(texts: tuple[str, ...]) -> NDArray[np.float32]:
+    return sentence_vectors(texts)
 
 
 @checked
@@ -172,6 +170,14 @@ def nearest_skill(
     return table[found[0]], found[1] / 100
 
 
+class MappedQuery(NamedTuple):
+    """The query that a text was taken for."""
+
+    query: Query | None
+    distance: float  # of its furthest clause
+    exact: bool = False  # whether the text is a query itself
+
+
 class StepMapper:
     """Maps the words of an answer, by data/words.toml, to queries and skills; a distance is 1 minus a similarity.
 
@@ -182,15 +188,15 @@ class StepMapper:
         self.task, self.skills = task, skills_for(task, skills)
         self.compared = 0
 
-    def query(self, text: str) -> tuple[Query | None, float]:
-        """The nearest query and the distance of its furthest clause; no query if that is beyond the limit."""
+    def query(self, text: str) -> MappedQuery:
+        """Map a text to the nearest query; to none if that is beyond the limit."""
         if (query := read_query(text, self.task)) is not None:
-            return query, 0.0
+            return MappedQuery(query, 0.0, exact=True)
         self.compared += 1
         if self.compared > _MOST_COMPARED or len(text) > _LONGEST:
-            return None, 1.0
-        found, distance = _nearest_condition(text, self.task)
-        return (found if distance <= LIMIT else None), distance
+            return MappedQuery(None, 1.0)
+        query, distance = _nearest_condition(text, self.task)
+        return MappedQuery(query if distance <= LIMIT else None, distance)
 
     def skill(self, text: str) -> tuple[str | None, float]:
         """The text of the nearest scripted skill and its distance; no text if that is beyond the limit."""

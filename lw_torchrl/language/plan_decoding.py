@@ -11,10 +11,10 @@ from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.base import Clause, Note, Reading, Section, listed_steps
 from lw_torchrl.language.formats.prose import ProseReading
 from lw_torchrl.language.formats.python import PythonReading
-from lw_torchrl.language.nearest import StepMapper
+from lw_torchrl.language.nearest import MappedQuery, StepMapper
 from lw_torchrl.language.plan_text import MOST_STEPS
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
-from lw_torchrl.language.queries import Query, read_query
+from lw_torchrl.language.queries import Query
 from lw_torchrl.language.skills import Skills, canonical_skill
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
 
@@ -175,8 +175,8 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
         notes.append(Note(clause.line, text))
 
     written = " ".join(clause.condition.split())
-    condition, distance = mapper.query(written)
-    goal, goal_distance = mapper.query(clause.goal) if clause.goal else (None, 0.0)
+    condition, distance, exact = mapper.query(written)
+    goal, goal_distance, exact_goal = mapper.query(clause.goal) if clause.goal else MappedQuery(None, 0.0)
     dropped = ""
     try:
         words = canonical_skill(clause.skill, mapper.task)
@@ -185,14 +185,14 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
     scripted, skill_distance = mapper.skill(words)
     if condition is None:
         dropped = f"no query is near enough to the condition {shown(written)} (distance {distance:.2f})"
-    elif read_query(written, mapper.task) is None:
+    elif not exact:
         note(f"the condition {shown(written)} is taken for {str(condition)!r} (distance {distance:.2f})")
     if dropped:
         note(f"a step is left out: {dropped}")
     else:
         if clause.goal and goal is None:
             note(f"no query is near enough to the goal {shown(clause.goal)} (distance {goal_distance:.2f})")
-        elif clause.goal and read_query(clause.goal, mapper.task) is None:
+        elif clause.goal and not exact_goal:
             note(f"the goal {shown(clause.goal)} is taken for {str(goal)!r} (distance {goal_distance:.2f})")
         if scripted is None:
             note(f"no scripted skill is near enough to {shown(words)} (distance {skill_distance:.2f})")

@@ -17,8 +17,8 @@ from lw_torchrl.language.queries import Query, check_query, read_query
 from lw_torchrl.language.relations import comparisons
 from lw_torchrl.language.roles import StepRole
 from lw_torchrl.language.skills import canonical_skill, load_skills
-from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task, one_layout, task_id
-from lw_torchrl.language.things import role_object
+from lw_torchrl.language.task_objects import role_object
+from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task, one_layout, task_ids
 
 
 class PlanError(ValueError):
@@ -270,7 +270,7 @@ class Plans(Mapping[str, ConditionalPlan]):
     @property
     def task_ids(self) -> dict[str, int]:
         """The id of each task, see :func:`~lw_torchrl.task_id`."""
-        return {task: task_id(task) for task in self}
+        return task_ids(self)
 
     @cached_property
     def has_roles(self) -> bool:

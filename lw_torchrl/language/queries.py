@@ -233,5 +233,18 @@ def _parse(text: str, task: Task, explain: bool) -> Query:
 
 
 def check_query(query: str | Query, task: str | Task) -> Query:
-    """``query`` as a :class:`Query` of ``task``: a text is parsed, a Query is checked to name the task's objects."""
-    return parse_query(str(query) if isinstance(query, Query) else query, task)
+    """Return ``query`` as a :class:`Query` of ``task``: a text is parsed, a Query must name the task's objects."""
+    if not isinstance(query, Query):
+        return parse_query(query, task)
+    owner = get_task(task)
+    if 0 < len(query.clauses) <= _MOST_CLAUSES and all(_is_of(clause, owner) for clause in query.clauses):
+        return query
+    return parse_query(str(query), owner)  # reads aliases, or explains the fault
+
+
+def _is_of(clause: Clause, task: Task) -> bool:
+    if clause.predicate in UNARY:
+        fits = clause.object is None and (clause.predicate not in STATES or clause.subject in task.openings)
+    else:
+        fits = clause.predicate in RELATIONS and clause.object in task.object_names and clause.object != clause.subject
+    return fits and clause.subject in task.object_names and type(clause.negated) is bool

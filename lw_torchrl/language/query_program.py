@@ -14,7 +14,7 @@ from lw_torchrl._checks import check_choice, shown
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.query_tables import QueryTables, compile_facts, compile_queries
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
-from lw_torchrl.language.tasks import TASKS, Task, one_layout, task_id
+from lw_torchrl.language.tasks import TASKS, Task, one_layout, task_ids
 from lw_torchrl.language.value_checks import check_finite
 
 _LEAST, _MOST = 1e-6, 1e4  # of the size of a logit, and of metres where a length has a gradient
@@ -80,7 +80,7 @@ class QueryProgram(nn.Module):
         self.queries = dict(sorted(((task.name, found) for task, found in compiled.items())))
         self.tasks = tuple(self.queries)
         self.num_queries = max(map(len, compiled.values()))
-        index = TaskIndex({task: task_id(task) for task in self.tasks})
+        index = TaskIndex(task_ids(self.tasks))
         in_order = dict(sorted(compiled.items(), key=lambda item: index.row(item[0].name)))
         tables = compile_queries(in_order)
         self._any_far = bool(tables.far.any())

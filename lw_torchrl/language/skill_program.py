@@ -10,7 +10,7 @@ from lw_torchrl._checks import check_choice
 from lw_torchrl.language.named_objects import coordinate_indices
 from lw_torchrl.language.skills import ScriptedSkill, Skills, load_skills
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
-from lw_torchrl.language.tasks import Task, get_task, one_layout, task_id
+from lw_torchrl.language.tasks import Task, get_task, one_layout, task_ids
 
 
 class _Tables(NamedTuple):
@@ -62,7 +62,7 @@ class SkillProgram(nn.Module):
         self.layout = layout = one_layout(found)
         self._displaced = layout.displaced("scripted skills")
         self.num_skills = max(map(len, found.values()))
-        index = TaskIndex({task.name: task_id(task.name) for task in found})
+        index = TaskIndex(task_ids(task.name for task in found))
         constants = [0.0]
         place = torch.full((len(found), 2, self.num_skills, 3), layout.size)
         numbers = torch.zeros(len(found), 2, self.num_skills, 3, dtype=torch.float64)  # gain, gain times offset

@@ -89,12 +89,16 @@ class Task:
 
     def positions(self, observation: Tensor) -> dict[str, Tensor]:
         """Where each object is: (..., D) float, metres, to name -> (..., 3) of the same dtype, metres."""
-        import torch  # here, since words alone should not wait for it
 
-        def coordinate(at: int | float, shift: float) -> Tensor:
-            return (observation[..., at] if isinstance(at, int) else torch.full_like(observation[..., 0], at)) + shift
+        def position(named: NamedObject) -> Tensor:
+            xyz = observation[..., [at if isinstance(at, int) else 0 for at in named.position]]
+            for axis, (at, shift) in enumerate(zip(named.position, named.offset, strict=True)):
+                if not isinstance(at, int):
+                    xyz[..., axis] = at
+                xyz[..., axis] += shift
+            return xyz
 
-        return {one.name: torch.stack(list(map(coordinate, one.position, one.offset)), -1) for one in self.objects}
+        return {named.name: position(named) for named in self.objects}
 
     def to_json(self) -> dict[str, Any]:
         """The task as a row of tasks.toml; a :class:`TaskError` where a row cannot hold it, another gripper's say.
@@ -188,6 +192,11 @@ def task_id(name: str) -> int:
         return _RANK[name]
     digest = blake2b(_check_name(name).encode(), digest_size=8).digest()
     return len(MT50) + int.from_bytes(digest, "big") % _OWN_IDS
+
+
+def task_ids(names: Iterable[str]) -> dict[str, int]:
+    """Return the id of each task by its name."""
+    return {name: task_id(name) for name in names}
 
 
 def resolve_tasks(names: str | Iterable[str], *, tasks: Tasks = TASKS) -> tuple[str, ...]:

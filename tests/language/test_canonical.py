@@ -8,22 +8,32 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.language import canonical, phrases, things, wording
-from lw_torchrl.language.canonical import TRUSTED, default_plan, read_canonical
-from lw_torchrl.language.canonical_steps import step_vectors
-from lw_torchrl.language.things import GOAL, first_thing, mark, role_object
-from lw_torchrl.language.wording import read_steps
+from lw_torchrl.language import canonical, step_parser, step_text, task_objects
+from lw_torchrl.language.canonical import MIN_CONFIDENCE, canonical_plan, explain_canonical, fallback_plan
+from lw_torchrl.language.named_objects import GOAL, GRIPPER
+from lw_torchrl.language.roles import role_vectors
+from lw_torchrl.language.step_parser import parse_steps
+from lw_torchrl.language.step_text import mark_objects
+from lw_torchrl.language.task_objects import first_object, role_object
 
 OWN, MT10_SKILLS = lw.load_plans("MT50"), lw.load_plans("MT50", skills="MT10")
-G = "robot's gripper"
+G = GRIPPER
 
 
 def plan_of(task, *steps):
     return lw.ConditionalPlan.from_pairs(task, steps)
 
 
+def roles_of(plan):
+    return [step.role for step in canonical_plan(plan).steps]
+
+
+def without_roles(plan):
+    return replace(plan, steps=[replace(step, role=None) for step in plan.steps], confidence=None)
+
+
 def read_one(task, condition, text):
-    (found,) = read_steps(plan_of(task, (condition, text)))
+    (found,) = parse_steps(plan_of(task, (condition, text)))
     return found
 
 
@@ -68,44 +78,44 @@ HELD = "gripper is near the stick handle and gripper is closed"
     ],
 )
 def test_what_is_held_goes_where_words_or_conditions_say(condition, text, moved, target):
-    *_, found = read_steps(plan_of("stick-pull", GRASP, (condition, text)))
+    *_, found = parse_steps(plan_of("stick-pull", GRASP, (condition, text)))
     assert (found.moved, found.target) == (moved, target if target != GOAL else "target location")
 
 
 def test_the_point_that_a_condition_compares_is_what_is_moved():
-    steps = read_canonical(OWN["assembly"]).steps
-    assert [(one.verb, one.moved, one.target) for one in steps[3:]] == [("carry", "wrench ring", "peg")] * 2
+    roles = roles_of(OWN["assembly"])
+    assert [(role.verb, role.moved, role.target) for role in roles[3:]] == [("carry", "wrench ring", "peg")] * 2
 
 
 def test_over_a_wall_is_on_the_way_to_the_goal():
-    steps = read_canonical(OWN["push-wall"]).steps
-    assert [(one.verb, one.moved, one.target) for one in steps[3:]] == [("carry", "puck", GOAL)] * 2
+    roles = roles_of(OWN["push-wall"])
+    assert [(role.verb, role.moved, role.target) for role in roles[3:]] == [("carry", "puck", GOAL)] * 2
 
 
 @pytest.mark.parametrize("task", OWN)
 def test_shipped_plans_are_read_and_their_canonical_form_is_a_plan(task):
     for plan in (OWN[task], MT10_SKILLS[task]):
-        found = read_canonical(plan)
-        assert found.source in ("plan", "completed")
-        assert not found.left_out
-        bare = replace(found.plan, steps=[replace(step, role=None) for step in found.plan.steps], confidence=None)
-        assert lw.ConditionalPlan.from_pairs(task, [(s.condition, s.skill) for s in found.steps]) == bare
-        for step in found.steps:
-            for name in (step.moved, step.target):
+        report = explain_canonical(plan)
+        assert report.source in ("plan", "completed")
+        assert not report.left_out
+        assert lw.language.plans.parse_plan(str(report.plan)) == without_roles(report.plan)
+        for role in roles_of(plan):
+            for name in role.objects:
                 role_object(plan.definition, name)
 
 
 @pytest.mark.parametrize("task", OWN)
 def test_the_canonical_form_of_a_canonical_plan_is_itself(task):
-    found = read_canonical(OWN[task])
-    again = read_canonical(found.plan)
-    assert [(s.verb, s.moved, s.target, s.direction, s.condition) for s in again.steps] == [
-        (s.verb, s.moved, s.target, s.direction, s.condition) for s in found.steps
+    plan = canonical_plan(OWN[task])
+    again = canonical_plan(without_roles(plan))
+    assert without_roles(again) == without_roles(plan)
+    assert [(r.verb, r.moved, r.target, r.direction) for r in roles_of(again)] == [
+        (r.verb, r.moved, r.target, r.direction) for r in roles_of(plan)
     ]
 
 
 def test_nothing_of_a_plan_comes_from_the_shipped_plans_or_skills():
-    for module in (canonical, phrases, things, wording):
+    for module in (canonical, step_parser, step_text, task_objects):
         source = inspect.getsource(module)
         assert not any(name in source for name in ("load_plans", "load_skills", "skills_for", "usual_goal"))
 
@@ -115,31 +125,32 @@ def test_a_plan_that_leaves_states_out_is_completed():
         ("the gripper is not above the mug", "place the gripper above the mug"),
         ("the gripper is near the mug", "place the mug at goal"),
     ]
-    found = read_canonical(plan_of("coffee-pull", *steps))
-    assert found.source == "completed"
-    assert found.trust < TRUSTED
-    assert [one.verb for one in found.steps] == ["approach", "descend", "close", "carry"]
-    assert [one.target for one in found.steps] == ["mug rim"] * 3 + [GOAL]
-    assert [(note["written"], note["seen"]) for note in found.notes()] == [
+    report = explain_canonical(plan_of("coffee-pull", *steps))
+    assert report.source == "completed"
+    assert report.plan.confidence < MIN_CONFIDENCE
+    roles = roles_of(report.plan)
+    assert [role.verb for role in roles] == ["approach", "descend", "close", "carry"]
+    assert [role.target for role in roles] == ["mug rim"] * 3 + [GOAL]
+    assert [(note["written"], note["seen"]) for note in report.notes()] == [
         *((step[1], False) for step in steps), (None, True), (None, True), (None, True), (steps[1][1], True)
     ]  # fmt: skip
 
 
-def test_a_plan_without_a_motion_becomes_the_default_plan():
+def test_a_plan_without_a_motion_becomes_the_fallback_plan():
     steps = [("the gripper is open", "place the gripper above the mug"), ("the gripper is closed", "ponder")]
-    found = read_canonical(plan_of("coffee-pull", *steps))
-    assert (found.source, found.trust, found.left_out) == ("default", 0.0, ("ponder",))
-    default = default_plan(OWN["coffee-pull"])
-    assert [(s.verb, s.condition) for s in found.steps] == [(s.verb, s.condition) for s in default.steps]
-    assert read_canonical(default.plan).trust == 1.0
+    report = explain_canonical(plan_of("coffee-pull", *steps))
+    assert (report.source, report.plan.confidence, report.left_out) == ("fallback", 0.0, ("ponder",))
+    fallback = fallback_plan("coffee-pull")
+    assert without_roles(report.plan) == without_roles(fallback)
+    assert canonical_plan(without_roles(fallback)).confidence == 1.0
 
 
 def test_what_cannot_be_read_is_left_out_by_name():
     steps = [*((str(s.condition), s.skill) for s in OWN["push"].steps), ("the gripper is closed", "be careful")]
-    found = read_canonical(plan_of("push", *steps))
-    assert found.left_out == ("be careful",)
-    assert found.notes()[-1] == dict.fromkeys(("skill", "verb", "moved", "target", "condition")) | {
-        "written": "be careful", "sure": 0.0, "seen": False
+    report = explain_canonical(plan_of("push", *steps))
+    assert report.left_out == ("be careful",)
+    assert report.notes()[-1] == dict.fromkeys(("skill", "verb", "moved", "target", "condition")) | {
+        "written": "be careful", "confidence": 0.0, "seen": False
     }  # fmt: skip
 
 
@@ -157,11 +168,11 @@ points."cup rim" = { object = "cup", offset = [0.0, 0.0, 0.05] }
         ("gripper is near the cup rim", "grab the cup"),
         ("gripper is near the cup rim and gripper is closed", "lift the cup onto the saucer"),
     ]
-    found = read_steps(plan_of(tasks["stack-cup"], *steps))
+    found = parse_steps(plan_of(tasks["stack-cup"], *steps))
     assert [(one.target, one.moved) for one in found] == [("cup", G), ("cup", G), ("saucer", "cup")]
 
 
-def test_a_hand_goes_to_the_thing_that_is_named_where_a_task_has_no_goal_and_no_first_thing(tmp_path):
+def test_a_hand_goes_to_the_thing_that_is_named_where_a_task_has_no_goal_and_no_first_object(tmp_path):
     (tmp_path / "tasks.toml").write_text("""
 [touch-second]
 description = "Touch the second block."
@@ -169,8 +180,9 @@ objects.block = "obs[11:14]"
 """)
     task = lw.load_tasks(tmp_path / "tasks.toml")["touch-second"]
     plan = plan_of(task, ("the gripper is not near the block", "move the gripper to the block"))
-    assert [(one.verb, one.target) for one in read_canonical(plan).steps] == [("reach", "block")]
-    assert [(one.verb, one.target) for one in default_plan(plan).steps] == [("reach", "block"), ("hold", "block")]
+    assert [(role.verb, role.target) for role in roles_of(plan)] == [("reach", "block")]
+    fallback = roles_of(fallback_plan(task))
+    assert [(role.verb, role.target) for role in fallback] == [("reach", "block"), ("hold", "block")]
 
 
 words = st.text("abcdefghijklmnopqrstuvwxyz '-.,0123456789", min_size=1, max_size=60)
@@ -178,14 +190,14 @@ words = st.text("abcdefghijklmnopqrstuvwxyz '-.,0123456789", min_size=1, max_siz
 
 @given(st.sampled_from(sorted(OWN)), st.lists(st.tuples(st.integers(0, 5), words), min_size=1, max_size=6))
 def test_any_words_become_a_plan_that_covers_the_task(task, written):
-    """Whatever is written, there is a plan whose steps name things of the task, and a trust in [0, 1]."""
+    """Whatever is written, there is a plan whose steps name objects of the task, and a confidence in [0, 1]."""
     own = OWN[task].steps
     steps = [(own[number % len(own)].condition, f"push {text}") for number, text in written]
-    found = read_canonical(plan_of(task, *steps))
-    assert found.steps
-    assert 0.0 <= found.trust <= 1.0
-    assert len(step_vectors(found)) == len(found.steps)
-    assert found.plan.definition == OWN[task].definition
+    plan = canonical_plan(plan_of(task, *steps))
+    assert plan.steps
+    assert 0.0 <= plan.confidence <= 1.0
+    assert len(role_vectors(roles_of(plan))) == len(plan.steps)
+    assert plan.definition == OWN[task].definition
 
 
 @given(st.randoms(use_true_random=False), st.sampled_from(sorted(OWN)))
@@ -195,21 +207,21 @@ def test_the_order_of_clauses_does_not_matter(random, task):
         (" and ".join(map(str, random.sample(step.condition.clauses, len(step.condition.clauses)))), step.skill)
         for step in plan.steps
     ]
-    found, other = read_canonical(plan), read_canonical(plan_of(task, *shuffled))
-    assert (found.source, found.trust) == (other.source, other.trust)
-    assert [step.skill for step in found.steps] == [step.skill for step in other.steps]
+    report, other = explain_canonical(plan), explain_canonical(plan_of(task, *shuffled))
+    assert (report.source, report.plan.confidence) == (other.source, other.plan.confidence)
+    assert [step.skill for step in report.plan.steps] == [step.skill for step in other.plan.steps]
 
 
 def test_marks_are_of_the_longest_name():
     task = OWN["drawer-open"].definition
-    assert mark("Pull the drawer handle, then the drawer", task) == "pull <drawer handle>, then <drawer handle>"
-    assert first_thing(OWN["reach"].definition) is None
+    assert mark_objects("Pull the drawer handle, then the drawer", task) == "pull <drawer handle>, then <drawer handle>"
+    assert first_object(OWN["reach"].definition) is None
 
 
 def test_a_hand_that_is_told_to_go_to_itself_goes_to_the_thing():
     """As a small model put it."""
     far, over = "the gripper is not above the plate edge", "the gripper is above the plate edge"
     written = (far, "set the plate with the gripper above it"), (over, "lower the gripper onto the plate")
-    found = read_canonical(plan_of("plate-slide-back", *written, (over, "pull the plate to the target location")))
-    assert found.source == "completed"
-    assert {step.target for step in found.steps if step.moved == canonical.GRIPPER} == {"plate edge"}
+    report = explain_canonical(plan_of("plate-slide-back", *written, (over, "pull the plate to the target location")))
+    assert report.source == "completed"
+    assert {role.target for role in roles_of(report.plan) if role.moved == GRIPPER} == {"plate edge"}

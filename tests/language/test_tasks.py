@@ -226,7 +226,7 @@ def test_a_task_has_at_most_64_objects():
     objects = {f"cup {number}": "obs[4:7]" for number in range(63)}
     task = Task.from_json("mine", {"description": "Mine.", "objects": objects})
     assert len(task.object_names) == 64
-    assert nearest_query("cup 61 is abof cup 2", task).parts[0].query == "the cup 61 is above the cup 2"
+    assert str(nearest_query("cup 61 is abof cup 2", task).parts[0].query) == "the cup 61 is above the cup 2"
     with pytest.raises(TaskError, match="objects of task 'mine' must be at most 64, the gripper included, got 65"):
         Task.from_json("mine", {"description": "Mine.", "objects": objects | {"lid": "obs[4:7]"}})
 

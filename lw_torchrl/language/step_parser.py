@@ -1,0 +1,285 @@
+"""parse_steps: the verb, the moved object, its target and the direction of each step of a free-form plan."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from lw_torchrl.language.named_objects import GOAL, GRIPPER
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep
+from lw_torchrl.language.roles import Direction, Verb
+from lw_torchrl.language.skills import WORDS
+from lw_torchrl.language.step_text import mark_objects, simplify
+from lw_torchrl.language.task_objects import first_object, is_goal, object_of, same_object, whole_objects
+from lw_torchrl.language.tasks import Task
+
+_VERBS = {name: frozenset(words) for name, words in WORDS["canonical"]["verbs"].items()}
+_DIRECTIONS: dict[str, Direction] = {
+    word: name for name, words in WORDS["canonical"]["directions"].items() for word in words
+}
+_PLACES = {name: frozenset(words) for name, words in WORDS["canonical"]["places"].items()}
+_KNOWN = frozenset().union(*_VERBS.values()) | {"align", "slide", "sweep"}
+# "above the dial to turn it left": a later step's business
+_PURPOSE = re.compile(r"(?<=>) (?:in order )?to \w+ it\b.*")
+_TOOL = re.compile(r"(?<!line )(?<!level )(?<!aligned )\bwith <([^>]*)>")
+
+
+@dataclass(frozen=True)
+class ParsedStep:
+    """The meaning of one step.
+
+    Attributes:
+        verb: what is done.
+        moved: what is to arrive at the target: the robot's gripper, or an object that it holds; None if unknown.
+        target: the object or point to go to; None if unknown.
+        direction: where an object is pushed, pulled or moved to; "goal" leads from it to ``toward``.
+        confidence: 1 where the words say it, less where it follows from the condition, or from what is usual.
+        toward: an object; None for the task's goal.
+    """
+
+    verb: Verb
+    moved: str | None
+    target: str | None
+    direction: Direction | None = None
+    confidence: float = 1.0
+    toward: str | None = None
+
+
+def compared_with_gripper(step: PlanStep) -> tuple[str, ...]:
+    """Return the objects that a step's condition compares with the gripper, in its order."""
+    pairs = [(clause.subject, clause.object) for clause in step.condition.clauses if clause.object is not None]
+    return tuple(second if first == GRIPPER else first for first, second in pairs if GRIPPER in (first, second))
+
+
+@dataclass(frozen=True)
+class _Facts:
+    """What a condition says about the gripper."""
+
+    at: bool  # near or around an object
+    not_at: bool
+    aligned: bool  # any other relation
+    not_aligned: bool
+    open: bool
+    closed: bool
+    near: tuple[str, ...]  # the objects that it is compared with
+
+    @classmethod
+    def of(cls, step: PlanStep) -> _Facts:
+        facts = dict.fromkeys(("at", "not_at", "aligned", "not_aligned", "open", "closed"), False)
+        for clause in step.condition.clauses:
+            if clause.subject == GRIPPER and clause.object is None:
+                facts["open" if (clause.predicate == "open") != clause.negated else "closed"] = True
+            elif clause.object is not None and GRIPPER in (clause.subject, clause.object):
+                relation = "at" if clause.predicate in ("near", "around") else "aligned"
+                facts[f"not_{relation}" if clause.negated else relation] = True
+        return cls(near=compared_with_gripper(step), **facts)
+
+
+def parse_steps(plan: ConditionalPlan) -> tuple[ParsedStep | None, ...]:
+    """Parse each step of a plan; None for a step that cannot be read."""
+    task = plan.definition
+    facts = [_Facts.of(step) for step in plan.steps]
+    marked = [mark_objects(step.skill, task) for step in plan.steps]
+    parsed = _parse(plan, _resolve_it([simplify(text) for text in marked], facts, task), facts)
+    if all(each is None or each.verb in _NO_MOTION for each in parsed):  # "grab it and pull" in one step
+        parsed = _parse(plan, _resolve_it([_last_clause(text) for text in marked], facts, task), facts)
+    return parsed
+
+
+_IT = re.compile(r"^(\w+) (?:it|them|her|him)\b")
+_NO_MOTION = {"approach", "beside", "descend", "close", "open"}
+
+
+def _last_clause(text: str) -> str:
+    """Return what is said last, about the object named first: "grab <mug> and pull it back" is "pull <mug> back"."""
+    first, _, second = text.rpartition(" and ")
+    name = next((name for name in re.findall(r"<[^>]*>", first) if name != f"<{GRIPPER}>"), "it")
+    return simplify(re.sub(r"\b(?:it|them)\b", name, second, count=1)) if first else simplify(text)
+
+
+def _parse(plan: ConditionalPlan, texts: list[str], facts: list[_Facts]) -> tuple[ParsedStep | None, ...]:
+    task, each = plan.definition, list(zip(plan.steps, texts, facts, strict=True))
+    grasping = any(_grasps(text, fact) for _, text, fact in each)
+    parsed = [_StepParser(step, task, text, fact, grasping).parse() for step, text, fact in each]
+    if all(step is None or step.verb in ("approach", "descend", "beside") for step in parsed):
+        parsed = [_only_sent(step, text) for step, text in zip(parsed, texts, strict=True)]
+    return tuple(_pushed_or_pulled(parsed))
+
+
+def _resolve_it(texts: Iterable[str], facts: Iterable[_Facts], task: Task) -> list[str]:
+    """Replace "it" in "pull it" by the object of the step before, else by the first object."""
+    resolved, before = [], first_object(task)
+    for text, fact in zip(texts, facts, strict=True):
+        meant = before or (fact.near[-1] if fact.near else None)
+        if meant is not None and (start := _IT.match(text)):
+            meant = GRIPPER if f"<{meant}>" in text else meant  # "park it over <mug>", which is the mug already
+            text = f"{start[1]} <{meant}>{text[start.end() :]}"
+        resolved.append(text)
+        named = (name for name in re.findall(r"<([^>]*)>", text) if name != GRIPPER and not is_goal(task, name))
+        before = next(named, before)
+    return resolved
+
+
+def _only_sent(step: ParsedStep | None, text: str) -> ParsedStep | None:
+    """In a plan that does nothing else, "move the gripper to the block" is the whole motion."""
+    to_it = step is not None and step.verb == "descend" and re.match(rf"\w+ <{GRIPPER}> (?:to|at|toward|onto) <", text)
+    return replace(step, verb="reach") if step is not None and to_it else step
+
+
+def _grasps(text: str, facts: _Facts) -> bool:
+    """Return whether a step closes the gripper around an object, carries one, or has a closed gripper at it."""
+    verb, *rest = text.split()
+    if verb in _VERBS["held"] and rest and rest[0].startswith("<") and not text.startswith(f"{verb} <{GRIPPER}>"):
+        return True
+    return (verb in _VERBS["close"] and (verb != "close" or GRIPPER in text)) or (facts.closed and facts.at)
+
+
+def _pushed_or_pulled(parsed: Sequence[ParsedStep | None]) -> list[ParsedStep | None]:
+    """Decide where the words leave it open: a hand that came down around an object pulls it, any other pushes it."""
+    verbs = {step.verb for step in parsed if step is not None}
+
+    def decided(step: ParsedStep) -> ParsedStep:
+        if "beside" in verbs:
+            return replace(step, verb="push") if step.verb == "pull" else step
+        unsure = step.verb == "push" and step.confidence < 0.6
+        return replace(step, verb="pull") if unsure and "descend" in verbs else step
+
+    return [step and decided(step) for step in parsed]
+
+
+class _StepParser:
+    """Parses one step."""
+
+    def __init__(self, step: PlanStep, task: Task, text: str, facts: _Facts, grasping: bool) -> None:
+        self.step, self.task, self.text, self.facts, self.grasping = step, task, text, facts, grasping
+        text = _PURPOSE.sub("", text)
+        self.verb, *rest = re.sub(r"<[^>]*>", " ", text).split() or [""]
+        self.words = set(rest)
+        named = re.findall(r"<([^>]*)>", text)
+        self.by_hand = named[:1] == [GRIPPER]
+        self.named = [name for name in named if name != GRIPPER]
+        self.tool = match[1] if (match := _TOOL.search(text)) else None
+        if self.tool is not None:
+            self.named = [name for name in self.named if name != self.tool] or self.named
+        self.direction = next((_DIRECTIONS[word] for word in rest if word in _DIRECTIONS), None)
+        self.first = first_object(task)
+        self.near = facts.near[-1] if facts.near else self.first
+
+    def parse(self) -> ParsedStep | None:
+        parsed, known = self._parse(), self.verb in _KNOWN
+        if parsed is None or (known and self.named):
+            return parsed
+        if not known and not self.named and not self.by_hand:
+            return None
+        return replace(parsed, confidence=min(parsed.confidence, 0.8 if known else 0.6))
+
+    def _parse(self) -> ParsedStep | None:
+        if self.first is None:
+            elsewhere = self.named and not any(is_goal(self.task, name) for name in whole_objects(self.task))
+            target = self.named[-1] if elsewhere else GOAL
+            return ParsedStep("hold" if self.verb in _VERBS["hold"] else "reach", GRIPPER, target)
+        noun = self.named[0] if self.named else self.near
+        if noun is None:
+            return None
+        if is_goal(self.task, noun) and not self.by_hand and self.verb not in _VERBS["go"]:
+            at_goal = self.near is None or is_goal(self.task, self.near)
+            noun = self.first if at_goal else object_of(self.task, str(self.near))
+        opens = self.verb in _VERBS["open"] and GRIPPER in self.text and not self.words & {"around", "onto", "on"}
+        if opens or self.verb == "release":
+            return ParsedStep("open", GRIPPER, noun)
+        if self.verb in _VERBS["close"] and (self.verb != "close" or GRIPPER in self.text or self.grasping):
+            return self._closed(noun)
+        return self._by_hand() if self.by_hand else self._object_moved(noun)
+
+    def _closed(self, noun: str) -> ParsedStep:
+        """For a hand that is not there yet "grab the mug" is the way to it; for a hand that holds it, lifting it."""
+        if self.facts.not_at and not self.facts.at and not self.facts.closed:
+            return ParsedStep("descend", GRIPPER, noun)
+        if self.verb == "pick" and self.facts.closed and not self.facts.open:
+            return ParsedStep("move", noun, noun, "up")
+        return ParsedStep("close", GRIPPER, noun)
+
+    def _by_hand(self) -> ParsedStep | None:
+        """The gripper is put somewhere, and what it holds goes with it."""
+        target = self.named[-1] if self.named else self.near
+        if target is None:
+            return None
+        holds = self.grasping and (self.facts.closed or self.facts.at)
+        if is_goal(self.task, target):
+            if holds:
+                return ParsedStep("carry", self.first, target)
+            return ParsedStep("hold" if self.verb in _VERBS["hold"] else "reach", GRIPPER, target)
+        above = bool(self.words & _PLACES["above"])
+        if self.grasping and self.facts.closed and self.facts.at and (above or "to" in self.words):
+            elsewhere = self.near is None or not same_object(self.task, target, self.near)
+            return ParsedStep("carry", self.first, target if elsewhere else GOAL)
+        if above or self.verb == "raise":
+            return ParsedStep("approach", GRIPPER, target)
+        if "front" in self.words:
+            return ParsedStep("beside", GRIPPER, target, "away")
+        if "behind" in self.words:
+            return ParsedStep("beside", GRIPPER, target, "toward")
+        if self.words & _PLACES["beside"]:
+            return ParsedStep("beside", GRIPPER, target)
+        if self.verb == "align":
+            return ParsedStep("descend" if self.facts.aligned else "approach", GRIPPER, target)
+        down = self.verb in ("lower", "drop") or self.words & _PLACES["around"]
+        far = self.facts.not_aligned and not self.facts.aligned and not self.facts.not_at
+        return ParsedStep("approach" if far and not down else "descend", GRIPPER, target)
+
+    def _object_moved(self, noun: str) -> ParsedStep:
+        target = self._target(noun)
+        moved = self.tool if self.tool is not None and (target is None or not is_goal(self.task, target)) else noun
+        if target is not None:
+            moved = self._compared_point(moved, target)
+        if self.grasping:
+            if target is not None:
+                lifted = self.verb in _VERBS["carry"] or self.words & _PLACES["above"]
+                return ParsedStep("carry" if lifted else "move", moved, target)
+            direction: Direction | None = self.direction if self.direction != "down" else None
+            if self.verb in _VERBS["lift"]:
+                direction = "up"
+            if direction is not None:
+                return ParsedStep("move", moved, moved, direction)
+            return ParsedStep("carry" if self.verb in _VERBS["carry"] else "move", moved, GOAL, confidence=0.7)
+        direction = self.direction
+        if direction == "down" and self.verb not in ("push", "press"):
+            direction = None
+        if self.verb in _VERBS["lift"] and direction is None:
+            return ParsedStep("pull", GRIPPER, moved, "up")
+        if self.verb == "press" or direction == "down":
+            return ParsedStep("push", GRIPPER, moved, direction or "goal")
+        if self.verb in _VERBS["pull"] or direction == "toward" or "out" in self.words:
+            return ParsedStep("pull", GRIPPER, moved, direction or "goal")
+        pushed = self.verb in _VERBS["push"] or direction is not None
+        toward = None if direction is not None or target is None or is_goal(self.task, target) else target
+        return ParsedStep("push", GRIPPER, moved, direction or "goal", confidence=1.0 if pushed else 0.5, toward=toward)
+
+    def _target(self, noun: str) -> str | None:
+        """Return where an object is moved to, by the words, or by what the condition compares it with."""
+        goals = [name for name in self.named if is_goal(self.task, name)]
+        if goals:
+            return goals[-1]
+        for name in reversed(self.named[1:] if self.tool is None else self.named):
+            if not same_object(self.task, name, noun) or self.tool is not None:
+                return name
+        own, target = self.tool or noun, None
+        for first, second in self._pairs():
+            is_first, is_second = same_object(self.task, first, own), same_object(self.task, second, own)
+            if is_first != is_second:
+                target = second if is_first else first
+        return target
+
+    def _pairs(self) -> list[tuple[str, str]]:
+        """Return the objects that the condition compares; an object that is at another need not come to it."""
+        clauses = [c for c in self.step.condition.clauses if c.negated or c.predicate not in ("near", "around")]
+        return [(c.subject, c.object) for c in clauses if c.object is not None and GRIPPER not in (c.subject, c.object)]
+
+    def _compared_point(self, moved: str, target: str) -> str:
+        """Return the point on the moved object that the condition compares with the target: a wrench's ring."""
+        for pair in self._pairs():
+            for point, other in (pair, pair[::-1]):
+                if same_object(self.task, other, target) and same_object(self.task, point, moved):
+                    moved = point
+        return moved
