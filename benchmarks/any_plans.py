@@ -19,7 +19,7 @@ from benchmarks.finding_points import find_points
 from lw_torchrl._files import read_json, write_json, write_text
 from lw_torchrl.evaluation.statistics import mean_difference, mean_rate, wilson_interval
 from lw_torchrl.evaluation.summary import markdown_table
-from lw_torchrl.language.canonical import canonical_plan, default_plan, most_trusted
+from lw_torchrl.language.canonical import default_plan, most_trusted, read_canonical
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.training import load_evaluator
 
@@ -88,7 +88,7 @@ def main(arguments: Arguments) -> None:
                 actor = policy.with_plans(Plans([plans[task] for task in tasks]))
                 how["evaluator"] = load_evaluator(required(arguments.evaluator, "evaluator"), actor.plans).eval()
             result = lw.evaluate(actor, tasks=tasks, seed=fixes, stop_at_success=True, **how)
-            trust = {} if plans is None else {task: canonical_plan(plans[task]).trust for task in tasks}
+            trust = {} if plans is None else {task: read_canonical(plans[task]).trust for task in tasks}
             found[key] = {"row": row, "seed": seed, "success": result.success_once, "trust": trust}
             write_json(file, found)
             print(f"{key}: {result.mean_success:.3f}", flush=True)

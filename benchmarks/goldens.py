@@ -22,7 +22,7 @@ from tensordict import TensorDict
 
 import lw_torchrl as lw
 from benchmarks.any_plans import DEVELOPMENT, TEST
-from lw_torchrl.language.canonical import canonical_plan
+from lw_torchrl.language.canonical import read_canonical
 
 DATA = Path(__file__).parent / "data" / "goldens"
 OWN_WORDS = Path(__file__).parent / "data" / "own_words.json"
@@ -65,7 +65,7 @@ def canonical_forms(args: Arguments) -> Any:
 
 
 def _form(plan: lw.ConditionalPlan) -> list[str]:
-    canonical = canonical_plan(plan)
+    canonical = read_canonical(plan)
     steps = [f"{step.condition} -> {step.skill} ({step.manner}, {step.sure:g})" for step in canonical.steps]
     return [f"{canonical.source}, {canonical.trust:.4f}", *steps]
 

@@ -24,6 +24,7 @@ from lw_torchrl.evaluation import evaluate as evaluate
 from lw_torchrl.evaluation import from_pretrained as from_pretrained
 from lw_torchrl.evaluation import plot_success as plot_success
 from lw_torchrl.language.canonical import canonical_plan as canonical_plan
+from lw_torchrl.language.canonical import canonical_plans as canonical_plans
 from lw_torchrl.language.formats import PLAN_FORMATS as PLAN_FORMATS
 from lw_torchrl.language.formats import encode_plan as encode_plan
 from lw_torchrl.language.plan_decoding import decode_plan as decode_plan

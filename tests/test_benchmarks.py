@@ -18,6 +18,7 @@ from benchmarks import ablations, faults, truth
 from benchmarks.finding_points import PADS, find_points
 from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
+from lw_torchrl.language.canonical import read_canonical
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.modules.relative_positions import PlanRoles
 
@@ -111,7 +112,7 @@ def test_each_ablation_changes_one_ingredient_and_has_a_folder_of_its_own(settin
 
 def test_patches_leave_out_what_they_say_and_are_undone():
     plans = lw.load_plans("MT50", skills="MT10")
-    canonical = {task: lw.canonical_plan(plan) for task, plan in plans.items()}
+    canonical = {task: read_canonical(plan) for task, plan in plans.items()}
     tables = PlanTables(lw.Plans([found.plan for found in canonical.values()]))
     rows = torch.tensor([tables.index.row(task) for task in ("door-open", "drawer-open", "push", "window-open")])
     seen = torch.rand(4, 39), torch.ones(4, tables.mask.shape[-1]), rows

@@ -237,6 +237,7 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
             "progress": False,
         },
         "canonical_plan": {"plan": PLAN},
+        "canonical_plans": {"plans": {"reach": PLAN}},
         "collect_demonstrations": {
             "tasks": "reach",
             "episodes_per_task": 1,

@@ -197,10 +197,10 @@ class Read:
     json: options.Json = False
 
     def run(self) -> Output:
-        from lw_torchrl.language.canonical import canonical_plan, most_trusted
+        from lw_torchrl.language.canonical import most_trusted, read_canonical
 
         written = [plan for source in self.sources for plan in self._plans(source)]
-        plans, steps = [canonical_plan(plan) for plan in written], []
+        plans, steps = [read_canonical(plan) for plan in written], []
         for plan in plans:
             source = f"{plan.source}, confidence {plan.trust:.2f}"
             steps += [{"task": plan.written.task, "source": source, **note} for note in plan.notes()]

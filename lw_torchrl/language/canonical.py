@@ -7,14 +7,15 @@ from dataclasses import replace
 from typing import Any
 
 from lw_torchrl._checks import checked
-from lw_torchrl.language.canonical_steps import BY_HAND, VECTORS, CanonicalPlan, CanonicalStep, Manner, motion_of
-from lw_torchrl.language.named_objects import GRIPPER
-from lw_torchrl.language.plans import ConditionalPlan, PlanStep
+from lw_torchrl.language.canonical_steps import CanonicalPlan, CanonicalStep, motion_of
+from lw_torchrl.language.named_objects import GOAL, GRIPPER
+from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep, as_plans
 from lw_torchrl.language.queries import Query, check_query
+from lw_torchrl.language.roles import BY_HAND, VECTORS, Direction, Manner, Verb
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.language.things import GOAL, first_thing, is_goal, point_on, role_object, same_thing, thing_of, things
+from lw_torchrl.language.things import first_thing, is_goal, point_on, role_object, same_thing, thing_of, things
 from lw_torchrl.language.usual_states import covered
-from lw_torchrl.language.wording import Direction, Reading, Verb, compared_with_gripper, read_steps
+from lw_torchrl.language.wording import Reading, compared_with_gripper, read_steps
 
 RULES = 2
 """The version of the rules by which plans are read, which a policy's file keeps; raised when they change."""
@@ -23,24 +24,52 @@ TRUSTED = 0.75
 
 
 @checked
-def canonical_plan(plan: ConditionalPlan) -> CanonicalPlan:
-    """What policies see of a plan, from its words, its conditions and the task's things alone.
+def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> ConditionalPlan:
+    """Read a free-form plan and return it with a role for each step, completed where it says too little.
 
-    Each step becomes a verb, a thing that is moved, a target and a direction. Where the hand acts on a thing that has
-    a named point, the point stands for it. A plan whose conditions leave usual states out, or that closes the gripper
-    around nothing, keeps its motion, things and direction, and has conditions of ours. A plan that says no motion
-    becomes :func:`default_plan`.
+    Each step gets a verb, an object that is moved, a target and a direction (:class:`StepRole`), from its words, its
+    conditions and the task's objects alone. Where the hand acts on an object that has a named point, the point stands
+    for it. A plan whose conditions leave usual states out, or that closes the gripper around nothing, keeps its motion,
+    objects and direction, and gets standard conditions. A plan without any motion becomes the fallback plan: grasp the
+    first object and move it to the goal. A plan whose steps have roles already is not read again.
+
+    Args:
+        plan: a plan in any words.
+        fallback: append the steps of the fallback plan, whose roles say ``fallback=True``. Policies try them when the
+            plan makes no progress. Nothing is appended where the plan became the fallback plan, or has one.
+
+    Returns:
+        A plan for the same task with ``step.role`` and ``confidence``.
 
     Example:
         >>> import lw_torchrl as lw
         >>> written = [("gripper not above the mug", "put gripper over mug"), ("gripper near the mug", "grab it")]
         >>> written.append(("gripper near the mug", "put the mug at the goal"))
-        >>> found = canonical_plan(lw.ConditionalPlan.from_pairs("coffee-push", written))
-        >>> found.source, [step.verb for step in found.steps]
-        ('completed', ['approach', 'descend', 'close', 'carry'])
+        >>> plan = canonical_plan(lw.ConditionalPlan.from_pairs("coffee-push", written))
+        >>> [step.role.verb for step in plan.steps]
+        ['approach', 'descend', 'close', 'carry']
 
     Source: ours; the paper encodes a skill's words as they are.
     """
+    if not all(step.role for step in plan.steps):
+        plan = read_canonical(plan).plan
+    if not fallback or any(step.role.fallback for step in plan.steps if step.role):
+        return plan
+    other = default_plan(plan).plan.steps
+    if [(step.condition, step.skill) for step in plan.steps] == [(step.condition, step.skill) for step in other]:
+        return plan
+    steps = [replace(step, reason="fallback", role=replace(step.role, fallback=True)) for step in other if step.role]
+    return replace(plan, steps=(*plan.steps, *steps))
+
+
+@checked
+def canonical_plans(plans: AnyPlans, fallback: bool = False) -> Plans:
+    """Apply :func:`canonical_plan` to each of ``plans``."""
+    return Plans([canonical_plan(plan, fallback) for plan in as_plans(plans).values()])
+
+
+@checked
+def read_canonical(plan: ConditionalPlan) -> CanonicalPlan:
     read = read_steps(plan)
     left_out = tuple(step.skill for step, one in zip(plan.steps, read, strict=True) if one is None)
     steps = _steps(plan, read)
@@ -248,7 +277,7 @@ def _trust(task: Task, steps: Sequence[CanonicalStep]) -> float:
 def worth(plan: ConditionalPlan) -> tuple[bool, float, float]:
     """By what plans for a task compare where nobody can try them: whether it says a motion, its trust, and how sure its
     steps are on average. The larger tuple is the better plan."""
-    found = canonical_plan(plan)
+    found = read_canonical(plan)
     sure = sum(step.sure for step in found.read) / (len(found.read) + len(found.left_out))
     return found.source != "default", found.trust, sure
 

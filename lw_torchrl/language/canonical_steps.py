@@ -3,43 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import Query
-from lw_torchrl.language.skills import WORDS
-from lw_torchrl.language.things import GOAL
-from lw_torchrl.language.wording import Direction, Verb
+from lw_torchrl.language.roles import VECTORS as VECTORS
+from lw_torchrl.language.roles import Direction, Manner, StepRole, Verb, role_vectors
 
-Manner = Literal["grasp", "push", "press", "pull", "reach"]
-"""What a step is done for, which says how the hand comes: to grasp from above, to push from the side."""
-VECTORS: dict[str, tuple[float, float, float]] = {
-    "left": (1.0, 0.0, 0.0),
-    "right": (-1.0, 0.0, 0.0),
-    "away": (0.0, 1.0, 0.0),
-    "toward": (0.0, -1.0, 0.0),
-    "up": (0.0, 0.0, 1.0),
-    "down": (0.0, 0.0, -1.0),
-}
-"""Directions as unit vectors in the suites' frame; "left" and "right" are those of the query language."""
 _SOURCES = {"plan": "its own steps", "completed": "completed", "default": "the default plan in its place"}
-BY_HAND = ("approach", "descend", "beside", "open")
-_SAID: dict[Verb, str] = {
-    "approach": "place the gripper above the {target}",
-    "descend": "lower the gripper around the {target}",
-    "beside": "move the gripper beside the {target}",
-    "open": "open the gripper above the {target}",
-    "close": "close the gripper around the {target}",
-    "push": "push the {target}",
-    "pull": "pull the {target}",
-    "carry": "carry the {moved} to the {target}",
-    "move": "slide the {moved} to the {target}",
-    "reach": "move the gripper to the {target}",
-    "hold": "hold the gripper at the {target}",
-}
-_WAYS = {"left": "to the left", "right": "to the right", "away": "away from the robot", "toward": "toward the robot"}
 
 
 @dataclass(frozen=True)
@@ -70,16 +43,13 @@ class CanonicalStep:
     @property
     def skill(self) -> str:
         """The step in one wording for all plans, "carry the mug to the target location"."""
-        said = _SAID[self.verb].format(moved=self.moved, target=self.target)
-        way = "" if self.direction is None else _WAYS.get(self.direction, self.direction)
-        way = f"toward the {self.toward or GOAL}" if way == "goal" else way
-        if self.verb == "move" and way:
-            return f"slide the {self.moved} {way}"
-        if self.verb in ("push", "pull"):
-            return f"{said} {way}"
-        if self.verb in BY_HAND and self.manner != "grasp":
-            return f"{said} to {self.manner} it {way}".rstrip()
-        return said
+        return self.role.skill
+
+    @property
+    def role(self) -> StepRole:
+        return StepRole(
+            self.verb, self.moved, self.target, self.manner, self.direction, self.toward, self.written, self.sure
+        )
 
 
 @dataclass(frozen=True)
@@ -116,10 +86,11 @@ class CanonicalPlan:
         steps = []
         for number, step in enumerate(self.every_step):
             told = [f"plan trusted {self.trust:.2f}, {_SOURCES[self.source]}"] if number == 0 else []
-            told += ["in reserve"] if number >= len(self.steps) else []
+            role = replace(step.role, fallback=number >= len(self.steps))
+            told += ["fallback"] if number >= len(self.steps) else []
             told += [f"as written: {step.written}"] if step.written and step.written != step.skill else []
-            steps.append(PlanStep(step.condition, step.skill, "; ".join(told)))
-        return ConditionalPlan(self.written.task, tuple(steps), self.written.definition)
+            steps.append(PlanStep(step.condition, step.skill, "; ".join(told), role=role))
+        return ConditionalPlan(self.written.task, tuple(steps), self.written.definition, self.trust)
 
     def notes(self) -> list[dict[str, Any]]:
         """What became of each step as written, then the steps that policies see instead, if they do, as JSON.
@@ -149,17 +120,4 @@ def motion_of(steps: Sequence[CanonicalStep]) -> CanonicalStep | None:
 def step_vectors(plan: CanonicalPlan) -> list[list[float]]:
     """For each step, what is told of it beside its roles: ones for its verb, its manner and, if MT10 demonstrates the
     plan's motion in a way of its own, for that. Verbs of the same motion share theirs."""
-    found = []
-    for steps in (plan.steps, plan.reserve):
-        last = motion_of(steps)
-        own = [float(last is not None and [last.moved, last.target] == pair) for pair in _OWN]
-        for step in steps:
-            verb = _SAME_MOTION.get(step.verb, step.verb)
-            ones = [float(verb == one) for one in _VERBS], [float(step.manner == one) for one in get_args(Manner)]
-            found.append([*ones[0], *ones[1], *own])
-    return found
-
-
-_OWN: list[list[str]] = WORDS["canonical"]["own"]
-_SAME_MOTION: dict[str, Verb] = {"carry": "move", "open": "descend", "hold": "reach"}
-_VERBS = [verb for verb in get_args(Verb) if verb not in _SAME_MOTION]
+    return role_vectors([step.role for step in plan.plan.steps if step.role])

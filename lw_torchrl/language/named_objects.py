@@ -11,6 +11,8 @@ from lw_torchrl._checks import check_choice, shown
 from lw_torchrl.language.layout import METAWORLD, Layout, places
 
 GRIPPER = "robot's gripper"
+GOAL = "target location"
+"""The goal, which every observation has, whatever a task calls it."""
 Coordinate = int | float
 """An int is an index into the observation, a float a fixed number of metres."""
 TypedPosition = tuple[tuple[bool, Coordinate], ...]

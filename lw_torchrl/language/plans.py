@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from hashlib import sha256
 from typing import Any, NoReturn
 
-from lw_torchrl._checks import check_fields, checked, shown
+from lw_torchrl._checks import Probability, check_fields, checked, shown
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plan_text import MOST_STEPS, function_head, one_line, quote, read_plan_text, too_many_steps
 from lw_torchrl.language.queries import Query, check_query, read_query
 from lw_torchrl.language.relations import comparisons
+from lw_torchrl.language.roles import StepRole
 from lw_torchrl.language.skills import canonical_skill, load_skills
-from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task, one_layout
+from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task, one_layout, task_id
+from lw_torchrl.language.things import role_object
 
 
 class PlanError(ValueError):
@@ -37,9 +40,26 @@ class PlanStep:
     skill: str  # plain English, "place the gripper above the puck"
     reason: str = field(default="", compare=False)  # a comment for the reader; it does not change what the plan does
     goal: Query | None = None  # the state to reach, if not the skill's usual one; :attr:`ConditionalPlan.goals` has all
+    role: StepRole | None = None  # what the step does to which object, in plans of :func:`~lw_torchrl.canonical_plan`
 
     def __post_init__(self) -> None:
         check_fields(self)
+
+    def mentions(self, task: Task) -> set[str]:
+        """The names of the objects that the condition or the skill mentions; "target location" may stand for the goal.
+
+        A role says which objects the skill mentions; without one they are found in the skill's text.
+        """
+        clauses = self.condition.clauses
+        names = {name for clause in clauses for name in (clause.subject, clause.object) if name is not None}
+        if self.role is not None:
+            return names.union(self.role.objects)
+        text = self.skill
+        for name in sorted(task.object_names, key=len, reverse=True):  # "drawer handle" is not "drawer"
+            text, found = re.subn(rf"(?<![\w-]){re.escape(name)}(?![\w-])", " ", text)
+            if found:
+                names.add(name)
+        return names
 
 
 @dataclass(frozen=True)
@@ -51,6 +71,8 @@ class ConditionalPlan:
         steps: 1 to 1,000 of :class:`PlanStep`, in canonical spelling, so that the plan's text reads back as the same
             plan: conditions as ``str(query)``, "the" before nouns. Equal conditions, skills and goals make equal plans.
         definition: the :class:`Task` whose objects the conditions name; None for ours of that name.
+        confidence: of a plan of :func:`~lw_torchrl.canonical_plan`, the fraction of typical states in which the plan,
+            as written, does what its motion needs.
 
     Example:
         >>> plan = ConditionalPlan.from_pairs("reach", [("gripper is open", "move the gripper to the target")])
@@ -61,6 +83,7 @@ class ConditionalPlan:
     task: str
     steps: tuple[PlanStep, ...]
     definition: Task = field(default=None, compare=False, repr=False)  # type: ignore[assignment]
+    confidence: Probability | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -83,6 +106,8 @@ class ConditionalPlan:
             try:
                 condition, skill = check_query(step.condition, definition), canonical_skill(step.skill, definition)
                 goal = None if step.goal is None else check_query(step.goal, definition)
+                for name in () if step.role is None else step.role.objects:
+                    role_object(definition, name)
             except ValueError as error:
                 raise PlanError(f"{where}: {error}") from error
             goal = None if goal == usual_goal(skill, definition) else goal
@@ -115,6 +140,37 @@ class ConditionalPlan:
                 said.append(f"goal={quote(str(step.goal))}")
             lines += [f"    if check({quote(str(step.condition))}):", f"        robot.{verb}({', '.join(said)})"]
         return function_head(self.definition) + "".join(f"{line}\n" for line in lines)
+
+    def to_json(self) -> dict[str, Any]:
+        """The plan as chain_py text, its task unless this is a shipped one, and the roles and confidence if any."""
+        row: dict[str, Any] = {"plan": str(self)}
+        if self.definition != TASKS.get(self.task):
+            row["task"] = self.definition.to_json()
+        if any(step.role for step in self.steps):
+            row["roles"] = [step.role and step.role.to_json() for step in self.steps]
+        return row if self.confidence is None else {**row, "confidence": self.confidence}
+
+    @classmethod
+    def from_json(cls, name: str, row: Any) -> ConditionalPlan:
+        """The plan of :meth:`to_json` for the task ``name``; any other value is a :class:`PlanError`."""
+        where, keys = f"plan of {shown(name)}", ("plan", "task", "roles", "confidence")
+        if not isinstance(row, dict) or not isinstance(row.get("plan"), str) or set(row) - {*keys}:
+            raise PlanError(f'{where} must be like {{"plan": text, "task": table}}, got {shown(row)}')
+        try:
+            task = Task.from_json(name, row["task"]) if "task" in row else TASKS[check_task(name)]
+            plan = parse_plan(row["plan"], name, where, {name: task})
+            roles = row.get("roles", [None] * len(plan.steps))
+            if not isinstance(roles, list) or len(roles) != len(plan.steps):
+                raise ValueError(f"roles must be a list with one entry for each of its {len(plan.steps)} steps")
+            steps = [
+                replace(step, role=None if role is None else StepRole.from_json(role))
+                for step, role in zip(plan.steps, roles, strict=True)
+            ]
+            return replace(plan, steps=tuple(steps), confidence=row.get("confidence"))
+        except PlanError:
+            raise
+        except (ValueError, TypeError) as error:
+            raise PlanError(f"{where}: {error}") from error
 
 
 def check_plan(
@@ -212,6 +268,16 @@ class Plans(Mapping[str, ConditionalPlan]):
         return tuple(sorted({step.skill for plan in self.values() for step in plan.steps}))
 
     @property
+    def task_ids(self) -> dict[str, int]:
+        """The id of each task, see :func:`~lw_torchrl.task_id`."""
+        return {task: task_id(task) for task in self}
+
+    @cached_property
+    def has_roles(self) -> bool:
+        """Whether every step has a role, as in the plans of :func:`~lw_torchrl.canonical_plans`."""
+        return all(step.role is not None for plan in self.values() for step in plan.steps)
+
+    @property
     def numbers(self) -> dict[str, int]:
         """A number for each task's plan, below 2**60: plans with another :attr:`fingerprint` have another number."""
         return {task: int(Plans([plan]).fingerprint[:15], 16) for task, plan in self.items()}
@@ -243,7 +309,7 @@ class Plans(Mapping[str, ConditionalPlan]):
         return sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:32]
 
     def to_json(self) -> dict[str, Any]:
-        """Each task's plan as chain_py text, with the task if it is not the shipped one (see :meth:`Task.to_json`).
+        """Each task's plan as :meth:`ConditionalPlan.to_json` has it.
 
         Example:
             >>> from lw_torchrl.language.plan_files import load_plans
@@ -251,30 +317,14 @@ class Plans(Mapping[str, ConditionalPlan]):
             >>> Plans.from_json(plans.to_json()).fingerprint == plans.fingerprint
             True
         """
-        return {
-            task: {"plan": str(plan)}
-            | ({} if plan.definition == TASKS.get(task) else {"task": plan.definition.to_json()})
-            for task, plan in self.items()
-        }
+        return {task: plan.to_json() for task, plan in self.items()}
 
     @classmethod
     def from_json(cls, found: Any) -> Plans:
         """The plans of :meth:`to_json`; any other value is a :class:`PlanError`."""
         if not isinstance(found, dict):
             raise PlanError(f"plans must be an object of task names and plans, got {shown(found)}")
-        plans = []
-        for name, entry in found.items():
-            where = f"plan of {shown(name)}"
-            if not isinstance(entry, dict) or not isinstance(entry.get("plan"), str) or set(entry) - {"plan", "task"}:
-                raise PlanError(f'{where} must be like {{"plan": text, "task": table}}, got {shown(entry)}')
-            try:
-                task = Task.from_json(name, entry["task"]) if "task" in entry else TASKS[check_task(name)]
-                plans.append(parse_plan(entry["plan"], name, where, {name: task}))
-            except PlanError:
-                raise
-            except (ValueError, TypeError) as error:
-                raise PlanError(f"{where}: {error}") from error
-        return cls(plans)
+        return cls([ConditionalPlan.from_json(name, row) for name, row in found.items()])
 
     def differences(self, other: Plans) -> list[str]:
         """The common tasks whose plans have other fingerprints."""

@@ -6,12 +6,10 @@ import re
 from functools import lru_cache
 
 from lw_torchrl.language.layout import places
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject, typed
+from lw_torchrl.language.named_objects import GOAL, GRIPPER, NamedObject, typed
 from lw_torchrl.language.phrases import HANDS
 from lw_torchrl.language.tasks import Task
 
-GOAL = "target location"
-"""The goal, which every observation has, whatever a task calls it."""
 _NO_NAME = {"location", "target", "reach", "other", "side", "top", "edge"}  # words of names that name nothing alone
 _GOAL = r"(?:the )?(?:reach |reacher )?(?:goal|target|destination)(?: (?:location|position|area|place|point|bin|spot))?"
 

@@ -5,17 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Literal
 
-from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.named_objects import GOAL, GRIPPER
 from lw_torchrl.language.phrases import plain
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
+from lw_torchrl.language.roles import Direction, Verb
 from lw_torchrl.language.skills import WORDS
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.language.things import GOAL, first_thing, is_goal, mark, same_thing, thing_of, things
-
-Verb = Literal["approach", "beside", "descend", "close", "open", "push", "pull", "carry", "move", "reach", "hold"]
-Direction = Literal["left", "right", "away", "toward", "up", "down", "goal"]
+from lw_torchrl.language.things import first_thing, is_goal, mark, same_thing, thing_of, things
 
 _VERBS = {name: frozenset(words) for name, words in WORDS["canonical"]["verbs"].items()}
 _DIRECTIONS: dict[str, Direction] = {

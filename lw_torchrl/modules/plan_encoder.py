@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.envs import Compose, Transform
 
 from lw_torchrl._checks import check_probability, checked
-from lw_torchrl.language.canonical import RULES, canonical_plan, with_reserve
+from lw_torchrl.language.canonical import RULES, read_canonical, with_reserve
 from lw_torchrl.language.canonical_steps import CanonicalPlan, step_vectors
 from lw_torchrl.language.layout import METAWORLD, Layout, places
 from lw_torchrl.language.plans import AnyPlans, Plans, PlanStep, as_plans
@@ -122,7 +122,7 @@ class PlanEncoder(ReadsPlans, Encoder):
             raise ValueError("canonical must be true with roles=True, which are those of canonical plans")
         if reserve and not canonical:
             raise ValueError("canonical must be true with reserve=True, which holds canonical steps")
-        found = map(canonical_plan, self.written.values() if canonical else ())
+        found = map(read_canonical, self.written.values() if canonical else ())
         self.canonical = {one.written.task: with_reserve(one) if reserve else one for one in found}
         seen_plans = Plans([one.plan for one in self.canonical.values()]) if canonical else self.written
         if canonical and evaluator is not None and evaluator.plans.fingerprint == self.written.fingerprint:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.language.canonical import canonical_plan
+from lw_torchrl.language.canonical import read_canonical
 from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.phrases import plain
 from lw_torchrl.language.plans import ConditionalPlan
@@ -76,11 +76,11 @@ def steps_of(plan):
 def test_nine_of_ten_paraphrases_are_read_as_what_they_paraphrase():
     alike, unread = [], 0
     for plan in PLANS.values():
-        meant = steps_of(canonical_plan(plan))
+        meant = steps_of(read_canonical(plan))
         for step in plan.steps:
             for text in SAYINGS.get(step.skill, ()):
                 said = [(one.condition, text if one is step else one.skill) for one in plan.steps]
-                found = canonical_plan(ConditionalPlan.from_pairs(plan.definition, said))
+                found = read_canonical(ConditionalPlan.from_pairs(plan.definition, said))
                 alike.append(steps_of(found) == meant)
                 unread += bool(found.left_out)
     assert len(alike) > 1100

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 import lw_torchrl as lw
-from lw_torchrl.language.canonical import RULES, canonical_plan
+from lw_torchrl.language.canonical import RULES, read_canonical
 from lw_torchrl.language.canonical_steps import step_vectors
 from lw_torchrl.training.checkpoint import read_description, text_vectors
 
@@ -50,9 +50,9 @@ def make_state(actor, rows=12):
 def test_its_plans_are_the_canonical_ones_and_no_text_is_read(kind):
     actor = make(MT50, kind)
     assert actor.encoder.written == MT50
-    assert actor.encoder.canonical == {task: canonical_plan(plan) for task, plan in MT50.items()}
-    assert actor.plans.fingerprint == lw.Plans([canonical_plan(plan).plan for plan in MT50.values()]).fingerprint
-    assert actor.encoder.trust == {task: canonical_plan(plan).trust for task, plan in MT50.items()}
+    assert actor.encoder.canonical == {task: read_canonical(plan) for task, plan in MT50.items()}
+    assert actor.plans.fingerprint == lw.Plans([read_canonical(plan).plan for plan in MT50.values()]).fingerprint
+    assert actor.encoder.trust == {task: read_canonical(plan).trust for task, plan in MT50.items()}
     assert text_vectors(actor) == {}
     assert actor(make_state(actor))["action"].shape == (12, 4)
 
@@ -89,7 +89,7 @@ def test_somebody_s_words(kind):
     actor = make(MT10, kind)
     other = actor.with_plans({"coffee-pull": MINE})
     assert other.encoder.written["coffee-pull"] == MINE
-    assert other.plans["coffee-pull"] == canonical_plan(MINE).plan
+    assert other.plans["coffee-pull"] == read_canonical(MINE).plan
     assert other.encoder.trust["coffee-pull"] < 0.75
     assert other.head is actor.head
     assert other.encoder.texts is actor.encoder.texts

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 import lw_torchrl as lw
-from lw_torchrl.language.canonical import canonical_plan, default_plan, with_reserve
+from lw_torchrl.language.canonical import default_plan, read_canonical, with_reserve
 from lw_torchrl.transforms import QAFTransform, TakeTurns
 
 MT10, MT50 = lw.load_plans("MT10"), lw.load_plans("MT50")
@@ -28,20 +28,20 @@ def states(actor, turn=None, task="dial-turn", rows=200):
 def test_its_plans_end_with_the_default_plans_steps():
     actor = make(reserve=True)
     for task, plan in actor.plans.items():
-        own, other = canonical_plan(MT50[task]), default_plan(MT50[task])
+        own, other = read_canonical(MT50[task]), default_plan(MT50[task])
         assert [step.skill for step in plan.steps] == [step.skill for step in (*own.steps, *other.steps)]
-        assert plan.steps[len(own.steps)].reason.startswith("in reserve")
+        assert plan.steps[len(own.steps)].role.fallback
 
 
 def test_what_is_the_default_plan_already_has_none():
     wrong = lw.ConditionalPlan.from_pairs("push", [("the gripper is open", "ponder")])
-    assert with_reserve(canonical_plan(wrong)).reserve == ()
+    assert with_reserve(read_canonical(wrong)).reserve == ()
 
 
 @pytest.mark.parametrize("turn", [None, 0, 1, 2, 3])
 def test_only_the_steps_of_the_turn_have_weight(turn):
     actor = make(reserve=True)
-    own = len(canonical_plan(MT50["dial-turn"]).steps)
+    own = len(read_canonical(MT50["dial-turn"]).steps)
     weights = actor(states(actor, turn))["skill_weights"]
     here, there = (slice(own), slice(own, None)) if not (turn or 0) % 2 else (slice(own, None), slice(own))
     assert torch.allclose(weights[:, here].sum(-1), torch.ones(200))

@@ -10,7 +10,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import TD3Loss
 
 import lw_torchrl as lw
-from lw_torchrl.language.canonical import canonical_plan
+from lw_torchrl.language.canonical import read_canonical
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.modules.relative_positions import PlanRoles
 from lw_torchrl.training.normalization import fit_normalization
@@ -22,11 +22,11 @@ OPTIONS = {"roles": True, "features": "opening", "feature_noise": 0.0}
 
 def seen_of(plans):
     """The canonical plans, which policies see."""
-    return lw.Plans([canonical_plan(plan).plan for plan in plans.values()])
+    return lw.Plans([read_canonical(plan).plan for plan in plans.values()])
 
 
 def roles_of(plans=MT10, **options):
-    canonical = {task: canonical_plan(plan) for task, plan in plans.items()}
+    canonical = {task: read_canonical(plan) for task, plan in plans.items()}
     return PlanRoles(canonical, PlanTables(seen_of(plans)), **options).eval()
 
 
@@ -71,7 +71,7 @@ def test_toward_the_goal_is_from_the_thing_to_it_and_turns_with_the_scene():
         ("gripper is near the puck", "push the puck to the target location"),
     ]
     plans = lw.Plans([lw.ConditionalPlan.from_pairs("push", pairs)])
-    (number,) = (n for n, one in enumerate(canonical_plan(plans["push"]).steps) if one.verb == "push")
+    (number,) = (n for n, one in enumerate(read_canonical(plans["push"]).steps) if one.verb == "push")
     roles, (observation, weights, rows) = roles_of(plans), in_step(plans, "push", number)
     ahead = torch.nn.functional.normalize(observation[:, 36:39] - observation[:, 4:7], dim=-1)
     torch.testing.assert_close(roles.directions(observation, weights, rows), ahead)
@@ -91,7 +91,7 @@ def test_what_is_moved_to_a_side_has_a_place_there():
         ("gripper is near the puck and gripper is closed", "lift the puck"),
     ]
     plans = lw.Plans([lw.ConditionalPlan.from_pairs("push", pairs)])
-    (number,) = (n for n, one in enumerate(canonical_plan(plans["push"]).steps) if one.verb == "move")
+    (number,) = (n for n, one in enumerate(read_canonical(plans["push"]).steps) if one.verb == "move")
     seen = in_step(plans, "push", number)
     torch.testing.assert_close(roles_of(plans).positions(*seen)[:, 0], torch.tensor([0.0, 0.0, 0.15]).expand(5, 3))
     assert not roles_of(plans).directions(*seen).any()

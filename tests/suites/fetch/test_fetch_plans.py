@@ -8,7 +8,7 @@ pytest.importorskip("gymnasium_robotics")
 from fetch_runs import IDS, scripted
 
 import lw_torchrl as lw
-from lw_torchrl.language.canonical import canonical_plan
+from lw_torchrl.language.canonical import read_canonical
 from lw_torchrl.language.skills import skills_for
 from lw_torchrl.suites.fetch import TASKS, load_plans, load_skills
 
@@ -19,7 +19,7 @@ def test_every_step_has_a_scripted_skill_and_is_read():
     for plan in plans.values():
         allowed = skills_for(plan.definition, skills)
         assert {step.skill for step in plan.steps} <= set(allowed)
-        found = canonical_plan(plan)
+        found = read_canonical(plan)
         assert found.left_out == ()
         assert (found.source, found.trust) == ("plan", 1.0)
 

@@ -1,0 +1,136 @@
+"""StepRole: what a step does to which object, as policies see it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Literal, get_args
+
+from lw_torchrl._checks import Probability, check_fields, shown
+from lw_torchrl.language.named_objects import GOAL
+from lw_torchrl.language.skills import WORDS
+
+Verb = Literal["approach", "beside", "descend", "close", "open", "push", "pull", "carry", "move", "reach", "hold"]
+"""What is done: "carry" goes through the air, "move" straight."""
+Manner = Literal["grasp", "push", "press", "pull", "reach"]
+"""The purpose of a step, which says how the hand comes: to grasp from above, to push from the side."""
+Direction = Literal["left", "right", "away", "toward", "up", "down", "goal"]
+VECTORS: dict[str, tuple[float, float, float]] = {
+    "left": (1.0, 0.0, 0.0),
+    "right": (-1.0, 0.0, 0.0),
+    "away": (0.0, 1.0, 0.0),
+    "toward": (0.0, -1.0, 0.0),
+    "up": (0.0, 0.0, 1.0),
+    "down": (0.0, 0.0, -1.0),
+}
+"""Directions as unit vectors in the suites' frame; "left" and "right" are those of the query language."""
+BY_HAND = ("approach", "descend", "beside", "open")
+"""The verbs of a step that only brings the gripper to its place."""
+_SKILLS: dict[Verb, str] = {
+    "approach": "place the gripper above the {target}",
+    "descend": "lower the gripper around the {target}",
+    "beside": "move the gripper beside the {target}",
+    "open": "open the gripper above the {target}",
+    "close": "close the gripper around the {target}",
+    "push": "push the {target}",
+    "pull": "pull the {target}",
+    "carry": "carry the {moved} to the {target}",
+    "move": "slide the {moved} to the {target}",
+    "reach": "move the gripper to the {target}",
+    "hold": "hold the gripper at the {target}",
+}
+_WAYS = {"left": "to the left", "right": "to the right", "away": "away from the robot", "toward": "toward the robot"}
+
+
+@dataclass(frozen=True)
+class StepRole:
+    """What one step of a plan does, as :func:`~lw_torchrl.canonical_plan` reads it.
+
+    Attributes:
+        verb: what is done.
+        moved, target: what is to arrive where: names of the task's objects, or "target location", the goal.
+        manner: what it is done for.
+        direction: where an object is pushed, pulled or moved to; also given for a hand that comes to do so.
+        toward: the object that the direction "goal" leads to; None for the task's goal.
+        written: the skill in the plan's own words; "" for a step that the plan lacked.
+        confidence: from 0, a guess, to 1, stated in the plan's words.
+        fallback: whether the step belongs to the fallback plan, which is tried when the plan makes no progress.
+
+    Raises:
+        ValueError: an unknown verb, manner or direction, or a confidence outside [0, 1].
+    """
+
+    verb: Verb
+    moved: str
+    target: str
+    manner: Manner
+    direction: Direction | None = None
+    toward: str | None = None
+    written: str = ""
+    confidence: Probability = 1.0
+    fallback: bool = False
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    @property
+    def skill(self) -> str:
+        """The step in the wording that all plans share: "carry the mug to the target location"."""
+        said = _SKILLS[self.verb].format(moved=self.moved, target=self.target)
+        way = "" if self.direction is None else _WAYS.get(self.direction, self.direction)
+        way = f"toward the {self.toward or GOAL}" if way == "goal" else way
+        if self.verb == "move" and way:
+            return f"slide the {self.moved} {way}"
+        if self.verb in ("push", "pull"):
+            return f"{said} {way}"
+        if self.verb in BY_HAND and self.manner != "grasp":
+            return f"{said} to {self.manner} it {way}".rstrip()
+        return said
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """The names of the objects that the step is about, "target location" for the goal."""
+        led = (self.toward or GOAL,) if self.direction == "goal" else ()
+        return tuple(dict.fromkeys((self.moved, self.target, *led)))
+
+    def to_json(self) -> dict[str, Any]:
+        """The fields that differ from their defaults; :meth:`from_json` reads them back."""
+        return {each.name: value for each in fields(self) if (value := getattr(self, each.name)) != each.default}
+
+    @classmethod
+    def from_json(cls, row: Any) -> StepRole:
+        """The role of :meth:`to_json`; any other value is a :class:`ValueError`."""
+        names = [each.name for each in fields(cls)]
+        if not isinstance(row, dict) or set(row) - {*names} or not {*names[:4]} <= set(row):
+            raise ValueError(f"role must be a table of {', '.join(names)}, got {shown(row)}")
+        try:
+            return cls(**row)
+        except TypeError as error:
+            raise ValueError(f"role: {error}") from error
+
+
+def motion_of(roles: Sequence[StepRole]) -> StepRole | None:
+    """The last step that moves an object; in a plan without one, the last that brings the gripper to its place."""
+    moving = [role for role in roles if role.verb in ("carry", "move", "push", "pull")]
+    return next(reversed(moving or [role for role in roles if role.verb == "reach"]), None)
+
+
+def role_vectors(roles: Sequence[StepRole]) -> list[list[float]]:
+    """One vector for each step of a plan: what is done, without the objects.
+
+    It holds ones for the step's verb, its manner and, if MT10 demonstrates the plan's motion in a way of its own, for
+    that. Verbs of the same motion share theirs. The fallback plan's steps have a motion of their own.
+    """
+    vectors = []
+    motions = {fallback: motion_of([role for role in roles if role.fallback is fallback]) for fallback in (False, True)}
+    for role in roles:
+        last, verb = motions[role.fallback], _SAME_MOTION.get(role.verb, role.verb)
+        ones = [verb == name for name in _VERBS] + [role.manner == name for name in get_args(Manner)]
+        ones += [last is not None and [last.moved, last.target] == pair for pair in _OWN_MOTIONS]
+        vectors.append(list(map(float, ones)))
+    return vectors
+
+
+_OWN_MOTIONS: list[list[str]] = WORDS["canonical"]["own"]
+_SAME_MOTION: dict[str, Verb] = {"carry": "move", "open": "descend", "hold": "reach"}
+_VERBS = [verb for verb in get_args(Verb) if verb not in _SAME_MOTION]
