@@ -74,6 +74,7 @@ class PlanTables:
     Attributes:
         index: from task ids to rows, T of them.
         mask: (T, S) bool, the steps that there are.
+        turns: (T, 2, S) bool, the plan's own steps, and its fallback steps (its own, if it has no fallback steps).
         skill_index: (T, S) int64, the number of each step's skill in ``plans.skills``; 0 beyond the last step.
         number: (T,) int64, the number of each plan, as in :attr:`Plans.numbers`.
     """
@@ -82,11 +83,15 @@ class PlanTables:
         self.index = TaskIndex(plans)
         self._problem = f"tasks without a plan in {plans!r}"
         self.mask = torch.zeros(len(plans), plans.num_steps, dtype=torch.bool)
+        self.turns = torch.zeros(len(plans), 2, plans.num_steps, dtype=torch.bool)
         self.skill_index = torch.zeros(len(plans), plans.num_steps, dtype=torch.int64)
         skill = {text: number for number, text in enumerate(plans.skills)}
         for row, task in enumerate(self.index.tasks):
             steps = plans[task].steps
             self.mask[row, : len(steps)] = True
+            fallback = torch.tensor([step.role is not None and step.role.fallback for step in steps])
+            self.turns[row, 0, : len(steps)] = ~fallback
+            self.turns[row, 1, : len(steps)] = fallback if fallback.any() else ~fallback
             self.skill_index[row, : len(steps)] = torch.tensor([skill[step.skill] for step in steps])
         numbers = plans.numbers
         self.number = torch.tensor([numbers[task] for task in self.index.tasks])

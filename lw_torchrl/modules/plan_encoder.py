@@ -26,9 +26,9 @@ from lw_torchrl.modules.plan_attention import Answers, PlanAttention, attend, at
 from lw_torchrl.modules.policy import Encoder, Encoding
 from lw_torchrl.modules.query_evaluator import QueryEvaluator, ReadsPlans
 from lw_torchrl.modules.relative_positions import PlanFocus, PlanRoles, RelativePositions
+from lw_torchrl.transforms.fallback_turns import FallbackTurns
 from lw_torchrl.transforms.qaf import plan_number_key, plan_program
 from lw_torchrl.transforms.random_yaw import tilt_key, yaw_key
-from lw_torchrl.transforms.take_turns import TakeTurns, turn_key
 
 IN_FORCE = 0.01  # a step whose condition does not hold beside one that does has a weight of 1e-4
 
@@ -54,7 +54,7 @@ class PlanEncoder(ReadsPlans, Encoder):
             place of the texts, conditions that cover the usual states. ``plans`` are then these. None for ``roles``,
             which need it.
         reserve: when the plan's own steps get nowhere, try the default plan's, see
-            :class:`~lw_torchrl.transforms.TakeTurns`; ``plans`` then end with these. It needs ``canonical``.
+            :class:`~lw_torchrl.transforms.FallbackTurns`; ``plans`` then end with these. It needs ``canonical``.
         jitter: standard deviation, in metres, of noise on that position while training, where the gripper pushes.
         swap_unmentioned: the probability, in training, that an object or the goal is put where it is in another row,
             if no step in force mentions it, or with ``roles`` moves it or to it.
@@ -199,14 +199,14 @@ class PlanEncoder(ReadsPlans, Encoder):
         asked = super().transform()
         if not self.config["reserve"]:
             return asked
-        turns = TakeTurns(self.plans.layout, in_keys=self.own_keys[:1])
+        turns = FallbackTurns(self.plans.layout, in_keys=self.own_keys[:1])
         return turns if asked is None else Compose(asked, turns)
 
     def _in_turn(self, tensordict: TensorDictBase, rows: Tensor) -> Tensor:
         """(B, S) bool, the steps whose turn it is: the plan's own, or those in reserve."""
         if not self.config["reserve"]:
             return self.attention.mask[rows]
-        turn = tensordict.get(turn_key(self.in_keys[0]), None)
+        turn = tensordict.get("turn", None)
         return self.turns[rows, torch.zeros_like(rows) if turn is None else turn % 2]
 
     def _augmented(self, observation: Tensor, weights: Tensor, rows: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase, Transform
 
 from lw_torchrl._checks import Probability, Scale, checked
@@ -34,6 +35,9 @@ class Augmentation(Transform):
         )
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._refuse()
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         self._refuse()
 
     def set_container(self, container: Transform | EnvBase) -> None:
@@ -72,8 +76,8 @@ class PlanAugmentation(Augmentation):
 
     def answers(self, tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> tuple[Tensor, Tensor, Tensor]:
         """Return qaf (B, S), the rows' place in the tables (B,) int64, and the steps of the row's turn (B, S) bool."""
-        number = tensordict.get(plan_number_key(keys[0]), None)
-        qaf, rows = answers_of(*read(tensordict, keys), number, self._tables)
+        qaf, task_id = read(tensordict, keys)
+        qaf, rows = answers_of(qaf, task_id, tensordict.get(plan_number_key(keys[0]), None), self._tables)
         turn = tensordict.get("turn", None)
         return qaf, rows, self.table("steps", rows.device)[rows, torch.zeros_like(rows) if turn is None else turn % 2]
 
@@ -106,7 +110,8 @@ class SwapUnmentioned(PlanAugmentation):
         >>> import torch, lw_torchrl as lw
         >>> from tensordict import TensorDict
         >>> plans = lw.load_plans("MT10")
-        >>> rows = TensorDict(observation=torch.rand(2, 39), task_id=torch.full((2,), lw.task_id("reach"))).auto_batch_size_()
+        >>> reach = torch.full((2,), lw.task_id("reach"))
+        >>> rows = TensorDict(observation=torch.rand(2, 39), task_id=reach, batch_size=[2])
         >>> rows = lw.QAFTransform(plans)(rows)
         >>> swapped = lw.SwapUnmentioned(plans, 1.0)(rows)["observation"]
         >>> torch.equal(swapped[:, :4], rows["observation"][:, :4])  # the hand stays
@@ -118,7 +123,9 @@ class SwapUnmentioned(PlanAugmentation):
     mentioned: Tensor
 
     @checked
-    def __init__(self, plans: AnyPlans, probability: Probability, *, in_keys: Sequence[NestedKey] | None = None) -> None:
+    def __init__(
+        self, plans: AnyPlans, probability: Probability, *, in_keys: Sequence[NestedKey] | None = None
+    ) -> None:
         keys = as_keys("in_keys", in_keys, ("observation", "task_id", "qaf"))
         super().__init__(in_keys=keys, out_keys=keys[:1])
         self.probability = probability
@@ -140,7 +147,11 @@ class SwapUnmentioned(PlanAugmentation):
         if following is not None and (after := following.get(key, None)) is not None:
             observations[unravel_key(("next", key))] = after
             if following.get(qaf, None) is not None:
-                known = following if following.get(task, None) is not None else following.copy().set(task, tensordict.get(task))
+                known = (
+                    following
+                    if following.get(task, None) is not None
+                    else following.copy().set(task, tensordict.get(task))
+                )
                 kept = kept | self._kept(known)
         kept = kept.reshape(-1, kept.shape[-1])
         number, device = kept.shape[0], kept.device
@@ -238,7 +249,8 @@ class JitterTarget(PlanAugmentation):
         >>> import torch, lw_torchrl as lw
         >>> from tensordict import TensorDict
         >>> plans = lw.canonical_plans(lw.load_plans("MT10"))
-        >>> rows = TensorDict(observation=torch.rand(2, 39), task_id=torch.full((2,), lw.task_id("reach"))).auto_batch_size_()
+        >>> reach = torch.full((2,), lw.task_id("reach"))
+        >>> rows = TensorDict(observation=torch.rand(2, 39), task_id=reach, batch_size=[2])
         >>> lw.JitterTarget(plans, 0.03)(lw.QAFTransform(plans)(rows))["target_offset"].shape
         torch.Size([2, 3])
     """
@@ -261,7 +273,9 @@ class JitterTarget(PlanAugmentation):
         )
         check_apart(self.in_keys, self.out_keys)
         self.std = std
-        self.step_table("pushes", role_table(self._read_plans(plans), self._tables, lambda role: role.verb in ("push", "pull")))
+        self.step_table(
+            "pushes", role_table(self._read_plans(plans), self._tables, lambda role: role.verb in ("push", "pull"))
+        )
         self.step_table("scale", std * torch.tensor([0.5, 0.5, 1.0]))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

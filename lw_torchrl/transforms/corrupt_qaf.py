@@ -34,8 +34,8 @@ class CorruptQAF(EpisodeTransform):
     The random draws depend only on (task, seed, episode, step) and the answer's place in its plan. A larger probability
     inverts all that a smaller one inverts. In :func:`lw_torchrl.evaluate` it can be the ``evaluator``.
 
-    A learned evaluator in front of a policy overwrites ``qaf``. To corrupt its answers, run it in the environment
-    instead: append ``torchrl.envs.ModuleTransform(module=evaluator)`` and then this transform.
+    A learned evaluator in front of a policy overwrites ``qaf``. To corrupt its answers, run it in the environment: by a
+    transform before this one that calls it in ``_reset`` and ``_call``, and adapts the spec of ``qaf``.
 
     Args:
         plans: the plans whose conditions ``qaf`` answers.
@@ -134,8 +134,8 @@ class CorruptQAF(EpisodeTransform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         raise ValueError(
-            "CorruptQAF counts the steps of an environment's episodes, which rows of a replay buffer do not record: put "
-            "it into the environment, after QAFTransform, or give it to evaluate(evaluator=...)"
+            "CorruptQAF counts the steps of an environment's episodes, which rows of a replay buffer do not record: "
+            "put it into the environment, after QAFTransform, or give it to evaluate(evaluator=...)"
         )
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
