@@ -64,11 +64,8 @@ from lw_torchrl.training import OfflineTrainer as OfflineTrainer
 from lw_torchrl.training import load_actor as load_actor
 from lw_torchrl.training import save_actor as save_actor
 from lw_torchrl.transforms import CorruptQAF as CorruptQAF
-from lw_torchrl.transforms import HideOpening as HideOpening
-from lw_torchrl.transforms import JitterTarget as JitterTarget
 from lw_torchrl.transforms import QAFTransform as QAFTransform
 from lw_torchrl.transforms import RandomYaw as RandomYaw
-from lw_torchrl.transforms import SwapUnmentioned as SwapUnmentioned
 
 __version__: str
 __all__: list[str]

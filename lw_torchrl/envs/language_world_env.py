@@ -228,7 +228,7 @@ class LanguageWorldEnv(EnvBase):
         active = row_mask(tensordict, "_step", len(self.row_tasks))
         if (active & self._rows.over).any():
             rows = np.flatnonzero(active & self._rows.over)[:5].tolist()
-            what = "have ended or were never reset, or not since close() or load_state_dict()"
+            what = "have ended or were never reset, or not since close or load_state_dict"
             raise RuntimeError(f"rows {rows} {what}: reset them before the next step")
         stepped = active
         if math.isnan(action.sum()):  # of numbers in [-1, 1], so one of them is NaN

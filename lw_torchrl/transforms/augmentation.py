@@ -113,7 +113,7 @@ class SwapUnmentioned(PlanAugmentation):
         >>> reach = torch.full((2,), lw.task_id("reach"))
         >>> rows = TensorDict(observation=torch.rand(2, 39), task_id=reach, batch_size=[2])
         >>> rows = lw.QAFTransform(plans)(rows)
-        >>> swapped = lw.SwapUnmentioned(plans, 1.0)(rows)["observation"]
+        >>> swapped = lw.transforms.SwapUnmentioned(plans, 1.0)(rows)["observation"]
         >>> torch.equal(swapped[:, :4], rows["observation"][:, :4])  # the hand stays
         True
 
@@ -190,7 +190,7 @@ class HideOpening(PlanAugmentation):
         >>> import torch, lw_torchrl as lw
         >>> from tensordict import TensorDict
         >>> rows = TensorDict(observation=torch.rand(8, 39), batch_size=[8])
-        >>> torch.isin(lw.HideOpening(1.0)(rows)["observation"][:, 3], rows["observation"][:, 3]).all()
+        >>> torch.isin(lw.transforms.HideOpening(1.0)(rows)["observation"][:, 3], rows["observation"][:, 3]).all()
         tensor(True)
     """
 
@@ -251,7 +251,7 @@ class JitterTarget(PlanAugmentation):
         >>> plans = lw.canonical_plans(lw.load_plans("MT10"))
         >>> reach = torch.full((2,), lw.task_id("reach"))
         >>> rows = TensorDict(observation=torch.rand(2, 39), task_id=reach, batch_size=[2])
-        >>> lw.JitterTarget(plans, 0.03)(lw.QAFTransform(plans)(rows))["target_offset"].shape
+        >>> lw.transforms.JitterTarget(plans, 0.03)(lw.QAFTransform(plans)(rows))["target_offset"].shape
         torch.Size([2, 3])
     """
 

@@ -137,7 +137,7 @@ def test_a_closed_environment_must_be_reset_and_continues_with_the_next_episodes
     env.close()
     env.close()
     assert env.is_closed
-    with pytest.raises(RuntimeError, match=r"rows \[0, 1\] have ended .* or not since close\(\)"):
+    with pytest.raises(RuntimeError, match=r"rows \[0, 1\] have ended .* or not since close "):
         env.step(state.set("action", action))
     other.reset()
     found, expected = (

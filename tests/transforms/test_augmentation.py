@@ -89,7 +89,7 @@ def test_only_the_unmentioned_moves_and_only_to_where_it_is_in_another_row(numbe
     if soft:
         was["qaf"] = was["qaf"].float() * 0.9 + 0.05
     before = was.clone()
-    now = seeded(lw.SwapUnmentioned(PUSH, probability), was, seed)
+    now = seeded(lw.transforms.SwapUnmentioned(PUSH, probability), was, seed)
     assert (was == before).all()
     true = was["qaf"] > 0.5
     active = true | ~true.any(-1, keepdim=True)  # attention is uniform where no condition is true
@@ -107,12 +107,12 @@ def test_only_the_unmentioned_moves_and_only_to_where_it_is_in_another_row(numbe
 def test_the_probability_is_that_of_each_swap():
     was = rows(4000, step=0)
     was["observation"] = torch.arange(4000.0)[:, None].expand(-1, 39).clone()
-    moved = seeded(lw.SwapUnmentioned(PUSH, 0.3), was)["observation"] != was["observation"]
+    moved = seeded(lw.transforms.SwapUnmentioned(PUSH, 0.3), was)["observation"] != was["observation"]
     assert moved[:, 36].float().mean().item() == pytest.approx(0.3, abs=0.03)
     assert torch.equal(moved[:, 11], moved[:, 35])
     assert not torch.equal(moved[:, 11], moved[:, 36])
     assert not moved[:, 4].any()
-    shaped = seeded(lw.SwapUnmentioned(PUSH, 0.3), was.reshape(40, 100))["observation"]
+    shaped = seeded(lw.transforms.SwapUnmentioned(PUSH, 0.3), was.reshape(40, 100))["observation"]
     assert shaped.shape == (40, 100, 39)
     assert torch.equal(shaped.reshape(-1, 39) != was["observation"], moved)
 
@@ -120,11 +120,11 @@ def test_the_probability_is_that_of_each_swap():
 def test_the_next_observation_is_swapped_alike_and_keeps_what_either_mentions():
     was = rows(64, step=0)
     was["next"] = TensorDict(observation=was["observation"] + 100, batch_size=[64])
-    now = seeded(lw.SwapUnmentioned(PUSH, 1.0), was)
+    now = seeded(lw.transforms.SwapUnmentioned(PUSH, 1.0), was)
     assert torch.equal(now["next", "observation"], now["observation"] + 100)
     assert not torch.equal(now["observation"][:, 36:], was["observation"][:, 36:])
     was["next", "qaf"] = rows(64, step=1)["qaf"]
-    now = seeded(lw.SwapUnmentioned(PUSH, 1.0), was)
+    now = seeded(lw.transforms.SwapUnmentioned(PUSH, 1.0), was)
     assert torch.equal(now["observation"][:, 36:], was["observation"][:, 36:])
     assert torch.equal(now["next", "observation"], now["observation"] + 100)
 
@@ -132,7 +132,7 @@ def test_the_next_observation_is_swapped_alike_and_keeps_what_either_mentions():
 def test_fallback_steps_mention_nothing_in_the_plans_own_turn():
     plan = next(plan for plan in CANONICAL.values() if plan.steps[-1].role.fallback)
     own = sum(not step.role.fallback for step in plan.steps)
-    transform = lw.SwapUnmentioned(CANONICAL, 1.0)
+    transform = lw.transforms.SwapUnmentioned(CANONICAL, 1.0)
     was = rows(task=plan.task, plans=CANONICAL, step=own)
     active, _ = transform.active(was, ["qaf", "task_id"])
     assert active[:, :own].all(), "without a true condition in its turn, attention is uniform"
@@ -144,7 +144,7 @@ def test_fallback_steps_mention_nothing_in_the_plans_own_turn():
 
 def test_the_opening_is_that_of_another_row():
     was = rows(2000)
-    now = seeded(lw.HideOpening(0.3), was.exclude("qaf", "task_id"))["observation"]
+    now = seeded(lw.transforms.HideOpening(0.3), was.exclude("qaf", "task_id"))["observation"]
     others = [column for column in range(39) if column != OPENING]
     assert torch.equal(now[:, others], was["observation"][:, others])
     assert torch.isin(now[:, OPENING], was["observation"][:, OPENING]).all()
@@ -162,7 +162,7 @@ def steps_with(verbs, plans=CANONICAL):
 
 
 def test_a_gripper_that_closes_or_holds_is_not_hidden():
-    transform = lw.HideOpening(1.0, plans=CANONICAL)
+    transform = lw.transforms.HideOpening(1.0, plans=CANONICAL)
     for verbs, hidden in ((("close", "carry"), False), (("approach", "push"), True)):
         for task, step in steps_with(verbs):
             was = rows(64, plans=CANONICAL, task=task, step=step)
@@ -171,7 +171,7 @@ def test_a_gripper_that_closes_or_holds_is_not_hidden():
 
 
 def test_the_target_is_moved_where_something_is_pushed_or_pulled():
-    transform = lw.JitterTarget(CANONICAL, 0.03)
+    transform = lw.transforms.JitterTarget(CANONICAL, 0.03)
     for task, step in steps_with(("push", "pull")):
         offset = seeded(transform, rows(4000, plans=CANONICAL, task=task, step=step))["target_offset"]
         assert offset.dtype == torch.float32
@@ -187,9 +187,9 @@ def test_in_a_buffer_each_sample_is_drawn_anew_and_the_storage_is_left_alone():
         batch_size=64,
         transform=Compose(
             lw.QAFTransform(CANONICAL),
-            lw.SwapUnmentioned(CANONICAL, 1.0),
-            lw.HideOpening(1.0),
-            lw.JitterTarget(CANONICAL, 0.03),
+            lw.transforms.SwapUnmentioned(CANONICAL, 1.0),
+            lw.transforms.HideOpening(1.0),
+            lw.transforms.JitterTarget(CANONICAL, 0.03),
         ),
     )
     was = rows(64).exclude("qaf")
@@ -204,17 +204,17 @@ def test_keys_have_other_names():
     was = rows(64, step=0)
     moved = TensorDict({("a", "seen"): was["observation"], ("a", "task"): was["task_id"], "truth": was["qaf"]}, [64])
     keys = [("a", "seen"), ("a", "task"), "truth"]
-    expected = seeded(lw.SwapUnmentioned(PUSH, 1.0), was)["observation"]
-    assert torch.equal(seeded(lw.SwapUnmentioned(PUSH, 1.0, in_keys=keys), moved)["a", "seen"], expected)
-    moved = seeded(lw.JitterTarget(PUSH_ROLES, 0.1, in_keys=keys[1:], out_keys=[("a", "offset")]), moved)
+    expected = seeded(lw.transforms.SwapUnmentioned(PUSH, 1.0), was)["observation"]
+    assert torch.equal(seeded(lw.transforms.SwapUnmentioned(PUSH, 1.0, in_keys=keys), moved)["a", "seen"], expected)
+    moved = seeded(lw.transforms.JitterTarget(PUSH_ROLES, 0.1, in_keys=keys[1:], out_keys=[("a", "offset")]), moved)
     assert moved["a", "offset"].shape == (64, 3)
 
 
 PUSH_ROLES = Plans([ConditionalPlan("push", CANONICAL["push"].steps[:2])])
 MAKERS = {
-    "SwapUnmentioned": lambda: lw.SwapUnmentioned(CANONICAL, 0.5),
-    "HideOpening": lambda: lw.HideOpening(0.5, plans=CANONICAL),
-    "JitterTarget": lambda: lw.JitterTarget(CANONICAL, 0.03),
+    "SwapUnmentioned": lambda: lw.transforms.SwapUnmentioned(CANONICAL, 0.5),
+    "HideOpening": lambda: lw.transforms.HideOpening(0.5, plans=CANONICAL),
+    "JitterTarget": lambda: lw.transforms.JitterTarget(CANONICAL, 0.03),
 }
 
 
@@ -233,9 +233,9 @@ def test_answers_of_longer_plans_are_cut_if_they_are_for_the_same_plan(name):
     transform = MAKERS[name]()
     task = min(CANONICAL, key=lambda task: len(CANONICAL[task].steps))
     transform = {
-        "SwapUnmentioned": lambda plans: lw.SwapUnmentioned(plans, 0.5),
-        "HideOpening": lambda plans: lw.HideOpening(0.5, plans=plans),
-        "JitterTarget": lambda plans: lw.JitterTarget(plans, 0.03),
+        "SwapUnmentioned": lambda plans: lw.transforms.SwapUnmentioned(plans, 0.5),
+        "HideOpening": lambda plans: lw.transforms.HideOpening(0.5, plans=plans),
+        "JitterTarget": lambda plans: lw.transforms.JitterTarget(plans, 0.03),
     }[name](Plans([CANONICAL[task]]))
     was = lw.QAFTransform(CANONICAL)(rows(task=task).exclude("qaf"))
     now, expected = seeded(transform, was), seeded(MAKERS[name](), was)
@@ -257,11 +257,11 @@ def test_missing_keys_and_other_plans_are_named(name):
 
 def test_wrong_arguments_are_refused():
     with pytest.raises(ValueError, match=r"probability must be from 0 to 1, got 1\.5"):
-        lw.SwapUnmentioned(MT10, 1.5)
+        lw.transforms.SwapUnmentioned(MT10, 1.5)
     with pytest.raises(ValueError, match="probability must be finite and at least 0"):
-        lw.HideOpening(-0.1)
+        lw.transforms.HideOpening(-0.1)
     with pytest.raises(ValueError, match=r"plans must be those of lw.canonical_plans; step 0 of .* has no role"):
-        lw.JitterTarget(MT10, 0.1)
+        lw.transforms.JitterTarget(MT10, 0.1)
 
 
 @pytest.mark.slow
