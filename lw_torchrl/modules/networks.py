@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from tensordict.nn import TensorDictSequential
@@ -14,6 +14,14 @@ from torchrl.modules import MLP as TorchRLMLP
 from lw_torchrl._checks import check_int
 
 Module = TypeVar("Module", bound=nn.Module)
+
+
+def trunk_attributes(trunk: TensorDictSequential) -> dict[str, Any]:
+    """Return the ``plans``, ``tasks`` and ``layout`` of a trunk's first part that has them; plans may be None."""
+    part = next((part for part in trunk.module.values() if hasattr(part, "layout")), None)
+    if part is None:
+        raise ValueError("trunk must have a part with a layout: PlanAttention, SkillMixer, TaskLatent or features")
+    return {name: getattr(part, name, None) for name in ("plans", "tasks", "layout")}
 
 
 class MLP(TorchRLMLP):

@@ -20,7 +20,7 @@ from lw_torchrl.modules.attention import PlanAttention
 from lw_torchrl.modules.decoder import Decode, MLPDecoder
 from lw_torchrl.modules.features import ObservationFeatures
 from lw_torchrl.modules.mixer import SkillMixer
-from lw_torchrl.modules.networks import encoding_width, materialize
+from lw_torchrl.modules.networks import encoding_width, materialize, trunk_attributes
 from lw_torchrl.modules.stochastic import DistributionName, StochasticActor
 
 if TYPE_CHECKING:
@@ -76,14 +76,12 @@ class ConditionedActor(TensorDictSequential):
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("action",),
     ) -> None:
-        parts = dict(trunk.module.items())
-        known = [part.plans for part in parts.values() if hasattr(part, "plans")]
+        parts, about = dict(trunk.module.items()), trunk_attributes(trunk)
         self.__dict__["_out_names"] = as_keys("out_keys", out_keys, list(map(str, out_keys)))
-        self.__dict__["layout"] = getattr(known[0] if known else trunk, "layout", None)
         if decoder is None:
-            decoder = MLPDecoder(actions=4 if self.layout is None else self.layout.action_size)
+            decoder = MLPDecoder(actions=about["layout"].action_size)
         super().__init__(OrderedDict(**parts, decoder=self._as_decoder(decoder, trunk)))
-        self.plans = known[0] if known else None
+        self.plans, self.tasks, self.layout = about["plans"], about["tasks"], about["layout"]
         if in_keys is not None:
             self.in_keys = in_keys
 

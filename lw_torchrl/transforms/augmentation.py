@@ -18,7 +18,7 @@ from lw_torchrl.language.layout import METAWORLD, Layout, places
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.roles import StepRole
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.language.things import role_object
+from lw_torchrl.language.task_objects import role_object
 from lw_torchrl.language.value_checks import plain
 from lw_torchrl.transforms.qaf import answers_of, plan_number_key
 

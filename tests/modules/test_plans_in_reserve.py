@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 import lw_torchrl as lw
-from lw_torchrl.language.canonical import default_plan, read_canonical, with_reserve
+from lw_torchrl.language.canonical import read_canonical, with_reserve
 from lw_torchrl.transforms import FallbackTurns, QAFTransform
 
 MT10, MT50 = lw.load_plans("MT10"), lw.load_plans("MT50")
