@@ -4,24 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
-from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
 from torchrl.modules import MLP as TorchRLMLP
 
 from lw_torchrl._checks import check_int
 
 Module = TypeVar("Module", bound=nn.Module)
-
-
-def trunk_attributes(trunk: TensorDictSequential) -> dict[str, Any]:
-    """Return the ``plans``, ``tasks`` and ``layout`` of a trunk's first part that has them; plans may be None."""
-    part = next((part for part in trunk.module.values() if hasattr(part, "layout")), None)
-    if part is None:
-        raise ValueError("trunk must have a part with a layout: PlanAttention, SkillMixer, TaskLatent or features")
-    return {name: getattr(part, name, None) for name in ("plans", "tasks", "layout")}
 
 
 class MLP(TorchRLMLP):
@@ -55,13 +46,6 @@ def materialize(module: nn.Module, *inputs: Tensor) -> None:
     if any(isinstance(parameter, nn.parameter.UninitializedParameter) for parameter in module.parameters()):
         with evaluating(module):
             module(*inputs)
-
-
-def encoding_width(trunk: TensorDictSequential) -> int | None:
-    """Return D + F, how many numbers the trunk's latent and features are; None if its parts do not state it."""
-    latent, features = [*trunk.module.values()][-2:]
-    size, width = getattr(latent, "latent_size", None), getattr(features, "width", None)
-    return None if size is None or width is None else size + width
 
 
 @contextmanager

@@ -21,7 +21,8 @@ from lw_torchrl._checks import check_choice, checked
 from lw_torchrl._keys import key_beside
 from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
 from lw_torchrl.modules.features import Features
-from lw_torchrl.modules.networks import encoding_width, materialize, trunk_attributes
+from lw_torchrl.modules.networks import materialize
+from lw_torchrl.modules.sequence import encoding_width, trunk_attributes
 
 DistributionName = Literal["tanh_normal", "normal"]
 DISTRIBUTIONS: dict[str, Any] = {"tanh_normal": TanhNormal, "normal": IndependentNormal}
