@@ -1,0 +1,11 @@
+"""RerunLogger on a TorchRL environment that is not ours: a recording of a pendulum's tip."""
+
+import torch
+from torchrl.envs import PendulumEnv
+
+from lw_torchrl import RerunLogger
+
+rollout = PendulumEnv().rollout(20)
+tip = torch.stack((rollout["th"].sin(), torch.zeros(20), rollout["th"].cos()), -1)
+with RerunLogger("pendulum.rrd") as logger:
+    print(logger.log_episode(rollout, task="swing", objects={"tip": tip}))
