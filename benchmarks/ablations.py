@@ -12,6 +12,7 @@ from unittest.mock import patch
 
 import torch
 import tyro
+from lw_torchrl.modules.relative_positions import PlanRoles
 from torch import Tensor
 
 import lw_torchrl as lw
@@ -24,7 +25,6 @@ from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.task_objects import role_object
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.modules.relative_positions import PlanRoles
 
 Setting = Literal["few-shot", "zero-shot"]
 FULL: Mapping[str, Preset] = PRESETS["strong"]

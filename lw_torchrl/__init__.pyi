@@ -48,7 +48,6 @@ from lw_torchrl.modules import DescriptorConditionedActor as DescriptorCondition
 from lw_torchrl.modules import PlanConditionedActor as PlanConditionedActor
 from lw_torchrl.modules import PlanConditionedQValue as PlanConditionedQValue
 from lw_torchrl.modules import PlanConditionedValue as PlanConditionedValue
-from lw_torchrl.modules import Policy as Policy
 from lw_torchrl.modules import QueryEvaluator as QueryEvaluator
 from lw_torchrl.modules import ScriptedSkillActor as ScriptedSkillActor
 from lw_torchrl.modules import StateQueryEvaluator as StateQueryEvaluator

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from lw_torchrl.modules.relative_positions import PlanRoles
 
 import lw_torchrl as lw
 from benchmarks import __main__ as cli
@@ -20,7 +21,6 @@ from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, und
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
 from lw_torchrl.language.canonical_steps import read_canonical
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.modules.relative_positions import PlanRoles
 
 ROOT = Path(__file__).parent.parent
 

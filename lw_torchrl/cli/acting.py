@@ -12,8 +12,10 @@ from tyro.conf import arg
 
 import lw_torchrl as lw
 from lw_torchrl.cli import options
+from lw_torchrl.language.canonical import canonical_like
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import Task
+from lw_torchrl.modules.policy import layout_of, plans_of, with_plans
 
 
 @dataclass(kw_only=True)
@@ -64,18 +66,15 @@ class Acting:
         policy, plans = self._policy(who, tasks)
         if self.evaluator is None:
             return policy, plans, None
-        if getattr(policy, "plans", None) is None:
+        if plans_of(policy) is None:
             raise ValueError(f"--evaluator requires a policy with plans; {who} has none")
         evaluator = read_evaluator(self.evaluator, policy.plans, self.text_encoder)
-        try:
-            return policy.with_evaluator(evaluator), plans, None
-        except (AttributeError, TypeError, ValueError):  # a custom policy, or one that also reads exact truth
-            return policy, plans, evaluator
+        return policy, plans, evaluator
 
     def _policy(self, who: str, tasks: list[str]) -> tuple[Any, Plans | None]:
         from lw_torchrl.data.behaviours import BEHAVIOURS, SegmentActor, behaviour_of
         from lw_torchrl.data.missing_episodes import suite_expert
-        from lw_torchrl.modules.composed_actors import TransferredActor
+        from lw_torchrl.modules.wrappers import TransferredActor
         from lw_torchrl.suites.suite import find_suite
         from lw_torchrl.training.checkpoint import demonstration_seeds
 
@@ -96,18 +95,22 @@ class Acting:
             return SegmentActor(behaviour, shown, self.seed, self.max_steps or suite.max_steps, skills=skills), shown
         if is_object(who):
             policy = read_object(who)
-            policy = policy if plans is None else policy.with_plans(plans)
-            return policy, getattr(policy, "plans", None)
+            policy = policy if plans is None else _with_plans(policy, plans)
+            return policy, plans_of(policy)
         if self.seed in demonstration_seeds(who):
             raise ValueError(f"--seed {self.seed} is the seed of the demonstrations; evaluate on a different one")
         policy = lw.load_actor(who, text_encoder=options.read_encoder(self.text_encoder))
-        if suite is not None and policy.layout != suite.layout:
+        if suite is not None and layout_of(policy) != suite.layout:
             if (plans := plans or suite.plans) is None:
                 raise ValueError(f"suite {suite.name!r} has no plans; give some by --plans")
-            policy = TransferredActor(policy, plans, speed=self.speed)
+            policy = TransferredActor(policy, canonical_like(plans, plans_of(policy)), speed=self.speed)
         elif plans is not None:
-            policy = policy.with_plans(plans)
-        return policy, getattr(policy, "plans", None)
+            policy = _with_plans(policy, plans)
+        return policy, plans_of(policy)
+
+
+def _with_plans(policy: Any, plans: Plans) -> Any:
+    return with_plans(policy, canonical_like(plans, plans_of(policy)))
 
 
 def is_object(who: str) -> bool:
@@ -131,11 +134,11 @@ def policy_name(who: str) -> str:
 def read_evaluator(name: str, plans: Plans, text_encoder: str | None = None) -> lw.QueryEvaluator:
     """Return an evaluator for ``plans``: from a file or "my_module:evaluator", or a new one of a registered class."""
     encoder = options.read_encoder(text_encoder)
-    if Path(name).exists() or not (":" in name or name in lw.modules.EVALUATORS):
+    if Path(name).exists() or not (":" in name or name == "StateQueryEvaluator"):
         return lw.training.load_evaluator(name, plans, text_encoder=encoder)
-    found: Any = options.import_object("--evaluator", name) if ":" in name else lw.modules.EVALUATORS[name]
+    found: Any = options.import_object("--evaluator", name) if ":" in name else lw.StateQueryEvaluator
     if isinstance(found, lw.QueryEvaluator):
         return found.with_plans(plans)
     if not (isinstance(found, type) and issubclass(found, lw.QueryEvaluator)):
         raise ValueError(f"--evaluator {name} must be a lw.QueryEvaluator or a class of them, got {found!r:.80}")
-    return found.from_options(plans, {}, encoder)
+    return found(plans)

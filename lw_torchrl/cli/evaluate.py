@@ -108,13 +108,13 @@ def _default_tasks(policy: Any, demonstrated: set[str], suite: lw.suites.Suite |
     """Return the policy's demonstrated tasks, or all its tasks if none is recorded, that a suite simulates."""
     from lw_torchrl.suites.suite import known_suite
 
-    if not isinstance(policy, lw.Policy):
-        raise ValueError("--tasks is required: the policy is not a lw.Policy, which knows its tasks")
-    chosen = [task for task in policy.tasks if task in demonstrated] or list(policy.tasks)
+    if (known := lw.modules.tasks_of(policy)) is None:
+        raise ValueError("--tasks is required: the policy does not state its tasks")
+    chosen = [task for task in known if task in demonstrated] or list(known)
     tasks = [task for task in chosen if (known_suite(task) if suite is None else task in suite.tasks)]
     if not tasks:
         mend = "name others by --tasks, or the suite that has them: --import my_module or --suite my_module:suite"
         raise ValueError(f"no simulator has the policy's tasks, {', '.join(chosen)}; {mend}")
-    if len(tasks) < len(policy.tasks):
-        print(f"evaluating {counted(len(tasks), 'task')} of the policy's {len(policy.tasks)}; choose others by --tasks")
+    if len(tasks) < len(known):
+        print(f"evaluating {counted(len(tasks), 'task')} of the policy's {len(known)}; choose others by --tasks")
     return tasks

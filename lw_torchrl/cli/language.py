@@ -111,7 +111,7 @@ class Ask:
         env: EnvBase = lw.LanguageWorldEnv(name, seed=self.seed)
         expert = suite_expert(suite, (name,)) if self.step else None
         if isinstance(expert, lw.ScriptedSkillActor):
-            env = TransformedEnv(env, expert.transform())
+            env = TransformedEnv(env, lw.modules.transform_of(expert))
         state = env.reset(episode=self.episode)
         if expert is not None:
             state = env.rollout(self.step, expert, auto_reset=False, tensordict=state)[:, -1]["next"]

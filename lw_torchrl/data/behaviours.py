@@ -20,7 +20,8 @@ from lw_torchrl._seeding import episode_generator
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import task_id
-from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.describe import describe
+from lw_torchrl.modules.policy import draws
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.suites.suite import Suite, load_suite
 
@@ -114,9 +115,9 @@ def behaviour_of(
             raise ValueError("behaviour must name the policy, behaviour='my-policy' for example")
         if not isinstance(policy, nn.Module):
             return Behaviour(name, "policy")
-        if isinstance(policy, Policy) and policy.draws:
-            draws = f"this {type(policy).__name__} draws in the order in which it is called"
-            raise ValueError(f"policy: {draws}, so its episodes would depend on num_envs and on interruptions")
+        if draws(policy):
+            order = f"this {type(policy).__name__} draws in the order in which it is called"
+            raise ValueError(f"policy: {order}, so its episodes would depend on num_envs and on interruptions")
         return Behaviour(name, "policy", fingerprint=policy_fingerprint(policy))
     if isinstance(policy, str):
         policy = BEHAVIOURS[check_choice("policy", policy, BEHAVIOURS)]
@@ -133,11 +134,15 @@ def behaviour_of(
 def policy_fingerprint(policy: nn.Module) -> str:
     """A digest of a policy's description, or any module's class, of its weights and text vectors, which show another
     text encoder."""
-    described = policy.describe() if isinstance(policy, Policy) else type(policy).__qualname__
+    try:
+        described: object = describe(policy)
+    except TypeError:  # a part that cannot be saved
+        described = type(policy).__qualname__
     digest = sha256(json.dumps(described, sort_keys=True).encode())
     # Their signs, since the scale that they are brought to may round otherwise elsewhere.
-    named = policy.named_buffers(remove_duplicate=False)
-    texts = {name: vectors.sign() for name, vectors in named if name.rpartition(".")[2] == "text_vectors"}
+    parts = policy.named_modules(remove_duplicate=False)
+    vectors = ((name, getattr(part, "text_vectors", None)) for name, part in parts)
+    texts = {name: found.sign() for name, found in vectors if found is not None}
     stated = {key: value for key, value in policy.state_dict().items() if isinstance(value, Tensor)}
     for key, value in sorted({**stated, **texts}.items()):
         digest.update(f"{key} {value.dtype} {tuple(value.shape)}".encode())
@@ -200,7 +205,7 @@ class SegmentActor(TensorDictModuleBase):
         other = self._held[rows, step]
         if self.script is None:
             return tensordict.set("action", other)
-        weights, actions = self.script.prepare(tensordict)
+        weights, actions = self.script.skill_weights(tensordict), self.script.skill_actions(tensordict)
         if self.behaviour.otherwise == "skill":
             other = actions[rows, self._skill[rows, step]]
         follows = self._right[rows, step].unsqueeze(-1)

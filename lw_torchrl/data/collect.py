@@ -24,7 +24,7 @@ from lw_torchrl.data.memory_map import describe_episode, verify, write_rows
 from lw_torchrl.data.missing_episodes import EpisodeFiles, run_missing_episodes
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.networks import evaluating
-from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.policy import tasks_of
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
 
@@ -128,7 +128,7 @@ def collect_demonstrations(
         root: the dataset's folder, new or left by an earlier call.
         suite: the :class:`~lw_torchrl.suites.Suite` of the tasks; None for the suite that their names begin with.
         policy: who acts in the whole dataset. A name in :data:`BEHAVIOURS`: "expert" (Meta-World's script),
-            "scripted", "spoilt-60", "spoilt-30", "wrong" or "random"; a :class:`Behaviour`; a trained :class:`Policy`,
+            "scripted", "spoilt-60", "spoilt-30", "wrong" or "random"; a :class:`Behaviour`; a trained policy,
             any TensorDictModule or a function, run as :func:`evaluate` runs it: it reads ``observation`` (N, 39)
             float32, ``task_id`` and ``episode`` (N,) int64, and ``qaf`` if it has ``plans``, and writes ``action``
             (N, 4) float32. Its action in a row must depend only on that row. A function is identified by its label
@@ -161,7 +161,8 @@ def collect_demonstrations(
     found_suite = find_suite(tasks, suite)
     names = tuple(found_suite.named_tasks(tasks))
     actor = None if isinstance(policy, (str, Behaviour)) else policy
-    if isinstance(actor, Policy) and (unknown := [task for task in names if task not in actor.tasks]):
+    known = tasks_of(actor) or names
+    if unknown := [task for task in names if task not in known]:
         raise ValueError(f"tasks must be among the policy's, it was not made for {', '.join(unknown)}")
     config = CollectConfig(
         tasks=names,

@@ -19,7 +19,7 @@ from lw_torchrl.data.memory_map import COLUMNS
 from lw_torchrl.envs.episodes import policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.modules.policy import Policy, plans_of, transform_of
+from lw_torchrl.modules.policy import plans_of, transform_of
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.suites.suite import Suite
 from lw_torchrl.transforms.qaf import QAFTransform
@@ -100,7 +100,7 @@ def _clipped(policy: _Actor, size: int) -> _Actor:
 def _env_and_actor(config: CollectConfig, policy: Any, env: LanguageWorldEnv) -> tuple[EnvBase, _Actor]:
     if config.policy.kind == "expert":
         expert = suite_expert(env.suite, config.tasks)
-        if not isinstance(expert, Policy):
+        if plans_of(expert) is None:
             return env, expert
         policy = expert
     if policy is None:

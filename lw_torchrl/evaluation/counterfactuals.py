@@ -16,8 +16,9 @@ from lw_torchrl.evaluation.explanation import EpisodeStates, Scripts, candidates
 from lw_torchrl.evaluation.failure_records import MendedEpisode
 from lw_torchrl.evaluation.repeating import EpisodeId, EpisodeRepeater, NullControl, Perception
 from lw_torchrl.evaluation.scripts_in_charge import WithScripts
+from lw_torchrl.language.canonical import canonical_like
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.modules.policy import plans_of
+from lw_torchrl.modules.policy import plans_of, with_plans
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.transforms.qaf import plan_program
 
@@ -88,7 +89,7 @@ class Counterfactuals:
             return
         reference = Plans(different)
         try:
-            other = actor.with_plans(reference)
+            other = with_plans(actor, canonical_like(reference, plans_of(actor)))
             reference = plans_of(other) or reference  # a policy may complete what it is given
             theirs = evaluator.with_plans(reference) if hasattr(evaluator, "with_plans") else evaluator
             self.other, self.other_evaluator, self.reference = other, theirs, reference

@@ -5,13 +5,13 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from lw_torchrl._checks import checked
 from lw_torchrl._files import AnyPath, replacing, write_text
 from lw_torchrl.evaluation.card import hub, policy_card
 from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.language.text import TextEncoder
-from lw_torchrl.modules.policy import Policy
 from lw_torchrl.training.checkpoint import load_actor, policy_file
 
 POLICY_FILE, CARD = "policy.safetensors", "README.md"
@@ -70,7 +70,7 @@ def push_to_hub(
 
 
 @checked
-def from_pretrained(source: AnyPath, *, revision: str | None = None, text_encoder: TextEncoder | None = None) -> Policy:
+def from_pretrained(source: AnyPath, *, revision: str | None = None, text_encoder: TextEncoder | None = None) -> Any:
     """Load a policy from a folder or from the Hugging Face Hub, in eval mode. Nothing in the file is executed.
 
     Args:

@@ -20,7 +20,7 @@ from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult
 from lw_torchrl.evaluation.running import ROWS, Acts, answered_by, make_env, running
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.tasks import Task, TaskList
-from lw_torchrl.modules.policy import Policy, plans_of
+from lw_torchrl.modules.policy import plans_of, tasks_of
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
 
@@ -36,7 +36,9 @@ def actor_plans(actor: Any, plans: AnyPlans | None) -> Plans | None:
     return own or given
 
 
-def tasks_of(tasks: TaskList, plans: Plans | None, suite: str | Suite | None = None) -> tuple[Suite, dict[str, Task]]:
+def named_tasks_of(
+    tasks: TaskList, plans: Plans | None, suite: str | Suite | None = None
+) -> tuple[Suite, dict[str, Task]]:
     """The suite, and the tasks by name; a name of the user's own stands for the task that its plan is for."""
     tasks = listed_tasks(tasks)
     found = find_suite(tasks, suite)
@@ -96,7 +98,7 @@ def evaluate(
 
     Args:
         actor: reads ``observation``, ``task_id`` and, if it has plans, ``qaf``; writes ``action`` (N, 4) float32.
-        tasks: as for :func:`resolve_tasks`; of a :class:`~lw_torchrl.Policy`, among its ``tasks``.
+        tasks: as for :func:`resolve_tasks`; of an actor that knows its tasks, among these.
         plans: whose queries to answer; None for the actor's own.
         episodes_per_task: k.
         seed: one that no demonstration was collected with.
@@ -134,11 +136,11 @@ def evaluate(
     Source: paper section 'Conditional Plan Experiments': 20 episodes, action noise 0.1.
     """
     answered = actor_plans(actor, plans)
-    found_suite, chosen = tasks_of(tasks, answered, suite)
+    found_suite, chosen = named_tasks_of(tasks, answered, suite)
     names = tuple(chosen)
     if answered is not None:
         answered.require(names)
-    known = getattr(actor, "tasks", names) if isinstance(actor, Policy) else names
+    known = tasks_of(actor) or names
     if other := ", ".join(task for task in names if task not in known):
         raise ValueError(f"tasks must be among the actor's, {', '.join(known)}; it was not made for: {other}")
     if attribute and answered is None:

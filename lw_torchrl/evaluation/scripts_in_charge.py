@@ -11,7 +11,7 @@ from lw_torchrl.evaluation.running import Acts
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.language.tasks import TASKS, task_id
-from lw_torchrl.modules.plan_encoder import IN_FORCE
+from lw_torchrl.modules.attention import ACTIVE_WEIGHT
 from lw_torchrl.suites.metaworld.experts import ExpertActor
 
 
@@ -76,4 +76,4 @@ class WithScripts(nn.Module):
         assert self._steps is not None
         which = zip(seen.get("task_id").tolist(), seen.get("episode").tolist(), strict=True)
         asked = torch.tensor([self._steps.get(one, -1) for one in which], device=weights.device)
-        return (weights.gather(-1, asked.clamp(min=0).unsqueeze(-1)).squeeze(-1) > IN_FORCE) & (asked >= 0)
+        return (weights.gather(-1, asked.clamp(min=0).unsqueeze(-1)).squeeze(-1) > ACTIVE_WEIGHT) & (asked >= 0)

@@ -24,8 +24,6 @@ from lw_torchrl.language.task_objects import (
 )
 from lw_torchrl.language.tasks import Task, get_task
 
-RULES = 2
-"""The version of the rules by which plans are read, which a policy's file keeps; raised when they change."""
 MIN_CONFIDENCE = 0.75
 """A plan of at least this confidence keeps its own conditions."""
 Source = Literal["plan", "completed", "fallback"]
@@ -373,3 +371,11 @@ def most_confident(plans: Iterable[ConditionalPlan]) -> ConditionalPlan:
     if not (listed := list(plans)):
         raise ValueError("plans must be at least one, got none")
     return max(listed, key=worth)
+
+
+def canonical_like(plans: Plans, reference: Plans | None) -> Plans:
+    """Return plans in the form of ``reference``: canonical, with or without fallback, if the reference is."""
+    if reference is None or not reference.has_roles or plans.has_roles:
+        return plans
+    roles = [step.role for plan in reference.values() for step in plan.steps]
+    return canonical_plans(plans, fallback=any(role is not None and role.fallback for role in roles))

@@ -1,27 +1,30 @@
-"""Policies as TensorDictModules: plan-conditioned ones, the baselines, and what they are made of."""
+"""Policies as TensorDict modules, in parts that can be used alone: attention, mixers, features, decoders, critics."""
 
 import lw_torchrl._torchrl  # noqa: F401
-from lw_torchrl.modules.composed_actors import ActorEnsemble, DemonstratedActor, TransferredActor
-from lw_torchrl.modules.conditioned_actor import ConditionedActor
-from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedValue, QValue, Value, plan_actor_value
-from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor, DescriptorEncoder
+from lw_torchrl.modules.attention import PlanAttention, attend
+from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedValue, QValue, Value
+from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
+from lw_torchrl.modules.describe import describe, from_description
+from lw_torchrl.modules.descriptor_conditioned_actor import DescriptorConditionedActor, TaskLatent, descriptor_trunk
+from lw_torchrl.modules.features import Concat, Features, ObservationFeatures
 from lw_torchrl.modules.image_query_evaluator import IMAGE_ENCODERS, ImageQueryEvaluator
-from lw_torchrl.modules.observation_features import ObservationFeatures
-from lw_torchrl.modules.plan_attention import PlanAttention
-from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
-from lw_torchrl.modules.plan_encoder import PlanEncoder
-from lw_torchrl.modules.policy import Encoder, Encoding, Policy
-from lw_torchrl.modules.query_evaluator import EVALUATORS, QueryEvaluator
-from lw_torchrl.modules.registry import ENCODERS, METHODS, POLICIES, Method, make_policy
-from lw_torchrl.modules.relative_positions import PlanFocus
+from lw_torchrl.modules.mixer import ActionMixer, SkillEncoder, SkillMixer
+from lw_torchrl.modules.plan_conditioned_actor import ConditionedActor, PlanConditionedActor, plan_trunk
+from lw_torchrl.modules.policy import layout_of, plans_of, tasks_of, transform_of, with_plans
+from lw_torchrl.modules.query_evaluator import QueryEvaluator
+from lw_torchrl.modules.registry import METHODS, make_policy
+from lw_torchrl.modules.relative_features import FocusFeatures, RoleFeatures
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
+from lw_torchrl.modules.stochastic import StochasticActor
+from lw_torchrl.modules.wrappers import ActorEnsemble, DecideGripper, DemonstratedActor, TransferredActor
 
 __all__ = [
-    "ENCODERS", "EVALUATORS", "IMAGE_ENCODERS", "METHODS", "POLICIES", "ActorEnsemble", "ConditionedActor",
-    "DemonstratedActor", "DescriptorConditionedActor", "DescriptorEncoder", "Encoder", "Encoding",
-    "ImageQueryEvaluator", "Method", "ObservationFeatures", "PlanAttention", "PlanConditionedActor",
-    "PlanConditionedQValue", "PlanConditionedValue", "PlanEncoder", "PlanFocus", "Policy", "QValue", "QueryEvaluator",
-    "ScriptedSkillActor", "StateQueryEvaluator", "TransferredActor", "Value", "make_policy",
-    "plan_actor_value",
+    "IMAGE_ENCODERS", "METHODS", "ActionMixer", "ActorEnsemble", "Concat", "ConditionedActor", "DecideGripper",
+    "Decode", "DemonstratedActor", "DescriptorConditionedActor", "Features", "FocusFeatures", "GaussianDecoder",
+    "ImageQueryEvaluator", "MLPDecoder", "ObservationFeatures", "PlanAttention", "PlanConditionedActor",
+    "PlanConditionedQValue", "PlanConditionedValue", "QValue", "QueryEvaluator", "RoleFeatures", "ScriptedSkillActor",
+    "SkillEncoder", "SkillMixer", "StateQueryEvaluator", "StochasticActor", "TaskLatent", "TransferredActor", "Value",
+    "attend", "describe", "descriptor_trunk", "from_description", "layout_of", "make_policy", "plan_trunk", "plans_of",
+    "tasks_of", "transform_of", "with_plans",
 ]  # fmt: skip

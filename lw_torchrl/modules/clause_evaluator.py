@@ -1,4 +1,4 @@
-"""ClauseEvaluator: answers conditions by a network, clause by clause; and plans' clauses as tensors."""
+"""ClauseEvaluator: a network that answers conditions clause by clause, and clauses as tensors."""
 
 from __future__ import annotations
 
@@ -14,57 +14,56 @@ from lw_torchrl.language.queries import Clause
 from lw_torchrl.language.relations import PREDICATES, STATES
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.modules.query_evaluator import QueryEvaluator
+from lw_torchrl.modules.query_evaluator import Answers, QueryEvaluator
 
 _PADDING = -1e4  # as QueryProgram.logits has it
 
 
 class Clauses(NamedTuple):
-    """Clauses (...,), of whatever tasks. The tasks' table says where the objects stand, the answer does not: the
-    difference of a clause's two positions is ``observation[first] - observation[second] + shift``."""
+    """Clauses (...,) of any tasks. A clause compares two positions of an observation, whose difference is
+    ``observation[first] - observation[second] + shift``."""
 
-    first: Tensor  # (..., 3) int64, indices into the observation and the 0 behind it
+    first: Tensor  # (..., 3) int64, indices into the observation; one beyond its end stands for 0
     second: Tensor  # (..., 3) int64
     shift: Tensor  # (..., 3) float32, metres
-    predicate: Tensor  # (...) int64, its number in the list of predicates
+    predicate: Tensor  # (...) int64, an index into the list of predicates
     negated: Tensor  # (...) bool
-    subject: Tensor  # (...) int64, its name's number in the list of names
-    object: Tensor  # (...) int64, likewise; the number behind the last for none
-    # Of T tasks' plans alone, whose clauses (T, C) come once each:
+    subject: Tensor  # (...) int64, an index into the list of names
+    object: Tensor  # (...) int64, likewise; beyond the last for a clause without an object
+    # Only of the plans of T tasks, each of whose clauses (T, C) is listed once:
     parts: Tensor = torch.empty(0)  # (T, S, K) int64, which of its task's clauses make up each condition
-    mask: Tensor = torch.empty(0)  # (T, S, K) bool, the parts that there are
+    mask: Tensor = torch.empty(0)  # (T, S, K) bool, true where there is such a clause
 
     def pick(self, which: Tensor) -> Clauses:
-        """Of (G,) clauses those of these numbers, (...) int64."""
+        """Select from (G,) clauses by their indices, (...) int64."""
         return Clauses(*(table[which] for table in self[:7]))
-
-    def to(self, device: torch.device) -> Clauses:
-        return Clauses(*(table.to(device, non_blocking=True) for table in self))
 
 
 def conjunction(logits: Tensor, mask: Tensor) -> Tensor:
-    """The logit (...) of all of some statements, of logits (..., K) of size 30 at most, where ``mask`` (..., K) bool is
-    true; of none it is 30. Of independent statements the probabilities sigmoid(l) have the product p, whose logit
-    log(p / (1 - p)) is -log(expm1(sum(softplus(-l)))): of several sure ones nearly the least."""
+    """Return the logit (...) that all statements with logits (..., K) hold, where ``mask`` (..., K) bool is true.
+
+    The statements are taken as independent, so their probabilities sigmoid(l) multiply to p, and the logit of p is
+    -log(expm1(sum(softplus(-l)))). Logits are at most 30 in size; without any statement the result is 30.
+    """
     doubt = torch.where(mask, nn.functional.softplus(-logits), 0.0).sum(-1).clamp(min=1e-13)
     return -(doubt + torch.log(-torch.expm1(-doubt)))
 
 
 class ClauseEvaluator(QueryEvaluator):
-    """Answers conditions by a network that was trained on the query answering function's answers, and never asks it.
+    """Answers conditions by a network that was trained on the answers of the query answering function.
 
-    Reads what is seen of a state and ``task_id`` (B,) int64; writes ``qaf_logits`` (B, S) float32, positive where a
-    condition of the row's plan holds, -1e4 beyond its last step. A condition's clauses are answered one by one, and put
-    together as :func:`conjunction` says. A subclass gives ``network``, from what is seen of B states and their clauses
-    (B, C) to logits (B, C), and in ``seen_dims`` how many dimensions a state has.
+    Reads its view of a state and ``task_id`` (B,) int64; writes ``qaf`` and ``qaf_logits`` as :class:`QueryEvaluator`
+    does, -1e4 beyond a plan's last step. A condition's clauses are answered one by one and combined by
+    :func:`conjunction`. A subclass sets ``network``, which maps views of B states and their clauses (B, C) to logits
+    (B, C), and ``seen_dims``, the number of dimensions of a view.
 
     Args:
-        plans: whose conditions it answers.
-        predicates, names: the relations and predicates, and the things, that it can tell; None for all predicates, and
-            for no names where things are not told apart by name.
+        plans, answers: as for :class:`QueryEvaluator`.
+        predicates: the relations and predicates that it can answer; None for all.
+        names: the objects that it can tell apart; None if it does not tell them apart by name.
 
     Raises:
-        ValueError: a plan asks for what it cannot tell; at call time, another shape, or a task_id without a plan.
+        ValueError: a plan uses another predicate or object; at call time, a wrong shape, or a task_id without a plan.
 
     Source: paper section 'Differentiability and Optimization', which names a visual question answering model.
     """
@@ -73,22 +72,27 @@ class ClauseEvaluator(QueryEvaluator):
     seen_dims: ClassVar[int] = 1
 
     def __init__(
-        self, plans: Plans, *, predicates: Sequence[str] | None = None, names: Sequence[str] | None = None
+        self,
+        plans: Plans,
+        *,
+        answers: Answers = "soft",
+        predicates: Sequence[str] | None = None,
+        names: Sequence[str] | None = None,
     ) -> None:
-        super().__init__(plans)
+        super().__init__(plans, answers=answers)
         self.predicates = _different("predicates", sorted(PREDICATES) if predicates is None else predicates)
         self.names = () if names is None else _different("names", names)
-        self.config = {"predicates": list(self.predicates)}
+        self.config |= {"predicates": list(self.predicates)}
         index = TaskIndex(plans.task_ids)
         tables = _plan_clauses(plans, index.tasks, self.predicates, self.names)
         self.tables: TaskTables[Clauses] = TaskTables(index, tables, f"tasks without a plan in {plans!r}")
 
     def check_seen(self, seen: Tensor) -> None:
-        """Raise :class:`ValueError` unless it is what the network was made for."""
+        """Raise :class:`ValueError` unless the view has the shape and dtype that the network reads."""
         raise NotImplementedError(f"{type(self).__name__} must override check_seen")
 
     def logits(self, *read: Tensor) -> Tensor:
-        """What is seen (..., ...) and task_id (...) int64 to (..., S) float32."""
+        """Return (..., S) float32 from views (..., ...) and task_id (...) int64."""
         seen, task_id = read
         self.check_seen(seen)
         shape = seen.shape[: -self.seen_dims]
@@ -99,11 +103,11 @@ class ClauseEvaluator(QueryEvaluator):
         tables = self.tables.select(task_id.reshape(-1), rows)
         clauses = self.network(rows, tables)
         parts = clauses.gather(-1, tables.parts.flatten(1)).reshape(tables.parts.shape)
-        found = torch.where(tables.mask.any(-1), conjunction(parts, tables.mask), _PADDING)
-        return found.reshape(*task_id.shape, self.plans.num_steps)
+        logits = torch.where(tables.mask.any(-1), conjunction(parts, tables.mask), _PADDING)
+        return logits.reshape(*task_id.shape, self.plans.num_steps)
 
     def code(self, clauses: Sequence[tuple[Task, Clause]]) -> Clauses:
-        """Return any clauses of tasks as tensors, (G,), for the network."""
+        """Return clauses (G,) of any tasks as tensors for the network."""
         return _as_tensors(clauses, self.predicates, self.names)
 
 
@@ -114,41 +118,40 @@ def _different(argument: str, given: Sequence[str]) -> tuple[str, ...]:
 
 
 def _position(task: Task, name: str) -> tuple[list[int], list[float]]:
-    """Where in an observation an object's three numbers stand, and what is added to them."""
-    found = task.object(name)
-    nothing = task.layout.size  # the index of a 0 that stands behind an observation's numbers
-    index = [at if isinstance(at, int) else nothing for at in found.position]
-    fixed = [0.0 if isinstance(at, int) else at for at in found.position]
-    return index, [one + offset for one, offset in zip(fixed, found.offset, strict=True)]
+    """Return the indices of an object's three coordinates in an observation, and what is added to them."""
+    thing = task.object(name)
+    index = [at if isinstance(at, int) else task.layout.size for at in thing.position]
+    fixed = [0.0 if isinstance(at, int) else at for at in thing.position]
+    return index, [value + offset for value, offset in zip(fixed, thing.offset, strict=True)]
 
 
 def _ends(clause: Clause, task: Task) -> tuple[list[int], list[int], list[float]]:
-    nothing = [task.layout.size] * 3
+    zeros = [task.layout.size] * 3
     if clause.predicate in STATES:
-        return [*nothing[:2], task.openings[clause.subject]], nothing, [0.0] * 3
+        return [*zeros[:2], task.openings[clause.subject]], zeros, [0.0] * 3
     first, shift = _position(task, clause.subject)
     if clause.object is None:
-        return first, nothing, shift
+        return first, zeros, shift
     second, other = _position(task, clause.object)
     return first, second, [a - b for a, b in zip(shift, other, strict=True)]
 
 
 def _as_tensors(clauses: Sequence[tuple[Task, Clause]], predicates: Sequence[str], names: Sequence[str]) -> Clauses:
-    """Return clauses of tasks as tensors, (G,); without ``names`` all things are number 0."""
-    predicate, place = ({name: at for at, name in enumerate(those)} for those in (predicates, names))
+    """Return clauses of tasks as tensors, (G,). Without ``names`` every object has index 0."""
+    predicate, place = ({name: at for at, name in enumerate(known)} for known in (predicates, names))
     for task, clause in clauses:
         if clause.predicate not in predicate:
             error = unknown_name(f"predicate of {str(clause)!r}, in {task.name}", clause.predicate, predicates)
-            raise ValueError(f"{error}; an evaluator answers what it was made for: make and train one that has it")
+            raise ValueError(f"{error}; make and train an evaluator that has this predicate")
         for thing in (clause.subject, clause.object):
             if names and thing is not None and thing not in place:
                 error = unknown_name(f"thing in {str(clause)!r}, in {task.name}", thing, names)
-                raise ValueError(f"{error}; an evaluator sees what it was made for: make and train one that has it")
-    ends = [_ends(clause, task) for task, clause in clauses]
+                raise ValueError(f"{error}; make and train an evaluator that has this object")
+    first, second, shift = zip(*(_ends(clause, task) for task, clause in clauses), strict=True)
     return Clauses(
-        first=torch.tensor([first for first, _, _ in ends]),
-        second=torch.tensor([second for _, second, _ in ends]),
-        shift=torch.tensor([shift for _, _, shift in ends], dtype=torch.float32),
+        first=torch.tensor(first),
+        second=torch.tensor(second),
+        shift=torch.tensor(shift, dtype=torch.float32),
         predicate=torch.tensor([predicate[clause.predicate] for _, clause in clauses]),
         negated=torch.tensor([clause.negated for _, clause in clauses]),
         subject=torch.tensor([place.get(clause.subject, 0) for _, clause in clauses]),
@@ -156,24 +159,24 @@ def _as_tensors(clauses: Sequence[tuple[Task, Clause]], predicates: Sequence[str
     )
 
 
-def _of(plan: ConditionalPlan) -> list[Clause]:
+def _clauses_of(plan: ConditionalPlan) -> list[Clause]:
     return list(dict.fromkeys(clause for step in plan.steps for clause in step.condition.clauses))
 
 
 def _plan_clauses(plans: Plans, tasks: Sequence[str], predicates: Sequence[str], names: Sequence[str]) -> Clauses:
-    """The clauses of plans as tensors, with a row for each of ``tasks``; errors as of :func:`_as_tensors`."""
-    listed = [_of(plans[task]) for task in tasks]
-    flat = [(plans[task].definition, clause) for task, found in zip(tasks, listed, strict=True) for clause in found]
+    """Return the clauses of plans as tensors, with a row for each of ``tasks``; errors as of :func:`_as_tensors`."""
+    listed = [_clauses_of(plans[task]) for task in tasks]
+    flat = [(plans[task].definition, clause) for task, own in zip(tasks, listed, strict=True) for clause in own]
     width = max(len({*step.condition.clauses}) for task in tasks for step in plans[task].steps)
     number = torch.zeros(len(tasks), max(map(len, listed)), dtype=torch.int64)
     parts = torch.zeros(len(tasks), plans.num_steps, width, dtype=torch.int64)
     mask = torch.zeros(len(tasks), plans.num_steps, width, dtype=torch.bool)
     start = 0
-    for row, (task, found) in enumerate(zip(tasks, listed, strict=True)):
-        number[row, : len(found)] = torch.arange(start, start + len(found))
-        start += len(found)
+    for row, (task, own) in enumerate(zip(tasks, listed, strict=True)):
+        number[row, : len(own)] = torch.arange(start, start + len(own))
+        start += len(own)
         for column, step in enumerate(plans[task].steps):
-            own = [found.index(clause) for clause in dict.fromkeys(step.condition.clauses)]
-            parts[row, column, : len(own)] = torch.tensor(own)
-            mask[row, column, : len(own)] = True
+            which = [own.index(clause) for clause in dict.fromkeys(step.condition.clauses)]
+            parts[row, column, : len(which)] = torch.tensor(which)
+            mask[row, column, : len(which)] = True
     return _as_tensors(flat, predicates, names).pick(number)._replace(parts=parts, mask=mask)

@@ -1,4 +1,4 @@
-"""Critics: the value of a state, or of an action in it, on the encoders that actors are built on."""
+"""Critics: the value of a state, or of an action in it, on the trunks of policies."""
 
 from __future__ import annotations
 
@@ -7,53 +7,50 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_int, checked, passes_on
 from lw_torchrl._keys import as_keys, check_apart, check_key, dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans
-from lw_torchrl.modules.networks import DistributionName, head
-from lw_torchrl.modules.plan_conditioned_actor import PlanConditionedActor
-from lw_torchrl.modules.plan_encoder import PlanEncoder
-from lw_torchrl.modules.policy import Encoder
-
-_OWN = ("ensemble", "width", "depth", "out_keys")  # options of a critic, not of its encoder
+from lw_torchrl.language.text import TextEncoder
+from lw_torchrl.modules.networks import MLP, encoding_width, materialize
+from lw_torchrl.modules.plan_conditioned_actor import plan_trunk
+from lw_torchrl.modules.policy import layout_of, plans_of
 
 
 class Value(TensorDictModuleBase):
-    """The value of a state, on any encoder.
+    """The value of a state: a trunk with a head for values.
 
-    Reads what the encoder reads; writes ``state_value`` (B, 1) float32, the least of the ensemble's, and, with an
-    ensemble of several, ``state_values`` (B, E) float32, each of them.
+    Reads what the trunk reads; writes ``state_value`` (B, 1) float32, the minimum of the ensemble, and with an ensemble
+    of several networks ``state_values`` (B, E) float32.
 
     Args:
-        encoder: what it is conditioned on; one that is an actor's too is trained by both.
-        ensemble: E, networks on the one encoder. TorchRL's losses copy the whole critic ``num_qvalue_nets`` times
+        trunk: the parts before the head, such as :func:`plan_trunk`'s, or ``actor.trunk``, which both then train. The
+            last two keys that it writes are a latent (B, D) and features (B, F).
+        ensemble: E, the number of heads on the trunk. TorchRL's losses copy the whole critic ``num_qvalue_nets`` times
             themselves, and draw the copies' weights anew.
-        width, depth: hidden layers, each followed by a LayerNorm; a tuple of widths says both.
-        out_keys: other names for what it writes, in the order above; nested ones too.
+        width, depth: hidden layers, each followed by a LayerNorm; a sequence of widths gives both.
+        out_keys: other names for what it writes; nested keys are allowed.
 
     Example:
-        >>> import lw_torchrl as lw, torch
-        >>> from lw_torchrl.modules import DescriptorEncoder, Value
+        >>> import torch, lw_torchrl as lw
+        >>> from lw_torchrl.modules import Value, descriptor_trunk
         >>> reach = torch.full((5,), lw.task_id("reach"))
-        >>> Value(DescriptorEncoder("MT10"))(observation=torch.rand(5, 39), task_id=reach).shape
+        >>> Value(descriptor_trunk("MT10"))(observation=torch.rand(5, 39), task_id=reach).shape
         torch.Size([5, 1])
 
     Source: ``torchrl.modules.ValueOperator``.
     """
 
     _written = ("state_value", "state_values")
-    _of_action = False  # whether it reads one
     _numbers = 1  # of a value
 
     @checked
     def __init__(
         self,
-        encoder: Encoder,
+        trunk: TensorDictSequential,
         *,
         ensemble: int = 1,
         width: int | Sequence[int] = 256,
@@ -61,59 +58,59 @@ class Value(TensorDictModuleBase):
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__()
-        self.encoder = encoder
-        self.plans, self.tasks = encoder.plans, encoder.tasks
-        self.in_keys: list[NestedKey] = list(encoder.in_keys)
+        self.trunk = trunk
+        self.plans, self.layout = plans_of(trunk), layout_of(trunk)
+        self.in_keys: list[NestedKey] = list(trunk.in_keys)
         self.out_keys = as_keys("out_keys", out_keys, self._written[: 1 if ensemble == 1 else 2])
         check_apart(self.in_keys, self.out_keys)
-        more = encoder.layout.action_size if self._of_action else 0
         self.heads = nn.ModuleList(
-            head(encoder.width + more, self._numbers, width, depth, layer_norm=True)
+            MLP(self._numbers, width=width, depth=depth, layer_norm=True)
             for _ in range(check_int("ensemble", ensemble, minimum=1))
         )
+        if (size := encoding_width(trunk)) is not None:
+            for head in self.heads:
+                materialize(head, torch.zeros(1, size + self._extra))
 
-    def transform(self) -> Transform | None:
-        return self.encoder.transform()
+    @property
+    def _extra(self) -> int:
+        """How many numbers the heads read besides latent and features."""
+        return 0
 
-    def fit_normalization(self, observation: Tensor, weights: Tensor | None = None) -> None:
-        """As :meth:`Policy.fit_normalization`."""
-        self.encoder.features.fit(observation, weights)
-
-    def _input(self, tensordict: TensorDictBase) -> Tensor:
-        return self.encoder.encode(*self.encoder.prepare(tensordict)).joined
+    def _inputs(self, tensordict: TensorDictBase) -> Tensor:
+        seen = self.trunk(tensordict.copy())
+        return torch.cat([seen.get(key) for key in self.trunk.out_keys[-2:]], -1)
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        seen = self._input(tensordict)
-        values = torch.cat([each(seen) for each in self.heads], -1)
+        inputs = self._inputs(tensordict)
+        values = torch.cat([head(inputs) for head in self.heads], -1)
         if self._numbers > 1:
             return write(tensordict, self, [values])
         return write(tensordict, self, [values.amin(-1, keepdim=True), values][: len(self.out_keys_source)])
 
 
 class QValue(Value):
-    """The value of an action in a state, on any encoder.
+    """The value of an action in a state: a trunk with a head that also reads the action.
 
-    Reads what the encoder reads and ``action`` (B, 4) float32; writes ``state_action_value`` (B, 1) float32, the least
-    of the ensemble's, and, with an ensemble of several, ``state_action_values`` (B, E) float32, each of them. With
+    Reads what the trunk reads and ``action`` (B, A) float32; writes ``state_action_value`` (B, 1) float32, the minimum
+    of the ensemble, and with an ensemble of several networks ``state_action_values`` (B, E) float32. With
     ``quantiles``, ``state_action_value`` is (B, Q) float32.
 
     Args:
-        encoder, ensemble, width, depth, out_keys: as for :class:`Value`.
-        action_key: where the action is; may be nested.
-        quantiles: Q, how many quantiles of the return are the value, for ``torchrl.objectives.TQCLoss``; 1: its mean.
+        trunk, ensemble, width, depth, out_keys: as for :class:`Value`.
+        action_key: the key of the action; nested keys are allowed.
+        quantiles: Q, the number of quantiles of the return, for ``torchrl.objectives.TQCLoss``; 1 for its mean.
 
     Source: ``torchrl.modules.ValueOperator``.
     """
 
     _written = ("state_action_value", "state_action_values")
-    _of_action = True
 
     @passes_on(Value.__init__)
     @checked
     def __init__(
         self,
-        encoder: Encoder,
+        trunk: TensorDictSequential,
         *,
         ensemble: int = 1,
         action_key: NestedKey = "action",
@@ -123,25 +120,30 @@ class QValue(Value):
         self._numbers = check_int("quantiles", quantiles, minimum=1)
         if quantiles > 1 and ensemble != 1:
             raise ValueError(f"ensemble must be 1 with quantiles, got {ensemble}: TQCLoss makes several critics itself")
-        super().__init__(encoder, ensemble=ensemble, **options)
+        super().__init__(trunk, ensemble=ensemble, **options)
         check_key("action_key", action_key)
         self.action_key = action_key
         self.in_keys = [*self.in_keys, action_key]
         check_apart(self.in_keys, self.out_keys)
 
-    def _input(self, tensordict: TensorDictBase) -> Tensor:
+    @property
+    def _extra(self) -> int:
+        return self.layout.action_size
+
+    def _inputs(self, tensordict: TensorDictBase) -> Tensor:
         (action,) = read(tensordict, [self.action_key])
-        return torch.cat((super()._input(tensordict), action), -1)
+        seen = super()._inputs(tensordict)
+        return torch.cat((seen, action.to(seen.dtype)), -1)
 
 
 class PlanConditionedValue(Value):
-    """:class:`Value` on a :class:`PlanEncoder`.
+    """:class:`Value` on :func:`plan_trunk`.
 
-    Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool; writes as :class:`Value`.
+    Reads ``qaf`` (B, S) bool, ``task_id`` (B,) int64 and ``observation`` (B, 39) float32; writes as :class:`Value`.
 
     Args:
-        plans: a plan for each task that will be seen.
-        **options: of :class:`Value` and of :class:`PlanEncoder`; ``out_keys`` are the value's.
+        plans, skill_encoder, features, text_encoder: as for :class:`PlanConditionedActor`.
+        **options: of :class:`Value`.
 
     Example:
         >>> import lw_torchrl as lw
@@ -149,20 +151,28 @@ class PlanConditionedValue(Value):
         ['state_value']
     """
 
-    @passes_on(Value.__init__, PlanEncoder.__init__)
-    def __init__(self, plans: AnyPlans, **options: Any) -> None:
-        own = {name: options.pop(name) for name in _OWN if name in options}
-        super().__init__(PlanEncoder(plans, **options), **own)
+    @passes_on(Value.__init__)
+    def __init__(
+        self,
+        plans: AnyPlans,
+        *,
+        skill_encoder: nn.Module | None = None,
+        features: nn.Module | None = None,
+        text_encoder: TextEncoder | None = None,
+        **options: Any,
+    ) -> None:
+        trunk = plan_trunk(plans, skill_encoder=skill_encoder, features=features, text_encoder=text_encoder)
+        super().__init__(trunk, **options)
 
 
 class PlanConditionedQValue(QValue):
-    """:class:`QValue` on a :class:`PlanEncoder`.
+    """:class:`QValue` on :func:`plan_trunk`.
 
-    Reads what :class:`PlanConditionedValue` does, and ``action`` (B, 4) float32; writes as :class:`QValue`.
+    Reads what :class:`PlanConditionedValue` does, and ``action`` (B, A) float32; writes as :class:`QValue`.
 
     Args:
-        plans: a plan for each task that will be seen.
-        **options: of :class:`QValue` and of :class:`PlanEncoder`; ``out_keys`` are the value's.
+        plans, skill_encoder, features, text_encoder: as for :class:`PlanConditionedActor`.
+        **options: of :class:`QValue`.
 
     Example:
         >>> import lw_torchrl as lw
@@ -171,36 +181,15 @@ class PlanConditionedQValue(QValue):
         >>> loss = TD3BCLoss(lw.PlanConditionedActor(plans), lw.PlanConditionedQValue(plans), bounds=(-1.0, 1.0))
     """
 
-    @passes_on(QValue.__init__, PlanEncoder.__init__)
-    def __init__(self, plans: AnyPlans, **options: Any) -> None:
-        own = {name: options.pop(name) for name in (*_OWN, "action_key", "quantiles") if name in options}
-        super().__init__(PlanEncoder(plans, **options), **own)
-
-
-@passes_on(PlanConditionedActor.__init__)
-@checked
-def plan_actor_value(
-    plans: AnyPlans,
-    *,
-    distribution: DistributionName = "tanh_normal",
-    **options: Any,
-) -> tuple[PlanConditionedActor, Value]:
-    """An actor and the value of its states on one shared encoder, as PPO and A2C take them.
-
-    Args:
-        plans: a plan for each task that will be seen.
-        distribution: the actor's.
-        **options: of :class:`PlanConditionedActor`.
-
-    Returns:
-        The actor, and the :class:`Value` on its encoder.
-
-    Example:
-        >>> import lw_torchrl as lw
-        >>> from torchrl.objectives import ClipPPOLoss
-        >>> loss = ClipPPOLoss(*lw.modules.plan_actor_value(lw.load_plans("MT10")))
-
-    Source: ``torchrl.modules.ActorValueOperator``.
-    """
-    actor = PlanConditionedActor(plans, distribution=distribution, **options)
-    return actor, Value(actor.encoder)
+    @passes_on(QValue.__init__)
+    def __init__(
+        self,
+        plans: AnyPlans,
+        *,
+        skill_encoder: nn.Module | None = None,
+        features: nn.Module | None = None,
+        text_encoder: TextEncoder | None = None,
+        **options: Any,
+    ) -> None:
+        trunk = plan_trunk(plans, skill_encoder=skill_encoder, features=features, text_encoder=text_encoder)
+        super().__init__(trunk, **options)

@@ -2,106 +2,108 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal, Self
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 
-from lw_torchrl._checks import checked, passes_on
-from lw_torchrl._keys import as_keys, check_apart
-from lw_torchrl.language.plans import Plans
-from lw_torchrl.language.task_index import TaskIndex
-from lw_torchrl.language.tasks import MT50, Task, named_tasks, one_layout, task_ids
+from lw_torchrl._checks import checked
+from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
+from lw_torchrl.language.task_index import TaskIndex, pick
+from lw_torchrl.language.tasks import MT50, Task, named_tasks, one_layout, task_id
 from lw_torchrl.language.text import TextEncoder, encoded
-from lw_torchrl.modules.conditioned_actor import ConditionedActor
-from lw_torchrl.modules.networks import text_to_latent, unit_scale
-from lw_torchrl.modules.observation_features import Features, ObservationFeatures
-from lw_torchrl.modules.policy import Encoder, Encoding, described_tasks
+from lw_torchrl.modules.features import ObservationFeatures
+from lw_torchrl.modules.mixer import SkillEncoder, unit_scale
+from lw_torchrl.modules.networks import evaluating, materialize
+from lw_torchrl.modules.plan_conditioned_actor import ConditionedActor
+
+Condition = Literal["description", "one-hot"]
 
 
-class DescriptorEncoder(Encoder):
-    """The latent of the task's description, or of its number, beside the observation's features.
+class TaskLatent(TensorDictModuleBase):
+    """Encode the task's description, or its number, to a latent.
 
-    Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``encoding`` (B, D + F) float32.
+    Reads ``task_id`` (B,) int64; writes ``task_latent`` (B, D) float32.
 
     Args:
-        tasks: those that it knows, as for :func:`resolve_tasks`; a :class:`Task` brings its own description.
-        condition: "description", the text's vector; "one-hot", one number for each task, which knows no words.
-        features, feature_noise, latent_size, encoder_width, encoder_depth, text_encoder, in_keys, out_keys: as for
-            :class:`PlanEncoder`; ``features`` other than "opening" and "none".
+        tasks: the tasks that it knows, as for :func:`resolve_tasks`; a :class:`Task` brings its own description.
+        condition: "description", the text's vector; "one-hot", one number for each task, without words.
+        encoder: any module from T task vectors (T, E) float32 to latents (T, D); None for :class:`SkillEncoder`.
+        text_encoder: a function from n texts to vectors (n, E) float32; None for the shipped sentence encoder.
+        in_keys, out_keys: other names for what it reads and writes; nested keys are allowed.
+
+    Raises:
+        ValueError: an unknown task; at call time, a task_id outside ``tasks``.
 
     Source: paper section 'Conditional Plan Experiments'.
     """
 
-    text_vectors: Tensor
+    vectors: Tensor
 
     @checked
     def __init__(
         self,
         tasks: str | Iterable[str | Task],
+        condition: Condition = "description",
+        encoder: nn.Module | None = None,
         *,
-        condition: Literal["description", "one-hot"] = "description",
-        features: Features = "differences",
-        feature_noise: float = 0.0,
-        latent_size: int = 64,
-        encoder_width: int = 128,
-        encoder_depth: int = 1,
         text_encoder: TextEncoder | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__()
-        if features in ("opening", "none"):
-            raise ValueError(
-                f"features={features!r} shows nothing of where things are; only plans with roles or focus do"
-            )
         self.definitions = named_tasks(tasks)
         self.tasks, self.layout = tuple(self.definitions), one_layout(self.definitions.values())
-        self.in_keys = as_keys("in_keys", in_keys, ("observation", "task_id"))
-        self.out_keys = as_keys("out_keys", out_keys, ("encoding",))
+        self.condition, self.text_encoder = condition, text_encoder
+        self.in_keys = as_keys("in_keys", in_keys, ("task_id",))
+        self.out_keys = as_keys("out_keys", out_keys, ("task_latent",))
         check_apart(self.in_keys, self.out_keys)
-        seen = dict(condition=condition, features=features, feature_noise=feature_noise)
-        texts = dict(latent_size=latent_size, encoder_width=encoder_width, encoder_depth=encoder_depth)
-        self.config: dict[str, Any] = {**seen, **texts, "in_keys": self.in_keys}
-        self.text_encoder = text_encoder
         own = (lambda texts: torch.eye(len(texts))) if text_encoder is None and condition == "one-hot" else text_encoder
-        found = encoded([task.description for task in self.definitions.values()], own)
-        self.index = TaskIndex(task_ids(self.tasks))
+        vectors = encoded([task.description for task in self.definitions.values()], own)
+        self.index = TaskIndex({task: task_id(task) for task in self.tasks})
         order = [self.tasks.index(task) for task in self.index.tasks]
-        # A product of another number of rows rounds differently: whatever the tasks, there are 50 or more.
-        fill = found.new_zeros(max(0, len(MT50) - len(order)), found.shape[1])
-        vectors = torch.cat((unit_scale(found)[order], fill))
-        self.register_buffer("text_vectors", vectors, persistent=False)
-        self.latent_size = latent_size
-        self.texts = text_to_latent(found.shape[1], latent_size, encoder_width, encoder_depth)
-        self.features = ObservationFeatures(features, feature_noise, self.layout)
+        # Products of different numbers of rows round differently: whatever the tasks, there are at least 50 rows.
+        fill = vectors.new_zeros(max(0, len(MT50) - len(order)), vectors.shape[1])
+        self.register_buffer("vectors", torch.cat((unit_scale(vectors)[order], fill)), persistent=False)
+        self.encoder = SkillEncoder() if encoder is None else encoder
+        materialize(self.encoder, self.vectors)
+        with torch.no_grad(), evaluating(self.encoder):
+            self.latent_size = self.encoder(self.vectors[:1]).shape[-1]
 
-    def definition(self, task: str) -> Task | None:
-        return self.definitions.get(task)
+    @property
+    def text_vectors(self) -> Tensor:
+        """The vectors of the descriptions, (T, E) float32."""
+        return self.vectors
 
-    def prepare(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
-        """Each task's row (B,) int64, and the observation's features (B, F)."""
-        observation, task_id = self.read(tensordict)
-        rows = self.index.rows(task_id, "tasks this actor was not made for")
-        return rows, self.features(observation)
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        made = {"tasks": list(self.definitions.values()), "condition": self.condition, "encoder": self.encoder}
+        return {**made, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
 
-    def encode(self, *prepared: Tensor) -> Encoding:
-        rows, seen = prepared
-        return Encoding(self.texts(self.text_vectors)[: len(self.tasks)][rows], seen)
+    @dispatched
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        (given,) = read(tensordict, self.in_keys)
+        rows = self.index.rows(given, "tasks this actor was not made for")
+        return write(tensordict, self, [pick(self.encoder(self.vectors)[: len(self.tasks)], rows)])
 
 
 class DescriptorConditionedActor(ConditionedActor):
-    """The description's latent and the observation give the action: the paper's descriptor conditioning (DC).
+    """The paper's descriptor conditioning (DC): the description's latent and the observation give the action.
 
-    Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``action`` (B, 4) float32 in (-1, 1);
-    with a distribution also ``loc`` and ``scale`` (B, 4) float32 and ``action_log_prob`` (B,) float32.
+    Its parts are ``latent``, :class:`TaskLatent`, then ``features`` and ``decoder`` as of
+    :class:`PlanConditionedActor`. Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes
+    ``task_latent`` (B, D), ``features`` (B, F) and ``action`` (B, 4) float32 in (-1, 1).
 
     Args:
-        tasks: the tasks it is to act in, see :class:`DescriptorEncoder`.
-        **options: of :class:`ConditionedActor` and of :class:`DescriptorEncoder`; ``out_keys`` are the actor's.
+        tasks, condition, text_encoder: as for :class:`TaskLatent`.
+        task_encoder: any module from task vectors (T, E) float32 to latents (T, D); None for :class:`SkillEncoder`.
+        features, decoder, in_keys, out_keys: as for :class:`PlanConditionedActor`.
 
     Raises:
         ValueError: an unknown task; at call time, a task_id outside ``tasks``.
@@ -114,17 +116,43 @@ class DescriptorConditionedActor(ConditionedActor):
     Source: paper section 'Conditional Plan Experiments'.
     """
 
-    encoder_class = DescriptorEncoder
-    encoder: DescriptorEncoder
+    @checked
+    def __init__(
+        self,
+        tasks: str | Iterable[str | Task],
+        *,
+        condition: Condition = "description",
+        task_encoder: nn.Module | None = None,
+        features: nn.Module | None = None,
+        decoder: nn.Module | None = None,
+        text_encoder: TextEncoder | None = None,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] = ("action",),
+    ) -> None:
+        known = named_tasks(tasks)
+        if features is None:
+            features = ObservationFeatures(noise=0.05, layout=one_layout(known.values()))
+        trunk = descriptor_trunk(
+            known.values(), condition=condition, task_encoder=task_encoder, features=features, text_encoder=text_encoder
+        )
+        super().__init__(trunk, decoder, in_keys=in_keys, out_keys=out_keys)
 
-    @passes_on(ConditionedActor.__init__, DescriptorEncoder.__init__)
-    def __init__(self, tasks: str | Iterable[str | Task], **options: Any) -> None:
-        super().__init__(tasks, **options)
 
-    @classmethod
-    def for_plans(cls, plans: Plans, *, text_encoder: TextEncoder | None = None, **options: Any) -> Self:
-        return cls([plan.definition for plan in plans.values()], text_encoder=text_encoder, **options)
+def descriptor_trunk(
+    tasks: str | Iterable[str | Task],
+    *,
+    condition: Condition = "description",
+    task_encoder: nn.Module | None = None,
+    features: nn.Module | None = None,
+    text_encoder: TextEncoder | None = None,
+) -> TensorDictSequential:
+    """Return the description's latent and the features, as :func:`plan_trunk` does for plans.
 
-    @classmethod
-    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> Self:
-        return cls(described_tasks(found), text_encoder=text_encoder, **found["options"])
+    The arguments are :class:`DescriptorConditionedActor`'s.
+    """
+    latent = TaskLatent(tasks, condition, task_encoder, text_encoder=text_encoder)
+    if features is None:
+        features = ObservationFeatures(layout=latent.layout)
+    elif not isinstance(features, TensorDictModuleBase):
+        features = TensorDictModule(features, in_keys=["observation"], out_keys=["features"])
+    return TensorDictSequential(OrderedDict(latent=latent, features=features))

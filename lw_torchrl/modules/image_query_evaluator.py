@@ -1,4 +1,4 @@
-"""ImageQueryEvaluator: a network that answers plans' conditions from cameras' pictures."""
+"""ImageQueryEvaluator: a network that answers plans' conditions from camera pictures."""
 
 from __future__ import annotations
 
@@ -14,18 +14,19 @@ from lw_torchrl._registry import Registry, is_function
 from lw_torchrl._rendering import check_cameras
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
-from lw_torchrl.modules.networks import head
+from lw_torchrl.modules.networks import MLP, materialize
+from lw_torchrl.modules.query_evaluator import Answers
 from lw_torchrl.modules.state_query_evaluator import ClauseNetwork
 from lw_torchrl.transforms.camera import CameraTransform
 
-KEYS = 32  # numbers by which a thing is found in a picture
-_KEPT = 16  # numbers of what is seen there that tell where it is
-_LANDMARKS = 32  # that are sought in a picture whatever is asked
-_SHARP = 30.0  # what scores count in the softmax over a picture's places: at 1 a fresh network looks everywhere at once
+KEYS = 32  # size of the vector by which an object is found in a picture
+_KEPT = 16  # features at that place which help to locate it
+_LANDMARKS = 32  # points that are found in every picture
+_SHARP = 30.0  # scale of the scores in the softmax over a picture: at 1 a fresh network attends to the whole picture
 
 
 class SmallImageEncoder(nn.Module):
-    """Pictures (n, 3, H, W) float32 in [0, 1] to features (n, 32, H/2, W/2): five convolutions, some at a quarter."""
+    """Five convolutions from pictures (n, 3, H, W) float32 in [0, 1] to features (n, 32, H/2, W/2)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -44,15 +45,17 @@ def _conv(before: int, after: int, stride: int = 1) -> nn.Sequential:
 
 
 class PointingNetwork(ClauseNetwork):
-    """Points at things in pictures, and judges clauses by where they are, as :class:`ClauseNetwork` does.
+    """Locates objects in pictures and judges clauses by their positions, as :class:`ClauseNetwork` does.
 
-    A thing's learned vector is compared with the features of every place in each camera's picture; the softmax over the
-    places is where it points. From the places' mean coordinates and features, and from the coordinates of some
-    landmarks, which are the same for all things, an MLP gives the thing's four numbers: its position in metres, and how
-    far it is open.
+    An object's learned vector is compared with the features at every place of each camera's picture; a softmax over the
+    places attends to one of them. From the mean coordinates and features there, and the coordinates of landmarks that
+    all objects share, an MLP estimates the object's position in metres and how far it is open.
 
-    ``encoder`` makes a map of ``features`` (n, F, h, w) of pictures (n, 3, H, W) float32 in [0, 1]; ``names`` is the
-    number of things; ``trunk`` is as of :class:`ClauseNetwork`.
+    Args:
+        encoder: maps pictures (n, 3, H, W) float32 in [0, 1] to ``features`` (n, F, h, w).
+        features: F.
+        cameras, names: the number of cameras and of objects.
+        **trunk: as for :class:`ClauseNetwork`.
 
     Source: the spatial softmax of 'Deep spatial autoencoders for visuomotor learning' (Finn et al., 2016).
     """
@@ -66,14 +69,15 @@ class PointingNetwork(ClauseNetwork):
         self.seen = nn.Conv2d(features, _KEPT, 1)
         self.landmarks = nn.Conv2d(features, _LANDMARKS, 1)
         self.names = nn.Embedding(names, KEYS)
-        self.place = head(cameras * (2 + _KEPT + 2 * _LANDMARKS) + KEYS, self.numbers, self.width, 2)
+        self.place = MLP(self.numbers, width=self.width, depth=2)
+        materialize(self.place, torch.zeros(1, cameras * (2 + _KEPT + 2 * _LANDMARKS) + KEYS))
 
     def forward(self, seen: Tensor, clauses: Clauses) -> Tensor:
-        """As :class:`ClauseNetwork`, of pictures (B, H, W·C, 3) uint8 side by side."""
-        return self.tell(self.places(seen, self.names.weight)[0], clauses)
+        """Return logits (B, Q) from pictures (B, H, W·C, 3) uint8 side by side and clauses (B, Q)."""
+        return self.judge_at(self.places(seen, self.names.weight)[0], clauses)
 
-    def tell(self, places: Tensor, clauses: Clauses) -> Tensor:
-        """The logits (B, Q) of clauses (B, Q) about named things at places (B, N, 4)."""
+    def judge_at(self, places: Tensor, clauses: Clauses) -> Tensor:
+        """Return logits (B, Q) of clauses (B, Q) about N objects at ``places`` (B, N, 4)."""
         known = torch.cat((places, torch.zeros_like(places[:, :1])), -2)
         first, second = (
             known.gather(-2, which.unsqueeze(-1).expand(*which.shape, self.numbers))
@@ -82,8 +86,12 @@ class PointingNetwork(ClauseNetwork):
         return self.judge(first - second, clauses)
 
     def places(self, seen: Tensor, things: Tensor) -> tuple[Tensor, Tensor]:
-        """Of pictures (B, H, W·C, 3) uint8 and things' vectors (N, 32) float32: positions in metres and how far they
-        are open, (B, N, 4) float32; where they are seen, (B, C, N, h, w) float32, which sums to 1 over each picture."""
+        """Locate objects with vectors (N, 32) float32 in pictures (B, H, W·C, 3) uint8.
+
+        Returns:
+            Positions in metres and how far each object is open, (B, N, 4) float32; and the attention over each picture,
+            (B, C, N, h, w) float32.
+        """
         rows = len(seen)
         pictures = seen.unflatten(-2, (self.cameras, -1)).permute(0, 2, 4, 1, 3).flatten(0, 1)
         features = self.encoder(pictures.to(torch.float32) / 255.0)
@@ -102,43 +110,39 @@ class PointingNetwork(ClauseNetwork):
 
 
 IMAGE_ENCODERS = Registry("image encoder", "lw_torchrl.image_encoders", {"small": SmallImageEncoder}, is_function)
-"""What makes an encoder of pictures, by name: a module from (n, 3, H, W) float32 in [0, 1] to a map of features
-(n, F, h, w). Put yours here, one that is frozen with ``requires_grad_(False)`` too, to have it in files."""
+"""Factories of picture encoders by name: modules from (n, 3, H, W) float32 in [0, 1] to features (n, F, h, w). Add your
+own, which may be frozen by ``requires_grad_(False)``, so that files can name it."""
 
 _LARGEST = 512
 
 
 class ImageQueryEvaluator(ClauseEvaluator):
-    """Answers conditions from pictures, by a network that was trained on the query answering function's answers.
+    """Answers conditions from pictures, by a network that was trained on exact answers.
 
     Reads ``pixels`` (B, height, width·C, 3) uint8, of C cameras side by side, and ``task_id`` (B,) int64; writes
-    ``qaf_logits`` (B, S) float32, positive where a condition of the row's plan holds, -1e4 beyond its last step. It
-    points at the things that a clause names, see :class:`PointingNetwork`. ``transform()`` is the
-    :class:`CameraTransform` that takes its pictures.
+    ``qaf`` and ``qaf_logits`` (B, S) float32 as :class:`QueryEvaluator` does. See :class:`PointingNetwork` for the
+    network. ``transform()`` returns the :class:`CameraTransform` that takes its pictures.
 
     Args:
-        plans, predicates: as for :class:`~lw_torchrl.modules.clause_evaluator.ClauseEvaluator`, whose errors and
-            source it has.
+        plans, answers, predicates: as for :class:`~lw_torchrl.modules.clause_evaluator.ClauseEvaluator`, with its
+            errors and source.
         cameras, height, width: as for :class:`CameraTransform`; at most 512 pixels.
         every: steps from one picture to the next when it acts; in between its answers stay.
         encoder: a name in :data:`IMAGE_ENCODERS`.
-        hidden, depth: hidden layers of what judges differences.
-        names: the things that it can tell; None for those of the plans' tasks.
+        hidden, depth: hidden layers of the network that judges differences.
+        names: the objects that it can tell apart; None for those of the plans' tasks.
 
     Example:
         >>> import lw_torchrl as lw
-        >>> plans = lw.load_plans("MT10")
-        >>> actor = lw.ScriptedSkillActor(plans, evaluator=lw.modules.ImageQueryEvaluator(plans))
-        >>> actor.in_keys
-        ['observation', 'task_id', 'pixels']
-        >>> actor.transform().shape
-        (64, 128, 3)
+        >>> evaluator = lw.modules.ImageQueryEvaluator(lw.load_plans("MT10"))
+        >>> evaluator.in_keys, evaluator.transform().shape
+        (['pixels', 'task_id'], (64, 128, 3))
     """
 
     network: PointingNetwork
     seen_dims = 3
     rows_at_once = 4
-    """So many rows are evaluated together when it acts, so that results do not depend on other rows."""
+    """Number of rows that are evaluated together when it acts, so that results do not depend on other rows."""
 
     @checked
     def __init__(
@@ -152,12 +156,13 @@ class ImageQueryEvaluator(ClauseEvaluator):
         encoder: str = "small",
         hidden: int = 128,
         depth: int = 3,
+        answers: Answers = "soft",
         predicates: Sequence[str] | None = None,
         names: Sequence[str] | None = None,
     ) -> None:
         if names is None:
             names = sorted({name for plan in plans.values() for name in plan.definition.object_names})
-        super().__init__(plans, predicates=predicates, names=names)
+        super().__init__(plans, answers=answers, predicates=predicates, names=names)
         self.cameras, self.every = check_cameras(cameras, height, width), check_int("every", every, minimum=1)
         if max(height, width) > _LARGEST:
             raise ValueError(f"height and width must be at most {_LARGEST} pixels, got {height} and {width}")
@@ -178,22 +183,27 @@ class ImageQueryEvaluator(ClauseEvaluator):
         self.config |= dict(hidden=hidden, depth=depth, names=list(self.names))
 
     def transform(self) -> CameraTransform:
-        """A new transform that takes its pictures."""
+        """Return a new transform that takes its pictures."""
         return CameraTransform(self.cameras, height=self.height, width=self.width, every=self.every)
 
     def check_seen(self, seen: Tensor) -> None:
         shape = (self.height, self.width * len(self.cameras), 3)
         if seen.shape[-3:] != shape or seen.dtype != torch.uint8:
-            wanted = f"uint8 of shape (..., {', '.join(map(str, shape))}), pictures by {', '.join(self.cameras)}"
+            expected = f"uint8 of shape (..., {', '.join(map(str, shape))}), pictures by {', '.join(self.cameras)}"
             got = f"{seen.dtype} of shape {tuple(seen.shape)}; evaluator.transform() takes them"
-            raise ValueError(f"pixels must be {wanted} side by side, got {got}")
+            raise ValueError(f"pixels must be {expected} side by side, got {got}")
 
 
 @torch.no_grad()
 def _num_features(encoder: nn.Module, name: str, height: int, width: int) -> int:
-    """F, of the map of features that an encoder gives for a picture of zeros."""
-    found = encoder(torch.zeros(1, 3, height, width))
-    if not isinstance(found, Tensor) or found.dim() != 4 or len(found) != 1 or not found.is_floating_point():
-        got = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
+    """Return F, the number of features that an encoder returns."""
+    features = encoder(torch.zeros(1, 3, height, width))
+    if (
+        not isinstance(features, Tensor)
+        or features.dim() != 4
+        or len(features) != 1
+        or not features.is_floating_point()
+    ):
+        got = tuple(features.shape) if isinstance(features, Tensor) else type(features).__name__
         raise ValueError(f"encoder {name!r} must give a map of features (n, F, h, w), got {got}")
-    return found.shape[1]
+    return features.shape[1]

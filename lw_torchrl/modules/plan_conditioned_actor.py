@@ -1,109 +1,226 @@
-"""PlanConditionedActor: the policy that a conditional plan makes."""
+"""PlanConditionedActor: a conditional plan as a policy, in four parts that can be replaced."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Self
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.utils import NestedKey
+from torch import nn
+from torchrl.data import Bounded, Composite
 
-from lw_torchrl._checks import passes_on
-from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
+from lw_torchrl._checks import checked
+from lw_torchrl._keys import as_keys
+from lw_torchrl.language.task_index import as_plans
 from lw_torchrl.language.text import TextEncoder
-from lw_torchrl.modules.conditioned_actor import ConditionedActor
-from lw_torchrl.modules.plan_attention import Answers
-from lw_torchrl.modules.plan_encoder import PlanEncoder
-from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description, plans_and_evaluator
+from lw_torchrl.modules.attention import PlanAttention
+from lw_torchrl.modules.decoder import Decode, MLPDecoder
+from lw_torchrl.modules.features import ObservationFeatures
+from lw_torchrl.modules.mixer import SkillMixer
+from lw_torchrl.modules.networks import encoding_width, materialize
+from lw_torchrl.modules.stochastic import DistributionName, StochasticActor
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.plans import AnyPlans
+
+
+def plan_trunk(
+    plans: AnyPlans,
+    *,
+    skill_encoder: nn.Module | None = None,
+    features: nn.Module | None = None,
+    text_encoder: TextEncoder | None = None,
+) -> TensorDictSequential:
+    """Return attention, mixer and features: what a plan says to do now, and what is seen of the state.
+
+    Reads ``qaf`` (B, S) bool, ``task_id`` (B,) int64 and ``observation`` (B, 39) float32; writes ``skill_weights``
+    (B, S), ``skill_latent`` (B, D) and ``features`` (B, F) float32. The arguments are :class:`PlanConditionedActor`'s.
+    """
+    attention, mixer = PlanAttention(plans), SkillMixer(plans, skill_encoder, text_encoder=text_encoder)
+    if features is None:
+        features = ObservationFeatures(layout=mixer.plans.layout)
+    elif not isinstance(features, TensorDictModuleBase):
+        features = TensorDictModule(features, in_keys=["observation"], out_keys=["features"])
+    return TensorDictSequential(OrderedDict(attention=attention, mixer=mixer, features=features))
+
+
+class ConditionedActor(TensorDictSequential):
+    """A policy of a trunk, which says what to do and what is seen, and a decoder, which gives the action.
+
+    Reads what the trunk reads; writes what the trunk and the decoder write, ``action`` (B, A) float32 last. Each part
+    is an attribute of its name, and can be replaced: ``actor.decoder = network``.
+
+    Args:
+        trunk: a sequence of named parts; the last two keys that it writes are a latent (B, D) and features (B, F).
+        decoder: any module from latent and features, (B, D + F) float32, to the action (B, A), or a TensorDict module;
+            None for :class:`MLPDecoder`.
+        in_keys: other names for what the policy reads, in the order of ``in_keys``; nested keys are allowed.
+        out_keys: the names of what the decoder returns.
+
+    Example:
+        >>> import torch, lw_torchrl as lw
+        >>> trunk = lw.modules.plan_trunk(lw.load_plans("MT10"))
+        >>> lw.modules.ConditionedActor(trunk, torch.nn.LazyLinear(4)).out_keys
+        ['skill_weights', 'skill_latent', 'features', 'action']
+    """
+
+    @checked
+    def __init__(
+        self,
+        trunk: TensorDictSequential,
+        decoder: nn.Module | None = None,
+        *,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] = ("action",),
+    ) -> None:
+        parts = dict(trunk.module.items())
+        known = [part.plans for part in parts.values() if hasattr(part, "plans")]
+        self.__dict__["_out_names"] = as_keys("out_keys", out_keys, list(map(str, out_keys)))
+        self.__dict__["layout"] = getattr(known[0] if known else trunk, "layout", None)
+        if decoder is None:
+            decoder = MLPDecoder(actions=4 if self.layout is None else self.layout.action_size)
+        super().__init__(OrderedDict(**parts, decoder=self._as_decoder(decoder, trunk)))
+        self.plans = known[0] if known else None
+        if in_keys is not None:
+            self.in_keys = in_keys
+
+    def _as_decoder(self, decoder: nn.Module, trunk: TensorDictSequential) -> TensorDictModuleBase:
+        own = isinstance(decoder, Decode) or not isinstance(decoder, TensorDictModuleBase)
+        if own and (width := encoding_width(trunk)) is not None:
+            materialize(getattr(decoder, "network", decoder), torch.zeros(1, width))
+        if isinstance(decoder, TensorDictModuleBase):
+            return decoder
+        return Decode(decoder, in_keys=trunk.out_keys_source[-2:], out_keys=self._out_names)
+
+    @classmethod
+    def rebuild(cls, trunk: TensorDictSequential, decoder: TensorDictModuleBase) -> Self:
+        """Return an actor of these parts."""
+        actor = cls.__new__(cls)
+        ConditionedActor.__init__(actor, trunk, decoder)
+        return actor
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The arguments of :meth:`rebuild`."""
+        return {"trunk": self.trunk, "decoder": self.module["decoder"]}
+
+    @property
+    def trunk(self) -> TensorDictSequential:
+        """All parts but the decoder, with the same weights; critics can be built on it."""
+        return TensorDictSequential(OrderedDict([*self.module.items()][:-1]))
+
+    def __getattr__(self, name: str) -> Any:
+        parts = self.__dict__.get("_modules", {}).get("module") or {}
+        return parts[name] if name in parts else super().__getattr__(name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        parts = self.__dict__.get("_modules", {}).get("module") or {}
+        if name not in parts:
+            super().__setattr__(name, value)
+            return
+        if not isinstance(value, nn.Module):
+            raise TypeError(f"{name} must be a module, got {value!r:.80}")
+        if name == "decoder":
+            value = self._as_decoder(value, self.trunk)
+        elif not isinstance(value, TensorDictModuleBase):
+            value = TensorDictModule(value, in_keys=parts[name].in_keys[:1], out_keys=parts[name].out_keys)
+        parts[name] = value
+        self._update_keys()
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What is read. New names can be assigned, in the same order; all parts then read them."""
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, keys: Sequence[NestedKey]) -> None:
+        if "module" not in self._modules:  # TensorDictSequential's constructor
+            self._in_keys = list(keys)
+            return
+        renamed = dict(zip(self._in_keys, as_keys("in_keys", keys, list(map(str, self._in_keys))), strict=True))
+        for part in self.module.values():
+            part.in_keys = [renamed.get(key, key) for key in part.in_keys]
+        self._update_keys()
+
+    def _update_keys(self) -> None:
+        self._in_keys, out_keys = self._compute_in_and_out_keys(list(self.module.values()))
+        self._out_keys = self._out_keys_apparent = self._complete_out_keys = out_keys
+
+    @property
+    def spec(self) -> Composite:
+        """The specification of the action, (A,) float32 in [-1, 1], which TorchRL's losses read."""
+        spec = Composite()
+        spec[self.module["decoder"].out_keys_source[0]] = Bounded(-1.0, 1.0, (self.layout.action_size,))
+        return spec
+
+    def with_plans(self, plans: AnyPlans) -> Self:
+        """Return an actor with the same networks that follows other plans: training either trains both."""
+        parts = {n: part.with_plans(plans) if hasattr(part, "with_plans") else part for n, part in self.module.items()}
+        decoder = parts.pop("decoder")
+        return self.rebuild(TensorDictSequential(OrderedDict(parts)), decoder).train(self.training)
+
+    def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> StochasticActor:
+        """Return a copy that draws its actions, for RL, see :class:`~lw_torchrl.modules.StochasticActor`."""
+        return StochasticActor.of(self, distribution, init_std)
 
 
 class PlanConditionedActor(ConditionedActor):
-    """Plan Conditioned Behavioral Cloning's policy: each skill's text is encoded to a latent, the conditions' truth
-    gives attention over the steps, and the mixed latent and the observation give the action.
+    """Plan Conditioned Behavioral Cloning's policy.
 
-    Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool; writes ``action`` (B, 4)
-    float32 in (-1, 1), ``skill_weights`` (B, S) float32 and ``skill_latent`` (B, D) float32; with a distribution also
-    ``loc`` and ``scale`` (B, 4) float32, those of the Normal, and ``action_log_prob`` (B,) float32.
+    The policy attends to the skills whose conditions are true, mixes their latents, and decodes the mixture and the
+    observation's features into an action:
+
+    ====================  ============================================  =================================
+    part                  reads                                         writes
+    ====================  ============================================  =================================
+    ``attention``         ``qaf`` (B, S), ``task_id`` (B,)              ``skill_weights`` (B, S) float32
+    ``mixer``             ``skill_weights``, ``task_id``                ``skill_latent`` (B, D) float32
+    ``features``          ``observation`` (B, 39), ...                  ``features`` (B, F) float32
+    ``decoder``           ``skill_latent``, ``features``                ``action`` (B, 4) float32
+    ====================  ============================================  =================================
 
     Args:
-        plans: a plan for each task it is to act in.
-        **options: of :class:`ConditionedActor` and of :class:`PlanEncoder`; ``out_keys`` are the actor's.
-
-    Attributes:
-        skills: the K different skill texts, sorted.
+        plans: a plan for each task that the policy will see.
+        skill_encoder: any module from skill vectors (K, E) to latents (K, D); None for :class:`SkillEncoder`.
+        features: any module from an observation to features (B, F), or a TensorDict module with other inputs; None for
+            :class:`ObservationFeatures` with noise 0.05. Several are joined by :class:`Concat`.
+        decoder: any module from (B, D + F) to the action (B, A), or a TensorDict module; None for :class:`MLPDecoder`.
+        text_encoder: a function from n texts to vectors (n, E) float32; None for the shipped sentence encoder.
+        in_keys: other names for ``qaf``, ``task_id`` and ``observation``; nested keys are allowed.
+        out_keys: the names of what the decoder returns.
 
     Raises:
-        ValueError: at call time, a task_id without a plan, or ``qaf`` of other plans, as ``qaf_plan`` tells.
+        ValueError: at call time, a task without a plan, or ``qaf`` of other plans.
         ImportError: a skill's text is not shipped, and the extra ``[text]`` is not installed.
 
     Example:
         >>> import lw_torchrl as lw
+        >>> from torch import nn
         >>> from torchrl.envs import TransformedEnv
         >>> plans = lw.load_plans("MT10")
-        >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.QAFTransform(plans))
-        >>> lw.PlanConditionedActor(plans)(env.reset())["action"].shape
+        >>> actor = lw.PlanConditionedActor(plans, decoder=nn.Sequential(nn.LazyLinear(4), nn.Tanh()))
+        >>> actor(TransformedEnv(lw.LanguageWorldEnv("reach"), lw.QAFTransform(plans)).reset())["action"].shape
         torch.Size([1, 4])
-        >>> env.close()
 
     Source: paper section 'Plan Conditioning' and its figure of the architecture.
     """
 
-    plan_options = True
-    encoder_class = PlanEncoder
-    encoder: PlanEncoder
-    plans: Plans
-
-    @passes_on(ConditionedActor.__init__, PlanEncoder.__init__)
-    def __init__(self, plans: AnyPlans, **options: Any) -> None:
-        super().__init__(plans, **options)
-        self.skills = self.encoder.skills
-
-    @property
-    def evaluator(self) -> QueryEvaluator | None:
-        """What answers the conditions in the place of ``qaf``; None where ``qaf`` does."""
-        return self.encoder.evaluator
-
-    @classmethod
-    def for_plans(cls, plans: Plans, *, text_encoder: TextEncoder | None = None, **options: Any) -> Self:
-        """One for the tasks of ``plans``; its ``evaluator`` may be a description, which recipes have."""
-        if isinstance(asked := options.get("evaluator"), Mapping):
-            options["evaluator"] = evaluator_from_description(asked, plans, text_encoder)
-        return cls(plans, text_encoder=text_encoder, **options)
-
-    @classmethod
-    def from_description(cls, found: Mapping[str, Any], text_encoder: TextEncoder | None = None) -> Self:
-        plans, evaluator = plans_and_evaluator(found, text_encoder)
-        made = cls(plans, evaluator=evaluator, text_encoder=text_encoder, **found["options"])
-        made.encoder.check_rules(found)
-        return made
-
-    def with_evaluator(self, evaluator: QueryEvaluator, *, answers: Answers = "hard") -> PlanConditionedActor:
-        """An actor on the same weights that asks an evaluator in the place of ``qaf``: training either trains both.
-
-        Args:
-            evaluator: of its plans; the actor's own is replaced.
-            answers: as for the class; "hard", since the weights only know truth of 5 and -5.
-
-        Example:
-            >>> import lw_torchrl as lw
-            >>> plans = lw.load_plans("MT10")
-            >>> lw.PlanConditionedActor(plans).with_evaluator(lw.StateQueryEvaluator(plans)).in_keys
-            ['observation', 'task_id']
-        """
-        options = self.config | {"answers": answers, "in_keys": self.in_keys[:2]}
-        text_encoder = self.encoder.text_encoder
-        with torch.random.fork_rng(devices=[]):
-            plans = self.encoder.written
-            other = PlanConditionedActor(plans, evaluator=evaluator, text_encoder=text_encoder, **options)
-        other.encoder.texts, other.encoder.features, other.head = self.encoder.texts, self.encoder.features, self.head
-        return other.train(self.training)
-
-    def with_plans(self, plans: AnyPlans) -> PlanConditionedActor:
-        """An actor that carries out other plans with the same weights: training either trains both."""
-        encoder = self.encoder.with_plans(as_plans(plans))
-        text_encoder = self.encoder.text_encoder
-        options = dict(self.config)
-        if self.head.actions != encoder.layout.action_size:
-            options["action_size"] = self.head.actions
-        other = PlanConditionedActor(plans, evaluator=encoder.evaluator, text_encoder=text_encoder, **options)
-        other.encoder, other.head = encoder, self.head
-        return other.train(self.training)
+    @checked
+    def __init__(
+        self,
+        plans: AnyPlans,
+        *,
+        skill_encoder: nn.Module | None = None,
+        features: nn.Module | None = None,
+        decoder: nn.Module | None = None,
+        text_encoder: TextEncoder | None = None,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] = ("action",),
+    ) -> None:
+        if features is None:
+            features = ObservationFeatures(noise=0.05, layout=as_plans(plans).layout)
+        trunk = plan_trunk(plans, skill_encoder=skill_encoder, features=features, text_encoder=text_encoder)
+        super().__init__(trunk, decoder, in_keys=in_keys, out_keys=out_keys)

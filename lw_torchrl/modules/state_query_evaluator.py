@@ -12,18 +12,21 @@ from torchrl.modules import MLP
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
-from lw_torchrl.modules.observation_features import check_observation
+from lw_torchrl.modules.features import check_observation
+from lw_torchrl.modules.query_evaluator import Answers
 
-MOST = 30.0
-"""The size of the largest logit of a clause: a probability of 1e-13."""
-_SCALES = (0.005, 0.02, 0.1, 0.5)  # metres: where the squashed copies of d bend
+LARGEST_LOGIT = 30.0
+"""The size of the largest logit of a clause, a probability of 1e-13."""
+_SCALES = (0.005, 0.02, 0.1, 0.5)  # metres: the scales at which tanh squashes a difference
 
 
 class ClauseNetwork(nn.Module):
-    """The logit of a clause: a trunk on the difference d of two positions, times a learned vector of the predicate.
+    """The logit of a clause: a trunk reads the difference of two positions, and a learned vector of the predicate
+    weighs its output. "not" changes the sign.
 
-    The two positions are those of the subject and the object, where the tasks' table says that they stand; "not" turns
-    the sign. ``width`` and ``depth`` are of the trunk; ``predicates`` is their number.
+    Args:
+        width, depth: hidden layers of the trunk.
+        predicates: the number of predicates.
     """
 
     numbers: int = 3  # of a difference
@@ -43,37 +46,38 @@ class ClauseNetwork(nn.Module):
         self.predicates = nn.Embedding(predicates, width + 1)
 
     def forward(self, observation: Tensor, clauses: Clauses) -> Tensor:
-        """Observations (B, 39) and clauses (B, C) to logits (B, C) of size 30 at most."""
+        """Return logits (B, C) of size 30 at most from observations (B, 39) and clauses (B, C)."""
         numbers = torch.cat((observation, torch.zeros_like(observation[..., :1])), -1)
         first, second = (numbers.gather(-1, index.flatten(-2)) for index in (clauses.first, clauses.second))
-        d = (first - second).unflatten(-1, (-1, 3)) + clauses.shift  # metres, where the tasks' table has the two
+        d = (first - second).unflatten(-1, (-1, 3)) + clauses.shift
         return self.judge(d, clauses)
 
     def judge(self, d: Tensor, clauses: Clauses) -> Tensor:
-        """The logits (B, C) of differences d (B, C, 3)."""
+        """Return logits (B, C) from differences d (B, C, 3) in metres."""
         asked = self.predicates.weight[clauses.predicate]
         features = torch.cat([torch.tanh(d / scale) for scale in _SCALES], -1)
         logits = (self.trunk(features.to(asked.dtype)) * asked[..., :-1]).sum(-1) / sqrt(self.width) + asked[..., -1]
-        return torch.where(clauses.negated, -logits, logits).clamp(-MOST, MOST)
+        return torch.where(clauses.negated, -logits, logits).clamp(-LARGEST_LOGIT, LARGEST_LOGIT)
 
 
 class StateQueryEvaluator(ClauseEvaluator):
-    """Answers conditions from the observation, by a network that was trained on the query answering function's answers.
+    """Answers conditions from the observation, by a network that was trained on exact answers.
 
-    Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``qaf_logits`` (B, S) float32, positive
-    where a condition of the row's plan holds, -1e4 beyond its last step. Objects' positions are read where the tasks'
-    table says that they stand in the observation: only what the predicates mean is learned.
+    Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``qaf`` and ``qaf_logits`` (B, S) float32
+    as :class:`QueryEvaluator` does. It looks objects' positions up in the observation, so it only learns what
+    predicates mean.
 
     Args:
-        plans, predicates: as for :class:`~lw_torchrl.modules.clause_evaluator.ClauseEvaluator`, whose errors and
-            source it has.
+        plans, answers, predicates: as for :class:`~lw_torchrl.modules.clause_evaluator.ClauseEvaluator`, with its
+            errors and source.
         width, depth: hidden layers.
 
     Example:
         >>> import lw_torchrl as lw
+        >>> from tensordict.nn import TensorDictSequential
         >>> plans = lw.load_plans("MT10")
-        >>> actor = lw.PlanConditionedActor(plans, evaluator=StateQueryEvaluator(plans), answers="tanh")
-        >>> actor(lw.LanguageWorldEnv("reach").reset())["action"].shape
+        >>> policy = TensorDictSequential(StateQueryEvaluator(plans), lw.PlanConditionedActor(plans))
+        >>> policy(lw.LanguageWorldEnv("reach").reset())["action"].shape
         torch.Size([1, 4])
     """
 
@@ -86,9 +90,10 @@ class StateQueryEvaluator(ClauseEvaluator):
         *,
         width: int = 128,
         depth: int = 3,
+        answers: Answers = "soft",
         predicates: Sequence[str] | None = None,
     ) -> None:
-        super().__init__(plans, predicates=predicates)
+        super().__init__(plans, answers=answers, predicates=predicates)
         self.network = ClauseNetwork(width, depth, predicates=len(self.predicates))
         self.config |= {"width": width, "depth": depth}
 

@@ -25,7 +25,7 @@ from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.failure_records import Failure
-from lw_torchrl.evaluation.protocol import actor_plans, tasks_of
+from lw_torchrl.evaluation.protocol import actor_plans, named_tasks_of
 from lw_torchrl.evaluation.running import answered_by, make_env, running
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.named_objects import GRIPPER
@@ -265,7 +265,7 @@ def run_recorded(
         By task, as they were given, and episode: TensorDicts of batch (T,).
     """
     answered = actor_plans(actor, plans)
-    found_suite, chosen = tasks_of(tasks, answered, suite)
+    found_suite, chosen = named_tasks_of(tasks, answered, suite)
     options: dict[str, Any] = {"seed": seed, "max_steps": max_steps, "suite": found_suite, "engine": engine}
     env = make_env(actor, answered, LanguageWorldEnv(list(chosen.values()), strict=True, **options), evaluator)
     written = set() if answered is None else {"qaf", *actor.out_keys}

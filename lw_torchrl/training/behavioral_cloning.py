@@ -19,7 +19,8 @@ from lw_torchrl._checks import Count, Positive, Scale, check_fields, checked, pa
 from lw_torchrl._devices import place
 from lw_torchrl.data.replay_checks import check_replay
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.describe import describe
+from lw_torchrl.modules.features import Features
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.training.checkpoint import check_can_be_saved
 from lw_torchrl.training.descriptions import describe_data, describe_replay
@@ -100,7 +101,7 @@ class EvaluatorAnchor:
     def __call__(self, batch: TensorDictBase) -> Tensor:
         """() float32, of a minibatch with ``observation``, ``task_id`` and what the evaluator reads."""
         task = batch.get("task_id")
-        logits = self.evaluator.answers(*(batch.get(key) for key in self.evaluator.in_keys))
+        logits = self.evaluator.logits(*(batch.get(key) for key in self.evaluator.in_keys))
         truth = self.program(batch.get("observation"), task).to(logits.dtype)
         steps = self.tables.mask.to(task.device)[self.tables.rows(task)]
         return nn.functional.binary_cross_entropy_with_logits(logits[steps], truth[steps])
@@ -156,7 +157,8 @@ class BehavioralCloningTrainer(Training):
         check_replay(actor, replay, config.batch_size)
         self._anchor = EvaluatorAnchor(actor) if config.qaf_anchor else None
         if self.checkpoint is not None:
-            self.described = {"actor": check_can_be_saved(actor).describe(), "training": config.describe()}
+            check_can_be_saved(actor)
+            self.described = {"actor": describe(actor), "training": config.describe()}
             self.described |= {"data": describe_data(replay), "replay": describe_replay(replay)}
         self.loss = bc_loss(actor, config.loss_function)
         self.optimizer = make_optimizer(self.loss.parameters(), config)
@@ -164,7 +166,7 @@ class BehavioralCloningTrainer(Training):
         self.states = [ReplayState(replay, config.seed)]
         if self.resume():
             return
-        if config.normalize and isinstance(actor, Policy):
+        if config.normalize and any(isinstance(part, Features) for part in actor.modules()):
             fit_normalization(actor, replay)
         else:
             check_contacts(actor)

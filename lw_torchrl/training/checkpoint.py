@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from lw_torchrl._checks import checked, differences
@@ -15,56 +16,56 @@ from lw_torchrl._files import AnyPath, absent_policy, shipped_policy
 from lw_torchrl._tensor_files import read_tensors, write_tensors
 from lw_torchrl.language.plans import AnyPlans, PlanError, as_plans
 from lw_torchrl.language.text import TEXT_DIMENSION, TextEncoder
-from lw_torchrl.modules.policy import Policy
-from lw_torchrl.modules.query_evaluator import QueryEvaluator, evaluator_from_description
-from lw_torchrl.modules.registry import from_description
+from lw_torchrl.modules.describe import describe, from_description, same_keys
+from lw_torchrl.modules.query_evaluator import QueryEvaluator
 
-VERSION = 1
+VERSION = 2
 KINDS: Mapping[str, str] = {"actor": "a policy", "evaluator": "an evaluator", "training": "a training state"}
 _ARGUMENTS = {"actor": "checkpoint", "evaluator": "evaluator", "training": "checkpoint"}
 _TEXTS = "texts/"  # begins the names of text vectors, which show whether another text encoder is in use
 _TEXT_TOLERANCE = 0.01  # machines differ by less, encoders by more
 
-Module = TypeVar("Module", bound=nn.Module)
-
 
 @checked
-def save_actor(actor: Policy, path: AnyPath, **about: Any) -> None:
+def save_actor(actor: TensorDictModuleBase, path: AnyPath, **about: Any) -> None:
     """Write a policy for :func:`load_actor`. An earlier file is replaced whole.
 
     Args:
-        actor: the policy.
+        actor: a policy made of our parts, and of modules of your own with a ``config``, a dict of their constructor's
+            keyword arguments as JSON.
         path: the file, by convention named ``.safetensors``.
         **about: further metadata, as JSON.
 
     Raises:
-        TypeError: the actor is not a :class:`Policy`.
-        ValueError: :func:`load_actor` could not make it again, since its weights do not fit its description or are not
+        TypeError: a part has no ``config``; the message names the part.
+        ValueError: :func:`load_actor` could not rebuild it, because its weights do not fit its description or are not
             finite; or ``about`` uses a reserved name.
         OSError: the file cannot be written; an earlier file stays.
 
     Example:
         >>> import lw_torchrl as lw, os, tempfile
         >>> path = os.path.join(tempfile.mkdtemp(), "policy.safetensors")
-        >>> lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=8), path)
-        >>> lw.load_actor(path).config["width"]
-        8
+        >>> lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10")), path)
+        >>> lw.load_actor(path).tasks == lw.MT10
+        True
     """
-    _save(path, "actor", check_can_be_saved(actor), about)
+    check_can_be_saved(actor)
+    _save(path, "actor", actor, about)
 
 
 @checked
-def load_actor(path: AnyPath, *, text_encoder: TextEncoder | None = None) -> Policy:
+def load_actor(path: AnyPath, *, text_encoder: TextEncoder | None = None, parts: Sequence[type[nn.Module]] = ()) -> Any:
     """Load a policy with its plans and weights, in eval mode.
 
     Args:
         path: the file; or "few-shot-mt50", a policy that is shipped, if there is no file of that name.
         text_encoder: the one that the policy was made with, if it was not the shipped one.
+        parts: classes of your own that the policy is made of, unless the module that defines them is imported already.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is damaged, is not a policy's, or its weights do not fit its description or are not finite;
-            or the policy was made with another text encoder.
+        ValueError: the file is damaged or not a policy's, its weights do not fit its description or are not finite, a
+            class is not known, or the policy was made with another text encoder.
         ImportError: its texts are not shipped, and the extra ``[text]`` is not installed.
 
     Example:
@@ -72,7 +73,7 @@ def load_actor(path: AnyPath, *, text_encoder: TextEncoder | None = None) -> Pol
         >>> lw.load_actor("few-shot-mt50").tasks == lw.MT50
         True
     """
-    return _load(policy_file(path), "actor", from_description, text_encoder)
+    return _load(policy_file(path), "actor", lambda found: from_description(found, text_encoder, parts))
 
 
 @checked
@@ -80,7 +81,7 @@ def save_evaluator(evaluator: QueryEvaluator, path: AnyPath, **about: Any) -> No
     """Write an evaluator's network for :func:`load_evaluator`. An earlier file is replaced whole.
 
     Args:
-        evaluator: of a class in :data:`~lw_torchrl.modules.EVALUATORS`; else :class:`TypeError`.
+        evaluator: the evaluator; a class of your own keeps its constructor's keyword arguments in ``config``.
         path, **about: as for :func:`save_actor`, with its errors.
 
     Example:
@@ -90,28 +91,37 @@ def save_evaluator(evaluator: QueryEvaluator, path: AnyPath, **about: Any) -> No
         >>> lw.training.load_evaluator(path, lw.load_plans("MT50")).config["width"]
         8
     """
-    _save(path, "evaluator", check_evaluator_can_be_saved(evaluator), about)
+    check_can_be_saved(evaluator, "evaluator")
+    _save(path, "evaluator", evaluator, about)
 
 
 @checked
-def load_evaluator(path: AnyPath, plans: AnyPlans, *, text_encoder: TextEncoder | None = None) -> QueryEvaluator:
+def load_evaluator(
+    path: AnyPath,
+    plans: AnyPlans,
+    *,
+    text_encoder: TextEncoder | None = None,
+    parts: Sequence[type[nn.Module]] = (),
+) -> QueryEvaluator:
     """Load an evaluator for the conditions of any plans, in eval mode.
 
     Args:
-        path, text_encoder: as for :func:`load_actor`, with its errors.
+        path, text_encoder, parts: as for :func:`load_actor`, with its errors.
         plans: the plans; :class:`ValueError` if the evaluator cannot answer their conditions.
     """
+    others = [as_plans(plans).to_json()]
 
-    def make(description: Any, encoder: TextEncoder | None) -> QueryEvaluator:
-        return evaluator_from_description(description, as_plans(plans), encoder)
+    def make(found: Any) -> Any:
+        return from_description({**found, "plans": others}, text_encoder, parts)
 
-    return _load(Path(path), "evaluator", make, text_encoder)
+    evaluator: QueryEvaluator = _load(Path(path), "evaluator", make)
+    return evaluator
 
 
-def _save(path: AnyPath, kind: str, module: Any, about: dict[str, Any]) -> None:
+def _save(path: AnyPath, kind: str, module: nn.Module, about: dict[str, Any]) -> None:
     if reserved := sorted({"format", "version", "versions", kind, "state"} & set(about)):
         raise ValueError(f"about must not be named {', '.join(reserved)}, which {KINDS[kind]}'s file says itself")
-    write_file(path, kind, {kind: module.describe(), **about}, {**module.state_dict(), **text_vectors(module)})
+    write_file(path, kind, {kind: describe(module), **about}, {**module.state_dict(), **text_vectors(module)})
 
 
 def write_file(
@@ -121,15 +131,10 @@ def write_file(
     write_tensors(path, {**_header(kind), **described}, tensors, state)
 
 
-def _load(
-    path: Path,
-    kind: str,
-    make: Callable[[Any, TextEncoder | None], Module],
-    encoder: TextEncoder | None,
-) -> Module:
+def _load(path: Path, kind: str, make: Callable[[Any], nn.Module]) -> Any:
     description, tensors = read_file(path, kind)
     try:
-        module = make(description[kind], encoder)
+        module = make(description[kind])
         copy_tensors(tensors, {**module.state_dict(keep_vars=True), **text_vectors(module)})
     except ImportError:
         raise
@@ -174,6 +179,8 @@ def copy_tensors(stored: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> No
     for name in live.keys() - weights.keys():
         _check_texts(stored[name], live[name])
     for name, tensor in weights.items():
+        if isinstance(tensor, nn.parameter.UninitializedParameter):  # of a lazy layer
+            tensor.materialize(stored[name].shape)
         if (stored[name].dtype, stored[name].shape) != (tensor.dtype, tensor.shape):
             said = f"{stored[name].dtype} of shape {tuple(stored[name].shape)}"
             raise ValueError(f"{name} must be {tensor.dtype} of shape {tuple(tensor.shape)}, got {said}")
@@ -199,46 +206,26 @@ def check_finite(weights: Mapping[str, Tensor]) -> None:
 
 
 def text_vectors(module: nn.Module) -> dict[str, Tensor]:
-    """Return the vectors of a module's texts by name; canonical plans have none, since no encoder gives them."""
-    vectors = {}
-    for name, part in module.named_modules(remove_duplicate=False):  # an ensemble may hold a member twice
-        own = part._buffers.get("text_vectors")
-        if own is not None and not getattr(part, "canonical", False):
-            vectors[_TEXTS + f"{name}.text_vectors".lstrip(".")] = own
-    return vectors
+    """Return the vectors of a module's texts by name, which show whether another text encoder is in use."""
+    parts = module.named_modules(remove_duplicate=False)  # an ensemble may hold a member twice
+    vectors = ((name, getattr(part, "text_vectors", None)) for name, part in parts)
+    return {_TEXTS + name: tensor for name, tensor in vectors if tensor is not None}
 
 
-def check_can_be_saved(actor: Any) -> Policy:
-    """Return the actor if :func:`load_actor` could load it; called before training, so that no training is lost."""
-    if not isinstance(actor, Policy):
-        message = f"actor must be a Policy to be kept in a file, got {type(actor).__name__}"
-        raise TypeError(f"{message}: save the policy inside of it, or derive your class from lw_torchrl.Policy")
-    widths = [vectors.shape[-1] for vectors in text_vectors(actor).values()]
-
-    def make(description: Any) -> Policy:  # without loading a text model
-        again = from_description(description, lambda texts: torch.ones(len(texts), (widths or [TEXT_DIMENSION])[0]))
-        if (again.in_keys, again.out_keys_source) != (actor.in_keys, actor.out_keys_source):
-            raise ValueError("its in_keys or out_keys were changed later: pass them to its constructor")
-        return again
-
-    _check_rebuilt("actor", actor, make)
-    return actor
-
-
-def check_evaluator_can_be_saved(evaluator: Any) -> QueryEvaluator:
-    """As :func:`check_can_be_saved`, for an evaluator."""
-    if not isinstance(evaluator, QueryEvaluator):
-        raise TypeError(f"evaluator must be a QueryEvaluator to be kept in a file, got {type(evaluator).__name__}")
-    plans, encoder = evaluator.plans, evaluator.text_encoder
-    _check_rebuilt("evaluator", evaluator, lambda found: evaluator_from_description(found, plans, encoder))
-    return evaluator
-
-
-def _check_rebuilt(kind: str, module: Any, make: Callable[[Any], nn.Module]) -> None:
-    description = module.describe()
+def check_can_be_saved(module: nn.Module, kind: str = "actor") -> None:
+    """Raise an error unless a module could be saved and loaded; called before training, so that none is lost."""
+    widths = [vectors.shape[-1] for vectors in text_vectors(module).values()]
+    own = [type(part) for part in module.modules() if not type(part).__module__.startswith("torch.")]
+    description = describe(module)
     try:
-        with torch.random.fork_rng(devices=[]):
-            again = make(json.loads(json.dumps(description)))
+        with torch.random.fork_rng(devices=[]):  # without loading a text model
+            again = from_description(
+                json.loads(json.dumps(description)),
+                lambda texts: torch.ones(len(texts), (widths or [TEXT_DIMENSION])[0]),
+                own,
+            )
+        if not same_keys(module, again):
+            raise ValueError("its in_keys or out_keys were changed later: pass them to its constructor")
         copy_tensors(module.state_dict(), again.state_dict(keep_vars=True))
     except Exception as error:
         message = f"{kind} cannot be kept in a file, because its description does not rebuild it"

@@ -14,9 +14,10 @@ from torch import Tensor, nn
 from lw_torchrl._checks import checked, passes_on
 from lw_torchrl._devices import device_of, place
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
+from lw_torchrl.modules.describe import describe
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
-from lw_torchrl.training.checkpoint import check_evaluator_can_be_saved
+from lw_torchrl.training.checkpoint import check_can_be_saved
 from lw_torchrl.training.labelled_queries import Asked, ImageQueryEvaluatorConfig, LabelledQueries, QueryEvaluatorConfig
 from lw_torchrl.training.loop import Training, TrainingOptions
 
@@ -189,9 +190,9 @@ class QueryEvaluatorTrainer(Training):
         groups = [{"params": trained, "initial_lr": rate}]
         self.optimizer = torch.optim.AdamW(groups, lr=rate, weight_decay=config.weight_decay)
         if self.checkpoint is not None:
-            check_evaluator_can_be_saved(evaluator)
+            check_can_be_saved(evaluator, "evaluator")
             described = data.describe() | {"labels": self._minibatches.labels}
-            self.described = {"evaluator": evaluator.describe(), "training": asdict(config), "data": described}
+            self.described = {"evaluator": describe(evaluator), "training": asdict(config), "data": described}
         self.resume()
 
     def state_dict(self) -> dict[str, Any]:

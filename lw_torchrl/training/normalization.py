@@ -13,10 +13,8 @@ from torchrl.objectives import LossModule
 
 from lw_torchrl._checks import checked
 from lw_torchrl.language.layout import Layout
-from lw_torchrl.modules.critics import Value
-from lw_torchrl.modules.observation_features import ObservationFeatures
-from lw_torchrl.modules.policy import Policy
-from lw_torchrl.modules.relative_positions import PlanRoles
+from lw_torchrl.modules.features import Features, ObservationFeatures
+from lw_torchrl.modules.relative_features import RoleFeatures
 
 
 @checked
@@ -26,7 +24,7 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
     Each row counts as often as :class:`CoLearningSampler` draws it: a target's few rows would not count otherwise.
 
     Args:
-        target: a :class:`Policy`, a critic, a module with :class:`ObservationFeatures` in it, or a loss of such.
+        target: an actor, a critic, any module with :class:`Features` in it, or a loss of such.
         replay: rows of ``observation`` (D,) float32.
 
     Raises:
@@ -44,29 +42,30 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
         >>> plans = lw.load_plans("MT10")
         >>> loss = TD3Loss(lw.PlanConditionedActor(plans), lw.PlanConditionedQValue(plans), bounds=(-1.0, 1.0))
         >>> fit_normalization(loss, replay)
-        >>> loss.qvalue_network_params["encoder", "features", "mean"].shape  # of two critics
+        >>> loss.qvalue_network_params["trunk", "module", "features", "mean"].shape  # of two critics
         torch.Size([2, 56])
 
-    Source: :meth:`Policy.fit_normalization`.
+    Source: ``torchrl.envs.ObservationNorm``.
     """
     weigh = getattr(replay.sampler, "row_weights", None)
     weights = None if weigh is None else weigh(replay.storage)
     rows = replay.storage.get(slice(0, len(replay)))
-    if (seen := rows.get("observation", None)) is None:
+    if rows.get("observation", None) is None:
         raise ValueError(f"replay must hold 'observation', its rows hold {', '.join(map(str, rows.keys(True, True)))}")
-    observation = seen.cpu()  # the same sums on every device
-    if isinstance(target, (Policy, Value)):
-        target.fit_normalization(observation, weights)
-        if isinstance(target, Policy) and (task_id := rows.get("task_id", None)) is not None:
-            target.fit_contacts(observation, task_id.cpu())
+    if not isinstance(target, LossModule):
+        features = [part for part in target.modules() if isinstance(part, Features)]
+        if not features:
+            raise ValueError(f"{type(target).__name__} holds no Features: there is nothing to normalise")
+        for part in features:
+            part.fit(rows.cpu(), weights)
         return
     check_contacts(target)
     known: dict[tuple[str, Layout], ObservationFeatures] = {}
     for features, of in _held(target, ObservationFeatures):
         kind = features.kind, features.layout
         if kind not in known:
-            known[kind] = ObservationFeatures(features.kind, layout=features.layout).to(observation.device)
-            known[kind].fit(observation, weights)
+            known[kind] = ObservationFeatures(features.kind, layout=features.layout)
+            known[kind].fit(rows.cpu(), weights)
         with torch.no_grad():
             of("mean").copy_(known[kind].mean)
             of("std").copy_(known[kind].std)
@@ -76,7 +75,7 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
 
 def check_contacts(actor: nn.Module) -> None:
     """Raise :class:`ValueError` if an actor with ``roles`` would be trained without contacts."""
-    if any(not of("fitted") for _, of in _held(actor, PlanRoles)):
+    if any(not of("fitted") for _, of in _held(actor, RoleFeatures)):
         raise ValueError(
             "roles want to know where the demonstrations touch things; call fit_normalization(actor, replay) of "
             "lw_torchrl.training, as normalize=True does; with roles: do so before the loss is made of the actor"

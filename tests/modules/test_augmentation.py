@@ -4,12 +4,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lw_torchrl.modules.plan_encoder import mentioned, swap_unmentioned
 from tensordict import TensorDict
 
 import lw_torchrl as lw
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.modules.plan_encoder import mentioned, swap_unmentioned
 
 PLACES = {0: [*range(4, 11), *range(22, 29)], 1: [*range(11, 18), *range(29, 36)], 2: [36, 37, 38]}
 

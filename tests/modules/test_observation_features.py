@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from lw_torchrl.modules.observation_features import differences
 
 from lw_torchrl.modules import ObservationFeatures
-from lw_torchrl.modules.observation_features import differences
 
 
 def random_observation(*shape, seed=0):

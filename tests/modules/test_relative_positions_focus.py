@@ -4,12 +4,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from lw_torchrl.modules.relative_positions import PlanFocus
 from tensordict import TensorDict
 
 import lw_torchrl as lw
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.modules.relative_positions import PlanFocus
 
 HAND, OBJECT, SECOND, GOAL = slice(0, 3), slice(4, 7), slice(11, 14), slice(36, 39)
 

@@ -1,0 +1,119 @@
+"""PlanAttention: turn the truth of a plan's conditions into attention over its steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from lw_torchrl._checks import checked
+from lw_torchrl._keys import as_keys, check_apart, dispatched, key_beside, read, write
+from lw_torchrl.language.task_index import PlanTables, as_plans, pick
+from lw_torchrl.language.value_checks import check_values
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.plans import AnyPlans
+
+TRUE_LOGIT = 5.0  # a true condition counts 5, a false one -5 (paper, section "Plan Conditioning")
+ACTIVE_WEIGHT = 0.01  # a false step beside a true one has a weight of 1e-4: above this, a step is active
+
+
+def attend(logits: Tensor, mask: Tensor) -> Tensor:
+    """Return the softmax of logits (..., S) over the steps that exist, mask (..., S) bool; 0 on the others."""
+    return logits.masked_fill(~mask, -torch.inf).softmax(-1)
+
+
+class PlanAttention(TensorDictModuleBase):
+    """Attention over a plan's steps: the softmax of 10·truth - 5 over the steps that exist.
+
+    If no condition is true, the attention is uniform over the plan's steps.
+
+    Reads ``qaf`` (B, S) bool, or float in [0, 1] for soft truth, and ``task_id`` (B,) int64; for plans with fallback
+    steps also ``turn`` (B,) int64, see :class:`~lw_torchrl.transforms.FallbackTurns` (0 if it is absent). Writes
+    ``skill_weights`` (B, S) float32, which sum to 1.
+
+    Args:
+        plans: the plans whose steps are attended to.
+        in_keys, out_keys: other names for what it reads and writes, in the order above; nested keys are allowed.
+
+    Raises:
+        ValueError: at call time, if ``qaf`` has another number of steps, holds values outside [0, 1] or belongs to
+            other plans, or if a task has no plan. A wider ``qaf`` is accepted if ``qaf_plan`` shows that the plans
+            agree.
+
+    Example:
+        >>> import torch, lw_torchrl as lw
+        >>> plans = lw.load_plans("MT10")
+        >>> reach = torch.tensor([lw.task_id("reach")])
+        >>> weights = lw.modules.PlanAttention(plans)(qaf=torch.zeros(1, plans.num_steps), task_id=reach)
+        >>> len(plans["reach"].steps), int((weights > 0).sum())
+        (3, 3)
+
+    Source: paper section 'Plan Conditioning'.
+    """
+
+    mask: Tensor
+
+    @checked
+    def __init__(
+        self,
+        plans: AnyPlans,
+        *,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        super().__init__()
+        self.plans = as_plans(plans)
+        self.tables = PlanTables(self.plans)
+        # (T, 2, S) bool: the plan's own steps, and the fallback steps; both hold all steps of a plan without fallback.
+        self.register_buffer("mask", self.tables.turns, persistent=False)
+        self.has_fallback = not torch.equal(self.mask[:, 0], self.mask[:, 1])
+        self.in_keys = as_keys("in_keys", in_keys, ("qaf", "task_id", "turn")[: 2 + self.has_fallback])
+        self.out_keys = as_keys("out_keys", out_keys, ("skill_weights",))
+        check_apart(self.in_keys, self.out_keys)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        return {"plans": self.plans, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
+
+    @property
+    def truth_keys(self) -> tuple[NestedKey, NestedKey]:
+        """The keys of the conditions' truth and of the task."""
+        return self.in_keys[0], self.in_keys[1]
+
+    def with_plans(self, plans: AnyPlans) -> PlanAttention:
+        """Return the attention over other plans' steps."""
+        other = PlanAttention(plans, out_keys=self.out_keys_source)
+        other.in_keys = [*self.in_keys[:2], *other.in_keys[2:]]
+        return other.to(self.mask.device).train(self.training)
+
+    def weights(self, qaf: Tensor, rows: Tensor, turn: Tensor | None = None) -> Tensor:
+        """Return the attention (..., S) float32 for truth (..., S), table rows (...) int64 and turns (...) int64."""
+        mask = pick(self.mask.flatten(0, 1), 2 * rows if turn is None else 2 * rows + turn % 2)
+        if qaf.shape != mask.shape:
+            raise ValueError(
+                f"qaf must have shape {tuple(mask.shape)}, one column for each step of the actor's plans, got "
+                f"{tuple(qaf.shape)}; give QAFTransform the same plans"
+            )
+        if qaf.dtype != torch.bool:
+            problem = "qaf must be bool, or numbers from 0 to 1 for soft truth; it holds other numbers, or NaN"
+            check_values(lambda truth: ((truth >= 0) & (truth <= 1)).all(), qaf, problem)
+        return attend(2 * TRUE_LOGIT * qaf.to(torch.float32) - TRUE_LOGIT, mask)
+
+    @dispatched
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        qaf, task_id = read(tensordict, self.in_keys[:2])
+        rows = self.tables.rows(task_id)
+        plan = tensordict.get(key_beside(self.in_keys[0], "_plan"), None)
+        self.tables.refuse_others(plan, rows)
+        steps = self.mask.shape[-1]
+        if plan is not None and qaf.shape[-1] > steps:  # answers for more plans, of which some are longer
+            qaf = qaf[..., :steps]
+        turn = tensordict.get(self.in_keys[2], None) if self.has_fallback else None
+        return write(tensordict, self, [self.weights(qaf, rows, turn)])

@@ -1,0 +1,132 @@
+"""Decoders: from a skill latent and features to an action, or to the parameters of its distribution."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from lw_torchrl._checks import check_scale, checked
+from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
+from lw_torchrl.modules.networks import MLP
+
+LEAST_STD = 1e-3
+
+
+class MLPDecoder(MLP):
+    """The paper's action decoder, an MLP from a latent and features (..., D + F) to an action (..., A).
+
+    Args:
+        width, depth: units and number of the hidden layers; a sequence of widths gives both.
+        actions: A.
+        squash: keep each number of the action in (-1, 1) by tanh; without, as in the paper, the environment clips it.
+
+    Example:
+        >>> import torch, lw_torchrl as lw
+        >>> lw.modules.MLPDecoder(width=64)(torch.rand(5, 120)).shape
+        torch.Size([5, 4])
+
+    Source: paper section 'Plan Conditioning'.
+    """
+
+    @checked
+    def __init__(
+        self, *, width: int | Sequence[int] = 256, depth: int = 3, actions: int = 4, squash: bool = True
+    ) -> None:
+        super().__init__(actions, width=width, depth=depth)
+        self.actions, self.squash = actions, squash
+        self.config: dict[str, Any] = {"width": width, "depth": depth, "actions": actions, "squash": squash}
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        action = super().forward(*inputs)
+        return torch.tanh(action) if self.squash else action
+
+
+class GaussianDecoder(MLP):
+    """An MLP from a latent and features (..., D + F) to mean and standard deviation of a Normal, (..., A) each.
+
+    Args:
+        width, depth, actions: as for :class:`MLPDecoder`.
+        squash: keep the mean in (-1, 1), for a Normal around the action; False for a Normal that goes through tanh.
+        init_std: the standard deviation at every state before training.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> from torchrl.modules import ProbabilisticActor, TanhNormal
+        >>> decoder = lw.modules.GaussianDecoder(init_std=0.2)
+        >>> trunk = lw.PlanConditionedActor(lw.load_plans("MT10"), decoder=decoder, out_keys=["loc", "scale"])
+        >>> policy = ProbabilisticActor(trunk, in_keys=["loc", "scale"], distribution_class=TanhNormal)
+
+    Source: ``torchrl.modules.NormalParamExtractor``, with softplus.
+    """
+
+    @checked
+    def __init__(
+        self,
+        *,
+        width: int | Sequence[int] = 256,
+        depth: int = 3,
+        actions: int = 4,
+        squash: bool = False,
+        init_std: float = 0.3,
+    ) -> None:
+        if check_scale("init_std", init_std) <= LEAST_STD:
+            raise ValueError(f"init_std must be above {LEAST_STD}, got {init_std}")
+        super().__init__(2 * actions, width=width, depth=depth)
+        self.actions, self.squash = actions, squash
+        self.config: dict[str, Any] = {"width": width, "depth": depth, "actions": actions, "squash": squash}
+        self.config["init_std"] = init_std
+        self._offset = math.log(math.expm1(init_std - LEAST_STD)) if init_std < 20 else init_std
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        loc, scale = super().forward(*inputs).chunk(2, -1)
+        loc = torch.tanh(loc) if self.squash else loc
+        return loc, nn.functional.softplus(scale + self._offset) + LEAST_STD
+
+    @torch.no_grad()
+    def copy_from(self, decoder: MLPDecoder) -> None:
+        """Copy a deterministic decoder's weights to the mean; the standard deviation becomes the same everywhere."""
+        for own, theirs in zip([*self][:-1], [*decoder][:-1], strict=True):
+            own.load_state_dict(theirs.state_dict())
+        last, trained = self[-1], decoder[-1]
+        last.weight.zero_()
+        last.bias.zero_()
+        last.weight[: self.actions] = trained.weight
+        last.bias[: self.actions] = trained.bias
+
+
+class Decode(TensorDictModuleBase):
+    """A decoder as a TensorDict module.
+
+    Reads ``skill_latent`` (B, D) float32 and ``features`` (B, F) float32; writes what the network returns, by default
+    ``action`` (B, A) float32.
+
+    Args:
+        network: any module from the concatenation (B, D + F) to one tensor for each of ``out_keys``.
+        in_keys, out_keys: other names for what it reads and writes; nested keys are allowed.
+    """
+
+    def __init__(
+        self, network: nn.Module, *, in_keys: Sequence[NestedKey] | None = None, out_keys: Sequence[NestedKey]
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.in_keys = as_keys("in_keys", in_keys, ("skill_latent", "features"))
+        self.out_keys = list(out_keys)
+        check_apart(self.in_keys, self.out_keys)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        return {"network": self.network, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
+
+    @dispatched
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        decoded = self.network(torch.cat(read(tensordict, self.in_keys), -1))
+        return write(tensordict, self, decoded if isinstance(decoded, tuple) else (decoded,))

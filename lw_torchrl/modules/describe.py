@@ -1,0 +1,199 @@
+"""Descriptions of modules as JSON: the class and the arguments of each part, from which it is built again."""
+
+from __future__ import annotations
+
+import sys
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from inspect import signature
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import nn
+
+from lw_torchrl._checks import shown
+from lw_torchrl.language.layout import METAWORLD, Layout
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import TASKS, Task
+from lw_torchrl.language.text import TextEncoder
+
+_NETWORKS: dict[type[nn.Module], tuple[str, ...]] = {
+    nn.Linear: ("in_features", "out_features"),
+    nn.ReLU: (),
+    nn.Tanh: (),
+    nn.GELU: (),
+    nn.SiLU: (),
+    nn.ELU: ("alpha",),
+    nn.Dropout: ("p",),
+    nn.LayerNorm: ("normalized_shape",),
+}
+"""PyTorch's own modules that need no ``config``, and the arguments that rebuild them."""
+_TENSORDICT = {kind.__name__: kind for kind in (TensorDictSequential, TensorDictModule)}
+_KEYS = ("in_keys", "out_keys")
+
+
+def describe(module: nn.Module) -> dict[str, Any]:
+    """Return a module's description, from which :func:`from_description` builds it again, with fresh weights.
+
+    It holds the class of each part, by its import path, and its arguments, those of the attribute ``config``: JSON
+    values, plans, tasks, layouts and other modules.
+
+    Raises:
+        TypeError: a part that has no ``config``, by name.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> lw.modules.describe(lw.modules.MLPDecoder(width=8))["options"]["width"]
+        8
+    """
+    plans: list[Plans] = []
+    node = _encode_module(module, plans, "")
+    return {**node, "plans": [each.to_json() for each in plans]}
+
+
+def _encode_module(module: nn.Module, plans: list[Plans], path: str) -> dict[str, Any]:
+    kind = type(module)
+    if kind in (TensorDictSequential, nn.Sequential):
+        parts: Any = module.module if kind is TensorDictSequential else module
+        named = isinstance(parts, nn.ModuleDict)
+        children = [(name, _encode_module(part, plans, _join(path, name))) for name, part in parts.named_children()]
+        return {"class": kind.__name__, "parts": dict(children) if named else [node for _, node in children]}
+    if kind is TensorDictModule:
+        wrapped: Any = module
+        inner = _encode_module(wrapped.module, plans, path)
+        keys = {"in_keys": list(wrapped.in_keys), "out_keys": list(wrapped.out_keys_source)}
+        return {"class": "TensorDictModule", "options": {"module": {"module": inner}, **keys}}
+    if kind in _NETWORKS:
+        options: Any = {name: getattr(module, name) for name in _NETWORKS[kind]}
+        if kind is nn.Linear:
+            options["bias"] = module.bias is not None
+        name = f"torch.nn:{kind.__name__}"
+    else:
+        options = getattr(module, "config", None)
+        if not isinstance(options, Mapping):
+            raise TypeError(
+                f"{path or 'the policy'} is a {kind.__qualname__}, which cannot be saved: give it an attribute config, "
+                "a dict of its constructor's keyword arguments, as JSON"
+            )
+        if "plans" not in options and "plans" in signature(getattr(kind, "rebuild", kind)).parameters:
+            options = {"plans": module.plans, **options}
+        name = kind.__name__ if kind.__module__.startswith("lw_torchrl.") else f"{kind.__module__}:{kind.__qualname__}"
+    return {"class": name, "options": {key: _encode(options[key], plans, _join(path, key)) for key in options}}
+
+
+def _encode(value: Any, plans: list[Plans], path: str) -> Any:
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, nn.Module):
+        return {"module": _encode_module(value, plans, path)}
+    if isinstance(value, Plans):
+        same = (number for number, other in enumerate(plans) if other is value or other == value)
+        number = next(same, len(plans))
+        plans += [value] if number == len(plans) else []
+        return {"plans": number}
+    if isinstance(value, Task):
+        return value.name if value == TASKS.get(value.name) else {"task": {"name": value.name, **value.to_json()}}
+    if isinstance(value, Layout):
+        return {"layout": METAWORLD.name if value == METAWORLD else value.to_json()}
+    if isinstance(value, (list, tuple, torch.Size)):
+        return [_encode(each, plans, f"{path}[{number}]") for number, each in enumerate(value)]
+    if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
+        return {"dict": {key: _encode(each, plans, _join(path, key)) for key, each in value.items()}}
+    raise TypeError(f"{path} must be JSON, plans, a task, a layout or a module to be saved, got {shown(value)}")
+
+
+def _join(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
+
+
+def from_description(
+    description: Any, text_encoder: TextEncoder | None = None, parts: Sequence[type[nn.Module]] = ()
+) -> Any:
+    """Build the module of a description, with fresh weights.
+
+    Args:
+        description: what :func:`describe` returned.
+        text_encoder: passed to parts that encode texts; None for the shipped sentence encoder.
+        parts: classes of your own. A class is also found if the module that defines it is imported already. Modules are
+            never imported because a file names them: the file may come from a stranger.
+
+    Raises:
+        ValueError: not a description, or a class that is not known here.
+    """
+    if not isinstance(description, Mapping) or not isinstance(description.get("plans"), list):
+        raise ValueError(f"a description must have class, options and plans, got {shown(description)}")
+    plans = [Plans.from_json(row) for row in description["plans"]]
+    return _Decoder(plans, text_encoder, parts).module(description)
+
+
+class _Decoder:
+    def __init__(self, plans: list[Plans], text_encoder: TextEncoder | None, parts: Sequence[type[nn.Module]]) -> None:
+        self.plans, self.text_encoder = plans, text_encoder
+        self.own = {f"{kind.__module__}:{kind.__qualname__}": kind for kind in parts}
+        self.own |= {f"__main__:{kind.__qualname__}": kind for kind in parts}
+
+    def module(self, node: Any) -> Any:
+        if not isinstance(node, Mapping) or not isinstance(node.get("class"), str):
+            raise ValueError(f"a part must have a class, got {shown(node)}")
+        name, parts = node["class"], node.get("parts")
+        if name in ("TensorDictSequential", "Sequential"):
+            if isinstance(parts, Mapping):
+                return TensorDictSequential(OrderedDict((key, self.module(part)) for key, part in parts.items()))
+            if not isinstance(parts, list):
+                raise ValueError(f"parts of a {name} must be a list or a table, got {shown(parts)}")
+            return (TensorDictSequential if name in _TENSORDICT else nn.Sequential)(*map(self.module, parts))
+        kind = _TENSORDICT.get(name) or self.find(name)
+        if not isinstance(node.get("options"), Mapping):
+            raise ValueError(f"options of a {name} must be a table, got {shown(node.get('options'))}")
+        options = {key: self.value(value) for key, value in node["options"].items()}
+        rebuild: Callable[..., Any] = getattr(kind, "rebuild", kind)
+        if "text_encoder" in signature(rebuild).parameters:
+            options["text_encoder"] = self.text_encoder
+        several = [value for key, values in options.items() if key.startswith("*") for value in values]
+        return rebuild(*several, **{key: value for key, value in options.items() if not key.startswith("*")})
+
+    def find(self, name: str) -> type[nn.Module]:
+        """Return the class of a name: ours, given ones, or one of a module that is imported already."""
+        from lw_torchrl import modules
+
+        place, _, path = name.rpartition(":")
+        kind: Any
+        if not place:
+            kind = getattr(modules, path, None) if path.isidentifier() else None
+        elif place == "torch.nn":
+            kind = next((one for one in _NETWORKS if one.__name__ == path), None)
+        else:
+            kind = self.own.get(name) or sys.modules.get(place)
+            for step in path.split(".") if not isinstance(kind, type) else ():
+                kind = getattr(kind, step, None)
+        if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
+            hint = f": import {place} first, on the command line by --import {place}, or pass parts=[{path}]"
+            hint = f": pass the class, parts=[{path}]" if place == "__main__" else hint if place else ""
+            raise ValueError(f"the class {shown(name)} is not known here{hint}")
+        return kind
+
+    def value(self, value: Any) -> Any:
+        if isinstance(value, list):
+            return [self.value(each) for each in value]
+        if not isinstance(value, Mapping):
+            return value
+        ((kind, content),) = value.items()
+        if kind == "module":
+            return self.module(content)
+        if kind == "plans":
+            return self.plans[content]
+        if kind == "task":
+            return Task.from_json(content["name"], {key: each for key, each in content.items() if key != "name"})
+        if kind == "layout":
+            return METAWORLD if content == METAWORLD.name else Layout.from_json(content)
+        if kind == "dict":
+            return {key: self.value(each) for key, each in content.items()}
+        raise ValueError(f"a value must be a module, plans, a task, a layout or a dict, got {shown(value)}")
+
+
+def same_keys(module: nn.Module, other: nn.Module) -> bool:
+    """Return whether both read and write the same keys."""
+    return not isinstance(module, TensorDictModuleBase) or all(
+        getattr(module, name) == getattr(other, name) for name in _KEYS
+    )

@@ -1,0 +1,264 @@
+"""Features: what a policy sees of an observation, normalised with statistics that are part of the module."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.objectives import add_random_module
+
+from lw_torchrl._checks import check_choice, check_scale, checked
+from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
+from lw_torchrl.language.layout import METAWORLD, Layout
+from lw_torchrl.language.value_checks import check_finite
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.plans import AnyPlans
+
+Kind = Literal["raw", "differences", "relative", "opening", "none", "both"]
+_FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
+
+
+class Features(TensorDictModuleBase):
+    """Base class of features. A subclass implements :meth:`compute`; noise is added while training.
+
+    Reads ``in_keys``; writes ``features`` (B, F) float32. The noise is drawn from PyTorch's global generator.
+
+    Args:
+        noise: standard deviation of Gaussian noise while training, in units of the normalised features.
+        in_keys: what it reads.
+        out_keys: another name for ``features``.
+
+    Attributes:
+        width: F, the number of features.
+    """
+
+    width: int
+
+    def __init__(self, noise: float, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey] | None = None) -> None:
+        super().__init__()
+        self.noise = check_scale("noise", noise)
+        self.in_keys, self.out_keys = list(in_keys), as_keys("out_keys", out_keys, ("features",))
+        check_apart(self.in_keys, self.out_keys)
+
+    @property
+    def observation_key(self) -> NestedKey:
+        """The key of the observation."""
+        key: NestedKey = self.in_keys[0]
+        return key
+
+    def compute(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the features (B, F) without noise."""
+        raise NotImplementedError(f"{type(self).__name__} must override compute")
+
+    def fit(self, rows: TensorDictBase, weights: Tensor | None = None) -> None:
+        """Take statistics from R rows of a dataset, weighted by ``weights`` (R,) float32 of sum 1; by default none."""
+
+    @dispatched
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        features = self.compute(tensordict)
+        if self.training and self.noise:
+            features = features + self.noise * torch.randn_like(features)
+        return write(tensordict, self, [features])
+
+
+class ObservationFeatures(Features):
+    """Normalised features of the observation alone.
+
+    Reads ``observation`` (B, D) float; writes ``features`` (B, F), within 10 standard deviations of the mean.
+
+    Args:
+        kind: "raw", the observation; "differences", see :func:`differences`; "relative", see :func:`relative`;
+            "opening", only the gripper's opening; "none", nothing; "both", the observation and the differences.
+        noise: standard deviation of the noise while training, in standard deviations of each feature.
+        layout: the layout of the observations; None for Meta-World's.
+        in_keys, out_keys: other names for what it reads and writes; nested keys are allowed.
+
+    Attributes:
+        width: F, the number of features.
+        mean, std: (F,) float32 buffers, set by :meth:`fit` and saved with the module.
+
+    Example:
+        >>> import torch, lw_torchrl as lw
+        >>> lw.modules.ObservationFeatures("differences")(observation=torch.rand(5, 39)).shape
+        torch.Size([5, 56])
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    @checked
+    def __init__(
+        self,
+        kind: Kind = "differences",
+        noise: float = 0.0,
+        layout: Layout | None = None,
+        *,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        super().__init__(noise, as_keys("in_keys", in_keys, ("observation",)), out_keys)
+        self.layout: Layout = METAWORLD if layout is None else layout
+        self.kind = check_choice("kind", kind, _KINDS)
+        self.width = _KINDS[kind](torch.zeros(self.layout.size), self.layout).shape[-1]
+        self.register_buffer("mean", torch.zeros(self.width))
+        self.register_buffer("std", torch.ones(self.width))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        keys = {"in_keys": self.in_keys, "out_keys": self.out_keys_source}
+        return {"kind": self.kind, "noise": self.noise, "layout": self.layout, **keys}
+
+    def with_plans(self, plans: AnyPlans) -> ObservationFeatures:
+        """Return the features, with the same statistics, for plans of another layout.
+
+        Raises:
+            ValueError: the features mean something else in that layout.
+        """
+        layout = plans.layout  # type: ignore[union-attr]
+        if layout == self.layout:
+            return self
+        if self.kind not in TRANSFERS:
+            raise ValueError(
+                f"features {self.kind!r} of layout {self.layout.name!r} do not transfer to {layout.name!r}; those that "
+                f"do are RoleFeatures, with {' or '.join(map(repr, TRANSFERS))} of the observation"
+            )
+        other = ObservationFeatures(**{**self.config, "layout": layout})
+        other.mean, other.std = self.mean, self.std
+        return other.train(self.training)
+
+    def _select(self, observation: Tensor) -> Tensor:
+        check_observation(observation, self.layout)
+        check_finite("observation", observation)
+        return _KINDS[self.kind](observation, self.layout)
+
+    @torch.no_grad()
+    def fit(self, rows: TensorDictBase, weights: Tensor | None = None) -> None:
+        """Take mean and standard deviation from the rows; a feature that hardly varies keeps its scale."""
+        (observation,) = read(rows, self.in_keys)
+        found = self._select(observation.reshape(-1, self.layout.size))
+        if not found.shape[-1]:
+            return  # PyTorch warns of the deviation of nothing
+        if weights is None:
+            mean, std = found.mean(0), found.std(0, unbiased=False)
+        else:
+            mean = weights @ found
+            std = (weights @ (found - mean).square()).sqrt()
+        self.mean.copy_(mean)
+        self.std.copy_(torch.where(std > 1e-4, std, 1.0))
+
+    def compute(self, tensordict: TensorDictBase) -> Tensor:
+        (observation,) = read(tensordict, self.in_keys)
+        return ((self._select(observation).to(self.mean.dtype) - self.mean) / self.std).clamp(-10.0, 10.0)
+
+
+class Concat(TensorDictModuleBase):
+    """Concatenate the features of several modules.
+
+    Reads what the modules read; writes ``features`` (B, F), those of the first module first.
+
+    Args:
+        parts: :class:`Features`, or any TensorDict modules; the first key that each one writes is taken.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> plans = lw.load_plans("MT10")
+        >>> seen = lw.modules.Concat(lw.modules.ObservationFeatures(), lw.modules.FocusFeatures(plans))
+        >>> seen.width
+        74
+
+    Source: ``torchrl.envs.CatTensors``, as a module.
+    """
+
+    def __init__(self, *parts: TensorDictModuleBase, out_keys: Sequence[NestedKey] | None = None) -> None:
+        super().__init__()
+        if not parts or not all(isinstance(part, TensorDictModuleBase) for part in parts):
+            raise TypeError(f"parts must be at least one TensorDict module, got {parts!r:.200}")
+        self.parts: Any = nn.ModuleList(parts)
+        self.out_keys = as_keys("out_keys", out_keys, ("features",))
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        return list(dict.fromkeys(key for part in self.parts for key in part.in_keys))
+
+    @in_keys.setter
+    def in_keys(self, keys: Sequence[NestedKey]) -> None:
+        renamed = dict(zip(self.in_keys, as_keys("in_keys", keys, list(map(str, self.in_keys))), strict=True))
+        for part in self.parts:
+            part.in_keys = [renamed[key] for key in part.in_keys]
+
+    @property
+    def width(self) -> int:
+        """F, the number of features."""
+        return sum(part.width for part in self.parts)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The arguments that rebuild it."""
+        return {"*parts": list(self.parts), "out_keys": self.out_keys_source}
+
+    def with_plans(self, plans: AnyPlans) -> Concat:
+        """Return the same features for other plans."""
+        parts = [part.with_plans(plans) if hasattr(part, "with_plans") else part for part in self.parts]
+        return Concat(*parts, out_keys=self.out_keys_source).train(self.training)
+
+    @dispatched
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        seen = [part(tensordict.copy()).get(part.out_keys[0]) for part in self.parts]
+        return write(tensordict, self, [torch.cat(seen, -1)])
+
+
+def check_observation(observation: Tensor, layout: Layout) -> None:
+    """Raise :class:`ValueError` unless observations are floats (..., D) of a layout."""
+    if observation.shape[-1:] != (layout.size,) or not observation.is_floating_point():
+        got = f"{observation.dtype} of shape {tuple(observation.shape)}"
+        raise ValueError(f"observation must be float32 of shape (..., {layout.size}), got {got}")
+
+
+def relative(observation: Tensor, layout: Layout) -> Tensor:
+    """Return the pairwise differences between hand, objects and goal: metres, and squashed at 2 cm and at 10 cm.
+
+    With Meta-World's two objects, (..., 39) gives (..., 54). Differences to an object that a task lacks are 0.
+    """
+    places = [observation[..., place] for place in layout.positions]
+    absent = {n: (places[n] == 0).all(-1, keepdim=True) for n in range(2, len(places) - 1)}
+    pairs = []
+    for first, second in combinations(range(len(places)), 2):
+        difference = places[second] - places[first]
+        for number in {first, second} & absent.keys():
+            difference = torch.where(absent[number], 0.0, difference)
+        pairs.append(difference)
+    d = torch.cat(pairs, -1)
+    return torch.cat((d, *squash(d)), -1)
+
+
+def differences(observation: Tensor, layout: Layout) -> Tensor:
+    """Return :func:`relative`, the hand's height and the gripper's opening: (..., 39) gives (..., 56)."""
+    height, opening = (observation[..., at : at + 1] for at in (layout.hand + 2, layout.opening))
+    return torch.cat((relative(observation, layout), height, opening), -1)
+
+
+def squash(difference: Tensor) -> tuple[Tensor, Tensor]:
+    """Return metres through tanh at 2 cm, which shows alignment, and at 10 cm, which shows direction."""
+    return torch.tanh(difference / _FINE), torch.tanh(difference / _COARSE)
+
+
+_KINDS: dict[str, Callable[[Tensor, Layout], Tensor]] = {
+    "raw": lambda observation, layout: observation,
+    "differences": differences,
+    "relative": relative,
+    "opening": lambda observation, layout: observation[..., layout.opening : layout.opening + 1],
+    "none": lambda observation, layout: observation[..., :0],
+    "both": lambda observation, layout: torch.cat((observation, differences(observation, layout)), -1),
+}
+TRANSFERS = ("opening", "none")
+"""The kinds of features that mean the same in every layout."""
+
+add_random_module(Features)  # losses that vmap over networks then let each network draw its own noise

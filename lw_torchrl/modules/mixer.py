@@ -1,0 +1,211 @@
+"""Mix skills by attention: SkillMixer mixes their latents, ActionMixer the actions that are decoded from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from lw_torchrl._checks import check_int, checked
+from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
+from lw_torchrl.language.task_index import PlanTables, as_plans, pick
+from lw_torchrl.language.text import TextEncoder, encoded
+from lw_torchrl.modules.networks import MLP, evaluating, materialize
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.plans import AnyPlans, Plans
+
+
+def unit_scale(vectors: Tensor) -> Tensor:
+    """Rescale vectors (n, E) to a root mean square of 1: a fresh network hardly tells smaller vectors apart."""
+    vectors = vectors.to(torch.float32)
+    return vectors / vectors.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-6)
+
+
+class SkillEncoder(MLP):
+    """An MLP from a skill's vector (K, E) to its latent (K, D).
+
+    Args:
+        latent_size: D.
+        width, depth: units and number of the hidden layers.
+
+    Example:
+        >>> import torch, lw_torchrl as lw
+        >>> lw.modules.SkillEncoder(latent_size=32)(torch.rand(5, 384)).shape
+        torch.Size([5, 32])
+    """
+
+    def __init__(self, latent_size: int = 64, *, width: int | Sequence[int] = 128, depth: int = 1) -> None:
+        super().__init__(check_int("latent_size", latent_size, minimum=1), width=width, depth=depth)
+        self.config = {"latent_size": latent_size, "width": width, "depth": depth}
+
+
+class _Mixer(TensorDictModuleBase):
+    """Base of the mixers: the vector of each different skill, and which of them each step has."""
+
+    index: Tensor
+    vectors: Tensor
+
+    def __init__(self, plans: AnyPlans, encoder: nn.Module | None, text_encoder: TextEncoder | None) -> None:
+        super().__init__()
+        self.plans, self.text_encoder = as_plans(plans), text_encoder
+        self.tables = PlanTables(self.plans)
+        if self.plans.has_roles:
+            index, vectors = _role_vectors(self.plans, self.tables)
+        else:
+            index, vectors = self.tables.skill_index, encoded(self.plans.skills, text_encoder)
+        # The tables come from the plans, not from training: they are not part of the state that is saved.
+        self.register_buffer("index", index, persistent=False)  # (T, S) int64
+        self.register_buffer("vectors", unit_scale(vectors), persistent=False)  # (K, E) float32
+        self.encoder = SkillEncoder() if encoder is None else encoder
+        materialize(self.encoder, self.vectors)
+        with torch.no_grad(), evaluating(self.encoder):
+            self.latent_size = self.latents().shape[-1]
+
+    @property
+    def text_vectors(self) -> Tensor | None:
+        """The vectors of the skills' texts, (K, E) float32; None for skills that are encoded by their roles."""
+        return None if self.plans.has_roles else self.vectors
+
+    def latents(self) -> Tensor:
+        """Return the latent of each different skill, (K, D)."""
+        latents: Tensor = self.encoder(self.vectors)
+        return latents
+
+    def per_skill(self, weights: Tensor, task_id: Tensor, latents: Tensor) -> Tensor:
+        """Sum attention over steps (..., S) to attention over the K different skills, (..., K)."""
+        zeros = weights.new_zeros((*weights.shape[:-1], len(latents)))
+        return zeros.scatter_add(-1, pick(self.index, self.tables.rows(task_id)), weights).to(latents.dtype)
+
+
+class SkillMixer(_Mixer):
+    """Encode each skill's text to a latent, and mix the latents by the attention over the plan's steps.
+
+    Plans whose steps carry roles, see :func:`~lw_torchrl.canonical_plans`, are encoded by verb and manner, not by text.
+
+    Reads ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64; writes ``skill_latent`` (B, D) float32.
+
+    Args:
+        plans: the plans whose skills are mixed.
+        encoder: any module from K skill vectors (K, E) float32 to latents (K, D); None for :class:`SkillEncoder`.
+        text_encoder: a function from n texts to vectors (n, E) float32; None for the shipped sentence encoder.
+        in_keys, out_keys: other names for what it reads and writes, in the order above; nested keys are allowed.
+
+    Raises:
+        ImportError: a skill's text is not shipped, and the extra ``[text]`` is not installed.
+
+    Example:
+        >>> import torch, lw_torchrl as lw
+        >>> plans = lw.load_plans("MT10")
+        >>> mixer = lw.modules.SkillMixer(plans, torch.nn.Linear(384, 16))
+        >>> weights = torch.ones(2, plans.num_steps) / plans.num_steps
+        >>> mixer(skill_weights=weights, task_id=torch.full((2,), lw.task_id("reach"))).shape
+        torch.Size([2, 16])
+
+    Source: paper section 'Plan Conditioning'.
+    """
+
+    @checked
+    def __init__(
+        self,
+        plans: AnyPlans,
+        encoder: nn.Module | None = None,
+        *,
+        text_encoder: TextEncoder | None = None,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        super().__init__(plans, encoder, text_encoder)
+        self.in_keys = as_keys("in_keys", in_keys, ("skill_weights", "task_id"))
+        self.out_keys = as_keys("out_keys", out_keys, ("skill_latent",))
+        check_apart(self.in_keys, self.out_keys)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        keys = {"in_keys": self.in_keys, "out_keys": self.out_keys_source}
+        return {"plans": self.plans, "encoder": self.encoder, **keys}
+
+    def with_plans(self, plans: AnyPlans) -> SkillMixer:
+        """Return a mixer of other plans' skills with the same encoder: training either trains both."""
+        options: dict[str, Any] = {"text_encoder": self.text_encoder, "in_keys": self.in_keys}
+        other = SkillMixer(plans, self.encoder, out_keys=self.out_keys_source, **options)
+        return other.to(self.index.device).train(self.training)
+
+    @dispatched
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        weights, task_id = read(tensordict, self.in_keys)
+        latents = self.latents()
+        # One matrix product over the K skills is faster than picking a latent for each step, (B, S, D).
+        return write(tensordict, self, [self.per_skill(weights, task_id, latents) @ latents])
+
+
+class ActionMixer(_Mixer):
+    """Decode each skill's latent to an action, and mix the actions by the attention over the plan's steps.
+
+    It takes the place of :class:`SkillMixer` and the decoder. Reads ``skill_weights`` (B, S) float32, ``task_id``
+    (B,) int64 and ``features`` (B, F) float32; writes ``action`` (B, A) float32.
+
+    Args:
+        plans, encoder, text_encoder: as for :class:`SkillMixer`.
+        decoder: any module from a latent and the features, (..., D + F) float32, to an action (..., A).
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> from tensordict.nn import TensorDictSequential
+        >>> plans = lw.load_plans("MT10")
+        >>> parts = lw.modules.PlanAttention(plans), lw.modules.ObservationFeatures()
+        >>> actor = TensorDictSequential(*parts, lw.modules.ActionMixer(plans, lw.modules.MLPDecoder()))
+        >>> actor.in_keys
+        ['qaf', 'task_id', 'observation']
+
+    Source: a mixture of experts; the paper mixes latents.
+    """
+
+    @checked
+    def __init__(
+        self,
+        plans: AnyPlans,
+        decoder: nn.Module,
+        encoder: nn.Module | None = None,
+        *,
+        text_encoder: TextEncoder | None = None,
+    ) -> None:
+        super().__init__(plans, encoder, text_encoder)
+        self.decoder = decoder
+        self.in_keys, self.out_keys = ["skill_weights", "task_id", "features"], ["action"]
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        return {"plans": self.plans, "decoder": self.decoder, "encoder": self.encoder}
+
+    def with_plans(self, plans: AnyPlans) -> ActionMixer:
+        """Return a mixer of other plans' skills with the same networks: training either trains both."""
+        other = ActionMixer(plans, self.decoder, self.encoder, text_encoder=self.text_encoder)
+        return other.to(self.index.device).train(self.training)
+
+    @dispatched
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        weights, task_id, features = read(tensordict, self.in_keys)
+        latents = self.latents()
+        shape = *features.shape[:-1], *latents.shape
+        each = torch.cat((latents.expand(shape), features.unsqueeze(-2).expand(*shape[:-1], -1)), -1)
+        actions = self.decoder(each)  # (..., K, A)
+        return write(tensordict, self, [(self.per_skill(weights, task_id, latents).unsqueeze(-1) * actions).sum(-2)])
+
+
+def _role_vectors(plans: Plans, tables: PlanTables) -> tuple[Tensor, Tensor]:
+    """Return the index (T, S) int64 of each step's vector, and the different vectors (K, E) float32."""
+    from lw_torchrl.language.roles import role_vectors
+
+    index, different = torch.zeros_like(tables.skill_index), dict[tuple[float, ...], int]()
+    for task, plan in sorted(plans.items()):
+        for number, vector in enumerate(role_vectors([step.role for step in plan.steps if step.role is not None])):
+            index[tables.index.row(task), number] = different.setdefault(tuple(vector), len(different))
+    return index, torch.tensor([*different])

@@ -1,0 +1,345 @@
+"""FocusFeatures and RoleFeatures: relative positions of the objects that a plan's active steps are about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+from weakref import WeakSet
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from lw_torchrl._checks import checked
+from lw_torchrl._keys import as_keys, read
+from lw_torchrl.language.layout import places
+from lw_torchrl.language.named_objects import GOAL, GRIPPER, NamedObject, coordinate_indices
+from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, as_plans
+from lw_torchrl.language.roles import VECTORS, StepRole
+from lw_torchrl.language.task_index import PlanTables, pick
+from lw_torchrl.language.task_objects import role_object
+from lw_torchrl.modules.attention import PlanAttention
+from lw_torchrl.modules.features import Features, squash
+from lw_torchrl.transforms.qaf import plan_program
+from lw_torchrl.transforms.random_yaw import tilt_key, turn_observation, turn_vectors, yaw_key
+
+_SCALE = 0.1  # metres
+_FAR = 0.25  # metres, beyond which demonstrations say nothing
+_LIFTED = 0.15  # metres above its target, on the way there
+_AWAY = 0.15  # metres: a place to the left, for what is moved to the left
+_KEYS = ("observation", "skill_weights", "task_id")
+Pair = tuple[NamedObject, NamedObject]
+
+
+class _RelativePositions(Features):
+    """Positions of objects relative to other objects, mixed by the attention over a plan's steps.
+
+    ``pairs`` gives for each step of a plan up to ``number`` P pairs: the object from which, and the object to which.
+    A step with fewer pairs has 0 there.
+    """
+
+    begin: Tensor
+    end: Tensor
+    offset: Tensor
+    constants: Tensor
+
+    def __init__(
+        self,
+        plans: AnyPlans,
+        pairs: Callable[[ConditionalPlan], Sequence[Sequence[Pair]]],
+        number: int,
+        noise: float = 0.0,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        super().__init__(noise, as_keys("in_keys", in_keys, _KEYS), out_keys)
+        self.plans = plans = as_plans(plans)
+        self.tables = PlanTables(plans)
+        self.width = 9 * number
+        constants = [0.0]
+        shape = (len(plans), plans.num_steps, number, 3)
+        self.layout, size = plans.layout, plans.layout.size
+        index = torch.full((2, *shape), size)  # the constant 0
+        offset = torch.zeros(shape)
+        for task, plan in plans.items():
+            for step, of_step in enumerate(pairs(plan)):
+                for one, ends in enumerate(of_step):
+                    at = (self.tables.index.row(task), step, one)
+                    for side, thing in enumerate(ends):
+                        index[(side, *at)] = torch.tensor(coordinate_indices(thing.position, constants, size))
+                        offset[at] += torch.tensor(thing.offset) * (2 * side - 1)
+        # The tables come from the plans, not from training: they are not part of the state that is saved.
+        self.register_buffer("begin", index[0], persistent=False)
+        self.register_buffer("end", index[1], persistent=False)
+        self.register_buffer("offset", offset, persistent=False)
+        self.register_buffer("constants", torch.tensor(constants), persistent=False)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        return {"plans": self.plans, "noise": self.noise, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
+
+    def with_plans(self, plans: AnyPlans) -> Any:
+        """Return the same features of other plans."""
+        return type(self)(**{**self.config, "plans": plans}).to(self.offset.device).train(self.training)
+
+    def positions(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
+        """Return the relative positions (..., P, 3) in metres.
+
+        Args:
+            observation: (..., D) float32.
+            weights: the attention over steps (..., S) float32.
+            rows: rows of the plans' tables, (...) int64.
+            yaw: the angle (...) in radians by which :class:`RandomYaw` turned the observation; turns fixed places too.
+        """
+        if yaw is not None:
+            observation = turn_observation(observation, -yaw, self.layout)
+        found = (weights[..., None, None] * self.of_steps(observation, rows)).sum(-3)
+        return found if yaw is None else turn_vectors(found, yaw.unsqueeze(-1))
+
+    def of_steps(self, observation: Tensor, rows: Tensor) -> Tensor:
+        """Return the relative positions of each step, (..., S, P, 3) in metres."""
+        known = torch.cat((observation, self.constants.expand(*observation.shape[:-1], -1)), -1)
+        begin, end = pick(self.begin, rows), pick(self.end, rows)  # (..., S, P, 3)
+        flat = (*begin.shape[: rows.ndim], -1)
+        found = (known.gather(-1, end.reshape(flat)) - known.gather(-1, begin.reshape(flat))).reshape(begin.shape)
+        return found + pick(self.offset, rows)
+
+    def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+        observation, weights, task_id = read(tensordict, self.in_keys)
+        yaw = tensordict.get(yaw_key(self.in_keys[0]), None)
+        return observation.to(self.offset.dtype), weights.to(self.offset.dtype), self.tables.rows(task_id), yaw
+
+    def compute(self, tensordict: TensorDictBase) -> Tensor:
+        position = self.positions(*self._inputs(tensordict)).flatten(-2)
+        return torch.cat((position / _SCALE, *squash(position)), -1)
+
+
+def _compared(plan: ConditionalPlan) -> list[list[Pair]]:
+    of = plan.definition.object
+    each = [[(of(c.subject), of(c.object)) for c in step.condition.clauses if c.object] for step in plan.steps]
+    return [[pairs[0], pairs[-1]] if pairs else [] for pairs in each]
+
+
+class FocusFeatures(_RelativePositions):
+    """Positions of the objects that the active steps' conditions compare.
+
+    A condition names what its skill is about: "the gripper is above the handle and not near the handle". The position
+    of the handle relative to the gripper stands in the same place as that of the puck in another task, so that what was
+    learned there is of use here.
+
+    Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64; writes
+    ``features`` (B, 18): for the first and the last clause with two objects, the position of the second object relative
+    to the first, in units of 10 cm, and through tanh at 2 cm and at 10 cm. Both are 0 for a step without such clauses.
+
+    Args:
+        plans: the plans whose conditions are read.
+        noise: standard deviation of the noise while training.
+        in_keys, out_keys: other names for what it reads and writes; nested keys are allowed.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> plans = lw.load_plans("MT10")
+        >>> actor = lw.PlanConditionedActor(plans, features=lw.modules.FocusFeatures(plans))
+    """
+
+    @checked
+    def __init__(
+        self,
+        plans: AnyPlans,
+        noise: float = 0.0,
+        *,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        super().__init__(plans, _compared, 2, noise, in_keys, out_keys)
+
+
+class RoleFeatures(_RelativePositions):
+    """The target's position relative to the object that the active step moves, and the step's direction.
+
+    "lower the gripper around the puck" and "... the mug" are the same motion in this relative position, so that what
+    was learned in one task is of use in another. "push the dial to the right" points right, "push it toward the target
+    location" from the object to the goal. Positions farther than 25 cm count as 25 cm away.
+
+    Where the gripper acts on an object that is touched beside its position, the target is the *contact*, which
+    demonstrations of the task show, see :meth:`fit`; a task without demonstrations has the points that its plan names.
+    What is carried in such a task is lifted first, to 15 cm above its target, and comes down over it.
+
+    Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64, and what
+    :class:`RandomYaw` and :class:`JitterTarget` wrote; writes ``features`` (B, 12): the relative position in units of
+    10 cm, through tanh at 2 cm and at 10 cm, and a unit vector, which is 0 for a step without a direction.
+
+    Args:
+        plans: plans whose steps have roles, see :func:`~lw_torchrl.canonical_plans`.
+        noise: standard deviation of the noise while training.
+        in_keys, out_keys: other names for what it reads and writes; nested keys are allowed.
+
+    Attributes:
+        contact: (T, 3) float32, metres, for each task, from the first object to the hand while it acts on the object.
+        demonstrated: (T,) bool, the tasks with demonstrations.
+        fitted: () bool, whether :meth:`fit` was called.
+
+    Raises:
+        ValueError: plans without roles.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> plans = lw.canonical_plans(lw.load_plans("MT10"))
+        >>> lw.PlanConditionedActor(plans, features=lw.modules.RoleFeatures(plans)).features.width
+        12
+
+    Source: ours; like the keypoints of task-axis controllers, read from words.
+    """
+
+    contact: Tensor
+    demonstrated: Tensor
+    fitted: Tensor
+    at_contact: Tensor
+    acts: Tensor
+    lifts: Tensor
+    direction: Tensor
+    ahead_begin: Tensor
+
+    @checked
+    def __init__(
+        self,
+        plans: AnyPlans,
+        noise: float = 0.0,
+        *,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        plans = as_plans(plans)
+        if not plans.has_roles:
+            raise ValueError("plans must have roles for RoleFeatures; use lw.canonical_plans(plans)")
+        super().__init__(plans, _moved_to_target, 1, noise, in_keys, out_keys)
+        self.width += 3
+        shape = len(plans), plans.num_steps
+        at_contact, acts, lifts = (torch.zeros(shape, dtype=torch.bool) for _ in range(3))
+        direction = torch.zeros(*shape, 3)
+        for task, plan in plans.items():
+            for number, role in enumerate(_roles(plan)):
+                at = (self.tables.index.row(task), number)
+                by_hand, way = role.moved == GRIPPER, torch.tensor(VECTORS.get(role.direction or "", (0.0,) * 3))
+                at_contact[at] = by_hand and _is_first(plan, role.target)
+                touches = role.verb in ("close", "pull") or (role.verb == "push" and role.manner == "push")
+                acts[at] = _is_first(plan, role.moved) or (at_contact[at] and touches)
+                lifts[at] = role.verb == "carry"
+                if role.verb == "move":  # a place beside where it is
+                    self.offset[at] += _AWAY * way
+                else:
+                    direction[at] = way
+        for name, table in (("at_contact", at_contact), ("acts", acts), ("lifts", lifts), ("direction", direction)):
+            self.register_buffer(name, table, persistent=False)
+        self.ahead = _RelativePositions(plans, _ahead, 1)
+        self.attention = PlanAttention(plans)
+        self.register_buffer("contact", torch.zeros(len(plans), 3))
+        self.register_buffer("demonstrated", torch.zeros(len(plans), dtype=torch.bool))
+        self.register_buffer("fitted", torch.tensor(False))
+        self._sharing: WeakSet[RoleFeatures] = WeakSet([self])  # features of actors with the same weights
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_sharing": None}  # a copy has weights of its own
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._sharing = WeakSet([self])
+
+    def with_plans(self, plans: AnyPlans) -> RoleFeatures:
+        """Return the features of other plans; the same tasks share contacts, now and whenever either is fitted."""
+        other: RoleFeatures = super().with_plans(plans)
+        other._sharing = self._sharing
+        other._sharing.add(other)
+        other._copy(self)
+        return other
+
+    @torch.no_grad()
+    def fit(self, rows: TensorDictBase, weights: Tensor | None = None) -> None:
+        """Take the contacts from demonstrations, in place.
+
+        A contact is the median of hand minus object while a step is active that closes the gripper around the first
+        object, pushes or pulls it, or moves it, but not while it is pressed from above.
+
+        Args:
+            rows: R rows with ``observation`` (R, D) float32 and ``task_id`` (R,) int64.
+            weights: not used.
+        """
+        observation, task_id = read(rows, [self.in_keys[0], self.in_keys[2]])
+        observation, task_id = observation.reshape(-1, self.layout.size), task_id.reshape(-1)
+        truth = plan_program(self.plans)(observation, task_id)
+        at = self.tables.rows(task_id)
+        observation, truth, at = (tensor.to(self.contact.device) for tensor in (observation, truth, at))
+        held = (self.attention.weights(truth, at) * self.acts[at]).sum(-1) > 0.5
+        hand, first, *_ = self.layout.positions
+        away = observation[:, hand] - observation[:, first]
+        for row in at[held].unique().tolist():
+            self.contact[row] = away[held & (at == row)].median(0).values
+        self.demonstrated[at.unique()] = True
+        self.fitted.fill_(True)
+        for other in self._sharing:
+            if other is not self:
+                other._copy(self)
+
+    @torch.no_grad()
+    def _copy(self, other: RoleFeatures) -> None:
+        self.fitted.copy_(other.fitted)
+        for task in {*self.tables.index.tasks} & {*other.tables.index.tasks}:
+            own, theirs = self.tables.index.row(task), other.tables.index.row(task)
+            self.contact[own], self.demonstrated[own] = other.contact[theirs], other.demonstrated[theirs]
+
+    def of_steps(self, observation: Tensor, rows: Tensor) -> Tensor:
+        """Return the relative positions of each step; targets are contacts, and what is carried is lifted first."""
+        found = super().of_steps(observation, rows)
+        found = found + (pick(self.at_contact, rows)[..., None] * pick(self.contact, rows).unsqueeze(-2)).unsqueeze(-2)
+        lifts = (pick(self.lifts, rows) & ~pick(self.demonstrated, rows).unsqueeze(-1))[..., None, None]
+        beside, height = found[..., :2], found[..., 2:]
+        far = beside.norm(dim=-1, keepdim=True)
+        height = height + lifts * _LIFTED * ((far - 0.03) / 0.04).clamp(0.0, 1.0)
+        rising = torch.where(lifts, ((0.06 - height) / 0.04).clamp(0.0, 1.0), 1.0)
+        return torch.cat((beside * rising, height), -1)
+
+    def directions(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
+        """Return the direction of the active step, (..., 3); arguments as for :meth:`positions`."""
+        if yaw is not None:
+            observation = turn_observation(observation, -yaw, self.layout)
+        ahead = self.ahead.of_steps(observation, rows).squeeze(-2)
+        each = pick(self.direction, rows) + ahead / ahead.norm(dim=-1, keepdim=True).clamp(min=0.02)
+        found = (weights.unsqueeze(-1) * each).sum(-2)
+        return found if yaw is None else turn_vectors(found, yaw)
+
+    def compute(self, tensordict: TensorDictBase) -> Tensor:
+        inputs = self._inputs(tensordict)
+        position = self.positions(*inputs)
+        if (offset := tensordict.get("target_offset", None)) is not None:
+            position = position + offset.unsqueeze(-2)
+        position = position.flatten(-2)
+        if (tilt := tensordict.get(tilt_key(self.in_keys[0]), None)) is not None:
+            position = (tilt @ position.unsqueeze(-1)).squeeze(-1)
+        position = position * (_FAR / position.norm(dim=-1, keepdim=True).clamp(min=_FAR))
+        return torch.cat((position / _SCALE, *squash(position), self.directions(*inputs)), -1)
+
+
+def _roles(plan: ConditionalPlan) -> list[StepRole]:
+    return [step.role for step in plan.steps if step.role is not None]
+
+
+def _moved_to_target(plan: ConditionalPlan) -> list[list[Pair]]:
+    task = plan.definition
+    return [[(role_object(task, role.moved), role_object(task, role.target))] for role in _roles(plan)]
+
+
+def _ahead(plan: ConditionalPlan) -> list[list[Pair]]:
+    task = plan.definition
+    x, y, z = places(task.layout.positions[1])
+    first = NamedObject("first object", (x, y, z))
+    return [
+        [(first, role_object(task, role.toward or GOAL))] if role.direction == "goal" else [] for role in _roles(plan)
+    ]
+
+
+def _is_first(plan: ConditionalPlan, name: str) -> bool:
+    """Return whether a name is that of the first object itself, not of a point beside it."""
+    thing = role_object(plan.definition, name)
+    return thing.position == places(plan.definition.layout.things[0].xyz) and not any(thing.offset)

@@ -1,0 +1,130 @@
+"""StochasticActor: a policy with a distribution of actions, for RL."""
+
+from __future__ import annotations
+
+import copy
+from collections import OrderedDict
+from typing import Any, Literal
+
+import torch
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
+from torchrl.data import Composite
+from torchrl.modules import IndependentNormal, TanhNormal
+
+from lw_torchrl._checks import check_choice, checked
+from lw_torchrl._keys import key_beside
+from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
+from lw_torchrl.modules.features import Features
+from lw_torchrl.modules.networks import encoding_width, materialize
+
+DistributionName = Literal["tanh_normal", "normal"]
+DISTRIBUTIONS: dict[str, Any] = {"tanh_normal": TanhNormal, "normal": IndependentNormal}
+
+
+class StochasticActor(ProbabilisticTensorDictSequential):
+    """A policy whose actions are drawn from a Normal, as TorchRL's ``ProbabilisticActor``.
+
+    Reads what the trunk reads; writes what the trunk writes, ``loc`` and ``scale`` (B, A) float32, ``action`` (B, A)
+    float32, drawn under ``set_exploration_type(ExplorationType.RANDOM)`` and the mode otherwise, and
+    ``action_log_prob`` (B,) float32.
+
+    Args:
+        trunk: a sequence of named parts, as for :class:`ConditionedActor`.
+        decoder: writes the Normal's mean and standard deviation.
+        distribution: "tanh_normal", a Normal through tanh; "normal", whose actions the environment clips.
+        spec: the specification of the action.
+        action: the key of the action.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> actor = lw.PlanConditionedActor(lw.load_plans("MT10")).stochastic("tanh_normal", init_std=0.2)
+        >>> actor.out_keys[-4:]
+        ['loc', 'scale', 'action', 'action_log_prob']
+
+    Source: ``torchrl.modules.ProbabilisticActor``.
+    """
+
+    @checked
+    def __init__(
+        self,
+        trunk: TensorDictSequential,
+        decoder: TensorDictModuleBase,
+        distribution: DistributionName = "tanh_normal",
+        *,
+        spec: Composite | None = None,
+        action: Any = "action",
+    ) -> None:
+        check_choice("distribution", distribution, DISTRIBUTIONS)
+        loc, scale = decoder.out_keys
+        if isinstance(decoder, Decode) and (width := encoding_width(trunk)) is not None:
+            materialize(decoder.network, torch.zeros(1, width))
+        sampler = ProbabilisticTensorDictModule(
+            in_keys={"loc": loc, "scale": scale},
+            out_keys=[action],
+            distribution_class=DISTRIBUTIONS[distribution],
+            default_interaction_type=InteractionType.DETERMINISTIC,
+            return_log_prob=True,
+            log_prob_key=key_beside(action, "_log_prob"),
+        )
+        super().__init__(OrderedDict(**dict(trunk.module.items()), decoder=decoder, sampler=sampler))
+        known = [part.plans for part in trunk.module.values() if hasattr(part, "plans")]
+        self.plans, self.spec = known[0] if known else None, spec
+        self.distribution, self.action = distribution, action
+
+    @classmethod
+    def of(cls, actor: Any, distribution: DistributionName, init_std: float) -> StochasticActor:
+        """Return a copy of a deterministic actor whose mode is that actor's action.
+
+        Its features have no noise, which would change the likelihoods from call to call.
+
+        Raises:
+            TypeError: the actor's decoder is not an :class:`MLPDecoder`; give a custom decoder that returns mean and
+                standard deviation, and ``out_keys=["loc", "scale"]``, and wrap the actor by TorchRL's
+                ``ProbabilisticActor``.
+            ValueError: a Normal through tanh, of an actor that does not squash its actions.
+        """
+        old = getattr(actor.decoder, "network", None)
+        if not isinstance(old, MLPDecoder):
+            raise TypeError(
+                f"stochastic() needs an MLPDecoder, this actor has {type(old or actor.decoder).__name__}; give it a "
+                "decoder that returns mean and standard deviation, with out_keys=['loc', 'scale'], and wrap it in "
+                "torchrl.modules.ProbabilisticActor"
+            )
+        if distribution == "tanh_normal" and not old.squash:
+            raise ValueError("distribution 'tanh_normal' squashes actions, and this actor does not; use 'normal'")
+        options = {**old.config, "squash": distribution == "normal" and old.squash, "init_std": init_std}
+        with torch.random.fork_rng(devices=[]):
+            decoder = GaussianDecoder(**options)
+            materialize(decoder, torch.zeros(1, old[0].in_features))
+        decoder.to(next(old.parameters())).copy_from(old)
+        trunk = copy.deepcopy(actor.trunk)
+        for part in trunk.modules():
+            if isinstance(part, Features):
+                part.noise = 0.0
+        action = actor.decoder.out_keys_source[0]
+        keys = ["loc", "scale"] if isinstance(action, str) else [(*action[:-1], name) for name in ("loc", "scale")]
+        decode = Decode(decoder, in_keys=actor.decoder.in_keys, out_keys=keys)
+        return cls(trunk, decode, distribution, spec=actor.spec, action=action).train(actor.training)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        made = {"distribution": self.distribution, "action": self.action}
+        return {"trunk": self.trunk, "decoder": self.module["decoder"], **made}
+
+    @property
+    def trunk(self) -> TensorDictSequential:
+        """All parts but decoder and sampler, with the same weights; critics can be built on it."""
+        return TensorDictSequential(OrderedDict([*self.module.items()][:-2]))
+
+    def with_plans(self, plans: Any) -> StochasticActor:
+        """Return a policy with the same networks that follows other plans: training either trains both."""
+        parts = {n: p.with_plans(plans) if hasattr(p, "with_plans") else p for n, p in self.trunk.module.items()}
+        options: dict[str, Any] = {**self.config, "trunk": TensorDictSequential(OrderedDict(parts)), "spec": self.spec}
+        return StochasticActor(**options).train(self.training)
