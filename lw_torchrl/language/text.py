@@ -9,8 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lw_torchrl.language.embeddings import sentence_vectors
-
 TEXT_DIMENSION = 384
 TABLE = "embeddings.npz"
 
@@ -32,6 +30,8 @@ def _shipped() -> dict[str, Tensor]:
 
 def sentence_encoder(texts: Sequence[str]) -> Tensor:
     """Encode texts with all-MiniLM-L6-v2, (n, 384) float32 of length 1; needs the extra ``[text]``."""
+    from lw_torchrl.language.embeddings import sentence_vectors  # here: the shipped texts do without it
+
     return torch.from_numpy(sentence_vectors(texts))
 
 
