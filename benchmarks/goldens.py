@@ -173,7 +173,7 @@ def _evaluations() -> dict[str, tuple[Any, tuple[str, ...]]]:
         "shipped policy few-shot-mt50": (lw.load_actor("few-shot-mt50"), lw.MT50),
         "scripted skills": (lw.ScriptedSkillActor(natural), lw.MT50),
         "zero-shot, natural plans": (
-            zero_shot.with_plans(lw.Plans([natural[task] for task in outside])),
+            zero_shot.with_plans(lw.canonical_plans(lw.Plans([natural[task] for task in outside]), fallback=True)),
             outside,
         ),
     }

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from lw_torchrl.language.canonical_steps import read_canonical
 from lw_torchrl.modules.relative_positions import PlanRoles
 
 import lw_torchrl as lw
@@ -19,7 +20,6 @@ from benchmarks import ablations, faults, truth
 from benchmarks.finding_points import PADS, find_points
 from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
-from lw_torchrl.language.canonical_steps import read_canonical
 from lw_torchrl.language.task_index import PlanTables
 
 ROOT = Path(__file__).parent.parent

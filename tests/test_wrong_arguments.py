@@ -35,7 +35,7 @@ MORE = {
         "ImageQueryEvaluatorConfig", "ImageQueryEvaluatorTrainer", "LabelledQueries", "QueryEvaluatorConfig",
         "QueryEvaluatorTrainer", "load_evaluator", "save_evaluator",
     ),
-    "transforms": ("CameraTransform", "EnvState"),
+    "transforms": ("CameraTransform", "EnvState", "HideOpening", "JitterTarget", "SwapUnmentioned"),
 }  # fmt: skip
 PUBLIC |= {name: import_module(f"lw_torchrl.{room}") for room, names in MORE.items() for name in names}
 PUBLIC |= {name: lw.modules for name in ("Value", "QValue", "PlanEncoder")}

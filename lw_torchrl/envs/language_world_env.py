@@ -6,6 +6,7 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, Literal, NoReturn
 
 import numpy as np
@@ -17,6 +18,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
 from lw_torchrl._checks import Count, check_int, checked
+from lw_torchrl._devices import check_device
 from lw_torchrl._keys import row_mask
 from lw_torchrl._rendering import check_picture
 from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, done_spec, observation_spec
@@ -45,9 +47,14 @@ class LanguageWorldEnv(EnvBase):
     function that makes the environment; elsewhere (Ray, RPC, your own processes) give ``worker=(w, W)``, or another
     seed to each.
 
+    ``close()`` frees the simulators, and ends all episodes; the next ``reset()`` makes new ones and continues with the
+    next episodes.
+
     ``state_dict`` holds the seed and the counters; an environment that loads it must be reset, and continues with the
     next episodes. A TransformedEnv, and a Collector with it, saves it by its
     :class:`~lw_torchrl.transforms.QAFTransform` or :class:`~lw_torchrl.transforms.EnvState`.
+
+    The simulation runs on the CPU; with ``device="cuda"``, or after ``env.to("cuda")``, tensors are copied there.
 
     Keys (B = (N,)); a ``_step`` mask leaves rows where they are, a ``_reset`` mask resets only its rows:
         observation: (N, 39) float32, Meta-World's vector: metres, gripper opening in [0, 1], quaternions.
@@ -79,6 +86,7 @@ class LanguageWorldEnv(EnvBase):
         strict: raise on a NaN action, instead of truncating the row with a warning as for an unstable simulation.
         worker: (w, W), the index of this one of W environments; None asks TorchRL.
         batch_size: () for a single environment without the dimension of rows, for AsyncEnvPool.
+        device: where the tensors of resets and steps are; "auto" for this machine's accelerator.
 
     Raises:
         RuntimeError: a step of a row that has ended; a reset or step in a forked process that did not make it.
@@ -116,6 +124,7 @@ class LanguageWorldEnv(EnvBase):
         strict: bool = False,
         worker: tuple[int, int] | None = None,
         batch_size: tuple[()] | None = None,
+        device: str | torch.device = "cpu",
     ) -> None:
         tasks = listed_tasks(tasks)
         self.suite = find_suite(tasks, suite)
@@ -136,18 +145,16 @@ class LanguageWorldEnv(EnvBase):
         self.worker = found if worker is None else check_worker(worker)
         self._process = os.getpid()
         self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_int("seed", seed), self.worker)
-        super().__init__(device=torch.device("cpu"), batch_size=(num_envs,) if batch_size is None else ())
+        super().__init__(device=check_device("device", device), batch_size=(num_envs,) if batch_size is None else ())
         self._rows = RowStates(self.row_tasks, self.layout)
         which = ... if batch_size is None else 0
-        self.observation_spec = observation_spec(self._rows.task_id, self.layout)[which]
-        self.action_spec = action_spec(num_envs, self.layout)[which]
-        self.reward_spec = Unbounded((num_envs, 1))[which]
-        self.done_spec = done_spec(num_envs)[which]
-        options: Any = {"reward": reward, "num_threads": num_threads}
-        if engine is None:
-            self._engine = self.suite.make_engine(list(self.row_tasks), **options)
-        else:
-            self._engine = make_engine(engine, self.row_tasks, **options)
+        self.observation_spec = observation_spec(self._rows.task_id, self.layout)[which].to(self.device)
+        self.action_spec = action_spec(num_envs, self.layout)[which].to(self.device)
+        self.reward_spec = Unbounded((num_envs, 1))[which].to(self.device)
+        self.done_spec = done_spec(num_envs)[which].to(self.device)
+        make = self.suite.make_engine if engine is None else partial(make_engine, engine)
+        self._make_engine = partial(make, list(self.row_tasks), reward=reward, num_threads=num_threads)
+        self._engine: Engine = self._make_engine()
         self.is_closed = False  # EnvBase starts with True
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
@@ -194,9 +201,7 @@ class LanguageWorldEnv(EnvBase):
     def __getstate__(self) -> NoReturn:
         raise TypeError("a LanguageWorldEnv can be neither pickled nor copied: pass a function that makes it")
 
-    def _check_usable(self) -> None:
-        if self.is_closed:
-            raise RuntimeError("this environment is closed (a collector closes its own at its end): make a new one")
+    def _check_process(self) -> None:
         if os.getpid() != self._process:
             raise RuntimeError(
                 "this environment was made in the process that this one was forked from: make the environment in this "
@@ -204,7 +209,9 @@ class LanguageWorldEnv(EnvBase):
             )
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None) -> TensorDict:
-        self._check_usable()
+        self._check_process()
+        if self.is_closed:
+            self._engine, self.is_closed = self._make_engine(), False
         rows = np.flatnonzero(row_mask(tensordict, "_reset", len(self.row_tasks)))
         episodes = self._counter.next(rows) if episode is None else self._counter.asked(episode, rows)
         self._rows.begin(rows, episodes, self._engine.reset(rows.tolist(), self._counter.seeds(rows, episodes)))
@@ -212,16 +219,16 @@ class LanguageWorldEnv(EnvBase):
         return self._shown(self._rows.as_tensordict())
 
     def _shown(self, rows: TensorDict) -> TensorDict:
-        return rows if self.batch_size else rows[0]
+        return (rows if self.batch_size else rows[0]).to(self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        self._check_usable()
+        self._check_process()
         size = self.layout.action_size
         action = clipped_action(tensordict, (*self.batch_size, size)).cpu().numpy().reshape(-1, size)
         active = row_mask(tensordict, "_step", len(self.row_tasks))
         if (active & self._rows.over).any():
             rows = np.flatnonzero(active & self._rows.over)[:5].tolist()
-            what = "have ended or were never reset, or not since load_state_dict"
+            what = "have ended or were never reset, or not since close or load_state_dict"
             raise RuntimeError(f"rows {rows} {what}: reset them before the next step")
         stepped = active
         if math.isnan(action.sum()):  # of numbers in [-1, 1], so one of them is NaN
@@ -282,7 +289,8 @@ class LanguageWorldEnv(EnvBase):
             rows: which to draw, by their numbers; None for all.
 
         Raises:
-            RuntimeError: a row that was never reset; or the process was forked from one that took pictures.
+            RuntimeError: a row that was never reset, or not since ``close()``; or the process was forked from one that
+                took pictures.
             ImportError: there is no OpenGL; it names what to install.
             NotImplementedError: your own engine has no ``render``.
 
@@ -293,22 +301,24 @@ class LanguageWorldEnv(EnvBase):
             torch.Size([1, 48, 64, 3])
             >>> env.close()
         """
-        self._check_usable()
+        self._check_process()
         check_picture(camera, height, width)
         asked = range(len(self.row_tasks)) if rows is None else [check_int("rows", row, minimum=0) for row in rows]
         if asked and max(asked) >= len(self.row_tasks):
             raise ValueError(f"rows must be below {len(self.row_tasks)}, got {max(asked)}")
-        if (self._rows.episode[list(asked)] < 0).any():
+        if self.is_closed or (self._rows.episode[list(asked)] < 0).any():
             raise RuntimeError("there is nothing to see before a reset: call env.reset()")
         if not hasattr(self._engine, "render"):
             raise NotImplementedError(f"engine {type(self._engine).__name__} has no render; see suites.cameras")
         if not asked:
-            return torch.zeros(0, height, width, 3, dtype=torch.uint8)
-        pictures = torch.from_numpy(self._engine.render(asked, camera=camera, height=height, width=width))
+            return torch.zeros(0, height, width, 3, dtype=torch.uint8, device=self.device)
+        drawn = self._engine.render(asked, camera=camera, height=height, width=width)
+        pictures = torch.from_numpy(drawn).to(self.device)
         return pictures if self.batch_size else pictures[0]
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free the simulators."""
+        """Free the simulators, and end all episodes; the next reset makes new simulators."""
         if not self.is_closed:
             self._engine.close()
+            self._rows.over[:] = True
         super().close(raise_if_closed=raise_if_closed)

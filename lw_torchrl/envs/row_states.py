@@ -16,12 +16,12 @@ from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.tasks import MT50, task_id
 
 
-def _moving(method: Callable[..., Any], move: Callable[..., Tensor]) -> Any:
-    """A method of Categorical that makes another spec, whose ids are moved alike."""
+def _with_ids(method: Callable[..., Any], change: Callable[..., Tensor] = lambda ids, *_args, **_kwargs: ids) -> Any:
+    """Wrap a method of Categorical that makes another spec, so that it keeps the rows' ids, changed alike."""
 
     def make(self: TaskIds, *args: Any, **kwargs: Any) -> TaskIds:
         made = method(self, *args, **kwargs)
-        made.ids = None if self.ids is None else move(self.ids, *args, **kwargs)
+        made.ids = None if self.ids is None else change(self.zero(), *args, **kwargs)
         return made
 
     return make
@@ -38,19 +38,20 @@ class TaskIds(Categorical):
         self.ids = ids
 
     def zero(self, shape: torch.Size | None = None) -> Tensor:
-        """The rows' ids, with the dimensions of ``shape`` in front."""
-        if self.ids is None:
+        """Return the rows' ids, with the dimensions of ``shape`` in front."""
+        if self.ids is None or self.ids.numel() != self.shape.numel():
             return super().zero(shape)
-        return self.ids.expand((*(shape or ()), *self.shape)).clone()
+        # Transforms such as UnsqueezeTransform assign another shape to the spec.
+        return self.ids.reshape(self.shape).expand((*(shape or ()), *self.shape)).clone()
 
-    expand = _moving(Categorical.expand, Tensor.expand)
-    _reshape = _moving(Categorical._reshape, Tensor.reshape)
-    _unflatten = _moving(Categorical._unflatten, Tensor.unflatten)
-    squeeze = _moving(Categorical.squeeze, lambda ids, dim=None: ids.squeeze() if dim is None else ids.squeeze(dim))
-    unsqueeze = _moving(Categorical.unsqueeze, Tensor.unsqueeze)
-    to = _moving(Categorical.to, lambda ids, dest: ids if isinstance(dest, torch.dtype) else ids.to(dest))
-    clone = _moving(Categorical.clone, Tensor.clone)
-    __getitem__ = _moving(Categorical.__getitem__, Tensor.__getitem__)
+    expand = _with_ids(Categorical.expand, Tensor.expand)
+    __getitem__ = _with_ids(Categorical.__getitem__, Tensor.__getitem__)
+    to = _with_ids(Categorical.to, lambda ids, dest: ids if isinstance(dest, torch.dtype) else ids.to(dest))
+    _reshape = _with_ids(Categorical._reshape)
+    _unflatten = _with_ids(Categorical._unflatten)
+    squeeze = _with_ids(Categorical.squeeze)
+    unsqueeze = _with_ids(Categorical.unsqueeze)
+    clone = _with_ids(Categorical.clone)
 
 
 def observation_spec(task_id: Tensor, layout: Layout) -> Composite:

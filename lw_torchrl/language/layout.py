@@ -119,6 +119,8 @@ class Layout:
             if not isinstance(relation, str) or type(threshold) is not float or abs(threshold) > 1e3:
                 raise ValueError(f"thresholds of layout {self.name!r} must map relations to metres, got {relation!r}")
         object.__setattr__(self, "thresholds", MappingProxyType(dict(self.thresholds)))
+        for name in ("present", "positions", "all_positions", "parts"):
+            getattr(self, name)  # computed here: torch.compile cannot trace the lock of a cached_property
 
     @cached_property
     def present(self) -> tuple[slice, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import torch
@@ -19,14 +18,6 @@ _KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
 Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
 
 
-def as_plans(plans: AnyPlans) -> Plans:
-    """Return ``plans``, or make :class:`Plans` of a mapping from task names to plans."""
-    if hasattr(plans, "num_steps"):
-        return plans  # type: ignore[return-value]
-    made: Plans = import_module("lw_torchrl.language.plans").as_plans(plans)  # only then: plans import no tables
-    return made
-
-
 def pick(table: Tensor, rows: Tensor) -> Tensor:
     """Return ``table[rows]``, also for one row inside of ``vmap``: (T, ...) and (B...) int64 to (B..., ...)."""
     return table.index_select(0, rows.reshape(-1)).reshape(*rows.shape, *table.shape[1:])
@@ -36,18 +27,17 @@ class TaskIndex:
     """The rows that tasks have in a table, in the order of their ids.
 
     Args:
-        ids: the id of each task, as :attr:`Plans.task_ids`; :class:`ValueError` if two tasks have one id.
+        task_ids: task name to id, as :attr:`Plans.task_ids`; two tasks of one id are a ValueError.
 
     Example:
-        >>> import lw_torchrl as lw
-        >>> index = TaskIndex({task: lw.task_id(task) for task in ("reach", "stack-blocks", "push")})
-        >>> index.tasks, index.rows(torch.tensor([lw.task_id("reach")]), "tasks without a plan").tolist()
-        (('push', 'reach', 'stack-blocks'), [1])
+        >>> index = TaskIndex({"reach": 35, "stack-blocks": 650718257, "push": 32})
+        >>> index.tasks, index.rows(torch.tensor([35, 32]), "tasks without a plan").tolist()
+        (('push', 'reach', 'stack-blocks'), [1, 0])
     """
 
-    def __init__(self, ids: Mapping[str, int]) -> None:
+    def __init__(self, task_ids: Mapping[str, int]) -> None:
         names: dict[int, str] = {}
-        for name, number in ids.items():
+        for name, number in task_ids.items():
             if number in names:
                 raise ValueError(f"tasks {names[number]!r} and {name!r} have the same id; choose another name")
             names[number] = name
@@ -76,14 +66,27 @@ class TaskIndex:
         found = ids.index_select(0, rows.reshape(-1)).reshape(rows.shape)
         if kept and not waits(task_id):
             if not torch.equal(found, given):
-                wrong = given[found != given].unique().tolist()[:5]
-                known = import_module("lw_torchrl.language.tasks").MT50
-                names = (known[i] if 0 <= i < len(known) else f"{i} (none of the 50)" for i in wrong)
-                raise ValueError(f"task_id names {problem}: {', '.join(names)}")
+                raise _unknown_ids(given[found != given].unique().tolist()[:5], problem)
             return rows
         if asserted(task_id):
             torch._assert_async((found == given).all(), f"task_id names {problem}")
         return torch.where(found == given, rows, len(self.tasks))
+
+
+def _unknown_ids(ids: list[int], problem: str) -> ValueError:
+    from lw_torchrl.language.tasks import MT50  # here: only the message needs the names of other tasks
+
+    names = (MT50[i] if 0 <= i < len(MT50) else f"{i} (none of the 50)" for i in ids)
+    return ValueError(f"task_id names {problem}: {', '.join(names)}")
+
+
+def as_plans(plans: AnyPlans) -> Plans:
+    """As :func:`lw_torchrl.language.plans.as_plans`, which is only imported where ``plans`` are not yet Plans."""
+    if isinstance(plans, Mapping) and hasattr(plans, "task_ids"):
+        return plans  # type: ignore[return-value]
+    from lw_torchrl.language import plans as library
+
+    return library.as_plans(plans)
 
 
 class PlanTables:

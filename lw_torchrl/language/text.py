@@ -30,7 +30,7 @@ def _shipped() -> dict[str, Tensor]:
 
 def sentence_encoder(texts: Sequence[str]) -> Tensor:
     """Encode texts with all-MiniLM-L6-v2, (n, 384) float32 of length 1; needs the extra ``[text]``."""
-    from lw_torchrl.language.embeddings import sentence_vectors  # here: the shipped texts do without it
+    from lw_torchrl.language.embeddings import sentence_vectors  # here: only texts that are not shipped need the model
 
     return torch.from_numpy(sentence_vectors(texts))
 

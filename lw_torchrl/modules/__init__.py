@@ -17,10 +17,10 @@ from lw_torchrl.modules.relative_features import FocusFeatures, RoleFeatures
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
 from lw_torchrl.modules.stochastic import StochasticActor
-from lw_torchrl.modules.wrappers import ActorEnsemble, DecideGripper, DemonstratedActor, TransferredActor
+from lw_torchrl.modules.wrappers import ActorEnsemble, DecidedGripper, DemonstratedActor, TransferredActor
 
 __all__ = [
-    "IMAGE_ENCODERS", "METHODS", "ActionMixer", "ActorEnsemble", "Concat", "ConditionedActor", "DecideGripper",
+    "IMAGE_ENCODERS", "METHODS", "ActionMixer", "ActorEnsemble", "Concat", "ConditionedActor", "DecidedGripper",
     "Decode", "DemonstratedActor", "DescriptorConditionedActor", "Features", "FocusFeatures", "GaussianDecoder",
     "ImageQueryEvaluator", "MLPDecoder", "ObservationFeatures", "PlanAttention", "PlanConditionedActor",
     "PlanConditionedQValue", "PlanConditionedValue", "QValue", "QueryEvaluator", "RoleFeatures", "ScriptedSkillActor",

@@ -69,6 +69,7 @@ class PlanAttention(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.plans = as_plans(plans)
+        self.tasks, self.layout = tuple(self.plans), self.plans.layout
         self.tables = PlanTables(self.plans)
         # (T, 2, S) bool: the plan's own steps, and the fallback steps; both hold all steps of a plan without fallback.
         self.register_buffer("mask", self.tables.turns, persistent=False)

@@ -15,9 +15,10 @@ from lw_torchrl._checks import check_int, checked, passes_on
 from lw_torchrl._keys import as_keys, check_apart, check_key, dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans
 from lw_torchrl.language.text import TextEncoder
-from lw_torchrl.modules.networks import MLP, encoding_width, materialize
+from lw_torchrl.modules.networks import MLP, materialize
 from lw_torchrl.modules.plan_conditioned_actor import plan_trunk
 from lw_torchrl.modules.policy import layout_of, plans_of
+from lw_torchrl.modules.sequence import encoding_width
 
 
 class Value(TensorDictModuleBase):

@@ -8,13 +8,14 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from lw_torchrl._checks import check_scale, checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
-from lw_torchrl.modules.networks import MLP
+from lw_torchrl.modules.networks import MLP, materialize
+from lw_torchrl.modules.sequence import encoding_width
 
 LEAST_STD = 1e-3
 
@@ -130,3 +131,14 @@ class Decode(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         decoded = self.network(torch.cat(read(tensordict, self.in_keys), -1))
         return write(tensordict, self, decoded if isinstance(decoded, tuple) else (decoded,))
+
+
+def as_decoder(decoder: nn.Module, trunk: TensorDictSequential, out_keys: Sequence[NestedKey]) -> TensorDictModuleBase:
+    """Return a decoder behind a trunk: a plain module reads the trunk's latent and features and writes ``out_keys``."""
+    own = isinstance(decoder, Decode) or not isinstance(decoder, TensorDictModuleBase)
+    if own and (width := encoding_width(trunk)) is not None:
+        materialize(getattr(decoder, "network", decoder), torch.zeros(1, width))
+    if isinstance(decoder, TensorDictModuleBase):
+        return decoder
+    keys = as_keys("out_keys", out_keys, list(map(str, out_keys)))
+    return Decode(decoder, in_keys=trunk.out_keys_source[-2:], out_keys=keys)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from lw_torchrl._checks import checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
 from lw_torchrl.language.task_index import TaskIndex, pick
-from lw_torchrl.language.tasks import MT50, Task, named_tasks, one_layout, task_id
+from lw_torchrl.language.tasks import MT50, Task, named_tasks, one_layout, task_ids
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.features import ObservationFeatures
 from lw_torchrl.modules.mixer import SkillEncoder, unit_scale
@@ -65,7 +65,7 @@ class TaskLatent(TensorDictModuleBase):
         check_apart(self.in_keys, self.out_keys)
         own = (lambda texts: torch.eye(len(texts))) if text_encoder is None and condition == "one-hot" else text_encoder
         vectors = encoded([task.description for task in self.definitions.values()], own)
-        self.index = TaskIndex({task: task_id(task) for task in self.tasks})
+        self.index = TaskIndex(task_ids(self.tasks))
         order = [self.tasks.index(task) for task in self.index.tasks]
         # Products of different numbers of rows round differently: whatever the tasks, there are at least 50 rows.
         fill = vectors.new_zeros(max(0, len(MT50) - len(order)), vectors.shape[1])

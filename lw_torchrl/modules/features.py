@@ -15,10 +15,10 @@ from torchrl.objectives import add_random_module
 
 from lw_torchrl._checks import check_choice, check_scale, checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
-from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.value_checks import check_finite
 
 if TYPE_CHECKING:
+    from lw_torchrl.language.layout import Layout
     from lw_torchrl.language.plans import AnyPlans
 
 Kind = Literal["raw", "differences", "relative", "opening", "none", "both"]
@@ -104,7 +104,11 @@ class ObservationFeatures(Features):
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         super().__init__(noise, as_keys("in_keys", in_keys, ("observation",)), out_keys)
-        self.layout: Layout = METAWORLD if layout is None else layout
+        if layout is None:
+            from lw_torchrl.language.layout import METAWORLD
+
+            layout = METAWORLD
+        self.layout: Layout = layout
         self.kind = check_choice("kind", kind, _KINDS)
         self.width = _KINDS[kind](torch.zeros(self.layout.size), self.layout).shape[-1]
         self.register_buffer("mean", torch.zeros(self.width))

@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 import torch
-from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
 from torchrl.modules import MLP as TorchRLMLP
 
@@ -47,13 +46,6 @@ def materialize(module: nn.Module, *inputs: Tensor) -> None:
     if any(isinstance(parameter, nn.parameter.UninitializedParameter) for parameter in module.parameters()):
         with evaluating(module):
             module(*inputs)
-
-
-def encoding_width(trunk: TensorDictSequential) -> int | None:
-    """Return D + F, how many numbers the trunk's latent and features are; None if its parts do not state it."""
-    latent, features = [*trunk.module.values()][-2:]
-    size, width = getattr(latent, "latent_size", None), getattr(features, "width", None)
-    return None if size is None or width is None else size + width
 
 
 @contextmanager

@@ -6,25 +6,23 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Self
 
-import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.data import Bounded, Composite
 
 from lw_torchrl._checks import checked
-from lw_torchrl._keys import as_keys
 from lw_torchrl.language.task_index import as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.attention import PlanAttention
-from lw_torchrl.modules.decoder import Decode, MLPDecoder
+from lw_torchrl.modules.decoder import MLPDecoder, as_decoder
 from lw_torchrl.modules.features import ObservationFeatures
 from lw_torchrl.modules.mixer import SkillMixer
-from lw_torchrl.modules.networks import encoding_width, materialize
-from lw_torchrl.modules.stochastic import DistributionName, StochasticActor
+from lw_torchrl.modules.sequence import NamedParts, trunk_attributes
 
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import AnyPlans
+    from lw_torchrl.modules.stochastic import DistributionName, StochasticActor
 
 
 def plan_trunk(
@@ -47,7 +45,7 @@ def plan_trunk(
     return TensorDictSequential(OrderedDict(attention=attention, mixer=mixer, features=features))
 
 
-class ConditionedActor(TensorDictSequential):
+class ConditionedActor(NamedParts):
     """A policy of a trunk, which says what to do and what is seen, and a decoder, which gives the action.
 
     Reads what the trunk reads; writes what the trunk and the decoder write, ``action`` (B, A) float32 last. Each part
@@ -76,24 +74,17 @@ class ConditionedActor(TensorDictSequential):
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("action",),
     ) -> None:
-        parts = dict(trunk.module.items())
-        known = [part.plans for part in parts.values() if hasattr(part, "plans")]
-        self.__dict__["_out_names"] = as_keys("out_keys", out_keys, list(map(str, out_keys)))
-        self.__dict__["layout"] = getattr(known[0] if known else trunk, "layout", None)
-        if decoder is None:
-            decoder = MLPDecoder(actions=4 if self.layout is None else self.layout.action_size)
-        super().__init__(OrderedDict(**parts, decoder=self._as_decoder(decoder, trunk)))
-        self.plans = known[0] if known else None
+        plans, tasks, layout = trunk_attributes(trunk).values()
+        decoder = MLPDecoder(actions=layout.action_size) if decoder is None else decoder
+        super().__init__(OrderedDict(**trunk.module, decoder=as_decoder(decoder, trunk, out_keys)))
+        self.plans, self.tasks, self.layout = plans, tasks, layout
         if in_keys is not None:
             self.in_keys = in_keys
 
-    def _as_decoder(self, decoder: nn.Module, trunk: TensorDictSequential) -> TensorDictModuleBase:
-        own = isinstance(decoder, Decode) or not isinstance(decoder, TensorDictModuleBase)
-        if own and (width := encoding_width(trunk)) is not None:
-            materialize(getattr(decoder, "network", decoder), torch.zeros(1, width))
-        if isinstance(decoder, TensorDictModuleBase):
-            return decoder
-        return Decode(decoder, in_keys=trunk.out_keys_source[-2:], out_keys=self._out_names)
+    def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
+        if name == "decoder":
+            return as_decoder(module, self.trunk, self.decoder.out_keys_source)
+        return super().as_part(name, module)
 
     @classmethod
     def rebuild(cls, trunk: TensorDictSequential, decoder: TensorDictModuleBase) -> Self:
@@ -104,56 +95,19 @@ class ConditionedActor(TensorDictSequential):
 
     @property
     def config(self) -> dict[str, Any]:
-        """The arguments of :meth:`rebuild`."""
-        return {"trunk": self.trunk, "decoder": self.module["decoder"]}
+        """The arguments of :meth:`rebuild`, from which a file builds the actor again."""
+        return {"trunk": self.trunk, "decoder": self.decoder}
 
     @property
     def trunk(self) -> TensorDictSequential:
         """All parts but the decoder, with the same weights; critics can be built on it."""
         return TensorDictSequential(OrderedDict([*self.module.items()][:-1]))
 
-    def __getattr__(self, name: str) -> Any:
-        parts = self.__dict__.get("_modules", {}).get("module") or {}
-        return parts[name] if name in parts else super().__getattr__(name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        parts = self.__dict__.get("_modules", {}).get("module") or {}
-        if name not in parts:
-            super().__setattr__(name, value)
-            return
-        if not isinstance(value, nn.Module):
-            raise TypeError(f"{name} must be a module, got {value!r:.80}")
-        if name == "decoder":
-            value = self._as_decoder(value, self.trunk)
-        elif not isinstance(value, TensorDictModuleBase):
-            value = TensorDictModule(value, in_keys=parts[name].in_keys[:1], out_keys=parts[name].out_keys)
-        parts[name] = value
-        self._update_keys()
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """What is read. New names can be assigned, in the same order; all parts then read them."""
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, keys: Sequence[NestedKey]) -> None:
-        if "module" not in self._modules:  # TensorDictSequential's constructor
-            self._in_keys = list(keys)
-            return
-        renamed = dict(zip(self._in_keys, as_keys("in_keys", keys, list(map(str, self._in_keys))), strict=True))
-        for part in self.module.values():
-            part.in_keys = [renamed.get(key, key) for key in part.in_keys]
-        self._update_keys()
-
-    def _update_keys(self) -> None:
-        self._in_keys, out_keys = self._compute_in_and_out_keys(list(self.module.values()))
-        self._out_keys = self._out_keys_apparent = self._complete_out_keys = out_keys
-
     @property
     def spec(self) -> Composite:
         """The specification of the action, (A,) float32 in [-1, 1], which TorchRL's losses read."""
         spec = Composite()
-        spec[self.module["decoder"].out_keys_source[0]] = Bounded(-1.0, 1.0, (self.layout.action_size,))
+        spec[self.decoder.out_keys_source[0]] = Bounded(-1.0, 1.0, (self.layout.action_size,))
         return spec
 
     def with_plans(self, plans: AnyPlans) -> Self:
@@ -164,6 +118,8 @@ class ConditionedActor(TensorDictSequential):
 
     def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> StochasticActor:
         """Return a copy that draws its actions, for RL, see :class:`~lw_torchrl.modules.StochasticActor`."""
+        from lw_torchrl.modules.stochastic import StochasticActor
+
         return StochasticActor.of(self, distribution, init_std)
 
 

@@ -12,8 +12,8 @@ from torchrl.envs import Compose, Transform
 
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
+from lw_torchrl.transforms.fallback_turns import FallbackTurns
 from lw_torchrl.transforms.qaf import QAFTransform
-from lw_torchrl.transforms.take_turns import TakeTurns
 
 
 def _parts(actor: Any) -> Iterator[Any]:
@@ -87,7 +87,7 @@ def transform_of(actor: Any, plans: Plans | None = None) -> Transform | None:
     if answered is not None:
         parts.insert(0, QAFTransform(answered, in_keys=[observation, task_id], out_keys=[qaf]))
     if own is not None and "turn" in reads:
-        parts.append(TakeTurns(own.layout, in_keys=[observation]))
+        parts.append(FallbackTurns(own.layout, in_keys=[observation]))
     if not parts:
         return None
     return parts[0] if len(parts) == 1 else Compose(*parts)

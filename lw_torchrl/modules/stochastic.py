@@ -21,7 +21,8 @@ from lw_torchrl._checks import check_choice, checked
 from lw_torchrl._keys import key_beside
 from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
 from lw_torchrl.modules.features import Features
-from lw_torchrl.modules.networks import encoding_width, materialize
+from lw_torchrl.modules.networks import materialize
+from lw_torchrl.modules.sequence import encoding_width, trunk_attributes
 
 DistributionName = Literal["tanh_normal", "normal"]
 DISTRIBUTIONS: dict[str, Any] = {"tanh_normal": TanhNormal, "normal": IndependentNormal}
@@ -73,8 +74,8 @@ class StochasticActor(ProbabilisticTensorDictSequential):
             log_prob_key=key_beside(action, "_log_prob"),
         )
         super().__init__(OrderedDict(**dict(trunk.module.items()), decoder=decoder, sampler=sampler))
-        known = [part.plans for part in trunk.module.values() if hasattr(part, "plans")]
-        self.plans, self.spec = known[0] if known else None, spec
+        self.plans, self.tasks, self.layout = trunk_attributes(trunk).values()
+        self.spec = spec
         self.distribution, self.action = distribution, action
 
     @classmethod

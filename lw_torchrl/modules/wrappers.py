@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import checked, shown
 from lw_torchrl._keys import dispatched, read, write
-from lw_torchrl.language.layout import METAWORLD, Layout
+from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.policy import layout_of, plans_of, tasks_of, with_plans
@@ -53,6 +53,7 @@ class ActorEnsemble(TensorDictModuleBase):
             if any(of(member) != of(first) for member in members):
                 raise ValueError(f"members must have the same {name}")
         self.members: Any = nn.ModuleList(members)
+        self.plans, self.tasks, self.layout = plans_of(first), tasks_of(first), layout_of(first)
         self.in_keys = list(dict.fromkeys(key for member in members for key in member.in_keys))
         written = [key for key in first.out_keys if _last(key) in ("action", "skill_weights")]
         self.out_keys = sorted(written, key=_last)
@@ -73,40 +74,52 @@ class ActorEnsemble(TensorDictModuleBase):
         return ActorEnsemble([with_plans(member, plans) for member in self.members]).train(self.training)
 
 
-class DecideGripper(TensorDictModuleBase):
+class DecidedGripper(TensorDictModuleBase):
     """Open or close the gripper fully while not training.
 
-    Half open fingers push objects over, and half closed ones lose them. Put it behind an actor:
-    ``TensorDictSequential(actor, DecideGripper())``.
+    Half open fingers push objects over, and half closed ones lose them.
 
-    Reads and writes ``action`` (B, A) float32; the effort becomes -1 or 1.
+    Reads what the actor reads; writes what the actor writes, where the effort of ``action`` (B, A) is -1 or 1.
 
     Args:
-        layout: the layout of the actions; None for Meta-World's.
+        actor: any actor.
         closes_above: the effort above which the gripper closes; None for the layout's.
+        layout: the layout of the actions; None for the actor's.
 
     Example:
-        >>> import torch, lw_torchrl as lw
-        >>> lw.modules.DecideGripper().eval()(action=torch.tensor([[0.0, 0.0, 0.1, 0.9]]))
-        tensor([[0.0000, 0.0000, 0.1000, 1.0000]])
+        >>> import lw_torchrl as lw
+        >>> actor = lw.modules.DecidedGripper(lw.DescriptorConditionedActor("MT10")).eval()
+        >>> actor(lw.LanguageWorldEnv("reach").reset())["action"][0, 3].abs()
+        tensor(1.)
     """
 
     @checked
-    def __init__(self, layout: Layout | None = None, closes_above: float | None = None) -> None:
+    def __init__(
+        self, actor: TensorDictModuleBase, closes_above: float | None = None, layout: Layout | None = None
+    ) -> None:
         super().__init__()
-        self.action_layout, self.closes_above = layout or METAWORLD, closes_above
-        self.in_keys, self.out_keys = ["action"], ["action"]
+        self.actor, self.closes_above = actor, closes_above
+        self.action_layout = layout or layout_of(actor)
+        self.plans, self.tasks, self.layout = plans_of(actor), tasks_of(actor), layout_of(actor)
+        self.in_keys, self.out_keys = list(actor.in_keys), list(actor.out_keys)
 
     @property
     def config(self) -> dict[str, Any]:
         """The keyword arguments that rebuild it."""
-        return {"layout": self.action_layout, "closes_above": self.closes_above}
+        return {"actor": self.actor, "closes_above": self.closes_above, "layout": self.action_layout}
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        (action,) = read(tensordict, self.in_keys)
-        decision = action if self.training else decided(action, self.action_layout, self.closes_above)
-        return write(tensordict, self, [decision])
+        outputs = self.actor(tensordict.copy())
+        if not self.training:
+            action = outputs.get(_action(self))
+            outputs.set(_action(self), decided(action, self.action_layout, self.closes_above))
+        return write(tensordict, self, [outputs.get(key) for key in self.out_keys_source])
+
+    def with_plans(self, plans: AnyPlans) -> DecidedGripper:
+        """Return the policy with the same networks that follows other plans."""
+        actor = with_plans(self.actor, plans)
+        return DecidedGripper(actor, self.closes_above, self.action_layout).train(self.training)
 
 
 def decided(action: Tensor, layout: Layout, closes_above: float | None = None) -> Tensor:

@@ -92,7 +92,7 @@ class CameraTransform(KeepsEnvState):
     def _rows(self, mask: Tensor | None) -> Tensor:
         env: Any = base_env(self)
         count = len(env.row_tasks)
-        return torch.ones(count, dtype=torch.bool) if mask is None else mask.reshape(count)
+        return torch.ones(count, dtype=torch.bool) if mask is None else mask.reshape(count).cpu()
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         begun = self._rows(tensordict.get("_reset", None))

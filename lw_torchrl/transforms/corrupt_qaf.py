@@ -1,4 +1,4 @@
-"""CorruptQAF: query answers that are updated rarely, delayed or wrong."""
+"""CorruptQAF: make query answers late, held or wrong."""
 
 from __future__ import annotations
 
@@ -22,25 +22,28 @@ _BLOCK = 64  # steps of an episode whose random numbers are drawn together
 
 
 class CorruptQAF(EpisodeTransform):
-    """Corrupt ``qaf`` in an environment, after a :class:`QAFTransform`, to measure the cost of slow and wrong answers.
+    """Make the answers in ``qaf`` late, held and wrong, to measure what slow or unreliable answers cost.
 
-    Reads ``qaf`` (B, S) bool, ``task_id`` (B,) and ``episode`` (B,) int64, and ``qaf_plan`` (B,) int64 where it is;
-    writes only ``qaf``. The corruptions are applied in this order:
+    For environments, after a :class:`QAFTransform`. Reads ``qaf`` (B, S) bool, or float in [0, 1], ``task_id`` (B,) and
+    ``episode`` (B,) int64, and ``qaf_plan`` (B,) int64 where it exists; changes only ``qaf``:
 
-    - **every, delay**: in step t of its episode, 0 at the reset, a row is shown the answers of step
+    - **every, delay** (held, late): in step t of its episode, 0 at the reset, a row shows the answers of step
       every · ⌊max(t - delay, 0) / every⌋;
-    - **flip**: in each step, the reset included, each answer is inverted with this probability.
+    - **flip** (wrong): in each step, the reset included, each answer is then inverted with this probability.
 
-    The random draws depend only on (task, seed, episode, step) and the answer's place in its plan. A greater
-    probability inverts all that a smaller one inverts. In :func:`lw_torchrl.evaluate` it is an ``evaluator``. A policy
-    with its own :class:`QueryEvaluator` does not read ``qaf`` and is not affected.
+    The random draws depend only on (task, seed, episode, step) and the answer's place in its plan. A larger probability
+    inverts all that a smaller one inverts. In :func:`lw_torchrl.evaluate` it can be the ``evaluator``.
+
+    A learned evaluator in front of a policy overwrites ``qaf``. To corrupt its answers, run it in the environment: by a
+    transform before this one that calls it in ``_reset`` and ``_call``, and adapts the spec of ``qaf``.
 
     Args:
-        plans: whose conditions ``qaf`` answers.
-        every, delay: steps between two updates of a row's answers, and steps until they are shown.
-        flip: a probability.
-        seed: any integer, of the random draws.
-        in_keys: where qaf, task_id and episode are, in this order; qaf is written where it was.
+        plans: the plans whose conditions ``qaf`` answers.
+        every: steps between two updates of a row's answers.
+        delay: steps until new answers are shown.
+        flip: probability of inverting an answer.
+        seed: any integer, for the random draws.
+        in_keys: other names for qaf, task_id and episode, in this order.
 
     Raises:
         ValueError: ``qaf`` is missing, has another shape or dtype, or belongs to other plans; or the transform is used
@@ -81,7 +84,7 @@ class CorruptQAF(EpisodeTransform):
     def _forget_episodes(self) -> None:
         self._places = -(-self.delay // self.every) + 1  # maximum number of answers waiting to be shown
         self._steps: Tensor | None = None  # B int64, of each row's episode
-        self._taken: Tensor | None = None  # (B, places, S) bool; the n-th answers are in place n % places
+        self._taken: Tensor | None = None  # (B, places, S); the n-th answers are in place n % places
         self._draws = _Draws(self.seed, self._tables, self.plans)
 
     def with_plans(self, plans: AnyPlans) -> CorruptQAF:
@@ -94,12 +97,11 @@ class CorruptQAF(EpisodeTransform):
         begun = tensordict.get("_reset", None)
         self._task, self._episode = reset_rows(self._task, task, begun), reset_rows(self._episode, episode, begun)
         self._plan = self._tables.rows(self._task)
-        number = tensordict_reset.get(plan_number_key(self.in_keys[0]), None)
-        if number is not None and bool(((number != self._tables.number[self._plan]) & (number != 0)).any()):
-            raise ValueError("qaf answers other plans than CorruptQAF was given: give both the same plans")
+        self._tables.refuse_others(tensordict_reset.get(plan_number_key(self.in_keys[0]), None), self._plan)
         shape = (*self._plan.shape, self.plans.num_steps)
-        if truth.dtype != torch.bool or truth.shape != shape:
-            raise ValueError(f"qaf must be bool of shape {shape}, got {truth.dtype} of shape {tuple(truth.shape)}")
+        if truth.shape != shape or not (truth.dtype == torch.bool or truth.is_floating_point()):
+            got = f"{truth.dtype} of shape {tuple(truth.shape)}"
+            raise ValueError(f"qaf must be bool, or float for soft truth, of shape {shape}, got {got}")
         self._steps = reset_rows(self._steps, torch.zeros_like(self._plan), begun)
         self._taken = reset_rows(self._taken, torch.stack([truth] * self._places, -2), begun, 2)
         return self._show(tensordict_reset)
@@ -126,13 +128,14 @@ class CorruptQAF(EpisodeTransform):
         place = self._place((self._steps - self.delay).clamp(min=0))[..., None, None]
         shown = self._taken.gather(-2, place.expand(*place.shape[:-1], self._taken.shape[-1])).squeeze(-2)
         if self.flip:
-            shown = shown ^ (self._draws(self._plan, self._episode, self._steps) < self.flip)
+            wrong = self._draws(self._plan, self._episode, self._steps) < self.flip
+            shown = shown ^ wrong if shown.dtype == torch.bool else torch.where(wrong, 1 - shown, shown)
         return tensordict.set(self.in_keys[0], shown)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         raise ValueError(
-            "CorruptQAF counts the steps of an environment's episodes, which rows of a replay buffer do not tell: put "
-            "it into the environment, behind QAFTransform, or give it to evaluate(evaluator=...)"
+            "CorruptQAF counts the steps of an environment's episodes, which rows of a replay buffer do not record: "
+            "put it into the environment, after QAFTransform, or give it to evaluate(evaluator=...)"
         )
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:

@@ -1,4 +1,4 @@
-"""QAFTransform: the truth of each condition of the task's plan, as a tensor."""
+"""QAFTransform: answer the conditions of each row's plan, as a tensor of their truth."""
 
 from __future__ import annotations
 
@@ -35,6 +35,27 @@ def plan_program(plans: Plans) -> QueryProgram:
 def plan_number_key(qaf: NestedKey) -> NestedKey:
     """Where :class:`QAFTransform` writes the plan's number: beside ``qaf``, ``qaf_plan``."""
     return key_beside(qaf, "_plan")
+
+
+def answers_of(qaf: Tensor, task_id: Tensor, number: Tensor | None, tables: PlanTables) -> tuple[Tensor, Tensor]:
+    """Return ``qaf`` (B, S) and each row's place (B,) int64 in the tables of plans that have S steps.
+
+    Answers for more plans, of which some are longer, are cut to S if ``number``, their ``qaf_plan``, shows that the
+    rows' plans are equal. A task without a plan, and the answers of other plans, are a :class:`ValueError`.
+    """
+    rows = tables.rows(one_per_row(task_id, qaf.shape[:-1]))
+    tables.refuse_others(number, rows)
+    wanted = (*rows.shape, tables.mask.shape[-1])
+    if number is not None and qaf.shape[:-1] == rows.shape and qaf.shape[-1] > wanted[-1]:
+        qaf = qaf[..., : wanted[-1]]
+    if qaf.shape != wanted:
+        raise ValueError(f"qaf must have shape {wanted}, one column for each step of plans, got {tuple(qaf.shape)}")
+    return qaf, rows
+
+
+def one_per_row(values: Tensor, rows: torch.Size) -> Tensor:
+    """Return values (B,), or (B, 1) as ``UnsqueezeTransform`` makes them, with the shape of the rows, (B,)."""
+    return values.squeeze(-1) if values.shape == (*rows, 1) else values
 
 
 class QAFTransform(KeepsEnvState):
@@ -80,8 +101,8 @@ class QAFTransform(KeepsEnvState):
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         truth = as_keys("out_keys", out_keys, ("qaf",))
-        read = as_keys("in_keys", in_keys, ("observation", "task_id"))
-        super().__init__(in_keys=read, out_keys=[*truth, plan_number_key(truth[0])])
+        keys = as_keys("in_keys", in_keys, ("observation", "task_id"))
+        super().__init__(in_keys=keys, out_keys=[*truth, plan_number_key(truth[0])])
         check_apart(self.in_keys, self.out_keys)
         self.plans = as_plans(plans)
         self.program = plan_program(self.plans)
@@ -100,6 +121,7 @@ class QAFTransform(KeepsEnvState):
         if observation.dtype in _HALF:
             got = f"got {observation.dtype}: put QAFTransform before what casts it"
             raise ValueError(f"observation must be float32 or float64, {got}")
+        task_id = one_per_row(task_id, observation.shape[:-1])
         tensordict.set(self.out_keys[0], self.program(observation, task_id))
         number = self._number.select(task_id.reshape(-1), observation).plan
         tensordict.set(self.out_keys[1], number.reshape(task_id.shape).clone())  # a collector zeroes what it is given

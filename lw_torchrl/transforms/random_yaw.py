@@ -1,27 +1,23 @@
-"""RandomYaw: demonstrations as they would look, had the scene been turned about the vertical."""
+"""RandomYaw: turn the scenes of demonstrations about the vertical."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.envs import EnvBase, Transform
 
 from lw_torchrl._checks import check_probability, check_scale, checked, missing_keys
-from lw_torchrl._keys import as_keys, check_apart, key_beside, read
+from lw_torchrl._keys import as_keys, check_apart, key_beside
 from lw_torchrl.language.layout import METAWORLD, Layout
-from lw_torchrl.language.plans import AnyPlans, as_plans
+from lw_torchrl.language.plans import AnyPlans
+from lw_torchrl.language.roles import StepRole
 from lw_torchrl.language.skills import has_direction
-from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.transforms.qaf import plan_number_key
+from lw_torchrl.transforms.augmentation import PlanAugmentation, role_table
 
-_TO_A_PLACE = re.compile(r"(?:carry|slide|move) the .+ to the (?!left$|right$)")
 _KEYS = ("observation", "action", "expert_action", "unclipped_action")
-_NOT_FOR_ENVIRONMENTS = "RandomYaw is for replay buffers: an environment has done its action before it is turned"
 
 
 def _turned(values: Tensor, starts: tuple[int, ...], cos: Tensor, sin: Tensor) -> Tensor:
@@ -71,30 +67,33 @@ def random_rotations(number: int, device: torch.device | None = None) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-class RandomYaw(Transform):
-    """Turns each sampled row, its positions and its action alike, by a random angle about the vertical, so that a
-    policy learns to move towards the goal rather than in the direction that the demonstrations happened to have. For
-    replay buffers; a :class:`QAFTransform` comes first, since conditions speak of the scene as it was.
+class RandomYaw(PlanAugmentation):
+    """Turn each sampled row, its positions and its actions, by a random angle about the vertical.
 
-    Changes ``observation`` (B, 39) float32 and ``action`` (B, 4) float32, and, where they are, ``expert_action`` and
-    ``unclipped_action`` (B, 4) float32 and ``("next", "observation")``; writes ``observation_yaw`` (B,) float32, the
-    angle in radians, and ``("next", "observation_yaw")``. An action's way in the plane is shortened where turning would
-    lead it out of [-1, 1]. Orientations stay as they were: use it with features that do not hold them, "differences" or
-    "relative". ``focus`` and ``roles`` turn fixed places by the angle, which is drawn from PyTorch's global generator.
+    A policy then learns to move towards the goal, and not in the direction that the demonstrations happened to have.
+    For replay buffers, after a :class:`QAFTransform`: conditions such as "left of" hold in the scene as it was.
+
+    Changes ``observation`` (B, 39) float32, ``action`` (B, 4) float32, and, where they exist, ``expert_action`` and
+    ``unclipped_action`` (B, 4) float32 and ``("next", "observation")``. Writes ``observation_yaw`` (B,) float32, the
+    angle in radians, and ``("next", "observation_yaw")``; features of fixed places turn these by the angle. An action's
+    displacement in the plane is shortened where turning would lead it out of [-1, 1]. Orientations are not turned: use
+    features without them, "differences" or "relative". Angles are drawn from PyTorch's global generator.
 
     Args:
         scale: standard deviation of the angle, in radians; 10 is any angle.
-        plans: the actor's plans: rows whose steps in force say no direction ("move the puck to the target location")
-            are then turned by any angle, by ``qaf`` (B, S) bool and ``task_id`` (B,) int64; None turns all rows alike.
-        tilt: the probability that a row is also turned in space, by any rotation, if its step in force moves something
-            freely to a place; of canonical plans, an actor's with ``roles``. Such a row's ``observation_tilt``
-            (B, 3, 3) float32 turns the relative position that ``roles`` show; of all others it is the identity.
+        plans: the actor's plans. Rows whose true conditions lead to no direction ("move the puck to the target
+            location") are then turned by any angle, by ``qaf`` (B, S) and ``task_id`` (B,) int64; None turns all rows
+            alike.
+        tilt: the probability that a row is also turned in space, by any rotation, if its steps move something freely
+            to a place. It needs canonical plans, see :func:`~lw_torchrl.canonical_plans`. Such a row's
+            ``observation_tilt`` (B, 3, 3) float32 turns the relative position that
+            :class:`~lw_torchrl.modules.RoleFeatures` shows; for all other rows it is the identity.
         layout: of the observations and actions; None for that of the plans, or Meta-World's without plans.
-        in_keys: where observation, action, the expert's action and the unclipped one are, in this order.
-        out_keys: where they go, turned; None for the same places.
+        in_keys: other names for observation, action, the expert's action and the unclipped one, in this order.
+        out_keys: where the turned ones go; None for the same places.
 
     Raises:
-        ValueError: a wrong argument; a sample without observation or action, or, with plans, qaf and task_id of them.
+        ValueError: a wrong argument; a sample without observation or action, or, with plans, without their answers.
         TypeError: it is given to an environment.
 
     Example:
@@ -104,7 +103,7 @@ class RandomYaw(Transform):
         >>> lw.RandomYaw(0.3)(rows)["action"][:, :2].norm(dim=-1)
         tensor([0.5000, 0.5000])
 
-    Source: data augmentation by a symmetry of the task, as for images in ``torchvision.transforms.RandomRotation``.
+    Source: data augmentation by a symmetry of the task, images in ``torchvision.transforms.RandomRotation``.
     """
 
     @checked
@@ -125,45 +124,38 @@ class RandomYaw(Transform):
         for own, there in zip(self.in_keys, self.out_keys, strict=True):
             if there != own:
                 check_apart(self.in_keys, [there])
-        self.scale = check_scale("scale", scale)
-        self._tables: PlanTables | None = None
-        self.layout = METAWORLD if layout is None else layout
+        self.scale, self.tilt = check_scale("scale", scale), check_probability("tilt", tilt)
+        self.has_plans = plans is not None
         if plans is not None:
-            plans = as_plans(plans)
+            plans = self._read_plans(plans)
             if layout not in (None, plans.layout):
                 raise ValueError(f"layout must be that of the plans, {plans.layout.name!r}, got {layout.name!r}")
-            self.layout = plans.layout
-            self.fingerprint = plans.fingerprint  # what checkpoints of trainers tell it by
-            self._tables = PlanTables(plans)
+            layout = plans.layout
             free = torch.tensor([not has_direction(skill) for skill in plans.skills])
-            self.register_buffer("_free", free[self._tables.skill_index], persistent=False)
-            places = torch.tensor([bool(_TO_A_PLACE.match(skill)) for skill in plans.skills])
-            self.register_buffer("_places", places[self._tables.skill_index], persistent=False)
+            self.step_table("free", free[self._tables.skill_index])
+            if tilt:
+                self.step_table("to_places", role_table(plans, self._tables, _moves_to_a_place))
         elif tilt:
             raise ValueError(f"tilt needs plans, which say what moves freely, and plans is None; got tilt={tilt}")
-        self.tilt = check_probability("tilt", tilt)
-        self._begin = self.layout.displaced("RandomYaw").start
+        self.layout = METAWORLD if layout is None else layout
+        self._begin, self._starts = self.layout.displaced("RandomYaw").start, _starts(self.layout)
 
     def _angle(self, tensordict: TensorDictBase, observation: Tensor) -> Tensor:
         angle = self.scale * torch.randn(observation.shape[:-1], device=observation.device)
-        if self._tables is None:
+        if not self.has_plans:
             return angle
         any_angle = torch.pi * (2 * torch.rand_like(angle) - 1)
-        return torch.where(self._all_in_force(tensordict, self._free), any_angle, angle)
+        return torch.where(self._all_true(tensordict, "free"), any_angle, angle)
 
-    def _all_in_force(self, tensordict: TensorDictBase, wanted: Tensor) -> Tensor:
-        """(B,) bool, whether steps are in force, and all that are have what is ``wanted`` (T, S) bool."""
-        assert self._tables is not None
-        qaf, task_id = read(tensordict, ["qaf", "task_id"])
-        rows = self._tables.rows(task_id)
-        self._tables.refuse_others(tensordict.get(plan_number_key("qaf"), None), rows)
-        if qaf.shape != (shape := (*rows.shape, self._free.shape[-1])):
-            raise ValueError(f"qaf must have shape {shape}, one column for each step of plans, got {tuple(qaf.shape)}")
-        return (wanted[rows] | (qaf < 0.5)).all(-1) & (qaf > 0.5).any(-1)
+    def _all_true(self, tensordict: TensorDictBase, name: str) -> Tensor:
+        """Return (B,) bool, whether some step's condition is true, and the table ``name`` holds for all such steps."""
+        qaf, rows, steps = self.answers(tensordict, ["qaf", "task_id"])
+        true = (qaf > 0.5) & steps
+        return (self.table(name, rows.device)[rows] | ~true).all(-1) & true.any(-1)
 
     def _tilt(self, tensordict: TensorDictBase) -> Tensor:
         """(B, 3, 3) float32, the rotation of each row."""
-        free = self._all_in_force(tensordict, self._places)
+        free = self._all_true(tensordict, "to_places")
         chosen = free & (torch.rand(free.shape, device=free.device) < self.tilt)
         found = random_rotations(free.numel(), free.device).reshape(*free.shape, 3, 3)
         return torch.where(chosen[..., None, None], found, torch.eye(3, device=free.device))
@@ -179,7 +171,7 @@ class RandomYaw(Transform):
         if tilt is not None:
             tensordict.set(tilt_key(seen[1]), tilt)
         cos, sin = angle.cos(), angle.sin()
-        starts, begin = _starts(self.layout), self._begin
+        starts, begin = self._starts, self._begin
         tensordict.set(seen[1], _turned(observation, starts, cos, sin)).set(yaw_key(seen[1]), angle)
         if (following := tensordict.get(unravel_key(("next", seen[0])), None)) is not None:
             after = unravel_key(("next", seen[1]))
@@ -198,10 +190,6 @@ class RandomYaw(Transform):
             tensordict.set(turned_key, turned)
         return tensordict
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        raise TypeError(_NOT_FOR_ENVIRONMENTS)
 
-    def set_container(self, container: Transform | EnvBase) -> None:
-        if isinstance(container, EnvBase):
-            raise TypeError(_NOT_FOR_ENVIRONMENTS)
-        super().set_container(container)
+def _moves_to_a_place(role: StepRole) -> bool:
+    return role.verb == "carry" or (role.verb == "move" and role.direction is None)

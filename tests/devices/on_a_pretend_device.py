@@ -13,10 +13,11 @@ from small_training import CONFIG, PLANS, SMALL, assert_same, collect_demos, fla
 from tensordict import TensorDict
 from test_losses import LOSSES, make_batch, make_loss, ready, total, trained
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose
+from torchrl.envs import Compose, TransformedEnv
 
 import lw_torchrl as lw
 from benchmarks.paper.stacked import StackedBehavioralCloning
+from lw_torchrl.transforms import FallbackTurns
 
 ACTORS = {
     "plan": lambda: make_actor(feature_noise=0.0),
@@ -396,3 +397,42 @@ def test_any_loss_over_a_buffer_waits_for_nothing_and_is_the_cpus(demos, name):
         for key in expected.keys():
             if expected[key].numel() == 1:
                 assert one[key].item() == pytest.approx(expected[key].item(), rel=1e-5), key
+
+
+def test_an_environment_is_where_it_is_put():
+    def parts():
+        return Compose(lw.QAFTransform(PLANS), lw.CorruptQAF(PLANS, every=2, delay=1, flip=0.3), FallbackTurns())
+
+    options = {"num_envs": 2, "max_steps": 4}
+    moved = TransformedEnv(lw.LanguageWorldEnv(["push", "reach"], **options), parts()).to(PRETEND)
+    made = TransformedEnv(lw.LanguageWorldEnv(["push", "reach"], device=PRETEND, **options), parts())
+    here = TransformedEnv(lw.LanguageWorldEnv(["push", "reach"], **options), parts())
+    found = []
+    for env in (moved, made, here):
+        still = lambda td: td.set("action", torch.full((2, 4), 0.5, device=td.device))  # noqa: E731
+        rollout = env.rollout(6, still, break_when_any_done=False)
+        assert {value.device for value in rollout.values(True, True)} == {env.device}
+        assert env.action_spec.device == env.full_done_spec.device == env.device
+        found.append(rollout.cpu())
+        env.close()
+    assert moved.device == made.device == PRETEND
+    assert (found[0] == found[2]).all()
+    assert (found[1] == found[2]).all()
+
+
+def test_augmentations_are_where_the_rows_are():
+    plans = lw.canonical_plans(PLANS, fallback=True)
+    augmented = Compose(
+        lw.QAFTransform(plans),
+        lw.transforms.SwapUnmentioned(plans, 0.5),
+        lw.transforms.HideOpening(0.5, plans=plans),
+        lw.transforms.JitterTarget(plans, 0.03),
+        lw.RandomYaw(0.3, plans=plans, tilt=0.5),
+    )
+    ids = torch.full((8,), lw.task_id("push"))
+    rows = TensorDict(observation=torch.rand(8, 39), action=torch.rand(8, 4), task_id=ids, batch_size=[8]).to(PRETEND)
+    augmented(rows)
+    WAITS.clear()
+    found = augmented(rows)
+    assert WAITS == []
+    assert {value.device for value in found.values(True, True)} == {PRETEND}

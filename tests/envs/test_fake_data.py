@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torchrl.envs import ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.collectors import Collector
+from torchrl.envs import ParallelEnv, SerialEnv, StepCounter, TransformedEnv, UnsqueezeTransform
 from torchrl.envs.utils import check_env_specs
 
 import lw_torchrl as lw
@@ -41,6 +42,20 @@ def test_a_policy_acts_on_fake_data(name, policy):
         assert torch.equal(fake["task_id"], fake["next", "task_id"])
     check_env_specs(env)
     env.close()
+
+
+def test_a_transform_may_change_the_shape_of_task_id():
+    """TorchRL's transforms assign a spec's shape; Collector and ParallelEnv act on the fake data."""
+    base = lw.LanguageWorldEnv(["push", "reach"], num_envs=3)
+    env = TransformedEnv(base, UnsqueezeTransform(-1, in_keys=["task_id"], out_keys=["column"]))
+    ids = base.observation_spec["task_id"].zero()
+    assert torch.equal(env.fake_tensordict()["column"], ids.unsqueeze(-1))
+    check_env_specs(env)
+    spec = env.observation_spec["column"]
+    assert torch.equal(spec.expand(2, 3, 1).zero(), ids.reshape(3, 1).expand(2, 3, 1))
+    collector = Collector(env, frames_per_batch=6, total_frames=6, trajs_per_batch=None)
+    assert [batch["column"].shape for batch in collector] == [(3, 2, 1)]
+    collector.shutdown()
 
 
 def test_the_ids_follow_every_change_of_shape():

@@ -132,7 +132,7 @@ def test_there_is_nothing_to_see_before_a_reset_or_after_the_end():
         env.render()
     env.reset()
     env.close()
-    with pytest.raises(RuntimeError, match="closed"):
+    with pytest.raises(RuntimeError, match="before a reset"):
         env.render()
 
 

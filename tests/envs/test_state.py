@@ -88,7 +88,7 @@ def test_the_episodes_that_ran_are_over():
     env = make_env()
     state = env.reset()
     env.load_state_dict(env.state_dict())
-    with pytest.raises(RuntimeError, match=r"rows \[0, 1, 2\] .* not since load_state_dict: reset them"):
+    with pytest.raises(RuntimeError, match=r"rows \[0, 1, 2\] .* not since close or load_state_dict: reset them"):
         env.step(state.set("action", torch.zeros(3, 4)))
     assert env.reset()["episode"].tolist() == [2, 1, 3]
     env.close()

@@ -9,6 +9,7 @@ from rows import ENGINES, FEW, ROWS, STATE, STEPS, actions_of, advance, others, 
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
+from torchrl.trainers import LogValidationReward
 
 import lw_torchrl as lw
 
@@ -128,16 +129,42 @@ def test_a_row_that_has_ended_must_be_reset(any_env):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_a_closed_environment_says_so(engine):
-    env = lw.LanguageWorldEnv("reach", engine=engine)
+def test_a_closed_environment_must_be_reset_and_continues_with_the_next_episodes(engine):
+    env, other = (lw.LanguageWorldEnv(["push", "reach"], engine=engine, max_steps=4) for _ in range(2))
+    action = torch.zeros(2, 4)
     state = env.reset()
     assert not env.is_closed
     env.close()
+    env.close()
     assert env.is_closed
-    with pytest.raises(RuntimeError, match="this environment is closed"):
-        env.step(state.set("action", torch.zeros(1, 4)))
-    with pytest.raises(RuntimeError, match="this environment is closed"):
-        env.reset()
+    with pytest.raises(RuntimeError, match=r"rows \[0, 1\] have ended .* or not since close "):
+        env.step(state.set("action", action))
+    other.reset()
+    found, expected = (
+        made.rollout(4, lambda td: td.set("action", action), break_when_any_done=False) for made in (env, other)
+    )
+    assert not env.is_closed
+    assert (found == expected).all()
+    assert found["episode"][:, 0].tolist() == [1, 1]
+    env.close()
+    other.close()
+
+
+def test_torchrl_validates_with_one_environment_again_and_again():
+    """``LogValidationReward`` closes its environment after each validation."""
+    plans = lw.load_plans("MT10")
+    env = TransformedEnv(lw.LanguageWorldEnv("reach", max_steps=5), lw.QAFTransform(plans))
+    hook = LogValidationReward(
+        record_interval=1,
+        record_frames=5,
+        frame_skip=1,
+        policy_exploration=lw.ScriptedSkillActor(plans),
+        environment=env,
+        log_keys=[("next", "reward")],
+    )
+    for _ in range(2):
+        assert set(hook(None)) >= {"r_evaluation"}
+        assert env.base_env.is_closed
 
 
 def test_a_row_that_was_never_reset_must_be():

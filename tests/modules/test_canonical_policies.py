@@ -6,11 +6,11 @@ import sys
 
 import pytest
 import torch
+from lw_torchrl.language.canonical_steps import read_canonical, step_vectors
 from tensordict import TensorDict
 
 import lw_torchrl as lw
 from lw_torchrl.language.canonical import RULES
-from lw_torchrl.language.canonical_steps import read_canonical, step_vectors
 from lw_torchrl.training.checkpoint import read_description, text_vectors
 
 MT10, MT50 = lw.load_plans("MT10"), lw.load_plans("MT50")

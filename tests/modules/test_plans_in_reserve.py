@@ -5,9 +5,8 @@ import torch
 from tensordict import TensorDict
 
 import lw_torchrl as lw
-from lw_torchrl.language.canonical import fallback_plan
-from lw_torchrl.language.canonical_steps import read_canonical, with_reserve
-from lw_torchrl.transforms import QAFTransform, TakeTurns
+from lw_torchrl.language.canonical import read_canonical, with_reserve
+from lw_torchrl.transforms import FallbackTurns, QAFTransform
 
 MT10, MT50 = lw.load_plans("MT10"), lw.load_plans("MT50")
 SMALL = {"width": 8, "depth": 1, "latent_size": 4, "encoder_width": 8, "feature_noise": 0.0}
@@ -23,7 +22,7 @@ def states(actor, turn=None, task="dial-turn", rows=200):
     torch.manual_seed(1)
     state = TensorDict(observation=torch.rand(rows, 39), task_id=torch.full((rows,), lw.task_id(task)))
     state = actor.transform()(state.auto_batch_size_())
-    return state if turn is None else state.set("observation_turn", torch.full((rows,), turn))
+    return state if turn is None else state.set("turn", torch.full((rows,), turn))
 
 
 def test_its_plans_end_with_the_default_plans_steps():
@@ -66,7 +65,7 @@ def test_in_reserve_it_does_what_it_does_under_the_default_plan():
 
 def test_its_transform_counts_turns_and_answers_queries():
     kinds = [type(one) for one in make(reserve=True).transform().transforms]
-    assert kinds == [QAFTransform, TakeTurns]
+    assert kinds == [QAFTransform, FallbackTurns]
 
 
 def test_a_policy_that_gets_nowhere_comes_to_its_reserve():
@@ -78,8 +77,8 @@ def test_a_policy_that_gets_nowhere_comes_to_its_reserve():
         tasks="reach",
         episodes_per_task=1,
         seed=1_000,
-        also_record=["observation_turn"],
-        on_episode=lambda episode: seen.append(episode.steps["observation_turn"].max()),
+        also_record=["turn"],
+        on_episode=lambda episode: seen.append(episode.steps["turn"].max()),
         progress=False,
     )
     assert max(seen) >= 1

@@ -5,13 +5,13 @@ from copy import deepcopy
 
 import pytest
 import torch
+from lw_torchrl.language.canonical_steps import read_canonical
 from lw_torchrl.modules.relative_positions import PlanRoles
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import TD3Loss
 
 import lw_torchrl as lw
-from lw_torchrl.language.canonical_steps import read_canonical
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.training.normalization import fit_normalization
 

@@ -257,7 +257,10 @@ def wrong_states() -> dict[str, tuple[dict[str, Tensor], str]]:
             {"observation": observation, "task_id": reach.float()},
             "task_id must be int64.* got torch.float32",
         ),
-        "extra axis": ({"observation": observation, "task_id": reach[:, None]}, r"task_id must be .*\(3,\).*\(3, 1\)"),
+        "extra axis": (
+            {"observation": observation, "task_id": reach.expand(2, 3).T},
+            r"task_id must be .*\(3,\).*\(3, 2\)",
+        ),
     }
 
 

@@ -1,15 +1,17 @@
 """RandomYaw's tilt: rows in which something is moved freely to a place are turned in space, too."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tensordict import TensorDict
 
 import lw_torchrl as lw
+from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.transforms.random_yaw import random_rotations
 
 MT10 = lw.load_plans("MT10")
-ACTOR = lw.PlanConditionedActor(MT10, roles=True, features="none", width=8, depth=1)
-PLANS = ACTOR.plans
+PLANS = lw.canonical_plans(MT10)
 NOW = torch.eye(3)
 
 
@@ -91,19 +93,23 @@ def test_every_step_in_force_has_to_and_one_must_be():
 
 
 def test_slid_to_a_side_is_no_place():
-    pairs = [("the gripper is near the puck and the gripper is open", "close the gripper around the puck")]
-    pairs += [
-        ("the gripper is near the puck and the gripper is closed", f"slide the puck {way}")
-        for way in ("to the left", "to the right", "away from the robot", "up", "to the target location")
-    ]
-    plans = lw.Plans([lw.ConditionalPlan.from_pairs("push", pairs)])
+    role = lw.canonical_plan(MT10["push"]).steps[-1].role
+    ways = ("left", "right", "away", "toward", "up", None)
+    roles = [replace(role, verb="move", direction=way) for way in ways]
+    condition = "the gripper is near the puck"
+    plans = lw.Plans([lw.ConditionalPlan("push", tuple(PlanStep(condition, role.skill, role=role) for role in roles))])
     was = rows("push", 0)
-    was["qaf"] = torch.zeros(400, 6, dtype=torch.bool)
-    for step in range(6):
-        state = was.clone()
-        state["qaf"][:, step] = True
-        turns = lw.RandomYaw(0.1, plans=plans, tilt=1.0)(state)["observation_tilt"]
-        assert torch.equal(turns, NOW.expand(400, 3, 3)) == (step != 5)
+    for step, way in enumerate(ways):
+        was["qaf"] = torch.nn.functional.one_hot(torch.full((400,), step), len(ways)).bool()
+        turns = lw.RandomYaw(0.1, plans=plans, tilt=1.0)(was)["observation_tilt"]
+        assert torch.equal(turns, NOW.expand(400, 3, 3)) == (way is not None)
+
+
+def test_it_needs_the_roles_of_canonical_plans():
+    with pytest.raises(ValueError, match=r"plans must be those of lw\.canonical_plans; step 0 of '.*' has no role"):
+        lw.RandomYaw(0.1, plans=MT10, tilt=0.5)
+    with pytest.raises(ValueError, match="tilt needs plans"):
+        lw.RandomYaw(0.1, tilt=0.5)
 
 
 def test_so_many_rows_are_tilted_as_it_says():
@@ -116,20 +122,20 @@ def test_so_many_rows_are_tilted_as_it_says():
 def test_roles_see_what_the_action_does():
     """The action towards the target stays the one towards what is seen."""
     was = rows("push", 3, 50)
-    ACTOR.encoder.roles.demonstrated.fill_(True)
+    actor = lw.PlanConditionedActor(MT10, roles=True, features="none", width=8, depth=1)
+    actor.encoder.roles.demonstrated.fill_(True)
     way = was["observation"][:, 36:39] - was["observation"][:, 4:7]
     was["action"][:, :3] = way * 0.3
     now = tilted(was)
-    roles, tables = ACTOR.eval().encoder.roles, ACTOR.encoder.attention.tables
+    roles, tables = actor.eval().encoder.roles, actor.encoder.attention.tables
     weights = torch.nn.functional.one_hot(torch.full((50,), 3), PLANS.num_steps).float()
     seen = roles(
         now["observation"], weights, tables.rows(now["task_id"]), now["observation_yaw"], now["observation_tilt"]
     )
     direction = torch.nn.functional.normalize
     torch.testing.assert_close(direction(seen[:, :3], dim=-1), direction(now["action"][:, :3], dim=-1))
-    prepared = ACTOR.prepare(now)[2]
+    prepared = actor.prepare(now)[2]
     torch.testing.assert_close(prepared, seen, atol=0.05, rtol=0)
-    ACTOR.encoder.roles.demonstrated.fill_(False)
 
 
 def test_keys_of_ones_own():

@@ -1,4 +1,4 @@
-"""TakeTurns: whose turn it is, the plan's own steps or those in reserve, by whether anything still moves."""
+"""FallbackTurns: switch between a plan's own steps and the fallback plan's when nothing moves any more."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,42 +10,38 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import Count, Scale, checked, missing_keys
-from lw_torchrl._keys import as_keys, check_apart, key_beside
+from lw_torchrl._checks import Count, Scale, checked
+from lw_torchrl._keys import as_keys, check_apart, read
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.transforms.environment import reset_rows
 
 
-def turn_key(observation: NestedKey) -> NestedKey:
-    """Where :class:`TakeTurns` writes the turn: beside ``observation``, ``observation_turn``."""
-    return key_beside(observation, "_turn")
-
-
 class _Rows(NamedTuple):
-    """What is kept of each row's episode."""
+    """The state of each row's episode."""
 
     turn: Tensor  # B int64
     waited: Tensor  # B int64, steps without motion
     lasted: Tensor  # B int64, steps of the turn
-    stood: Tensor  # (B, P, 3), where everything was when it last moved
+    stood: Tensor  # (B, P, 3) metres, positions at the last motion
 
 
-class TakeTurns(Transform):
-    """Counts an episode's turns: 0 while the plan's own steps get somewhere, 1 when those in reserve are to be tried, 2
-    when the plan's own are once more, and so on.
+class FallbackTurns(Transform):
+    """Count the turns of an episode: the plan's own steps have the even turns, the fallback plan's steps the odd ones.
 
-    A turn ends when neither the hand nor a thing has moved farther than ``still`` for ``patience`` steps, and at the
-    latest after ``longest`` steps. Nobody has to tell it whether the task was done.
+    A turn ends when neither the hand nor an object has moved farther than ``still`` for ``patience`` steps, and at the
+    latest after ``longest`` steps. It does not depend on rewards or success.
+    :class:`~lw_torchrl.modules.PlanAttention` reads the turn if its plans have fallback steps, see
+    :func:`~lw_torchrl.canonical_plans`.
 
-    In an environment it reads ``observation`` (B, 39) float32, metres, and writes ``observation_turn`` (B,) int64. Rows
-    of a replay buffer keep the turn with which they were collected, and have 0 without one.
+    In an environment it reads ``observation`` (B, 39) float32, metres, and writes ``turn`` (B,) int64, from 0. Rows of
+    a replay buffer keep the turn with which they were collected; rows without one get 0.
 
     Args:
-        layout: where the hand and the things are in an observation.
+        layout: of the observations.
         patience: steps without motion that end a turn.
-        longest: steps that end a turn in any case.
-        still: metres, a motion that is none.
-        in_keys: where the observation is.
+        longest: maximum length of a turn, in steps.
+        still: metres, the largest motion that counts as none.
+        in_keys, out_keys: other names for observation and turn.
 
     Raises:
         ValueError: a wrong argument, or no observation.
@@ -53,8 +49,8 @@ class TakeTurns(Transform):
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> import lw_torchrl as lw
-        >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.transforms.TakeTurns(patience=5))
-        >>> env.rollout(12, lambda td: td.set("action", td["observation"].new_zeros(1, 4)))["observation_turn"].max()
+        >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.transforms.FallbackTurns(patience=5))
+        >>> env.rollout(12, lambda td: td.set("action", td["observation"].new_zeros(1, 4)))["turn"].max()
         tensor(2)
         >>> env.close()
 
@@ -70,21 +66,21 @@ class TakeTurns(Transform):
         longest: Count = 250,
         still: Scale = 0.02,
         in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        read = as_keys("in_keys", in_keys, ("observation",))
-        super().__init__(in_keys=read, out_keys=[turn_key(read[0])])
+        super().__init__(
+            in_keys=as_keys("in_keys", in_keys, ("observation",)), out_keys=as_keys("out_keys", out_keys, ("turn",))
+        )
         check_apart(self.in_keys, self.out_keys)
         self.layout, self.patience, self.longest, self.still = layout, patience, longest, still
         self._rows: _Rows | None = None
 
     def _positions(self, tensordict: TensorDictBase) -> Tensor:
-        observation = tensordict.get(self.in_keys[0], None)
-        if observation is None:
-            raise missing_keys(tensordict.keys(True, True), str(self.in_keys[0]))
+        (observation,) = read(tensordict, self.in_keys)
         return torch.stack([observation[..., part] for part in self.layout.positions[:-1]], -2)
 
     def _keep(self, tensordict: TensorDictBase, now: _Rows, which: Tensor | None) -> TensorDictBase:
-        """Keep the state of the rows ``which``, B bool or None for all, and write whose turn it is."""
+        """Keep the state of the rows ``which``, B bool or None for all, and write the turn."""
         before = self._rows or [None] * len(now)
         kept = (reset_rows(old, new, which, new.dim() - now.turn.dim()) for old, new in zip(before, now, strict=True))
         self._rows = _Rows(*kept)
@@ -92,8 +88,8 @@ class TakeTurns(Transform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         now = self._positions(tensordict_reset)
-        none = torch.zeros(now.shape[:-2], dtype=torch.int64, device=now.device)
-        return self._keep(tensordict_reset, _Rows(none, none, none, now), tensordict.get("_reset", None))
+        zeros = torch.zeros(now.shape[:-2], dtype=torch.int64, device=now.device)
+        return self._keep(tensordict_reset, _Rows(zeros, zeros, zeros, now), tensordict.get("_reset", None))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self._rows is None:
@@ -109,8 +105,8 @@ class TakeTurns(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         for rows in (tensordict, tensordict.get("next", None)):
             if rows is not None and rows.get(self.out_keys[0], None) is None:
-                none = torch.zeros(rows.batch_size, dtype=torch.int64, device=tensordict.device)
-                rows.set(self.out_keys[0], none)
+                zeros = torch.zeros(rows.batch_size, dtype=torch.int64, device=tensordict.device)
+                rows.set(self.out_keys[0], zeros)
         return tensordict
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:

@@ -1,4 +1,4 @@
-"""TakeTurns: a turn ends when nothing moves, or after its longest; rows do not depend on one another."""
+"""FallbackTurns: a turn ends when nothing moves, or after its longest; rows do not depend on one another."""
 
 import pytest
 import torch
@@ -9,23 +9,21 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 import lw_torchrl as lw
-from lw_torchrl.transforms import TakeTurns
+from lw_torchrl.transforms import FallbackTurns
 
 HAND, THING = slice(0, 3), slice(4, 7)
 
 
 def turns_of(ways, rows=None, **options):
     """The turn after each step of observations (T, B, 39), of which the first is a reset's."""
-    transform = TakeTurns(**options)
+    transform = FallbackTurns(**options)
     start = TensorDict(observation=ways[0], batch_size=[ways.shape[1]])
-    found = [transform._reset(TensorDict(batch_size=start.batch_size), start)["observation_turn"]]
+    found = [transform._reset(TensorDict(batch_size=start.batch_size), start)["turn"]]
     for number, now in enumerate(ways[1:]):
         before = TensorDict(batch_size=start.batch_size)
         if rows is not None:
             before["_step"] = rows[number]
-        found.append(
-            transform._step(before, TensorDict(observation=now, batch_size=start.batch_size))["observation_turn"]
-        )
+        found.append(transform._step(before, TensorDict(observation=now, batch_size=start.batch_size))["turn"])
     return torch.stack(found)
 
 
@@ -77,31 +75,31 @@ def test_a_row_that_makes_no_step_does_not_wait():
 
 
 def test_a_reset_begins_with_turn_0_in_the_rows_that_begin():
-    transform, state = TakeTurns(patience=1), TensorDict(observation=torch.zeros(2, 39), batch_size=[2])
+    transform, state = FallbackTurns(patience=1), TensorDict(observation=torch.zeros(2, 39), batch_size=[2])
     transform._reset(TensorDict(batch_size=[2]), state.clone())
-    assert transform._step(TensorDict(batch_size=[2]), state.clone())["observation_turn"].tolist() == [1, 1]
+    assert transform._step(TensorDict(batch_size=[2]), state.clone())["turn"].tolist() == [1, 1]
     begun = TensorDict(_reset=torch.tensor([True, False]), batch_size=[2])
-    assert transform._reset(begun, state.clone())["observation_turn"].tolist() == [0, 1]
+    assert transform._reset(begun, state.clone())["turn"].tolist() == [0, 1]
 
 
 def test_an_environment_with_it_has_right_specs():
-    env = TransformedEnv(lw.LanguageWorldEnv(["reach", "push"], num_envs=4), TakeTurns(patience=2))
+    env = TransformedEnv(lw.LanguageWorldEnv(["reach", "push"], num_envs=4), FallbackTurns(patience=2))
     check_env_specs(env)
-    assert env.reset()["observation_turn"].dtype == torch.int64
+    assert env.reset()["turn"].dtype == torch.int64
     env.close()
 
 
 def test_rows_of_a_buffer_keep_what_they_have():
-    rows = TensorDict(observation=torch.zeros(2, 39), observation_turn=torch.tensor([0, 3]), batch_size=[2])
-    assert TakeTurns()(rows.clone())["observation_turn"].tolist() == [0, 3]
-    assert TakeTurns()(rows.exclude("observation_turn"))["observation_turn"].tolist() == [0, 0]
+    rows = TensorDict(observation=torch.zeros(2, 39), turn=torch.tensor([0, 3]), batch_size=[2])
+    assert FallbackTurns()(rows.clone())["turn"].tolist() == [0, 3]
+    assert FallbackTurns()(rows.exclude("turn"))["turn"].tolist() == [0, 0]
 
 
 def test_demonstrations_train_a_policy_that_has_plans_in_reserve(tmp_path):
     lw.collect_demonstrations("reach", root=tmp_path, episodes_per_task=1, seed=0, progress=False)
     actor = lw.PlanConditionedActor(lw.load_plans("MT10"), reserve=True, roles=True, features="none", width=8)
     replay = lw.LanguageWorldExperienceReplay(tmp_path, transform=actor.transform(), batch_size=4)
-    assert replay.sample()["observation_turn"].tolist() == [0] * 4
+    assert replay.sample()["turn"].tolist() == [0] * 4
     lw.BehavioralCloningTrainer(
         actor, replay, lw.BehavioralCloningConfig(steps=2, batch_size=4), progress=False
     ).train()

@@ -1,0 +1,312 @@
+"""Augmentations of sampled rows: transforms of a replay buffer that keep a policy from relying on chance details."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NoReturn
+
+import torch
+from tensordict import TensorDictBase, unravel_key
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import TensorSpec
+from torchrl.envs import EnvBase, Transform
+
+from lw_torchrl._checks import Probability, Scale, checked
+from lw_torchrl._keys import as_keys, check_apart, read
+from lw_torchrl.language.layout import METAWORLD, Layout, places
+from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
+from lw_torchrl.language.roles import StepRole
+from lw_torchrl.language.task_index import PlanTables
+from lw_torchrl.language.task_objects import role_object
+from lw_torchrl.language.value_checks import plain
+from lw_torchrl.transforms.qaf import answers_of, plan_number_key
+
+_HOLDING = ("close", "carry", "move")  # verbs of steps for which the gripper is closed or closes
+ACTIVE = 0.01  # attention of an active step: a step whose condition is false beside a true one has 1e-4
+
+
+class Augmentation(Transform):
+    """Base class of transforms that change sampled rows at random. An environment refuses them."""
+
+    def _refuse(self) -> NoReturn:
+        raise TypeError(
+            f"{type(self).__name__} is for replay buffers: in an environment it would change what the policy acts on"
+        )
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._refuse()
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        self._refuse()
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        if isinstance(container, EnvBase):
+            self._refuse()
+        super().set_container(container)
+
+    def table(self, name: str, device: torch.device) -> Tensor:
+        """Return a buffer on a device; it stays there for the next batch."""
+        table: Tensor = getattr(self, name)
+        if table.device != device:
+            table = table.to(device)
+            if plain(table):
+                setattr(self, name, table)
+        return table
+
+
+class PlanAugmentation(Augmentation):
+    """Base class of augmentations that depend on which steps of a row's plan are active.
+
+    A step is active if its attention weight is above 0.01, see :class:`~lw_torchrl.modules.PlanAttention`.
+    """
+
+    steps: Tensor
+
+    def _read_plans(self, plans: AnyPlans) -> Plans:
+        plans = as_plans(plans)
+        self.fingerprint = plans.fingerprint  # identifies this transform in checkpoints of trainers
+        self._tables = PlanTables(plans)
+        self.register_buffer("steps", self._tables.turns, persistent=False)  # (T, 2, S) bool
+        return plans
+
+    def step_table(self, name: str, values: Tensor) -> None:
+        """Register a table (T, S, ...) of values of the plans' steps."""
+        self.register_buffer(name, values, persistent=False)
+
+    def answers(self, tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return qaf (B, S), the rows' place in the tables (B,) int64, and the steps of the row's turn (B, S) bool."""
+        qaf, task_id = read(tensordict, keys)
+        qaf, rows = answers_of(qaf, task_id, tensordict.get(plan_number_key(keys[0]), None), self._tables)
+        turn = tensordict.get("turn", None)
+        return qaf, rows, self.table("steps", rows.device)[rows, torch.zeros_like(rows) if turn is None else turn % 2]
+
+    def active(self, tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> tuple[Tensor, Tensor]:
+        """Return which steps are active, (B, S) bool, and the rows' place in the tables, (B,) int64."""
+        qaf, rows, steps = self.answers(tensordict, keys)
+        weights = (10.0 * qaf.to(torch.float32) - 5.0).masked_fill(~steps, -torch.inf).softmax(-1)
+        return weights > ACTIVE, rows
+
+
+class SwapUnmentioned(PlanAugmentation):
+    """Put objects that no active step mentions where they are in another row, so that a policy cannot rely on them.
+
+    A step mentions the objects and the goal that its condition and its skill name. For replay buffers, after a
+    :class:`QAFTransform`: the answers are those of the scene as it was.
+
+    Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); changes ``observation`` (B, D), and ``("next", "observation")``
+    alike, where an object stays that an active step of either mentions. Draws from PyTorch's global generator.
+
+    Args:
+        plans: the plans whose conditions ``qaf`` answers.
+        probability: of each object, and of the goal, in each row.
+        in_keys: other names for observation, task_id and qaf, in this order.
+
+    Raises:
+        ValueError: at call time, a missing key, a task without a plan, or the answers of other plans.
+        TypeError: it is given to an environment.
+
+    Example:
+        >>> import torch, lw_torchrl as lw
+        >>> from tensordict import TensorDict
+        >>> plans = lw.load_plans("MT10")
+        >>> reach = torch.full((2,), lw.task_id("reach"))
+        >>> rows = TensorDict(observation=torch.rand(2, 39), task_id=reach, batch_size=[2])
+        >>> rows = lw.QAFTransform(plans)(rows)
+        >>> swapped = lw.transforms.SwapUnmentioned(plans, 1.0)(rows)["observation"]
+        >>> torch.equal(swapped[:, :4], rows["observation"][:, :4])  # the hand stays
+        True
+
+    Source: ours; domain randomisation of what the plan says is irrelevant.
+    """
+
+    mentioned: Tensor
+
+    @checked
+    def __init__(
+        self, plans: AnyPlans, probability: Probability, *, in_keys: Sequence[NestedKey] | None = None
+    ) -> None:
+        keys = as_keys("in_keys", in_keys, ("observation", "task_id", "qaf"))
+        super().__init__(in_keys=keys, out_keys=keys[:1])
+        self.probability = probability
+        plans = self._read_plans(plans)
+        self._parts = plans.layout.parts
+        self.step_table("mentioned", mentioned(plans, self._tables))
+
+    def _kept(self, tensordict: TensorDictBase) -> Tensor:
+        """Return which objects, and the goal, stay where they are, (B, P) bool."""
+        active, rows = self.active(tensordict, [self.in_keys[2], self.in_keys[1]])
+        return (active.unsqueeze(-1) & self.table("mentioned", rows.device)[rows]).any(-2)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = tensordict.copy()  # of a buffer's whole range it may be the storage itself
+        key, task, qaf = self.in_keys
+        observations = {key: read(tensordict, [key])[0]}
+        kept = self._kept(tensordict)
+        following = tensordict.get("next", None)
+        if following is not None and (after := following.get(key, None)) is not None:
+            observations[unravel_key(("next", key))] = after
+            if following.get(qaf, None) is not None:
+                known = (
+                    following
+                    if following.get(task, None) is not None
+                    else following.copy().set(task, tensordict.get(task))
+                )
+                kept = kept | self._kept(known)
+        kept = kept.reshape(-1, kept.shape[-1])
+        number, device = kept.shape[0], kept.device
+        flat = {name: values.reshape(number, -1) for name, values in observations.items()}
+        swapped = {name: values.clone() for name, values in flat.items()}
+        for thing, parts in enumerate(self._parts):
+            away = (~kept[:, thing] & (torch.rand(number, device=device) < self.probability)).unsqueeze(-1)
+            others = torch.randint(number, (number,), device=device)
+            for name, values in flat.items():
+                for part in parts:
+                    swapped[name][:, part] = torch.where(away, values[others, part], values[:, part])
+        for name, values in swapped.items():
+            tensordict.set(name, values.reshape(observations[name].shape))
+        return tensordict
+
+
+class HideOpening(PlanAugmentation):
+    """Replace the gripper's opening by that of another row: it often reveals the task of a demonstration.
+
+    For replay buffers, after a :class:`QAFTransform`. Changes ``observation`` (B, D), not ``("next", "observation")``.
+    Draws from PyTorch's global generator.
+
+    Args:
+        probability: of each row.
+        plans: canonical plans, see :func:`~lw_torchrl.canonical_plans`: rows in which an active step closes the gripper
+            or moves what it holds keep their opening, by ``task_id`` (B,) int64 and ``qaf`` (B, S). None hides it in
+            any row.
+        layout: of the observations; None for that of the plans, or Meta-World's without plans.
+        in_keys: other names for observation, task_id and qaf, in this order.
+
+    Raises:
+        ValueError: at call time, as for :class:`SwapUnmentioned`.
+        TypeError: it is given to an environment.
+
+    Example:
+        >>> import torch, lw_torchrl as lw
+        >>> from tensordict import TensorDict
+        >>> rows = TensorDict(observation=torch.rand(8, 39), batch_size=[8])
+        >>> torch.isin(lw.transforms.HideOpening(1.0)(rows)["observation"][:, 3], rows["observation"][:, 3]).all()
+        tensor(True)
+    """
+
+    holds: Tensor
+
+    @checked
+    def __init__(
+        self,
+        probability: Probability,
+        *,
+        plans: AnyPlans | None = None,
+        layout: Layout | None = None,
+        in_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        keys = as_keys("in_keys", in_keys, ("observation", "task_id", "qaf"))
+        super().__init__(in_keys=keys, out_keys=keys[:1])
+        self.probability, self.plans, layout = probability, None, METAWORLD if layout is None else layout
+        if plans is not None:
+            self.plans = self._read_plans(plans)
+            layout = self.plans.layout
+            self.step_table("holds", role_table(self.plans, self._tables, lambda role: role.verb in _HOLDING))
+        self._opening = layout.opening
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        observation = read(tensordict, self.in_keys[:1])[0].clone()
+        opening = observation[..., self._opening]
+        number, device = opening.numel(), opening.device
+        hidden = torch.rand(opening.shape, device=device) < self.probability
+        if self.plans is not None:
+            active, rows = self.active(tensordict, [self.in_keys[2], self.in_keys[1]])
+            hidden &= ~(active & self.table("holds", device)[rows]).any(-1)
+        others = opening.flatten()[torch.randint(number, (number,), device=device)].reshape(opening.shape)
+        observation[..., self._opening] = torch.where(hidden, others, opening)
+        return tensordict.copy().set(self.in_keys[0], observation)
+
+
+class JitterTarget(PlanAugmentation):
+    """Draw an offset of the target for rows in which an active step pushes or pulls: contact points are uncertain.
+
+    :class:`~lw_torchrl.modules.RoleFeatures` adds the offset to the position of the target that it shows. For replay
+    buffers, after a :class:`QAFTransform`. Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); writes ``target_offset``
+    (B, 3) float32, metres: normal noise of ``std`` in z and half of it in x and y, or 0 in rows without such a step.
+    Draws from PyTorch's global generator.
+
+    Args:
+        plans: canonical plans, see :func:`~lw_torchrl.canonical_plans`, whose conditions ``qaf`` answers.
+        std: standard deviation of the offset's height, metres.
+        in_keys: other names for task_id and qaf, in this order.
+        out_keys: another name for the offset.
+
+    Raises:
+        ValueError: the plans have no roles; or at call time, as for :class:`SwapUnmentioned`.
+        TypeError: it is given to an environment.
+
+    Example:
+        >>> import torch, lw_torchrl as lw
+        >>> from tensordict import TensorDict
+        >>> plans = lw.canonical_plans(lw.load_plans("MT10"))
+        >>> reach = torch.full((2,), lw.task_id("reach"))
+        >>> rows = TensorDict(observation=torch.rand(2, 39), task_id=reach, batch_size=[2])
+        >>> lw.transforms.JitterTarget(plans, 0.03)(lw.QAFTransform(plans)(rows))["target_offset"].shape
+        torch.Size([2, 3])
+    """
+
+    pushes: Tensor
+    scale: Tensor
+
+    @checked
+    def __init__(
+        self,
+        plans: AnyPlans,
+        std: Scale,
+        *,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        super().__init__(
+            in_keys=as_keys("in_keys", in_keys, ("task_id", "qaf")),
+            out_keys=as_keys("out_keys", out_keys, ("target_offset",)),
+        )
+        check_apart(self.in_keys, self.out_keys)
+        self.std = std
+        self.step_table(
+            "pushes", role_table(self._read_plans(plans), self._tables, lambda role: role.verb in ("push", "pull"))
+        )
+        self.step_table("scale", std * torch.tensor([0.5, 0.5, 1.0]))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        active, rows = self.active(tensordict, self.in_keys[::-1])
+        pushed = (active & self.table("pushes", rows.device)[rows]).any(-1, keepdim=True)
+        offset = self.table("scale", rows.device) * torch.randn(*rows.shape, 3, device=rows.device)
+        return tensordict.copy().set(self.out_keys[0], torch.where(pushed, offset, 0.0))
+
+
+def mentioned(plans: Plans, tables: PlanTables) -> Tensor:
+    """Return (T, S, P) bool, whether a step mentions each object of the layout and, last, the goal."""
+    numbers = [{number for part in parts for number in places(part)} for parts in plans.layout.parts]
+    table = torch.zeros(*tables.mask.shape, len(numbers), dtype=torch.bool)
+    for task, plan in plans.items():
+        for step, names in enumerate(step.mentions(plan.definition) for step in plan.steps):
+            positions = {
+                number
+                for name in names
+                for number in role_object(plan.definition, name).position
+                if isinstance(number, int)  # a float is a fixed number of metres
+            }
+            table[tables.index.row(task), step] = torch.tensor([not positions.isdisjoint(own) for own in numbers])
+    return table
+
+
+def role_table(plans: Plans, tables: PlanTables, holds: Callable[[StepRole], bool]) -> Tensor:
+    """Return (T, S) bool, the steps for whose role ``holds`` is true; :class:`ValueError` if a step has no role."""
+    table = torch.zeros_like(tables.mask)
+    for task, plan in plans.items():
+        for number, step in enumerate(plan.steps):
+            if step.role is None:
+                raise ValueError(f"plans must be those of lw.canonical_plans; step {number} of {task!r} has no role")
+            table[tables.index.row(task), number] = holds(step.role)
+    return table

@@ -1,0 +1,272 @@
+"""Augmentations of sampled rows: objects that no active step mentions, the gripper's opening, and the target."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, TransformedEnv
+
+import lw_torchrl as lw
+from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.language.task_index import PlanTables
+from lw_torchrl.transforms.augmentation import mentioned
+
+PLACES = {0: [*range(4, 11), *range(22, 29)], 1: [*range(11, 18), *range(29, 36)], 2: [36, 37, 38]}
+MT10 = lw.load_plans("MT10")
+CANONICAL = lw.canonical_plans(MT10, fallback=True)
+OPENING = 3
+
+
+def table(task, *pairs):
+    plans = Plans([ConditionalPlan.from_pairs(task, pairs)])
+    return mentioned(plans, PlanTables(plans))[0].int().tolist()
+
+
+def test_conditions_and_skills_mention_objects():
+    assert table("push", ("the gripper is above the puck", "lower the gripper")) == [[1, 0, 0]]
+    assert table("push", ("the gripper is open", "move the puck to the target location")) == [[1, 0, 1]]
+    assert table("push", ("the gripper is open", "wait")) == [[0, 0, 0]]
+    assert table("push", ("the gripper is above the puck", "wait"), ("the gripper is open", "wait")) == [
+        [1, 0, 0],
+        [0, 0, 0],
+    ]
+
+
+def test_points_beside_an_object_mention_it_and_fixed_places_mention_nothing():
+    assert table("hammer", ("the gripper is above the hammer handle", "wait")) == [[1, 0, 0]]
+    assert table("hammer", ("the hammer head is near the nail", "wait")) == [[1, 1, 0]]
+    assert table("bin-picking", ("the gripper is above the other bin", "wait")) == [[0, 0, 0]]
+    plans = lw.load_plans("MT50")
+    assert mentioned(plans, PlanTables(plans)).any(-1).any(-1).all()
+
+
+@pytest.mark.parametrize("skills", ["own", "MT10"])
+def test_a_canonical_step_mentions_what_it_moves_and_its_target(skills):
+    """Also where the words do not: "lift the puck out of the hole" is on its way to the target location."""
+    plans = lw.canonical_plans(lw.load_plans("MT50", skills=skills))
+    tables = PlanTables(plans)
+    found = mentioned(plans, tables)
+    for task, plan in plans.items():
+        for number, step in enumerate(plan.steps):
+            if "target location" in (step.role.moved, step.role.target):
+                assert found[tables.index.row(task), number, 2], (task, step.skill)
+
+
+# One condition of push for each row: the puck alone is mentioned, or the goal too.
+PUSH = Plans(
+    [
+        ConditionalPlan.from_pairs(
+            "push", [("the gripper is above the puck", "wait"), ("the puck is near the target location", "wait")]
+        )
+    ]
+)
+KEPT = torch.tensor([[True, False, False], [True, False, True]])
+
+
+def rows(number=8, seed=0, plans=PUSH, task="push", step=None):
+    generator = torch.Generator().manual_seed(seed)
+    found = TensorDict(
+        observation=torch.randn(number, 39, generator=generator), task_id=torch.full((number,), lw.task_id(task))
+    ).auto_batch_size_(1)
+    found["qaf"] = torch.rand(number, plans.num_steps, generator=generator) < 0.5
+    if step is not None:
+        found["qaf"] = torch.nn.functional.one_hot(torch.as_tensor(step).expand(number), plans.num_steps).bool()
+    return found
+
+
+def seeded(transform, tensordict, seed=0):
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        return transform(tensordict)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 30), st.integers(0, 2**31), st.floats(0.0, 1.0), st.booleans())
+def test_only_the_unmentioned_moves_and_only_to_where_it_is_in_another_row(number, seed, probability, soft):
+    was = rows(number, seed)
+    if soft:
+        was["qaf"] = was["qaf"].float() * 0.9 + 0.05
+    before = was.clone()
+    now = seeded(lw.transforms.SwapUnmentioned(PUSH, probability), was, seed)
+    assert (was == before).all()
+    true = was["qaf"] > 0.5
+    active = true | ~true.any(-1, keepdim=True)  # attention is uniform where no condition is true
+    kept = (active.unsqueeze(-1) & KEPT).any(1)
+    observation, swapped = was["observation"], now["observation"]
+    others = [column for column in range(39) if not any(column in place for place in PLACES.values())]
+    assert torch.equal(swapped[:, others], observation[:, others])
+    for thing, place in PLACES.items():
+        assert torch.equal(swapped[kept[:, thing]][:, place], observation[kept[:, thing]][:, place])
+        for row in swapped[:, place]:
+            assert (observation[:, place] == row).all(-1).any()
+    assert torch.equal(now["qaf"], was["qaf"]), "answers are those of the scene as it was"
+
+
+def test_the_probability_is_that_of_each_swap():
+    was = rows(4000, step=0)
+    was["observation"] = torch.arange(4000.0)[:, None].expand(-1, 39).clone()
+    moved = seeded(lw.transforms.SwapUnmentioned(PUSH, 0.3), was)["observation"] != was["observation"]
+    assert moved[:, 36].float().mean().item() == pytest.approx(0.3, abs=0.03)
+    assert torch.equal(moved[:, 11], moved[:, 35])
+    assert not torch.equal(moved[:, 11], moved[:, 36])
+    assert not moved[:, 4].any()
+    shaped = seeded(lw.transforms.SwapUnmentioned(PUSH, 0.3), was.reshape(40, 100))["observation"]
+    assert shaped.shape == (40, 100, 39)
+    assert torch.equal(shaped.reshape(-1, 39) != was["observation"], moved)
+
+
+def test_the_next_observation_is_swapped_alike_and_keeps_what_either_mentions():
+    was = rows(64, step=0)
+    was["next"] = TensorDict(observation=was["observation"] + 100, batch_size=[64])
+    now = seeded(lw.transforms.SwapUnmentioned(PUSH, 1.0), was)
+    assert torch.equal(now["next", "observation"], now["observation"] + 100)
+    assert not torch.equal(now["observation"][:, 36:], was["observation"][:, 36:])
+    was["next", "qaf"] = rows(64, step=1)["qaf"]
+    now = seeded(lw.transforms.SwapUnmentioned(PUSH, 1.0), was)
+    assert torch.equal(now["observation"][:, 36:], was["observation"][:, 36:])
+    assert torch.equal(now["next", "observation"], now["observation"] + 100)
+
+
+def test_fallback_steps_mention_nothing_in_the_plans_own_turn():
+    plan = next(plan for plan in CANONICAL.values() if plan.steps[-1].role.fallback)
+    own = sum(not step.role.fallback for step in plan.steps)
+    transform = lw.transforms.SwapUnmentioned(CANONICAL, 1.0)
+    was = rows(task=plan.task, plans=CANONICAL, step=own)
+    active, _ = transform.active(was, ["qaf", "task_id"])
+    assert active[:, :own].all(), "without a true condition in its turn, attention is uniform"
+    assert not active[:, own:].any()
+    active, _ = transform.active(was.set("turn", torch.ones(8, dtype=torch.int64)), ["qaf", "task_id"])
+    assert active.sum(-1).tolist() == [1] * 8
+    assert active[:, own].all()
+
+
+def test_the_opening_is_that_of_another_row():
+    was = rows(2000)
+    now = seeded(lw.transforms.HideOpening(0.3), was.exclude("qaf", "task_id"))["observation"]
+    others = [column for column in range(39) if column != OPENING]
+    assert torch.equal(now[:, others], was["observation"][:, others])
+    assert torch.isin(now[:, OPENING], was["observation"][:, OPENING]).all()
+    moved = now[:, OPENING] != was["observation"][:, OPENING]
+    assert moved.float().mean().item() == pytest.approx(0.3, abs=0.04)
+
+
+def steps_with(verbs, plans=CANONICAL):
+    return [
+        (task, number)
+        for task, plan in plans.items()
+        for number, step in enumerate(plan.steps)
+        if step.role.verb in verbs and not step.role.fallback
+    ]
+
+
+def test_a_gripper_that_closes_or_holds_is_not_hidden():
+    transform = lw.transforms.HideOpening(1.0, plans=CANONICAL)
+    for verbs, hidden in ((("close", "carry"), False), (("approach", "push"), True)):
+        for task, step in steps_with(verbs):
+            was = rows(64, plans=CANONICAL, task=task, step=step)
+            now = seeded(transform, was)
+            assert torch.equal(now["observation"], was["observation"]) != hidden, (task, step)
+
+
+def test_the_target_is_moved_where_something_is_pushed_or_pulled():
+    transform = lw.transforms.JitterTarget(CANONICAL, 0.03)
+    for task, step in steps_with(("push", "pull")):
+        offset = seeded(transform, rows(4000, plans=CANONICAL, task=task, step=step))["target_offset"]
+        assert offset.dtype == torch.float32
+        assert offset.std(0).tolist() == pytest.approx([0.015, 0.015, 0.03], rel=0.1)
+        assert offset.mean(0).abs().max() < 0.003
+    for task, step in steps_with(("approach", "descend", "close", "carry", "move", "reach")):
+        assert not transform(rows(plans=CANONICAL, task=task, step=step))["target_offset"].any()
+
+
+def test_in_a_buffer_each_sample_is_drawn_anew_and_the_storage_is_left_alone():
+    replay = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(64),
+        batch_size=64,
+        transform=Compose(
+            lw.QAFTransform(CANONICAL),
+            lw.transforms.SwapUnmentioned(CANONICAL, 1.0),
+            lw.transforms.HideOpening(1.0),
+            lw.transforms.JitterTarget(CANONICAL, 0.03),
+        ),
+    )
+    was = rows(64).exclude("qaf")
+    replay.extend(was)
+    first, second = replay[:], replay[:]
+    assert not torch.equal(first["observation"], second["observation"])
+    assert torch.equal(replay.storage[:]["observation"], was["observation"])
+    assert "target_offset" in first.keys()
+
+
+def test_keys_have_other_names():
+    was = rows(64, step=0)
+    moved = TensorDict({("a", "seen"): was["observation"], ("a", "task"): was["task_id"], "truth": was["qaf"]}, [64])
+    keys = [("a", "seen"), ("a", "task"), "truth"]
+    expected = seeded(lw.transforms.SwapUnmentioned(PUSH, 1.0), was)["observation"]
+    assert torch.equal(seeded(lw.transforms.SwapUnmentioned(PUSH, 1.0, in_keys=keys), moved)["a", "seen"], expected)
+    moved = seeded(lw.transforms.JitterTarget(PUSH_ROLES, 0.1, in_keys=keys[1:], out_keys=[("a", "offset")]), moved)
+    assert moved["a", "offset"].shape == (64, 3)
+
+
+PUSH_ROLES = Plans([ConditionalPlan("push", CANONICAL["push"].steps[:2])])
+MAKERS = {
+    "SwapUnmentioned": lambda: lw.transforms.SwapUnmentioned(CANONICAL, 0.5),
+    "HideOpening": lambda: lw.transforms.HideOpening(0.5, plans=CANONICAL),
+    "JitterTarget": lambda: lw.transforms.JitterTarget(CANONICAL, 0.03),
+}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_an_environment_refuses_it(name):
+    env = lw.LanguageWorldEnv("reach")
+    with pytest.raises(TypeError, match=f"^{name} is for replay buffers"):
+        env.append_transform(MAKERS[name]())
+    with pytest.raises(TypeError, match=f"^{name} is for replay buffers"):
+        TransformedEnv(env, Compose(lw.QAFTransform(CANONICAL), MAKERS[name]())).rollout(1)
+    env.close()
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_answers_of_longer_plans_are_cut_if_they_are_for_the_same_plan(name):
+    transform = MAKERS[name]()
+    task = min(CANONICAL, key=lambda task: len(CANONICAL[task].steps))
+    transform = {
+        "SwapUnmentioned": lambda plans: lw.transforms.SwapUnmentioned(plans, 0.5),
+        "HideOpening": lambda plans: lw.transforms.HideOpening(0.5, plans=plans),
+        "JitterTarget": lambda plans: lw.transforms.JitterTarget(plans, 0.03),
+    }[name](Plans([CANONICAL[task]]))
+    was = lw.QAFTransform(CANONICAL)(rows(task=task).exclude("qaf"))
+    now, expected = seeded(transform, was), seeded(MAKERS[name](), was)
+    for key in ("observation", "target_offset"):
+        assert key not in now or torch.equal(now[key], expected[key])
+    with pytest.raises(ValueError, match="qaf must have shape"):
+        transform(was.exclude("qaf_plan"))
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_missing_keys_and_other_plans_are_named(name):
+    with pytest.raises(ValueError, match=r"qaf.* are needed"):
+        MAKERS[name]()(rows().exclude("qaf"))
+    with pytest.raises(ValueError, match="qaf answers other plans"):
+        MAKERS[name]()(lw.QAFTransform(MT10)(rows(plans=MT10)))
+    with pytest.raises(ValueError, match="tasks without a plan"):
+        MAKERS[name]()(rows(plans=CANONICAL, task="soccer"))
+
+
+def test_wrong_arguments_are_refused():
+    with pytest.raises(ValueError, match=r"probability must be from 0 to 1, got 1\.5"):
+        lw.transforms.SwapUnmentioned(MT10, 1.5)
+    with pytest.raises(ValueError, match="probability must be finite and at least 0"):
+        lw.transforms.HideOpening(-0.1)
+    with pytest.raises(ValueError, match=r"plans must be those of lw.canonical_plans; step 0 of .* has no role"):
+        lw.transforms.JitterTarget(MT10, 0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MAKERS)
+def test_it_compiles_to_one_graph(name):
+    torch._dynamo.reset()
+    compiled = torch.compile(MAKERS[name](), fullgraph=True, backend="eager")
+    assert compiled(rows(plans=CANONICAL)).batch_size == (8,)
