@@ -24,8 +24,6 @@ from lw_torchrl.language.task_objects import (
 )
 from lw_torchrl.language.tasks import Task, get_task
 
-RULES = 2
-"""The version of the rules by which plans are read, which a policy's file keeps; raised when they change."""
 MIN_CONFIDENCE = 0.75
 """A plan of at least this confidence keeps its own conditions."""
 Source = Literal["plan", "completed", "fallback"]

@@ -16,8 +16,9 @@ from lw_torchrl._checks import check_choice, checked, shown
 from lw_torchrl.language.embeddings import sentence_vectors
 from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, check_length, read_query
 from lw_torchrl.language.relations import PREDICATES
-from lw_torchrl.language.skills import WORDS, ScriptedSkill, SkillError, Skills, load_skills, skills_for
+from lw_torchrl.language.skills import ScriptedSkill, SkillError, Skills, load_skills, skills_for
 from lw_torchrl.language.tasks import Task, get_task
+from lw_torchrl.language.words import WORDS
 
 _NEGATIONS = frozenset(("not", "no", "never", "without", "cannot"))
 # Words that do not tell which query is meant.

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 from lw_torchrl._checks import Probability, check_fields, shown
 from lw_torchrl.language.named_objects import GOAL
-from lw_torchrl.language.skills import WORDS
+from lw_torchrl.language.words import WORDS
 
 Verb = Literal["approach", "beside", "descend", "close", "open", "push", "pull", "carry", "move", "reach", "hold"]
 """What is done: "carry" goes through the air, "move" straight."""

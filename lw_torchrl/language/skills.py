@@ -16,6 +16,7 @@ from lw_torchrl._checks import check_choice, checked, nearest, shown
 from lw_torchrl._files import AnyPath, read_toml
 from lw_torchrl.language.named_objects import GRIPPER, is_number, is_triple
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task
+from lw_torchrl.language.words import WORDS
 
 Triple = tuple[float, float, float]
 
@@ -171,11 +172,7 @@ def _shipped_for(task: Task) -> Skills:
     return MappingProxyType(dict(skills_for(task, _shipped())))
 
 
-WORDS: Mapping[str, Any] = read_toml(files("lw_torchrl.language") / "data" / "words.toml", ValueError)
-"""The tables of data/words.toml."""
-_BEFORE_NOUN, _CLOSES, _DIRECTIONS = (
-    frozenset(WORDS["in_skills"][name]) for name in ("before_noun", "closes", "directions")
-)
+_BEFORE_NOUN, _DIRECTIONS = (frozenset(WORDS["in_skills"][name]) for name in ("before_noun", "directions"))
 _LONGEST_BEFORE = max(map(len, _BEFORE_NOUN))
 
 
@@ -200,11 +197,6 @@ def _with_articles(details: str, task: Task) -> str:
     nouns = sorted({*task.object_names, "gripper"}, key=len, reverse=True)
     pattern = "|".join(re.escape(noun) for noun in nouns)
     return re.sub(rf"(?<![\w'-])(?:{pattern})(?![\w'-])", article, details)
-
-
-def closes(skill: str) -> bool:
-    """Whether a skill closes the gripper: "close the gripper around the puck"."""
-    return not _CLOSES.isdisjoint(skill.split())
 
 
 def has_direction(skill: str) -> bool:

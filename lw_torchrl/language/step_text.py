@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from functools import lru_cache
 
 from lw_torchrl.language.named_objects import GOAL, GRIPPER
-from lw_torchrl.language.skills import WORDS
 from lw_torchrl.language.task_objects import whole_objects
 from lw_torchrl.language.tasks import Task
+from lw_torchrl.language.words import WORDS
 
 _WORDS = WORDS["canonical"]
 _HANDS: dict[str, str] = dict.fromkeys([GRIPPER, *_WORDS["hands"]], GRIPPER)  # other names of the gripper

@@ -15,6 +15,7 @@ from torchrl.objectives import add_random_module
 
 from lw_torchrl._checks import check_choice, check_scale, checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
+from lw_torchrl.language.task_index import as_plans
 from lw_torchrl.language.value_checks import check_finite
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ class ObservationFeatures(Features):
         Raises:
             ValueError: the features mean something else in that layout.
         """
-        layout = plans.layout  # type: ignore[union-attr]
+        layout = as_plans(plans).layout
         if layout == self.layout:
             return self
         if self.kind not in TRANSFERS:

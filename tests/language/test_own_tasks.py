@@ -58,9 +58,7 @@ def test_plans_queries_and_actors_of_a_51st_task(mine):
     alone = lw.QueryProgram({"push": [step.condition for step in plans["push"].steps]})
     assert torch.equal(batch["qaf"][1], alone(batch["observation"][1], batch["task_id"][1]))
     torch.manual_seed(0)
-    actor = lw.PlanConditionedActor(
-        plans, focus=True, swap_unmentioned=0.5, text_encoder=lambda texts: torch.eye(len(texts), 8)
-    )
+    actor = lw.PlanConditionedActor(plans, text_encoder=lambda texts: torch.eye(len(texts), 8))
     assert actor(batch.clone())["skill_weights"][0, 2:].tolist() == [0.0] * (batch["qaf"].shape[-1] - 2)
     with_51, without = actor.eval()(batch.clone())["action"], actor.with_plans({"push": plans["push"]}).eval()
     # Texts of one plan alone are other rows of the encoder's input, but the weights' shape says who is who.
