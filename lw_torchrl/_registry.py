@@ -24,6 +24,25 @@ def entry_points_of(group: str) -> "dict[str, EntryPoint]":
     return {point.name: point for point in entry_points(group=group)}
 
 
+class ReadOnlyDict(Mapping[str, Entry]):
+    """A mapping that cannot be changed. Unlike ``types.MappingProxyType``, it can be pickled."""
+
+    def __init__(self, items: Mapping[str, Entry]) -> None:
+        self._items = items
+
+    def __getitem__(self, name: str) -> Entry:
+        return self._items[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._items)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __repr__(self) -> str:
+        return repr(self._items)
+
+
 class Registry(UserDict[str, Entry]):
     """A mapping from names to objects of one kind: those we ship, those you add, and those of installed packages.
 

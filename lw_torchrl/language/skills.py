@@ -9,11 +9,11 @@ from functools import cache, lru_cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from lw_torchrl._checks import check_choice, checked, nearest, shown
 from lw_torchrl._files import AnyPath, read_toml
+from lw_torchrl._registry import ReadOnlyDict
 from lw_torchrl.language.named_objects import GRIPPER, is_number, is_triple
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task
 from lw_torchrl.language.words import WORDS
@@ -116,7 +116,7 @@ def _skill(text: str, row: Any, tasks: Tasks) -> ScriptedSkill:
 
 @cache
 def _shipped() -> Skills:
-    return MappingProxyType(_read(files("lw_torchrl.language") / "data" / "skills.toml", TASKS))
+    return ReadOnlyDict(_read(files("lw_torchrl.language") / "data" / "skills.toml", TASKS))
 
 
 def _read(file: Path | Traversable, tasks: Tasks) -> dict[str, ScriptedSkill]:
@@ -144,7 +144,7 @@ def load_skills(path: AnyPath | None = None, *, tasks: Tasks = TASKS) -> Skills:
     """
     if path is None:
         return _shipped()
-    return MappingProxyType({**_shipped(), **_read(Path(path), tasks)})
+    return ReadOnlyDict({**_shipped(), **_read(Path(path), tasks)})
 
 
 @lru_cache(maxsize=256)
@@ -169,7 +169,7 @@ def skills_for(task: Task, skills: Skills | None = None) -> Skills:
 
 @lru_cache(maxsize=256)
 def _shipped_for(task: Task) -> Skills:
-    return MappingProxyType(dict(skills_for(task, _shipped())))
+    return ReadOnlyDict(dict(skills_for(task, _shipped())))
 
 
 _BEFORE_NOUN, _DIRECTIONS = (frozenset(WORDS["in_skills"][name]) for name in ("before_noun", "directions"))

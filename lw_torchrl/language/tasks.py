@@ -9,11 +9,11 @@ from functools import cached_property
 from hashlib import blake2b
 from importlib.resources import files
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from lw_torchrl._checks import check_choice, check_fields, checked, nearest, shown, unknown_name
 from lw_torchrl._files import AnyPath, read_toml
+from lw_torchrl._registry import ReadOnlyDict
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject, check_inside, read_objects, write_objects
 
@@ -153,7 +153,7 @@ class _Shipped(dict[str, Task]):
         return f"lw.TASKS, the {len(self)} tasks from {min(self)} to {max(self)}"
 
 
-TASKS: Tasks = MappingProxyType(_Shipped((name, Task.from_json(name, row)) for name, row in _TABLE.items()))
+TASKS: Tasks = ReadOnlyDict(_Shipped((name, Task.from_json(name, row)) for name, row in _TABLE.items()))
 MT10: tuple[str, ...] = tuple(name for name, row in _TABLE.items() if row.get("mt10"))
 """TASKS maps the 50 names, sorted, to their :class:`Task`; MT10 names the ten of the MT10 set."""
 MT50: tuple[str, ...] = tuple(TASKS)
@@ -290,4 +290,4 @@ def load_tasks(path: AnyPath) -> Tasks:
                 raise TaskError(f"task {name!r}: is none of the 50, so it must name its objects{near}")
         except TaskError as error:
             raise TaskError(f"{file}, {error}") from error
-    return MappingProxyType(dict(sorted(found.items())))
+    return ReadOnlyDict(dict(sorted(found.items())))

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 from lw_torchrl._checks import check_choice, check_fields, shown, unknown_name
-from lw_torchrl._registry import Registry
+from lw_torchrl._registry import ReadOnlyDict, Registry
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.relations import PREDICATES
@@ -68,8 +67,8 @@ class Suite:
                 raise ValueError(f"tasks of suite {self.name!r} must be named '{self.name}/...', got {name!r}")
         if self.plans is not None and (other := set(self.plans) - set(self.tasks)):
             raise ValueError(f"plans of suite {self.name!r} are for tasks that it lacks: {', '.join(sorted(other))}")
-        if not isinstance(self.tasks, MappingProxyType):
-            object.__setattr__(self, "tasks", MappingProxyType(dict(sorted(self.tasks.items()))))
+        if not isinstance(self.tasks, ReadOnlyDict):
+            object.__setattr__(self, "tasks", ReadOnlyDict(dict(sorted(self.tasks.items()))))
 
     def named_tasks(self, tasks: TaskList, own: Tasks | None = None) -> dict[str, Task]:
         """Full task names, sorted, to the tasks that are meant: the suite's name for all of them, a name with or

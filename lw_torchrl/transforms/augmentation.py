@@ -22,7 +22,6 @@ from lw_torchrl.language.task_objects import role_object
 from lw_torchrl.language.value_checks import plain
 from lw_torchrl.transforms.qaf import answers_of, plan_number_key
 
-_HOLDING = ("close", "carry", "move")  # verbs of steps for which the gripper is closed or closes
 ACTIVE = 0.01  # attention of an active step: a step whose condition is false beside a true one has 1e-4
 
 
@@ -144,15 +143,10 @@ class SwapUnmentioned(PlanAugmentation):
         observations = {key: read(tensordict, [key])[0]}
         kept = self._kept(tensordict)
         following = tensordict.get("next", None)
-        if following is not None and (after := following.get(key, None)) is not None:
-            observations[unravel_key(("next", key))] = after
-            if following.get(qaf, None) is not None:
-                known = (
-                    following
-                    if following.get(task, None) is not None
-                    else following.copy().set(task, tensordict.get(task))
-                )
-                kept = kept | self._kept(known)
+        if following is not None and following.get(key, None) is not None:
+            observations[unravel_key(("next", key))] = following.get(key)
+            if following.get(qaf, None) is not None:  # its task is that of the row
+                kept = kept | self._kept(following.copy().set(task, tensordict.get(task)))
         kept = kept.reshape(-1, kept.shape[-1])
         number, device = kept.shape[0], kept.device
         flat = {name: values.reshape(number, -1) for name, values in observations.items()}
@@ -168,61 +162,42 @@ class SwapUnmentioned(PlanAugmentation):
         return tensordict
 
 
-class HideOpening(PlanAugmentation):
+class HideOpening(Augmentation):
     """Replace the gripper's opening by that of another row: it often reveals the task of a demonstration.
 
-    For replay buffers, after a :class:`QAFTransform`. Changes ``observation`` (B, D), not ``("next", "observation")``.
-    Draws from PyTorch's global generator.
+    For replay buffers. Changes ``observation`` (B, D), not ``("next", "observation")``. Draws from PyTorch's global
+    generator.
 
     Args:
         probability: of each row.
-        plans: canonical plans, see :func:`~lw_torchrl.canonical_plans`: rows in which an active step closes the gripper
-            or moves what it holds keep their opening, by ``task_id`` (B,) int64 and ``qaf`` (B, S). None hides it in
-            any row.
-        layout: of the observations; None for that of the plans, or Meta-World's without plans.
-        in_keys: other names for observation, task_id and qaf, in this order.
+        layout: of the observations.
+        in_keys: another name for observation.
 
     Raises:
-        ValueError: at call time, as for :class:`SwapUnmentioned`.
         TypeError: it is given to an environment.
 
     Example:
         >>> import torch, lw_torchrl as lw
         >>> from tensordict import TensorDict
         >>> rows = TensorDict(observation=torch.rand(8, 39), batch_size=[8])
-        >>> torch.isin(lw.transforms.HideOpening(1.0)(rows)["observation"][:, 3], rows["observation"][:, 3]).all()
+        >>> hidden = lw.transforms.HideOpening(1.0)(rows)["observation"]
+        >>> torch.isin(hidden[:, 3], rows["observation"][:, 3]).all()
         tensor(True)
     """
 
-    holds: Tensor
-
     @checked
     def __init__(
-        self,
-        probability: Probability,
-        *,
-        plans: AnyPlans | None = None,
-        layout: Layout | None = None,
-        in_keys: Sequence[NestedKey] | None = None,
+        self, probability: Probability, *, layout: Layout = METAWORLD, in_keys: Sequence[NestedKey] | None = None
     ) -> None:
-        keys = as_keys("in_keys", in_keys, ("observation", "task_id", "qaf"))
-        super().__init__(in_keys=keys, out_keys=keys[:1])
-        self.probability, self.plans, layout = probability, None, METAWORLD if layout is None else layout
-        if plans is not None:
-            self.plans = self._read_plans(plans)
-            layout = self.plans.layout
-            self.step_table("holds", role_table(self.plans, self._tables, lambda role: role.verb in _HOLDING))
-        self._opening = layout.opening
+        keys = as_keys("in_keys", in_keys, ("observation",))
+        super().__init__(in_keys=keys, out_keys=keys)
+        self.probability, self._opening = probability, layout.opening
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        observation = read(tensordict, self.in_keys[:1])[0].clone()
+        observation = read(tensordict, self.in_keys)[0].clone()
         opening = observation[..., self._opening]
-        number, device = opening.numel(), opening.device
-        hidden = torch.rand(opening.shape, device=device) < self.probability
-        if self.plans is not None:
-            active, rows = self.active(tensordict, [self.in_keys[2], self.in_keys[1]])
-            hidden &= ~(active & self.table("holds", device)[rows]).any(-1)
-        others = opening.flatten()[torch.randint(number, (number,), device=device)].reshape(opening.shape)
+        others = opening.flatten()[torch.randint(opening.numel(), opening.shape, device=opening.device)]
+        hidden = torch.rand(opening.shape, device=opening.device) < self.probability
         observation[..., self._opening] = torch.where(hidden, others, opening)
         return tensordict.copy().set(self.in_keys[0], observation)
 

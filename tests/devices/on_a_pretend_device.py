@@ -425,7 +425,7 @@ def test_augmentations_are_where_the_rows_are():
     augmented = Compose(
         lw.QAFTransform(plans),
         lw.transforms.SwapUnmentioned(plans, 0.5),
-        lw.transforms.HideOpening(0.5, plans=plans),
+        lw.transforms.HideOpening(0.5),
         lw.transforms.JitterTarget(plans, 0.03),
         lw.RandomYaw(0.3, plans=plans, tilt=0.5),
     )

@@ -75,7 +75,7 @@ def test_workers_get_new_weights_and_differ(kind):
     assert first["action_log_prob"].isfinite().all()
     assert len(episodes(first)) == first.numel() // STEPS, "no episode twice"
     with torch.no_grad():
-        for p in actor.head.parameters():
+        for p in actor.module["decoder"].parameters():
             p.zero_()
     collector.update_policy_weights_()
     for _ in range(4):  # what was under way was done with the old ones
@@ -174,7 +174,7 @@ def test_ray():
             if len(found) == 4:
                 break
             with torch.no_grad():
-                for p in actor.head.parameters():
+                for p in actor.module["decoder"].parameters():
                     p.zero_()
             collector.update_policy_weights_()
         assert len(set().union(*found)) == sum(map(len, found)), "no episode twice"

@@ -73,7 +73,7 @@ def test_a_single_environment_has_no_dimension_of_rows(options):
     env = TransformedEnv(lw.LanguageWorldEnv("reach", batch_size=(), seed=2, **options), lw.QAFTransform(PLANS))
     check_env_specs(env)
     env.set_seed(2)
-    data = env.rollout(5, lw.PlanConditionedActor(PLANS, width=8))
+    data = env.rollout(5, lw.PlanConditionedActor(PLANS))
     assert data.batch_size == (5,)
     assert {key: tuple(data[key].shape) for key in ("observation", "task_id", "action", "qaf", "done")} == {
         "observation": (5, 39),

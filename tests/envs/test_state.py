@@ -123,7 +123,7 @@ def test_a_resumed_collector_goes_on(name):
 
 def test_a_collector_goes_on_after_a_reset_with_a_policy_of_plans():
     """It zeroes what the environment gave it."""
-    actor = lw.PlanConditionedActor(lw.load_plans("MT10"), width=8)
+    actor = lw.PlanConditionedActor(lw.load_plans("MT10"))
     collector = Collector(
         make_transformed(), actor, frames_per_batch=15, total_frames=-1, auto_register_policy_transforms=False
     )

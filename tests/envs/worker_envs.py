@@ -34,6 +34,6 @@ def make_single() -> TransformedEnv:
     return TransformedEnv(env, lw.QAFTransform(lw.load_plans("MT10")))
 
 
-def make_actor() -> lw.PlanConditionedActor:
+def make_actor() -> lw.modules.StochasticActor:
     torch.manual_seed(0)
-    return lw.PlanConditionedActor(lw.load_plans("MT10"), width=8, depth=1, distribution="tanh_normal")
+    return lw.PlanConditionedActor(lw.load_plans("MT10")).stochastic()

@@ -144,7 +144,7 @@ def test_fallback_steps_mention_nothing_in_the_plans_own_turn():
 
 def test_the_opening_is_that_of_another_row():
     was = rows(2000)
-    now = seeded(lw.transforms.HideOpening(0.3), was.exclude("qaf", "task_id"))["observation"]
+    now = seeded(lw.transforms.HideOpening(0.3), was)["observation"]
     others = [column for column in range(39) if column != OPENING]
     assert torch.equal(now[:, others], was["observation"][:, others])
     assert torch.isin(now[:, OPENING], was["observation"][:, OPENING]).all()
@@ -159,15 +159,6 @@ def steps_with(verbs, plans=CANONICAL):
         for number, step in enumerate(plan.steps)
         if step.role.verb in verbs and not step.role.fallback
     ]
-
-
-def test_a_gripper_that_closes_or_holds_is_not_hidden():
-    transform = lw.transforms.HideOpening(1.0, plans=CANONICAL)
-    for verbs, hidden in ((("close", "carry"), False), (("approach", "push"), True)):
-        for task, step in steps_with(verbs):
-            was = rows(64, plans=CANONICAL, task=task, step=step)
-            now = seeded(transform, was)
-            assert torch.equal(now["observation"], was["observation"]) != hidden, (task, step)
 
 
 def test_the_target_is_moved_where_something_is_pushed_or_pulled():
@@ -213,7 +204,7 @@ def test_keys_have_other_names():
 PUSH_ROLES = Plans([ConditionalPlan("push", CANONICAL["push"].steps[:2])])
 MAKERS = {
     "SwapUnmentioned": lambda: lw.transforms.SwapUnmentioned(CANONICAL, 0.5),
-    "HideOpening": lambda: lw.transforms.HideOpening(0.5, plans=CANONICAL),
+    "HideOpening": lambda: lw.transforms.HideOpening(0.5),
     "JitterTarget": lambda: lw.transforms.JitterTarget(CANONICAL, 0.03),
 }
 
@@ -228,31 +219,26 @@ def test_an_environment_refuses_it(name):
     env.close()
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", ["SwapUnmentioned", "JitterTarget"])
 def test_answers_of_longer_plans_are_cut_if_they_are_for_the_same_plan(name):
-    transform = MAKERS[name]()
     task = min(CANONICAL, key=lambda task: len(CANONICAL[task].steps))
-    transform = {
-        "SwapUnmentioned": lambda plans: lw.transforms.SwapUnmentioned(plans, 0.5),
-        "HideOpening": lambda plans: lw.transforms.HideOpening(0.5, plans=plans),
-        "JitterTarget": lambda plans: lw.transforms.JitterTarget(plans, 0.03),
-    }[name](Plans([CANONICAL[task]]))
+    transform = getattr(lw.transforms, name)(Plans([CANONICAL[task]]), 0.5)
     was = lw.QAFTransform(CANONICAL)(rows(task=task).exclude("qaf"))
-    now, expected = seeded(transform, was), seeded(MAKERS[name](), was)
-    for key in ("observation", "target_offset"):
-        assert key not in now or torch.equal(now[key], expected[key])
+    now, expected = seeded(transform, was), seeded(getattr(lw.transforms, name)(CANONICAL, 0.5), was)
+    assert (now == expected).all()
     with pytest.raises(ValueError, match="qaf must have shape"):
         transform(was.exclude("qaf_plan"))
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", ["SwapUnmentioned", "JitterTarget"])
 def test_missing_keys_and_other_plans_are_named(name):
+    transform = MAKERS[name]()
     with pytest.raises(ValueError, match=r"qaf.* are needed"):
-        MAKERS[name]()(rows().exclude("qaf"))
+        transform(rows().exclude("qaf"))
     with pytest.raises(ValueError, match="qaf answers other plans"):
-        MAKERS[name]()(lw.QAFTransform(MT10)(rows(plans=MT10)))
+        transform(lw.QAFTransform(MT10)(rows(plans=MT10)))
     with pytest.raises(ValueError, match="tasks without a plan"):
-        MAKERS[name]()(rows(plans=CANONICAL, task="soccer"))
+        transform(rows(plans=CANONICAL, task="soccer"))
 
 
 def test_wrong_arguments_are_refused():

@@ -237,7 +237,7 @@ def test_errors_under_way_do_not_outlive_a_loaded_state():
 @pytest.mark.parametrize("kind", ["scripted", "pcbc"])
 def test_an_evaluation_hangs_neither_on_num_envs_nor_on_the_tasks_beside(kind):
     plans = lw.load_plans("MT10")
-    actor = lw.ScriptedSkillActor(plans) if kind == "scripted" else lw.PlanConditionedActor(plans, width=8)
+    actor = lw.ScriptedSkillActor(plans) if kind == "scripted" else lw.PlanConditionedActor(plans)
     spoilt = lw.CorruptQAF(plans, flip=0.2, delay=1)
 
     def answers(**options) -> dict[tuple[str, int], Tensor]:

@@ -5,10 +5,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 import lw_torchrl as lw
+from lw_torchrl.modules.policy import transform_of
 from lw_torchrl.transforms import FallbackTurns
 
 HAND, THING = slice(0, 3), slice(4, 7)
@@ -95,11 +96,19 @@ def test_rows_of_a_buffer_keep_what_they_have():
     assert FallbackTurns()(rows.exclude("turn"))["turn"].tolist() == [0, 0]
 
 
-def test_demonstrations_train_a_policy_that_has_plans_in_reserve(tmp_path):
-    lw.collect_demonstrations("reach", root=tmp_path, episodes_per_task=1, seed=0, progress=False)
-    actor = lw.PlanConditionedActor(lw.load_plans("MT10"), reserve=True, roles=True, features="none", width=8)
-    replay = lw.LanguageWorldExperienceReplay(tmp_path, transform=actor.transform(), batch_size=4)
-    assert replay.sample()["turn"].tolist() == [0] * 4
-    lw.BehavioralCloningTrainer(
-        actor, replay, lw.BehavioralCloningConfig(steps=2, batch_size=4), progress=False
-    ).train()
+def test_a_policy_with_fallback_steps_acts_on_demonstrations_and_in_environments():
+    plans = lw.canonical_plans(lw.load_plans("MT10"), fallback=True)
+    actor = lw.PlanConditionedActor(plans)
+    assert "turn" in actor.in_keys
+    rows = TensorDict(observation=torch.rand(4, 39), task_id=torch.full((4,), lw.task_id("push")), batch_size=[4])
+    assert actor(transform_of(actor)(rows))["action"].shape == (4, 4)
+    assert rows["turn"].tolist() == [0] * 4
+    turns = lw.QAFTransform(plans), FallbackTurns(patience=3)
+    env = TransformedEnv(lw.LanguageWorldEnv("push", max_steps=12), Compose(*turns))
+    still = lambda td: actor(td).set("action", torch.zeros(1, 4))  # noqa: E731
+    rollout = env.rollout(12, still)
+    fallback = torch.tensor([step.role.fallback for step in plans["push"].steps])
+    weights = rollout["skill_weights"][0, :, : len(fallback)] @ fallback.float()
+    assert rollout["turn"].max() >= 2
+    torch.testing.assert_close(weights, (rollout["turn"][0] % 2).float())
+    env.close()

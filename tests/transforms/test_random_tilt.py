@@ -119,23 +119,29 @@ def test_so_many_rows_are_tilted_as_it_says():
     assert "observation_tilt" not in tilted(was, 0.0)
 
 
-def test_roles_see_what_the_action_does():
-    """The action towards the target stays the one towards what is seen."""
+def test_role_features_see_what_the_action_does():
+    """An action towards the target stays an action towards the target that the features show."""
     was = rows("push", 3, 50)
-    actor = lw.PlanConditionedActor(MT10, roles=True, features="none", width=8, depth=1)
-    actor.encoder.roles.demonstrated.fill_(True)
-    way = was["observation"][:, 36:39] - was["observation"][:, 4:7]
-    was["action"][:, :3] = way * 0.3
+    was["action"][:, :3] = (was["observation"][:, 36:39] - was["observation"][:, 4:7]) * 0.3
     now = tilted(was)
-    roles, tables = actor.eval().encoder.roles, actor.encoder.attention.tables
-    weights = torch.nn.functional.one_hot(torch.full((50,), 3), PLANS.num_steps).float()
-    seen = roles(
-        now["observation"], weights, tables.rows(now["task_id"]), now["observation_yaw"], now["observation_tilt"]
-    )
+    now["skill_weights"] = torch.nn.functional.one_hot(torch.full((50,), 3), PLANS.num_steps).float()
+    features = lw.modules.RoleFeatures(PLANS).eval()
+    features.demonstrated.fill_(True)
+    seen = features(now)["features"]
     direction = torch.nn.functional.normalize
     torch.testing.assert_close(direction(seen[:, :3], dim=-1), direction(now["action"][:, :3], dim=-1))
-    prepared = actor.prepare(now)[2]
-    torch.testing.assert_close(prepared, seen, atol=0.05, rtol=0)
+
+
+def test_role_features_add_the_jittered_targets_offset():
+    task, step = next((t, n) for t in PLANS for n, s in enumerate(PLANS[t].steps) if s.role.verb == "push")
+    was = rows(task, step, 50)
+    was["observation"] *= 0.1  # positions farther than 25 cm count as 25 cm away
+    was["skill_weights"] = torch.nn.functional.one_hot(torch.full((50,), step), PLANS.num_steps).float()
+    features = lw.modules.RoleFeatures(PLANS).eval()
+    now = lw.transforms.JitterTarget(PLANS, 0.01)(was)
+    shift = features(now.copy())["features"][:, :3] - features(was.copy())["features"][:, :3]
+    near = (was["observation"][:, 4:7] - was["observation"][:, :3]).norm(dim=-1) < 0.15
+    torch.testing.assert_close(shift[near] * 0.1, now["target_offset"][near])
 
 
 def test_keys_of_ones_own():

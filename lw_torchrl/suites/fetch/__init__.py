@@ -3,10 +3,10 @@ what its numbers mean, its words, and what simulates it.
 """
 
 from importlib.resources import files
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from lw_torchrl._files import read_toml
+from lw_torchrl._registry import ReadOnlyDict
 from lw_torchrl.language import plan_files, skills
 from lw_torchrl.language.layout import Layout, Slot
 from lw_torchrl.language.plans import Plans
@@ -37,7 +37,7 @@ FETCH = Layout(
 )
 """The 25 numbers of an observation: hand, opening, puck and its quaternion, the same 11 a step before, goal."""
 
-TASKS: Tasks = MappingProxyType(
+TASKS: Tasks = ReadOnlyDict(
     {name: Task.from_json(name, row, FETCH) for name, row in sorted(read_toml(_DATA / "tasks.toml", TaskError).items())}
 )
 """The four names, sorted, to their :class:`~lw_torchrl.language.tasks.Task`."""
