@@ -9,13 +9,14 @@ from lw_torchrl.data.exchange import ExchangeError, export_dataset, import_datas
 from lw_torchrl.data.loading import ROLLOUT, load_demonstrations, n_step_returns
 from lw_torchrl.data.pictures import add_pictures, load_pictures
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
+from lw_torchrl.data.rewards import REWARDS
 from lw_torchrl.data.samplers import TaskBalancedSampler
 from lw_torchrl.data.selection import EpisodeFilter, JoinedDemonstrations
 from lw_torchrl.data.storage import DatasetStorage
 
 __all__ = [
-    "BEHAVIOURS", "ROLLOUT", "Behaviour", "CoLearningSampler", "CollectConfig", "DatasetError", "DatasetStorage",
-    "Demonstrations", "EpisodeFilter", "ExchangeError", "JoinedDemonstrations", "LanguageWorldExperienceReplay",
-    "TaskBalancedSampler", "add_pictures", "collect_demonstrations", "export_dataset", "import_dataset",
-    "load_demonstrations", "load_pictures", "n_step_returns",
+    "BEHAVIOURS", "REWARDS", "ROLLOUT", "Behaviour", "CoLearningSampler", "CollectConfig", "DatasetError",
+    "DatasetStorage", "Demonstrations", "EpisodeFilter", "ExchangeError", "JoinedDemonstrations",
+    "LanguageWorldExperienceReplay", "TaskBalancedSampler", "add_pictures", "collect_demonstrations", "export_dataset",
+    "import_dataset", "load_demonstrations", "load_pictures", "n_step_returns",
 ]  # fmt: skip

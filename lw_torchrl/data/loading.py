@@ -10,7 +10,6 @@ from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from torch import Tensor
 
 from lw_torchrl._checks import Natural, check_int, check_path, check_probability, checked, unknown_name
 from lw_torchrl._devices import check_device
@@ -46,7 +45,8 @@ def n_step_returns(rollout: TensorDictBase, n_steps: int, gamma: float) -> Tenso
 
     Example:
         >>> done = torch.tensor([False, False, True, False])[:, None]
-        >>> rollout = TensorDict(next=TensorDict(reward=torch.ones(4, 1), done=done, x=torch.arange(4))).auto_batch_size_(1)
+        >>> after = TensorDict(reward=torch.ones(4, 1), done=done, x=torch.arange(4))
+        >>> rollout = TensorDict(next=after).auto_batch_size_(1)
         >>> ahead = n_step_returns(rollout, 2, gamma=0.5)
         >>> ahead["next", "reward"].flatten().tolist(), ahead["next", "x"].tolist()
         ([1.5, 1.5, 1.0, 1.0], [1, 2, 2, 3])
@@ -219,8 +219,8 @@ def load_demonstrations(
     The rows of one folder stay in its files, memory-mapped, as long as nothing is selected; changes to them never reach
     the files. Several folders, or a selection of rows, are copied into memory.
 
-    Rows (R,) hold observation (R, 39) float32, action (R, 4) float32, task_id and episode (R,) int64, and the columns of
-    ``label``. collector/traj_ids (R,) int64 is unique for each episode of all datasets; behaviour (R,) int64 is the
+    Rows (R,) hold observation (R, 39) float32, action (R, 4) float32, task_id and episode (R,) int64, and the columns
+    of ``label``. collector/traj_ids (R,) int64 is unique for each episode of all datasets; behaviour (R,) int64 is the
     rank of the collecting policy's label among those of all folders. is_demonstration (R,) bool is true. dataset (R,)
     int64 is the index of the folder, if there are several.
 

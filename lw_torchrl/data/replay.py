@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -46,9 +46,9 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
     ``keys``, samples hold no other columns: the sampler's ``index`` and ``is_target`` come with ``return_info=True``.
 
     Args:
-        root, episodes, keep, label, reward, after_success, terminate_on_success, n_steps, gamma, keys, device, check: as
-            for :func:`load_demonstrations`. Transforms run on the device of the rows, and minibatches are the same on
-            every device.
+        root, episodes, keep, label, reward, after_success, terminate_on_success, n_steps, gamma, keys, device, check:
+            as for :func:`load_demonstrations`. Transforms run on the device of the rows, and minibatches are the same
+            on every device.
         batch_size: rows of a sample.
         sampler: a TorchRL sampler, or a function that makes one, for example :class:`TaskBalancedSampler`; None for
             uniform.
@@ -182,10 +182,8 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         for part in self.parts:
             verify(read_metadata(part.root), part.episodes)
 
-    def __setitem__(self, index: Any, value: Any) -> NoReturn:
-        """Raise :class:`RuntimeError`: a dataset's rows are read-only."""
-        self.storage.set(index, value)
-        raise AssertionError
+    def __setitem__(self, index: Any, value: Any) -> None:
+        self.storage.set(index, value)  # which refuses it
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state, after :meth:`verify`; ValueError if it is of other rows."""

@@ -17,7 +17,6 @@ from lw_torchrl.data.behaviours import behaviour_of
 from lw_torchrl.data.dataset import EpisodeInfo
 from lw_torchrl.data.rewards import REWARDS
 from lw_torchrl.data.selection import episode_returns
-from lw_torchrl.language.tasks import task_id
 
 TASKS = ("push", "reach")
 STEPS = 34
