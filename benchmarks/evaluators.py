@@ -64,7 +64,8 @@ def demonstrations(
         redraw_failures=True,
         max_steps=max_steps,
     )
-    return lw.LanguageWorldExperienceReplay(root, sampler=lw.TaskBalancedSampler(), after_success=RECIPE.after_success)
+    sampler = lw.TaskBalancedSampler(exact=True)
+    return lw.LanguageWorldExperienceReplay(root, sampler=sampler, after_success=RECIPE.after_success)
 
 
 def evaluated(file: Path, actor: Any, tasks: Sequence[str], episodes: int, seed: int) -> EvaluationResult:

@@ -247,7 +247,7 @@ def train(args: Arguments) -> Any:
     plans = lw.Plans({task: lw.load_plans("MT50")[task] for task in tasks})
     how: dict[str, Any] = {"policy": "scripted", "seed": 0, "noise_scale": (0.05, 0.1, 0.2), "max_steps": 150}
     collect_demonstrations(list(plans), episodes_per_task=10, root=data, progress=False, **how)
-    sampler = lw.TaskBalancedSampler()
+    sampler = lw.TaskBalancedSampler(exact=True)
     replay = lw.LanguageWorldExperienceReplay(data, label="executed", sampler=sampler, after_success=20)
     torch.manual_seed(0)
     actor = lw.PlanConditionedActor(plans, features="both", width=192)

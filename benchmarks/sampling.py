@@ -1,5 +1,5 @@
 """Minibatches in exact proportions: equal numbers from every task; a target's demonstration beside the base tasks; rows
-that come beside demonstrations."""
+that come while batches are drawn."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import (
     LazyTensorStorage,
-    OfflineToOnlineReplayBuffer,
     RandomSampler,
-    ReplayBuffer,
     ReplayBufferEnsemble,
     TensorDictReplayBuffer,
     TensorStorage,
@@ -19,7 +17,6 @@ from torchrl.data import (
 
 import lw_torchrl as lw
 from benchmarks.report import Row, Settings, compare, take_turns
-from lw_torchrl.data import GrowingStorage, GrowingWriter, JoinedStorage
 
 TASKS, BATCH, CALLS = 50, 200, 20
 TARGET = "coffee-push"
@@ -99,10 +96,9 @@ def _co_learning(settings: Settings, count: int) -> list[Row]:
     base = _rows(count, torch.tensor([lw.task_id(task) for task in lw.MT10]).repeat_interleave(size))
     target = _rows(500, torch.full((500,), lw.task_id(TARGET)))
     ours = TensorDictReplayBuffer(
-        storage=JoinedStorage([base, target]),
+        storage=TensorStorage(torch.cat([base, target])),
         sampler=lw.CoLearningSampler(TARGET),
         batch_size=BATCH,
-        collate_fn=lambda batch: batch,
     )
     parts = [target, *(base[k * size : (k + 1) * size] for k in range(len(lw.MT10)))]
     members = [TensorDictReplayBuffer(storage=TensorStorage(part), batch_size=10) for part in parts]
@@ -113,27 +109,13 @@ def _co_learning(settings: Settings, count: int) -> list[Row]:
         "ensemble": ensemble.sample,
         "gather": lambda: base[torch.randint(count, (BATCH,))],
     }
-    name = f"CoLearningSampler, {BATCH} of {count + 500:,} joined rows"
+    name = f"CoLearningSampler, {BATCH} of {count + 500:,} rows of two datasets"
     rival = "a buffer for each task, 20 drawn by their shares for 10 rows each: the counts are right on average alone"
     return _compare(name, draws, settings.pick(30, 3), rival, targets=True)
 
 
-def _trajectories(count: int, task: torch.Tensor, first: int) -> TensorDict:
-    """Rows with all that a collector gives, each trajectory of 500."""
-    rows = _rows(count, task)
-    time = torch.arange(first, first + count)
-    rows["observation"] = (time % 2**20).float()[:, None].repeat(1, 39)
-    after = {"observation": rows["observation"].clone(), "task_id": task.clone()}
-    after["observation"] += 1
-    ends = (time % 500 == 499)[:, None]
-    flags = {"done": ends, "terminated": torch.zeros_like(ends), "truncated": ends.clone()}
-    rows["collector"] = TensorDict({"traj_ids": time // 500}, [count])
-    rows["next"] = TensorDict({**after, "reward": torch.rand(count, 1), **flags}, [count])
-    return rows
-
-
 def _growing(settings: Settings, count: int) -> list[Row]:
-    """100 rows come, then a batch of 200 is drawn: by task, and 1:1 with demonstrations."""
+    """100 rows come, then a batch of 200 is drawn by task."""
     task = torch.arange(count) % TASKS
     rows, come = _rows(count, task), 100
     batch = _rows(come, torch.arange(come) % TASKS)
@@ -170,37 +152,6 @@ def _growing(settings: Settings, count: int) -> list[Row]:
         ),
     ]
 
-    grown = count
-    base = _trajectories(count // 10, torch.arange(count // 10) * 10 // (count // 10), 0)
-    first = _trajectories(grown, torch.zeros(grown, dtype=torch.int64), 10**6)
-    ring = TensorDictReplayBuffer(
-        storage=GrowingStorage([base], grow=grown),
-        writer=GrowingWriter(),
-        sampler=lw.CoLearningSampler("grown"),
-        batch_size=BATCH,
-        collate_fn=lambda batch: batch,
-    )
-    theirs = OfflineToOnlineReplayBuffer(
-        ReplayBuffer(storage=TensorStorage(base), batch_size=BATCH // 2), online_capacity=grown, batch_size=BATCH
-    )
-    for buffer in (ring, theirs):
-        buffer.extend(first.clone())
-
-    def mixed(buffer: TensorDictReplayBuffer | OfflineToOnlineReplayBuffer) -> Callable[[], object]:
-        batches = iter(first.split(come))
-
-        def turn() -> None:
-            buffer.extend(next(batches).clone())
-            buffer.sample()
-
-        return turn
-
-    found = take_turns({"ours": mixed(ring), "theirs": mixed(theirs)}, settings.pick(200, 3), warm_up=1)
-    name = f"CoLearningSampler('grown'), {come} rows come and {BATCH} of {grown + count // 10:,} are drawn"
-    note = "no equal numbers of tasks, no trajectories told apart, no saved state"
-    result.append(
-        compare(name, found["ours"], "OfflineToOnlineReplayBuffer", found["theirs"], note=note, **unit)  # type: ignore[arg-type]
-    )
     return result
 
 

@@ -10,11 +10,10 @@ import warnings
 
 import torch
 from tensordict import TensorDict
-from torchrl.data import TensorDictReplayBuffer
+from torchrl.data import TensorDictReplayBuffer, TensorStorage
 from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
-from lw_torchrl.data import JoinedStorage
 
 BASE, TARGET = ["drawer-open", "door-open"], "window-open"
 
@@ -46,13 +45,12 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as root:
         lw.collect_demonstrations(BASE, episodes_per_task=args.demonstrations, root=root, noise_scale=[0.0, 0.2])
         mine = my_demonstration()
-        base = lw.LanguageWorldExperienceReplay(root, after_success=20)[:].select(*mine.keys())
+        base = lw.load_demonstrations(root, after_success=20, keys=mine.keys())
         replay = TensorDictReplayBuffer(
-            storage=JoinedStorage([base, mine]),
+            storage=TensorStorage(torch.cat([base, mine])),
             sampler=lw.CoLearningSampler(TARGET),
             transform=lw.QAFTransform(plans),
             batch_size=100,
-            collate_fn=lambda batch: batch,
         )
         actor = lw.PlanConditionedActor(plans)
         weights = replay.sampler.row_weights(replay.storage)

@@ -5,6 +5,7 @@ python examples/collect_on_ray.py --workers 2 --batches 4
 """
 
 import argparse
+from functools import partial
 
 import ray
 import torch
@@ -16,8 +17,9 @@ import lw_torchrl as lw
 TASKS = ["push", "reach"]
 
 
-def make_env() -> TransformedEnv:
-    return TransformedEnv(lw.LanguageWorldEnv(TASKS, max_steps=100), lw.QAFTransform(lw.load_plans("MT10")))
+def make_env(worker: tuple[int, int]) -> TransformedEnv:
+    env = lw.LanguageWorldEnv(TASKS, max_steps=100, worker=worker)
+    return TransformedEnv(env, lw.QAFTransform(lw.load_plans("MT10")))
 
 
 def main() -> None:
@@ -29,7 +31,7 @@ def main() -> None:
     actor = lw.PlanConditionedActor(lw.load_plans("MT10"), distribution="tanh_normal")
     frames = 100 * len(TASKS)
     collector = RayCollector(
-        [make_env] * args.workers,
+        [partial(make_env, worker=(w, args.workers)) for w in range(args.workers)],
         actor,
         frames_per_batch=frames,
         total_frames=frames * args.batches,

@@ -16,6 +16,7 @@ from lw_torchrl.data import TaskBalancedSampler as TaskBalancedSampler
 from lw_torchrl.data import collect_demonstrations as collect_demonstrations
 from lw_torchrl.data import export_dataset as export_dataset
 from lw_torchrl.data import import_dataset as import_dataset
+from lw_torchrl.data import load_demonstrations as load_demonstrations
 from lw_torchrl.envs import ExpertActor as ExpertActor
 from lw_torchrl.envs import LanguageWorldEnv as LanguageWorldEnv
 from lw_torchrl.evaluation import EvaluationResult as EvaluationResult

@@ -164,8 +164,6 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         batch_size=2,
         label="executed",
         terminate_on_success=True,
-        grow=4,
-        sampler=lw.CoLearningSampler("grown"),
         transform=lw.QAFTransform(plans),
     )
     actor = lw.PlanConditionedActor(plans, width=8)

@@ -233,13 +233,14 @@ class ImitationRun(Run):
             options: dict[str, Any] = {"checkpoint": checkpoint, "progress": work.progress, "device": work.device}
             trainer: BehavioralCloningTrainer | StackedBehavioralCloning
             if targets:
+                samplers = [CoLearningSampler(target, exact=True) for target in targets]
                 replays = [
-                    self._replay(member, work, actor, roots, CoLearningSampler(target), episodes=[None, {target: 1}])
-                    for target, actor in zip(targets, actors, strict=True)
+                    self._replay(member, work, actor, roots, sampler, episodes=[None, {target: 1}])
+                    for target, actor, sampler in zip(targets, actors, samplers, strict=True)
                 ]
                 trainer = StackedBehavioralCloning(actors, replays, config, **options)
             else:
-                replays = [self._replay(member, work, actors[0], roots[0], TaskBalancedSampler())]
+                replays = [self._replay(member, work, actors[0], roots[0], TaskBalancedSampler(exact=True))]
                 trainer = BehavioralCloningTrainer(actors[0], replays[0], config, **options)
             policy = dict(zip(targets, actors, strict=True)) if targets else actors[0]
             for step in preset.evaluated_before(steps):

@@ -98,7 +98,7 @@ class _Learned:
         if n_steps:
             options |= {"n_steps": recipe.n_steps, "gamma": recipe.gamma if recipe.n_steps > 1 else None}
         options |= {"label": "executed", "terminate_on_success": True, "reward": recipe.reward}
-        sampler, transform = TaskBalancedSampler(), QAFTransform(plans)
+        sampler, transform = TaskBalancedSampler(exact=True), QAFTransform(plans)
         return LanguageWorldExperienceReplay(roots, sampler=sampler, transform=transform, **options)
 
     def _config(self, steps: int) -> OfflineConfig:

@@ -17,6 +17,7 @@ import tyro
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import Collector
+from torchrl.data import OfflineToOnlineReplayBuffer
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 from torchrl.objectives import BCLoss
 
@@ -87,8 +88,10 @@ def main(args: Args) -> None:
 
     # The buffer holds demonstrations and the policy's own successful episodes.
     torch.manual_seed(20_000 + args.seed)
-    options |= {"grow": args.frames, "sampler": lw.CoLearningSampler("grown"), "transform": actor.transform()}
-    replay = lw.LanguageWorldExperienceReplay(demos, batch_size=args.batch_size, **options)
+    options |= {"keys": ["observation", "task_id", "action"], "transform": actor.transform()}
+    offline = lw.LanguageWorldExperienceReplay(demos, **options)
+    replay = OfflineToOnlineReplayBuffer(offline, online_capacity=args.frames, batch_size=args.batch_size)
+    keys = list(offline.sample(1).keys())
     warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # a warning of BCLoss about itself
     loss = BCLoss(actor.train(), loss_function="l1")  # learns in train mode, with noise on the features
     actor.eval()  # and acts without
@@ -112,7 +115,7 @@ def main(args: Args) -> None:
         ids, success = rows["collector", "traj_ids"], rows["next", "success"].squeeze(-1)
         successful = torch.isin(ids, ids[success])
         if successful.any():
-            replay.extend(rows[successful])
+            replay.extend(rows[successful].select(*keys))
         due = int(max(0, frames - args.learning_starts) * args.utd)
         if len(replay) == len(demonstrations):  # no success yet to learn from
             step = due

@@ -14,10 +14,12 @@ from pathlib import Path
 import torch
 import tyro
 from torchrl.collectors import Collector
+from torchrl.data import OfflineToOnlineReplayBuffer
 from torchrl.envs import TransformedEnv
 from torchrl.objectives import SoftUpdate
 
 import lw_torchrl as lw
+from lw_torchrl.data import REWARDS, ROLLOUT, n_step_returns
 
 
 @dataclass
@@ -30,6 +32,7 @@ class Args:
     cloning_steps: int = 1_500  # minibatches of behavioral cloning
     frames: int = 60_000  # environment steps
     num_envs: int = 20
+    rollout: int = 25  # steps of each environment in a batch, at whose end the n-step return is cut
     max_steps: int = 250  # steps per episode
     learning_starts: int = 1_000  # environment steps before the first gradient step
     utd: float = 0.4  # gradient steps per environment step
@@ -67,11 +70,13 @@ def main(args: Args) -> None:
         config = lw.BehavioralCloningConfig(args.cloning_steps, args.batch_size, seed=args.seed)
         lw.BehavioralCloningTrainer(actor, demonstrations, config).train()
 
-    # The buffer holds demonstrations and the collector's rows; the reward is a cost until success.
+    # Half of each minibatch are demonstrations, half the collector's rows; the reward is a cost until success.
     torch.manual_seed(20_000 + args.seed)
-    options |= {"reward": "dense_cost", "n_steps": args.n_steps, "gamma": args.gamma, "batch_size": args.batch_size}
-    options |= {"grow": args.frames, "sampler": lw.CoLearningSampler("grown"), "transform": actor.transform()}
-    replay = lw.LanguageWorldExperienceReplay(demos, **options)
+    options |= {"reward": "dense_cost", "n_steps": args.n_steps, "gamma": args.gamma, "transform": actor.transform()}
+    options |= {"keys": [*ROLLOUT, "steps_to_next_obs", "is_demonstration"]}
+    offline = lw.LanguageWorldExperienceReplay(demos, **options)
+    replay = OfflineToOnlineReplayBuffer(offline, online_capacity=args.frames, batch_size=args.batch_size)
+    keys = list(offline.sample(1).keys(True, True))
     critic = lw.PlanConditionedQValue(actor.plans).eval()
     critic.fit_normalization(demonstrations[:]["observation"])
     actor = actor.stochastic("tanh_normal", args.init_std).eval()
@@ -88,7 +93,7 @@ def main(args: Args) -> None:
     collector = Collector(
         TransformedEnv(env, actor.transform()),
         actor,
-        frames_per_batch=5 * args.num_envs,
+        frames_per_batch=args.rollout * args.num_envs,
         total_frames=args.frames,
         auto_register_policy_transforms=False,
     )
@@ -96,7 +101,10 @@ def main(args: Args) -> None:
     handler = signal.signal(signal.SIGINT, lambda *_: stop.set())
     frames = ended = succeeded = step = 0
     for iteration, rows in enumerate(collector, 1):
-        replay.extend(rows)
+        cost = REWARDS["dense_cost"].of(rows["next", "reward"], rows["next", "success"])
+        ahead = n_step_returns(rows.set(("next", "reward"), cost), args.n_steps, args.gamma)
+        ahead["is_demonstration"] = torch.zeros(ahead.shape, dtype=torch.bool)
+        replay.extend(ahead.reshape(-1).select(*keys))
         frames += rows.numel()
         ended += int(rows["next", "done"].sum())
         succeeded += int(rows["next", "success"].sum())
@@ -109,7 +117,7 @@ def main(args: Args) -> None:
             minimize(losses["loss_qvalue"], critic_optimizer)
             targets.step()
             step += 1
-        if iteration % 50 == 0 or frames >= args.frames:
+        if iteration % 10 == 0 or frames >= args.frames:
             print(f"step {frames:6}/{args.frames}: {succeeded} of {ended} episodes succeeded", flush=True)
             ended = succeeded = 0
         if stop.is_set():

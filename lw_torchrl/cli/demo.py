@@ -93,7 +93,9 @@ def _run(out: Path, config: DemoConfig) -> lw.EvaluationResult:
     torch.manual_seed(config.training_seed)
     actor = lw.PlanConditionedActor(plans)
     rows: dict[str, Any] = {"after_success": config.after_success, "transform": lw.QAFTransform(plans)}
-    replay = lw.LanguageWorldExperienceReplay(out / "demonstrations", sampler=lw.TaskBalancedSampler(), **rows)
+    replay = lw.LanguageWorldExperienceReplay(
+        out / "demonstrations", sampler=lw.TaskBalancedSampler(exact=True), **rows
+    )
     cloning = lw.BehavioralCloningConfig(config.training_steps, config.batch_size, seed=config.training_seed)
     lw.BehavioralCloningTrainer(actor, replay, cloning, checkpoint=out / "checkpoint.safetensors").train()
     print(f"3/4  evaluating {config.episodes_per_task} episodes per task on seeds that no demonstration used")

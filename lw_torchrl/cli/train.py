@@ -70,7 +70,7 @@ class Train:
             raise ValueError(f"the dataset {str(self.data)!r} has no demonstrations of {', '.join(sorted(missing))}")
         rows: dict[str, Any] = {"after_success": self.after_success, "device": self.device}
         rows["episodes"] = dict.fromkeys(tasks, dataset.episodes_per_task) if self.tasks else None
-        replay = lw.LanguageWorldExperienceReplay(self.data, sampler=lw.TaskBalancedSampler(), **rows)
+        replay = lw.LanguageWorldExperienceReplay(self.data, sampler=lw.TaskBalancedSampler(exact=True), **rows)
         torch.manual_seed(self.seed)
         actor = self._new_actor(plans, replay.tasks) if self.begin is None else self._begun_actor(plans)
         _read_transform(actor, replay, self.data)

@@ -6,17 +6,17 @@ from lw_torchrl.data.co_learning_sampler import CoLearningSampler
 from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations
 from lw_torchrl.data.exchange import ExchangeError, export_dataset, import_dataset
-from lw_torchrl.data.growing import GrowingStorage, GrowingWriter
+from lw_torchrl.data.loading import ROLLOUT, load_demonstrations, n_step_returns
 from lw_torchrl.data.pictures import add_pictures, load_pictures
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
+from lw_torchrl.data.rewards import REWARDS
 from lw_torchrl.data.samplers import TaskBalancedSampler
 from lw_torchrl.data.selection import EpisodeFilter, JoinedDemonstrations
-from lw_torchrl.data.storage import JoinedStorage
-from lw_torchrl.data.torch_datasets import RowDataset, WindowDataset
+from lw_torchrl.data.storage import DatasetStorage
 
 __all__ = [
-    "BEHAVIOURS", "Behaviour", "CoLearningSampler", "CollectConfig", "DatasetError", "Demonstrations", "EpisodeFilter",
-    "ExchangeError", "GrowingStorage", "GrowingWriter", "JoinedDemonstrations", "JoinedStorage",
-    "LanguageWorldExperienceReplay", "RowDataset", "TaskBalancedSampler", "WindowDataset", "add_pictures",
-    "collect_demonstrations", "export_dataset", "import_dataset", "load_pictures",
+    "BEHAVIOURS", "REWARDS", "ROLLOUT", "Behaviour", "CoLearningSampler", "CollectConfig", "DatasetError",
+    "DatasetStorage", "Demonstrations", "EpisodeFilter", "ExchangeError", "JoinedDemonstrations",
+    "LanguageWorldExperienceReplay", "TaskBalancedSampler", "add_pictures", "collect_demonstrations", "export_dataset",
+    "import_dataset", "load_demonstrations", "load_pictures", "n_step_returns",
 ]  # fmt: skip

@@ -173,7 +173,7 @@ def load_pictures(
     ValueError) is raised if they are missing or damaged.
     """
     pictures = Pictures.of(cameras, height, width, every)
-    _, lengths = torch.unique_consecutive(replay.storage.column(("collector", "traj_ids")), return_counts=True)
+    _, lengths = torch.unique_consecutive(replay.storage[:].get(("collector", "traj_ids")), return_counts=True)
     episodes = [(part.root, episode) for part in replay.parts for episode in part.episodes]
     images = torch.empty((int(lengths.sum()), *pictures.shape), dtype=torch.uint8)
     row = 0

@@ -1,18 +1,15 @@
 """Checks of a replay buffer of demonstrations, and of any buffer that a policy is trained on."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-import torch
 from torchrl.data import TensorDictReplayBuffer
-from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler, SliceSampler
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
 from torchrl.envs import Compose, MultiStepTransform, Reward2GoTransform
 
 from lw_torchrl.data.dataset import Demonstrations
-from lw_torchrl.data.rewards import REWARDS, RewardName, check_reward
 from lw_torchrl.data.samplers import GroupSampler
-from lw_torchrl.data.storage import DeviceStorage, device_of_rows
-from lw_torchrl.data.trajectories import Columns
+from lw_torchrl.data.storage import DatasetStorage, device_of_rows
 from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.policy import plans_of
 
@@ -47,27 +44,6 @@ def check_behaviours(parts: Sequence[Demonstrations]) -> None:
             raise ValueError(f"root: {part.config.behaviour!r} names different behaviours in {folders}")
 
 
-def check_growing(sampler: Any, options: Mapping[str, Any]) -> None:
-    """Raise for options that a growing buffer does not support."""
-    if options.get("prefetch"):
-        raise ValueError(f"prefetch={options['prefetch']} draws batches before the newest rows come; leave it out")
-    if options.get("shared"):
-        raise ValueError("shared=True: a growing buffer cannot be shared between processes")
-    if isinstance(sampler, SliceSampler) and not sampler._fetch_traj:
-        raise ValueError("sampler: a SliceSampler by end_key joins cut trajectories; use traj_key instead")
-
-
-def admit_rows(reward: RewardName, terminate_on_success: bool, rows: Columns) -> Columns:
-    """A collector's rows with the demonstrations' reward; ValueError for another reward, or other ends."""
-    demonstrated, success = REWARDS[reward], rows["next", "success"]
-    check_reward(demonstrated.source, rows["next", "reward"], success)
-    if not torch.equal(rows["next", "terminated"], success & terminate_on_success):
-        expected = "terminated at success" if terminate_on_success else "never terminated"
-        same = f"give the environment the same terminate_on_success, here {terminate_on_success}"
-        raise ValueError(f"batch: rows must be {expected}, as the demonstrations are; {same}")
-    return {**rows, ("next", "reward"): demonstrated.of(rows["next", "reward"], success)}
-
-
 def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, size: int) -> None:
     """Raise :class:`ValueError` unless networks can be trained on a buffer's minibatches, and training be resumed."""
     for network in networks:
@@ -85,7 +61,7 @@ def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, s
     rows, sampler = replay.storage, replay.sampler
     if isinstance(sampler, PrioritizedSampler):
         raise ValueError("replay: the trainers update no priorities, so a PrioritizedSampler draws uniformly")
-    on_cpu = isinstance(sampler, GroupSampler) or (isinstance(rows, DeviceStorage) and type(sampler) is RandomSampler)
+    on_cpu = isinstance(sampler, GroupSampler) or (isinstance(rows, DatasetStorage) and type(sampler) is RandomSampler)
     if not on_cpu and (device := device_of_rows(rows)).type != "cpu":
         sampled = f"replay: a {type(sampler).__name__} draws on {device} with its own generator, which is not saved"
         raise ValueError(f"{sampled}; use a TaskBalancedSampler or CoLearningSampler, or keep the rows on the CPU")

@@ -1,9 +1,11 @@
-"""GroupSampler and TaskBalancedSampler: exact numbers of rows from each group, each group in passes of its own."""
+"""GroupSampler and TaskBalancedSampler: fixed shares of rows from each group, each group in passes of its own."""
 
 from __future__ import annotations
 
 import os
 from abc import abstractmethod
+from functools import reduce
+from math import gcd
 from pathlib import Path
 from typing import Any
 
@@ -18,48 +20,48 @@ from lw_torchrl._checks import check_int
 from lw_torchrl._files import reading
 from lw_torchrl._keys import check_key
 from lw_torchrl._tensor_files import pop_state, read_tensors, write_tensors
-from lw_torchrl.data.storage import JoinedStorage, to_device_of
+from lw_torchrl.data.storage import to_device_of
 
 _FILE = "sampler.safetensors"
 
 
 def column(storage: Storage, key: NestedKey, rows: Tensor | None = None) -> Tensor:
-    """One column of some rows of a storage, by default all, row-major if of several dimensions, on the CPU."""
-    if isinstance(storage, JoinedStorage):
-        return storage.column(key, rows).cpu()
+    """Return the one value of a column in each row, (R,), or in some rows, on the CPU.
+
+    A row may hold the value in any shape, for example (1,), or (T,) if rows are pieces of trajectories.
+    """
     data = storage.get(slice(0, len(storage)))
-    each = [row.get(key, None) for row in data] if isinstance(data, list) else [data.get(key, None)]
-    if any(one is None for one in each):
+    leaves = [row.get(key, None) for row in data] if isinstance(data, list) else [data.get(key, None)]
+    if any(leaf is None for leaf in leaves):
         raise KeyError(f"the storage has no column {key!r}, by which rows are to be grouped")
-    whole = (torch.stack(each) if isinstance(data, list) else each[0]).flatten(0, storage.ndim - 1)
-    return (whole if rows is None else whole[rows.to(whole.device)]).cpu()
-
-
-def nearest_sizes(batch_size: int, unit: int) -> str:
-    """The multiples of ``unit`` next to a batch size, in words."""
-    below = batch_size // unit * unit
-    return " and ".join(str(size) for size in (below, below + unit) if size)
-
-
-def spans(first: Tensor, count: Tensor) -> Tensor:
-    """``count[g]`` places from ``first[g]`` on, group after group: (count.sum(),) int64."""
-    group = torch.repeat_interleave(count)
-    return torch.arange(len(group)) + (first - count.cumsum(0) + count)[group]
+    whole = (torch.stack(leaves) if isinstance(data, list) else leaves[0]).flatten(0, storage.ndim - 1)
+    values = (whole if rows is None else whole[rows.to(whole.device)]).cpu()
+    if values.dim() == 1:
+        return values
+    values = values.flatten(1)
+    if not (values == values[:, :1]).all():
+        raise ValueError(f"column {key!r} must have one value a row, got rows with several; split them by {key!r}")
+    return values[:, 0]
 
 
 class GroupSampler(Sampler):
-    """Exact numbers from groups of rows; within a group every row comes once before any comes again.
+    """Fixed shares of rows from each group; within a group every row comes once before any comes again.
 
-    A subclass gives the group of each row (:meth:`_label`) and the number of rows of each group in a batch
-    (:meth:`_shares`). A batch holds the groups one after another. If a group's pass ends within a batch, the rest comes
-    from the next pass, in a new order. For a storage of several dimensions (``ndim=2``) an index is a tuple of tensors.
-    A row that is written takes a random place in the rest of its group's pass. All rows are grouped again, and all
-    passes begin again, if a group comes or goes, or if a subclass cannot tell the group of single rows (:meth:`_keys`).
+    A subclass gives the group of each row (:meth:`_label`) and the share of each group (:meth:`_weights`). A batch
+    holds the groups one after another. If a batch size cannot be divided exactly, the shares are rounded, and later
+    batches make up for it, so that the totals stay within one row of the shares; with ``exact`` such a size is refused.
+    If a group's pass ends within a batch, the rest comes from the next pass, in a new order. For a storage of several
+    dimensions (``ndim=2``) an index is a tuple of tensors. A row that is written takes a random place in the rest of
+    its group's pass. All rows are grouped again, and all passes begin again, if a group comes or goes, or if a subclass
+    cannot tell the group of single rows (:meth:`_keys`).
     """
 
     ran_out = False  # whether the last batch ended an epoch: a pass over the group that takes the most batches
 
-    def __init__(self) -> None:
+    def __init__(self, exact: bool = False) -> None:
+        if not isinstance(exact, bool):
+            raise TypeError(f"exact must be True or False, got {exact!r}")
+        self.exact = exact
         self._process = os.getpid()
         self._empty()
 
@@ -68,6 +70,8 @@ class GroupSampler(Sampler):
         self._length = 0  # rows that are grouped; 0 to group again
         # The rows, group after group, each in the order of its pass; the size of each group, and its rows drawn so far.
         self._order, self._size, self._cursor = none, none, none
+        # The share of each group as whole numbers, and the rows that each is owed by rounding, times their sum.
+        self._weight, self._credit = none, none
         self._known: Tensor | None = None  # the key of each group's rows
         self._written: list[Tensor] = []  # rows written since the last batch
         self.ran_out = False
@@ -79,8 +83,8 @@ class GroupSampler(Sampler):
         """The group of each row: (R,) int64, 0 to G-1 without a gap, or -1 for a row that is left out."""
 
     @abstractmethod
-    def _shares(self, batch_size: int) -> Tensor:
-        """The rows of each group in a batch: (G,) int64, at least 1; ValueError for a size that cannot be exact."""
+    def _weights(self, groups: int) -> tuple[list[int], str]:
+        """The share of each of G groups as whole numbers of at least 1, and the reason for them, in words."""
 
     def _keys(self, storage: Storage, rows: Tensor) -> Tensor | None:
         """The key of each row's group, (n,) int64; None if that takes a look at all rows."""
@@ -94,7 +98,7 @@ class GroupSampler(Sampler):
         label = self._label(storage).cpu()
         order = torch.argsort(label, stable=True)
         self._order, self._size = order[int((label < 0).sum()) :], label[label >= 0].bincount()
-        self._cursor = torch.zeros_like(self._size)
+        self._cursor, self._credit = torch.zeros_like(self._size), torch.zeros_like(self._size)
         self._length, self._laid_out, self._restored = self._covered(storage), None, False
         self._written, self._known = [], self._keys_of_groups(storage)
         for group in range(len(self._size)):
@@ -162,11 +166,39 @@ class GroupSampler(Sampler):
     def _layout(self, batch_size: int) -> tuple[Tensor, Tensor, Tensor]:
         """The share of each group (G,), the group of each row of a batch (B,), its place within the group's (B,)."""
         if self._laid_out is None or self._laid_out[0] != batch_size:
-            shares = self._shares(batch_size)
+            weights, reason = self._weights(len(self._size))
+            divisor = reduce(gcd, weights)
+            self._weight = torch.tensor(weights) // divisor
+            unit = sum(weights) // divisor
+            if not batch_size % unit:
+                shares = self._weight * (batch_size // unit)
+            elif self.exact:
+                near = " and ".join(
+                    str(size) for size in (batch_size // unit * unit, (batch_size // unit + 1) * unit) if size
+                )
+                raise ValueError(
+                    f"batch_size must be a multiple of {unit}, {reason}, got {batch_size}; the nearest are {near}"
+                )
+            else:
+                shares = self._rounded(batch_size, unit)
             group = torch.repeat_interleave(shares)
             place = torch.arange(len(group)) - (shares.cumsum(0) - shares)[group]
-            self._laid_out = (batch_size, shares, group, place)
+            self._laid_out = (0 if batch_size % unit else batch_size, shares, group, place)  # rounded ones differ
         return self._laid_out[1:]
+
+    def _rounded(self, batch_size: int, unit: int) -> Tensor:
+        """The share of each group in a batch that cannot be exact, with what earlier batches owe."""
+        due = self._credit + self._weight * batch_size
+        shares = due.div(unit, rounding_mode="floor").clamp(min=0)
+        while rest := batch_size - int(shares.sum()):
+            ahead = shares * unit - due
+            if rest > 0:
+                shares[ahead.argsort(stable=True)[:rest]] += 1
+            else:
+                able = (shares > 0).nonzero().flatten()
+                shares[able[ahead[able].argsort(descending=True, stable=True)[:-rest]]] -= 1
+        self._credit = due - shares * unit
+        return shares
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
         batch_size = check_int("batch_size", batch_size, minimum=1)
@@ -189,7 +221,7 @@ class GroupSampler(Sampler):
         ending = self._cursor + shares >= self._size
         self._cursor += torch.where(ending, 0, shares)
         if ending.any():
-            batches = self._size / shares
+            batches = self._size / self._weight
             longest = batches == batches.max()
             first = shares.cumsum(0) - shares
             for number in ending.nonzero().flatten().tolist():
@@ -214,6 +246,7 @@ class GroupSampler(Sampler):
             "order": order.clone(),
             "size": size.clone(),
             "cursor": cursor.clone(),
+            "credit": self._credit.clone() if begun else none,
             "known": self._known.clone() if begun and self._known is not None else none,
             "written": torch.cat(self._written) if begun and self._written else none,
             "length": torch.tensor(self._length if begun else 0),
@@ -222,13 +255,14 @@ class GroupSampler(Sampler):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state; ValueError if it is not a sampler's, or at the next sample if it is of other rows."""
-        names = ("order", "size", "cursor", "known", "written", "length", "ran_out")
+        names = ("order", "size", "cursor", "credit", "known", "written", "length", "ran_out")
         if missing := [name for name in names if not isinstance(state_dict.get(name), Tensor)]:
             raise ValueError(f"state_dict must hold {', '.join(names)}; it lacks {', '.join(missing)}")
-        order, size, cursor, known, written, length, ran_out = (state_dict[name].cpu().clone() for name in names)
-        if len(order) != int(size.sum()) or size.shape != cursor.shape or bool((cursor >= size).any()):
+        order, size, cursor, credit, known, written, length, ran_out = (state_dict[n].cpu().clone() for n in names)
+        fits = len(order) == int(size.sum()) and size.shape == cursor.shape == credit.shape
+        if not fits or bool((cursor >= size).any()):
             raise ValueError("state_dict must hold the passes of a sampler: rows, and a place in each pass")
-        self._order, self._size, self._cursor = order, size, cursor
+        self._order, self._size, self._cursor, self._credit = order, size, cursor, credit
         self._known, self._written = known if len(known) else None, [written] if len(written) else []
         self._length, self.ran_out = int(length), bool(ran_out)
         self._laid_out, self._restored = None, True
@@ -262,15 +296,20 @@ class GroupSampler(Sampler):
 
 
 class TaskBalancedSampler(GroupSampler):
-    """Exactly equal numbers from every task; within a task every row comes once before any comes again.
+    """Draw equally many rows of every task; within a task every row comes once before any comes again.
 
-    The buffer may grow: a new row takes a random place in the rest of its task's pass, and an overwritten one leaves
-    it. When a task comes or goes, all passes begin again. The sampler draws from the replay buffer's generator, so
-    ``ReplayBuffer(..., generator=...)`` fixes the batches; its state is saved with the buffer's. An epoch is a pass
-    over the largest task. The storage's entry ``task_key`` holds the task.
+    It works in any :class:`torchrl.data.ReplayBuffer`. The buffer may grow: a new row takes a random place in the rest
+    of its task's pass, and an overwritten one leaves it. When a task comes or goes, all passes begin again. The sampler
+    draws from the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches; its state is
+    saved with the buffer's. An epoch is a pass over the largest task.
+
+    Args:
+        task_key: the entry of the storage that holds the task: one number a row, of any shape.
+        exact: refuse a batch size that the number of tasks does not divide. Otherwise some tasks get one row more, in
+            turn.
 
     Raises:
-        ValueError: at sampling, a batch size that the number of tasks does not divide (with the nearest that it does).
+        ValueError: at sampling, a row with several tasks; with ``exact``, a size that cannot be divided exactly.
 
     Example:
         >>> import torch
@@ -284,21 +323,16 @@ class TaskBalancedSampler(GroupSampler):
     Source: paper section 'Cross-Task Co-Learning via 1:1 Data Mixing', its minibatches of equal numbers.
     """
 
-    def __init__(self, task_key: NestedKey = "task_id") -> None:
+    def __init__(self, task_key: NestedKey = "task_id", *, exact: bool = False) -> None:
         check_key("task_key", task_key)
         self.task_key = task_key
-        super().__init__()
+        super().__init__(exact)
 
     def _label(self, storage: Storage) -> Tensor:
-        return torch.unique(column(storage, self.task_key).reshape(-1), return_inverse=True)[1]
+        return torch.unique(column(storage, self.task_key), return_inverse=True)[1]
 
     def _keys(self, storage: Storage, rows: Tensor) -> Tensor:
         return column(storage, self.task_key, rows)
 
-    def _shares(self, batch_size: int) -> Tensor:
-        groups = len(self._size)
-        count, rest = divmod(batch_size, groups)
-        if rest or not count:
-            what = f"batch_size must be divisible by the number of tasks, {groups}, got {batch_size}"
-            raise ValueError(f"{what}; the nearest are {nearest_sizes(batch_size, groups)}")
-        return torch.full((groups,), count)
+    def _weights(self, groups: int) -> tuple[list[int], str]:
+        return [1] * groups, "the number of tasks"

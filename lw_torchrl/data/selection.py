@@ -7,15 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from lw_torchrl._checks import check_fields, check_int, check_probability, check_text, shown, unknown_name
-from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations, EpisodeInfo
+from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo
 from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.data.rewards import REWARDS, RewardName
-from lw_torchrl.data.samplers import spans
-from lw_torchrl.language.value_checks import finite
 
 
 @dataclass(frozen=True)
@@ -138,51 +135,25 @@ def choose_episodes(dataset: Demonstrations, chosen: EpisodeChoice, argument: st
     return replace(dataset, episodes=tuple(e for e in dataset.episodes if (e.task, e.episode) in keep))
 
 
-def _kept(episodes: Sequence[EpisodeInfo], after: int | None) -> tuple[Tensor, Tensor]:
+def _spans(first: Tensor, count: Tensor) -> Tensor:
+    """``count[g]`` places from ``first[g]`` on, group after group: (count.sum(),) int64."""
+    group = torch.repeat_interleave(count)
+    return torch.arange(len(group)) + (first - count.cumsum(0) + count)[group]
+
+
+def kept_rows(episodes: Sequence[EpisodeInfo], after: int | None) -> tuple[Tensor, Tensor]:
     """The rows up to ``after`` steps past each episode's first success, and how many these are of each episode."""
     cuts = [e.length if after is None or e.first_success is None else e.first_success + after for e in episodes]
     shown = [min(e.length, cut) for e, cut in zip(episodes, cuts, strict=True)]
     starts, lengths = (torch.tensor(some, dtype=torch.int64) for some in ([e.start for e in episodes], shown))
-    return spans(starts, lengths), lengths
+    return _spans(starts, lengths), lengths
 
 
 def returns_of(whole: Demonstrations, chosen: Demonstrations, reward: RewardName, after: int | None) -> Tensor:
     """The return and the number of rows, (E, 2) float64, of the chosen episodes up to ``after`` steps past success."""
-    rows, (kept, lengths) = load_rows(whole).get("next"), _kept(chosen.episodes, after)
+    rows, (kept, lengths) = load_rows(whole).get("next"), kept_rows(chosen.episodes, after)
     made = REWARDS[reward]
     return episode_returns(made.of(rows.get(f"reward_{made.source}")[kept], rows.get("success")[kept]), lengths)
-
-
-def read_part(
-    whole: Demonstrations, chosen: Demonstrations, label: Label, reward: RewardName, after: int | None, terminate: bool
-) -> tuple[TensorDictBase, Tensor | None]:
-    """All rows of a dataset, memory-mapped, and the indices of the rows to show, (n,) int64, or None for all. Rewards
-    and the ends of shortened episodes, which differ from the files, are in memory."""
-    rows = load_rows(whole)
-    if label == "executed":
-        rows = rows.clone(recurse=False)
-        made = REWARDS[reward]
-        source, success = rows.get(("next", f"reward_{made.source}")), rows.get(("next", "success"))
-        rows.set(("next", "reward"), made.of(source, success))
-    else:
-        taken, other = ("expert_action", "unclipped_action")[:: 1 if label == "expert" else -1]
-        rows = rows.exclude("next", "action", other).rename_key_(taken, "action")
-    if not finite(rows.get("action")):
-        raise DatasetError(f"root: {str(whole.root)!r} holds an action that is NaN or infinite, for label={label!r}")
-    if chosen.episodes == whole.episodes and after is None:
-        return rows, None
-    kept, lengths = _kept(chosen.episodes, after)
-    if label == "executed" and after is not None:
-        last = kept[lengths.cumsum(0) - 1]
-        ends = {"done": last, "truncated": last}
-        if terminate:
-            succeeds = rows.get(("next", "success"))[last].reshape(-1)
-            ends |= {"truncated": last[~succeeds], "terminated": last[succeeds]}
-        for key, where in ends.items():
-            flag = rows.get(("next", key)).clone()
-            flag[last], flag[where] = False, True
-            rows.set(("next", key), flag)
-    return rows, kept
 
 
 @dataclass(frozen=True)

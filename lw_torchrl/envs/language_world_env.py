@@ -23,7 +23,6 @@ from lw_torchrl._keys import row_mask
 from lw_torchrl._rendering import check_picture
 from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, done_spec, observation_spec
 from lw_torchrl.envs.seeding import EpisodeCounter, check_worker
-from lw_torchrl.envs.workers import torchrl_worker
 from lw_torchrl.language.tasks import Task, one_layout
 from lw_torchrl.suites.engine import Engine, EngineStep
 from lw_torchrl.suites.metaworld.engines import make_engine
@@ -43,9 +42,9 @@ class LanguageWorldEnv(EnvBase):
     A SerialEnv or ParallelEnv takes ``reset(list_of_kwargs=[{"episode": ...}, ...])``. A reset ignores the ``episode``
     in a tensordict.
 
-    TorchRL's SerialEnv, ParallelEnv, AsyncEnvPool and multi-process collectors are recognised when they call the
-    function that makes the environment; elsewhere (Ray, RPC, your own processes) give ``worker=(w, W)``, or another
-    seed to each.
+    TorchRL does not tell the function that makes an environment which worker calls it. So give each worker of a
+    SerialEnv, ParallelEnv, AsyncEnvPool or multi-process collector its own ``worker=(w, W)``, as in
+    ``ParallelEnv(2, [partial(make_env, worker=(w, 2)) for w in range(2)])``; otherwise all run the same episodes.
 
     ``close()`` frees the simulators, and ends all episodes; the next ``reset()`` makes new ones and continues with the
     next episodes.
@@ -84,7 +83,7 @@ class LanguageWorldEnv(EnvBase):
         frame_skip: steps of the simulation for each action; their rewards are added, and any may succeed.
         terminate_on_success: end an episode at its first success, with ``terminated``.
         strict: raise on a NaN action, instead of truncating the row with a warning as for an unstable simulation.
-        worker: (w, W), the index of this one of W environments; None asks TorchRL.
+        worker: (w, W), the index of this one of W environments; None for the only one.
         batch_size: () for a single environment without the dimension of rows, for AsyncEnvPool.
         device: where the tensors of resets and steps are; "auto" for this machine's accelerator.
 
@@ -141,8 +140,7 @@ class LanguageWorldEnv(EnvBase):
             wanted = f"(), for a single environment, or None for one dimension of {num_envs} rows"
             raise ValueError(f"batch_size must be {wanted}, got {batch_size!r}")
         self.row_tasks = tuple(self.tasks[i % n] for i in range(num_envs))
-        found = torchrl_worker()  # which refuses some pools
-        self.worker = found if worker is None else check_worker(worker)
+        self.worker = (0, 1) if worker is None else check_worker(worker)
         self._process = os.getpid()
         self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_int("seed", seed), self.worker)
         super().__init__(device=check_device("device", device), batch_size=(num_envs,) if batch_size is None else ())

@@ -69,8 +69,8 @@ class _ImitatesDemonstrations(_Loss):
         key = self.tensor_keys.is_demonstration
         if (is_demonstration := tensordict.get(key, None)) is None:
             raise ValueError(
-                f"the batch lacks {key!r}, which marks the rows to imitate: LanguageWorldExperienceReplay and "
-                "GrowingStorage write it; in another buffer add it, (B,) bool, or set its name with set_keys"
+                f"the batch lacks {key!r}, which marks the rows to imitate: load_demonstrations "
+                "writes it; in other rows add it, (B,) bool, or set its name with set_keys"
             )
         if is_demonstration.dtype != torch.bool:
             raise ValueError(f"{key!r} must be torch.bool, true for demonstrations, got {is_demonstration.dtype}")
@@ -81,8 +81,8 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
     """TD3 loss on demonstrations and collected rows; the actor also imitates the demonstrations.
 
     The actor's loss is -Q / mean(abs(Q)) over all rows, where Q is the mean of the critics, plus ``bc_weight`` times
-    the mean squared distance to ``action`` over the rows where ``is_demonstration`` is true: the rows of the datasets
-    of a :class:`~lw_torchrl.LanguageWorldExperienceReplay`, not those it was extended with. The critics' loss is TD3's.
+    the mean squared distance to ``action`` over the rows where ``is_demonstration`` is true: the rows of datasets,
+    not those of a collector. The critics' loss is TD3's.
 
     Reads what TD3 reads, and ``is_demonstration`` (B,) bool. Writes what :class:`torchrl.objectives.TD3BCLoss` writes:
     ``loss_actor`` and ``loss_qvalue``, () float32 each, and, detached, the unweighted ``bc_loss`` (), ``lmbd`` (),

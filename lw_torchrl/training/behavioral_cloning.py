@@ -35,7 +35,7 @@ class BehavioralCloningConfig:
 
     Attributes:
         steps: minibatches.
-        batch_size: rows of a minibatch; with a :class:`TaskBalancedSampler` the number of tasks must divide it.
+        batch_size: rows of a minibatch; with ``TaskBalancedSampler(exact=True)`` the number of tasks must divide it.
         learning_rate: at the start.
         optimizer: "adamw" or "sgd".
         weight_decay: the optimizer's.

@@ -116,8 +116,6 @@ def test_wrong_columns_are_refused(roots, name, values, message):
     with pytest.raises(ValueError, match=message):
         replay.add_column(name, values(len(replay)))
     assert (replay[:] == before).all()
-    with pytest.raises(ValueError, match="add_column is not supported on a growing buffer"):
-        opened(roots, "one", grow=10).add_column("advantage", torch.zeros(len(replay)))
 
 
 def test_values_of_other_rows_are_refused(roots):

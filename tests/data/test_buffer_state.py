@@ -1,4 +1,4 @@
-"""The saved state of a buffer: sampler, generator and added rows, no rows of datasets, and no pickles."""
+"""The saved state of a buffer: sampler and generator, no rows of datasets, and no pickles."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import RandomSampler, SamplerWithoutReplacement
 
-from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, TaskBalancedSampler
+from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler
 
 KINDS = {
     "plain": {},
     "cut": dict(after_success=3),
     "joined": dict(episodes=2),
     "n steps": dict(label="executed", n_steps=3, gamma=0.9),
-    "growing": dict(label="executed", grow=20),
 }
 
 
@@ -105,21 +104,3 @@ def test_planted_pickles_are_never_executed(made, tmp_path):
     with pytest.raises(ValueError, match=f"path: '{folder}' holds no"):
         replay.loads(folder)
     assert not trace.exists()
-
-
-def test_a_growing_buffer_restores_its_rows(made, tmp_path):
-    def grown():
-        return open_replay(made, "growing", lambda: CoLearningSampler("grown"))
-
-    replay = grown()
-    replay.extend(replay[:10].exclude("behaviour", "index"))
-    replay.dumps(tmp_path)
-    again = grown()
-    again.loads(tmp_path)
-    assert (again[:] == replay[:]).all()
-    assert (drawn(again) == drawn(replay)).all()
-    state = replay.state_dict()
-    state["_storage"]["rows"]["observation"][3] = torch.nan
-    with pytest.raises(ValueError, match="state_dict: observation must be finite"):
-        grown().load_state_dict(state)
-    assert sum(path.stat().st_size for path in tmp_path.iterdir()) < 30_000

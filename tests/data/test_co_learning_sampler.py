@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorStorage
 
-from lw_torchrl.data import CoLearningSampler, JoinedStorage
-from lw_torchrl.language.tasks import MT50, task_id
+from lw_torchrl.data import CoLearningSampler
+from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.tasks import MT50, Task, task_id
 
 TARGET = "coffee-push"
 OTHERS = [i for i in range(50) if i != task_id(TARGET)]
@@ -49,12 +50,16 @@ def with_episodes(*episodes):
 
 def make_replay(rows, batch_size, sampler=None, seed=0):
     return TensorDictReplayBuffer(
-        storage=rows if isinstance(rows, JoinedStorage) else TensorStorage(rows),
+        storage=TensorStorage(rows),
         sampler=sampler or CoLearningSampler(TARGET),
         batch_size=batch_size,
         generator=torch.Generator().manual_seed(seed),
-        collate_fn=lambda batch: batch,
     )
+
+
+def joined(*parts):
+    """The rows of several datasets, as load_demonstrations joins them."""
+    return torch.cat([part.set("dataset", torch.full(part.shape, number)) for number, part in enumerate(parts)])
 
 
 def drawn(replay, number):
@@ -100,7 +105,7 @@ def test_target_and_each_base_task_come_once_before_any_row_comes_again(base, ta
 @given(base_sizes, target_size, fractions, st.integers(1, 300))
 def test_a_batch_that_cannot_be_exact_is_refused_with_the_nearest_that_can(base, target, fraction, size):
     unit = smallest(len(base), fraction)
-    sampler = CoLearningSampler(TARGET, target_fraction=fraction)
+    sampler = CoLearningSampler(TARGET, target_fraction=fraction, exact=True)
     replay = make_replay(make_rows(base, target), None, sampler)
     if size % unit == 0:
         assert len(replay.sample(size)) == size
@@ -192,11 +197,11 @@ def test_of_joined_datasets_a_named_target_is_the_last_ones():
     base = with_episodes((1, 4), (task_id(TARGET), 4), (2, 4))
     target = with_episodes((task_id(TARGET), 3)).apply(lambda column: column + 0)
     target["row"] += 100
-    replay = make_replay(JoinedStorage([base, target]), 8)
+    replay = make_replay(joined(base, target), 8)
     batches = [replay.sample() for _ in range(8)]
     assert torch.cat([b["row"][b["is_target"]] for b in batches]).unique().tolist() == [100, 101, 102]
     assert torch.cat([b["row"][~b["is_target"]] for b in batches]).unique().tolist() == [0, 1, 2, 3, 8, 9, 10, 11]
-    only_base = JoinedStorage([target, with_episodes((1, 4))])
+    only_base = joined(target, with_episodes((1, 4)))
     assert int(make_replay(only_base, 8).sample()["is_target"].sum()) == 4
 
 
@@ -208,9 +213,32 @@ def test_a_buffer_that_grows_is_grouped_again():
     assert sorted(replay.sample()["task_id"].unique(return_counts=True)[1].tolist()) == [2, 2, 2, 6]
 
 
+@settings(max_examples=30, deadline=None)
+@given(base_sizes, target_size, fractions, st.lists(st.integers(1, 40), min_size=1, max_size=20), seeds)
+def test_shares_are_rounded_and_later_batches_make_up_for_it(base, target, fraction, sizes, seed):
+    replay = make_replay(make_rows(base, target), None, CoLearningSampler(TARGET, target_fraction=fraction), seed)
+    batches = [replay.sample(size) for size in sizes]
+    assert [len(batch) for batch in batches] == sizes
+    tasks = torch.cat([batch["task_id"] for batch in batches])
+    share = [fraction] + [(1 - fraction) / len(base)] * len(base)
+    for part, task in zip(share, [task_id(TARGET), *OTHERS[: 4 * len(base) : 4]], strict=True):
+        assert abs(int((tasks == task).sum()) - part * sum(sizes)) < 2
+
+
+@pytest.mark.parametrize("name", [TARGET, "stack-blocks", "suite/stack-blocks"])
+def test_the_target_is_named_by_a_name_an_id_or_a_task(name):
+    task = Task(name, "Stack.", (NamedObject(GRIPPER, (0, 1, 2)), NamedObject("block", (4, 5, 6))))
+    rows = TensorDict({"task_id": torch.tensor([1] * 4 + [task_id(name)] * 2), "row": torch.arange(6)}, [6])
+    for target in (name, task_id(name), task):
+        assert make_replay(rows, 4, CoLearningSampler(target)).sample()["is_target"].sum() == 2
+    for target in (None, True, 2.0):
+        with pytest.raises(TypeError, match="target must be a task's name, a Task or a task's id, got"):
+            CoLearningSampler(target)
+
+
 def test_wrong_options_are_named():
-    with pytest.raises(ValueError, match=r"target must be one of .* got 'coffee-pusj'; did you mean 'coffee-pu"):
-        CoLearningSampler("coffee-pusj")
+    with pytest.raises(ValueError, match="the storage has no row of 'coffee-pusj'; its tasks are"):
+        make_replay(make_rows([2], 2), 4, CoLearningSampler("coffee-pusj")).sample()
     with pytest.raises(ValueError, match=r"whole numbers up to 10000, .* nearest is 10/81"):
         CoLearningSampler(TARGET, target_fraction=0.123456789)
 
@@ -246,6 +274,6 @@ def test_row_weights_are_how_often_rows_come(base, target, fraction, seed):
 def test_a_row_that_is_left_out_has_no_weight():
     parts = with_episodes((3, 4), (task_id(TARGET), 2), (7, 4)), with_episodes((task_id(TARGET), 2))
     sampler = CoLearningSampler(TARGET)
-    replay = make_replay(JoinedStorage(parts), 4, sampler)
+    replay = make_replay(joined(*parts), 4, sampler)
     weights = sampler.row_weights(replay.storage)
     assert weights.tolist() == pytest.approx([0.0625] * 4 + [0.0] * 2 + [0.0625] * 4 + [0.25] * 2)

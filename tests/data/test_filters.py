@@ -17,7 +17,6 @@ from lw_torchrl.data.behaviours import behaviour_of
 from lw_torchrl.data.dataset import EpisodeInfo
 from lw_torchrl.data.rewards import REWARDS
 from lw_torchrl.data.selection import episode_returns
-from lw_torchrl.language.tasks import task_id
 
 TASKS = ("push", "reach")
 STEPS = 34
@@ -231,35 +230,12 @@ def test_a_part_left_without_episodes_is_sampled_as_if_it_were_not_there(made, s
         )
         torch.manual_seed(0)  # a SliceSampler draws from the global generator
         found = [replay.sample() for _ in range(5)]
-        return len(replay), torch.cat(found).exclude("index", ("collector", "traj_ids"), "behaviour")
+        return len(replay), torch.cat(found).exclude("index", ("collector", "traj_ids"), "behaviour", "dataset")
 
     rows, alone = batches("scripted", keep=EpisodeFilter(behaviours=("scripted",)))
     joined_rows, joined = batches(*order, **EMPTY)
     assert joined_rows == rows
     assert (joined == alone).all()
-
-
-def test_a_part_left_without_episodes_beside_one_that_grows(made):
-    replay = opened(
-        made,
-        "random",
-        "scripted",
-        **EMPTY,
-        grow=50,
-        n_steps=2,
-        gamma=0.9,
-        batch_size=8,
-        sampler=CoLearningSampler("grown"),
-    )
-    env = lw.LanguageWorldEnv("reach", num_envs=2, max_steps=10)
-    rows = env.rollout(10, lw.ExpertActor("reach"))
-    rows["collector", "traj_ids"] = torch.arange(2)[:, None].expand(2, 10).clone()
-    env.close()
-    replay.extend(rows.exclude("expert_action", "unclipped_action"))
-    batch = replay.sample()
-    assert batch["is_target"].sum() == 4
-    assert "behaviour" not in batch.keys(), "rows that came have none"
-    assert batch["task_id"][~batch["is_target"]].unique().tolist() == sorted(map(task_id, TASKS))
 
 
 def test_a_trainer_of_another_choice_is_told_apart(made):

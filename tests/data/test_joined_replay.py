@@ -1,4 +1,4 @@
-"""The replay buffer over several datasets and chosen episodes: which rows, which label, and nothing copied."""
+"""The replay buffer over several datasets and chosen episodes: which rows, and which label."""
 
 from __future__ import annotations
 
@@ -11,10 +11,8 @@ from torchrl.data import SliceSampler
 from lw_torchrl.data import (
     CoLearningSampler,
     JoinedDemonstrations,
-    JoinedStorage,
     LanguageWorldExperienceReplay,
     collect_demonstrations,
-    selection,
 )
 from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.language.plan_files import load_plans
@@ -88,6 +86,7 @@ def test_labels_and_dropped_steps_are_those_of_each_dataset(base, target, label,
         ends = torch.cat([first_ends, second_ends])
         expected["next", "done"] = expected["next", "truncated"] = ends
     expected["behaviour"] = torch.zeros(len(expected), dtype=torch.int64)
+    expected["dataset"] = torch.tensor([0] * len(first) + [1] * len(second))
     expected["is_demonstration"] = torch.ones(len(expected), dtype=torch.bool)
     found = replay[:]
     assert len(replay) == len(expected)
@@ -141,22 +140,6 @@ def test_one_demonstration_beside_the_base_tasks(base, target):
     assert seen["episode"].unique().tolist() == [1]
     assert seen["collector", "traj_ids"].unique().tolist() == [6 + 1]
     assert torch.equal(seen["observation"].unique(dim=0), demonstration["observation"].unique(dim=0))
-
-
-@pytest.mark.parametrize("label", ["expert", "unclipped", "executed"])
-def test_no_column_of_numbers_is_copied(base, target, label, monkeypatch):
-    loaded = []
-    monkeypatch.setattr(selection, "load_rows", lambda part: loaded.append(load_rows(part)) or loaded[-1])
-    replay = LanguageWorldExperienceReplay([base.root, target.root], label=label, after_success=0)
-    assert isinstance(replay.storage, JoinedStorage)
-    # one number a row, changed
-    own = {"behaviour", "is_demonstration", ("collector", "traj_ids"), ("next", "done"), ("next", "truncated")}
-    for key, leaves in replay.storage._columns.items():
-        if key not in own:
-            source = {("next", "reward"): ("next", "reward_sparse")}.get(key, key)
-            if key == "action" and label != "executed":
-                source = f"{label}_action"
-            assert [leaf.data_ptr() for leaf in leaves] == [rows[source].data_ptr() for rows in loaded]
 
 
 def test_the_same_dataset_can_be_base_and_target(base):

@@ -8,15 +8,26 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from streams import Stream, own_rows
 from tensordict import TensorDict
 from torchrl.data import MultiStep
-from torchrl.envs import MultiStepTransform
 from torchrl.modules import ValueOperator
 from torchrl.objectives.value import TD0Estimator
 
-from lw_torchrl.data import JoinedStorage, LanguageWorldExperienceReplay, collect_demonstrations
-from lw_torchrl.data.growing import GrowingStorage
+from lw_torchrl.data import LanguageWorldExperienceReplay, collect_demonstrations, n_step_returns
+
+
+def own_rows(lengths):
+    """Trajectories of these lengths, one after another."""
+    total = sum(lengths)
+    observation = torch.arange(total, dtype=torch.float32)[:, None] + torch.zeros(total, 2)
+    ids = torch.repeat_interleave(torch.tensor(lengths))
+    done = torch.ones(total, 1, dtype=torch.bool)
+    done[:-1, 0] = ids[1:] != ids[:-1]
+    after = {"observation": observation + 1, "reward": (observation[:, :1] * 1.7).cos()}
+    after |= {"done": done, "truncated": done.clone(), "terminated": torch.zeros_like(done)}
+    columns = {"observation": observation, "action": (observation * 0.37).sin(), "collector": {"traj_ids": ids}}
+    return TensorDict({**columns, "next": after}, [total])
+
 
 steps = st.integers(2, 7)
 gammas = st.sampled_from([0.5, 0.97, 1.0])
@@ -44,54 +55,24 @@ def check(found, expected):
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.lists(st.integers(1, 9), min_size=1, max_size=5), steps, gammas, st.booleans())
-def test_they_are_torchrls(lengths, n_steps, gamma, two_parts):
+@given(st.lists(st.integers(1, 9), min_size=1, max_size=5), steps, gammas)
+def test_they_are_torchrls(lengths, n_steps, gamma):
     rows = own_rows(lengths)
-    parts = [rows, own_rows(lengths[::-1], first=500.0)] if two_parts else [rows]
-    expected = torch.cat([torchrls(trajectories(part), n_steps, gamma) for part in parts])
-    storage = JoinedStorage(parts, n_steps=n_steps, gamma=gamma)
-    check(storage[:], expected)
-    assert torch.equal(storage.column("steps_to_next_obs"), expected["steps_to_next_obs"])
-    assert torch.equal(storage.column(("next", "observation")), expected["next", "observation"])
-    some = torch.tensor([[0, -1]])
-    assert (storage[some] == storage[:][some]).all()
-
-
-def test_rows_that_are_chosen_do_not_look_over_those_that_are_not():
-    rows = own_rows([6])
-    found = JoinedStorage([rows], [torch.tensor([0, 1, 3, 4])], n_steps=4, gamma=0.5)[:]
-    assert found["steps_to_next_obs"].tolist() == [2, 1, 2, 1]
-    assert torch.equal(found["next", "observation"], rows["next", "observation"][[1, 1, 4, 4]])
+    check(n_step_returns(rows, n_steps, gamma), torchrls(trajectories(rows), n_steps, gamma))
 
 
 @settings(max_examples=20, deadline=None)
-@given(st.lists(st.integers(1, 6), min_size=1, max_size=6), st.integers(1, 3), steps, st.integers(0, 99))
-def test_rows_that_come_look_as_far_as_torchrls_transform_once_the_others_are_there(sizes, envs, n_steps, seed):
-    stream, storage = Stream(0, envs, seed), GrowingStorage([own_rows([3])], grow=200, n_steps=n_steps, gamma=0.9)
-    batches = [stream.batch(size) for size in sizes]
-    oracle = MultiStepTransform(n_steps, 0.9, done_keys=[])
-    expected = []
-    for batch in batches:
-        storage.extend(batch)
-        if (out := oracle.inv(batch.clone())) is not None:
-            expected.append(out.reshape(-1))
-    rows = storage[3:]
-    check(rows, torch.cat([torchrls([one], n_steps, 0.9) for one in separate(batches)])[order(batches, rows)])
-    if expected:
-        late = torch.cat(expected)
-        place = {x: k for k, x in enumerate(rows["observation"][:, 0].tolist())}
-        check(rows[[place[x] for x in late["observation"][:, 0].tolist()]], late)
-
-
-def separate(batches):
-    """The trajectories of one collector's batches."""
-    return [one for row in torch.cat(batches, 1) for one in trajectories(row)]
-
-
-def order(batches, rows):
-    """Where the storage's rows are among those of ``separate``."""
-    place = {x: k for k, x in enumerate(torch.cat(separate(batches))["observation"][:, 0].tolist())}
-    return [place[x] for x in rows["observation"][:, 0].tolist()]
+@given(st.integers(1, 4), st.integers(1, 9), steps, st.integers(0, 99))
+def test_a_collectors_batch_is_cut_at_its_end(envs, time, n_steps, seed):
+    """(N, T) rows, with and without the ids of trajectories."""
+    ends = torch.rand(envs, time, generator=torch.Generator().manual_seed(seed)) < 0.3
+    rows = own_rows([time] * envs).reshape(envs, time)
+    rows["next", "done"] = ends.unsqueeze(-1)
+    rows["collector", "traj_ids"] = torch.arange(envs)[:, None] * time + ends.cumsum(1) - ends.long()
+    found = n_step_returns(rows, n_steps, 0.9)
+    assert found.shape == rows.shape
+    check(found.reshape(-1), torchrls([one for row in rows for one in trajectories(row)], n_steps, 0.9))
+    assert (n_step_returns(rows.exclude("collector"), n_steps, 0.9) == found.exclude("collector")).all()
 
 
 def test_torchrls_own_flags_would_bootstrap_from_the_end():
@@ -101,13 +82,13 @@ def test_torchrls_own_flags_would_bootstrap_from_the_end():
     theirs = MultiStep(0.9, 3)(rows.unsqueeze(0))[0]
     assert torch.equal(theirs["next", "observation"][1], rows["next", "observation"][3])
     assert not theirs["next", "terminated"][1]
-    ours = JoinedStorage([rows], n_steps=3, gamma=0.9)[:]
+    ours = n_step_returns(rows, 3, 0.9)
     assert ours["next", "terminated"].flatten().tolist() == [False, True, True, True]
 
 
 def test_a_value_estimator_discounts_by_the_steps():
     rows = own_rows([5])
-    found = JoinedStorage([rows], n_steps=3, gamma=0.9)[:]
+    found = n_step_returns(rows, 3, 0.9)
     value = ValueOperator(torch.nn.Linear(2, 1), in_keys=["observation"])
     target = TD0Estimator(gamma=0.9, value_network=value).value_estimate(found)
     after = value.module(found["next", "observation"])
@@ -135,10 +116,7 @@ def test_of_a_dataset_they_end_with_the_episode_and_where_it_is_cut(root, after)
 def test_n_steps_need_a_discount_and_executed_actions(root):
     with pytest.raises(ValueError, match="n_steps=3 needs gamma"):
         LanguageWorldExperienceReplay(root, label="executed", n_steps=3)
-    with pytest.raises(ValueError, match="n_steps, grow and terminate_on_success need label='executed', got 'expert'"):
+    with pytest.raises(
+        ValueError, match="n_steps, terminate_on_success and keys='rollout' need label='executed', got 'expert'"
+    ):
         LanguageWorldExperienceReplay(root, n_steps=3, gamma=0.9)
-
-
-def test_columns_that_it_needs_are_named():
-    with pytest.raises(ValueError, match="n_steps=2 needs the columns next/reward, next/done, collector/traj_ids"):
-        JoinedStorage([TensorDict({"x": torch.arange(3)}, [3])], n_steps=2, gamma=0.9)

@@ -117,8 +117,53 @@ def test_the_state_goes_through_a_folder(tmp_path, before):
     ("tasks", "batch_size", "nearest"), [(3, 100, "99 and 102"), (3, 2, "3"), (10, 512, "510 and 520"), (7, 1, "7")]
 )
 def test_a_batch_that_the_tasks_do_not_divide_is_refused_with_the_nearest(tasks, batch_size, nearest):
-    replay = make_replay(make_rows([4] * tasks), batch_size)
-    with pytest.raises(ValueError, match=f"number of tasks, {tasks}, got {batch_size}; the nearest are {nearest}$"):
+    replay = make_replay(make_rows([4] * tasks), batch_size, sampler=TaskBalancedSampler(exact=True))
+    what = f"a multiple of {tasks}, the number of tasks, got {batch_size}; the nearest are {nearest}$"
+    with pytest.raises(ValueError, match=what):
+        replay.sample()
+
+
+@settings(max_examples=40, deadline=None)
+@given(sizes, st.lists(st.integers(1, 30), min_size=1, max_size=20), seeds)
+def test_other_batch_sizes_are_rounded_and_the_totals_stay_equal(sizes, batch_sizes, seed):
+    replay = make_replay(make_rows(sizes), None, seed)
+    batches = [replay.sample(size) for size in batch_sizes]
+    assert [len(batch) for batch in batches] == batch_sizes
+    drawn_of = torch.cat([batch["task_id"] for batch in batches]).bincount(minlength=3 + 2 * len(sizes))[3::2]
+    assert drawn_of.max() - drawn_of.min() <= 2
+    other = make_replay(make_rows(sizes), None, seed + 1)
+    other.load_state_dict(replay.state_dict())
+    for size in batch_sizes:
+        assert torch.equal(other.sample(size)["row"], replay.sample(size)["row"])
+
+
+def test_single_rows_are_of_each_task_in_turn():
+    replay = make_replay(make_rows([5, 5, 5]), 1)
+    tasks = [replay.sample()["task_id"].item() for _ in range(9)]
+    assert all(sorted(tasks[n : n + 3]) == [3, 5, 7] for n in (0, 3, 6))
+
+
+@pytest.mark.parametrize("tail", [(), (1,), (10,), (2, 3)])
+@pytest.mark.parametrize("kind", [LazyTensorStorage, ListStorage])
+def test_rows_may_hold_their_task_in_any_shape(tail, kind):
+    """Rows that are pieces of trajectories, (n, T), for example."""
+    task = torch.arange(8).view(8, *[1] * len(tail)).expand(8, *tail) % 2
+    rows = TensorDict({"task_id": task, "row": torch.arange(8)}, [8])
+    replay = make_replay(rows, 4, sampler=TaskBalancedSampler(), capacity=12) if kind is LazyTensorStorage else None
+    if replay is None:
+        replay = TensorDictReplayBuffer(storage=ListStorage(12), sampler=TaskBalancedSampler(), batch_size=4)
+        replay.extend(rows)
+    for _ in range(4):
+        batch = replay.sample()
+        assert batch["task_id"].shape == (4, *tail)
+        assert (batch["row"] % 2).bincount().tolist() == [2, 2]
+    replay.extend(rows[:2])
+    assert len(replay.sample()) == 4
+
+
+def test_a_row_of_several_tasks_is_refused():
+    replay = make_replay(TensorDict({"task_id": torch.arange(8).view(4, 2)}, [4]), 2)
+    with pytest.raises(ValueError, match="column 'task_id' must have one value a row, got rows with several; split"):
         replay.sample()
 
 

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from torchrl.collectors import Collector
 
 import lw_torchrl as lw
 
@@ -53,22 +52,3 @@ def test_it_is_bootstrapped_from_nothing_n_steps_ahead(root):
     rows = opened(root, n_steps=5, gamma=0.99)[:]
     assert torch.equal(rows["next", "terminated"], rows["next", "success"])
     assert (rows["next", "reward"][rows["next", "terminated"]] > 0).all()
-
-
-@pytest.mark.parametrize("env_ends", [True, False])
-@pytest.mark.parametrize("buffer_ends", [True, False])
-def test_rows_that_end_otherwise_are_refused(root, env_ends, buffer_ends):
-    replay = opened(root, terminate_on_success=buffer_ends, grow=1000)
-    env = lw.LanguageWorldEnv("reach", num_envs=2, max_steps=90, terminate_on_success=env_ends)
-    collector = Collector(
-        env, lw.ExpertActor("reach"), frames_per_batch=180, total_frames=180, auto_register_policy_transforms=False
-    )
-    (batch,) = collector
-    collector.shutdown()
-    assert batch["next", "success"].any()
-    if env_ends == buffer_ends:
-        replay.extend(batch)
-        assert torch.equal(replay[:]["next", "terminated"], replay[:]["next", "success"] & env_ends)
-    else:
-        with pytest.raises(ValueError, match=f"same terminate_on_success, here {buffer_ends}"):
-            replay.extend(batch)

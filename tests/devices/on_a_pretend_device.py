@@ -370,14 +370,12 @@ def test_a_loss_that_is_made_there_is_the_cpus(name, condition):
     assert torch.equal(total(other, batch), expected)
 
 
-def test_rows_ahead_are_there_too_and_a_buffer_that_grows_is_not(demos):
+def test_rows_ahead_are_there_too(demos):
     options = {"label": "executed", "n_steps": 3, "gamma": 0.9}
     here, there = (lw.LanguageWorldExperienceReplay(demos, device=where, **options) for where in (None, "pretend"))
     for replay in (here, there):
         replay.set_rng(torch.Generator().manual_seed(3))
     assert (there.sample(16).cpu() == here.sample(16)).all()
-    with pytest.raises(ValueError, match="device: a growing buffer is on the CPU"):
-        lw.LanguageWorldExperienceReplay(demos, label="executed", grow=10, device="pretend")
 
 
 @pytest.mark.parametrize("name", ["bc", "advantage", "value"])  # copies of critics are drawn where they are

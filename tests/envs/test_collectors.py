@@ -15,7 +15,7 @@ import torch
 from speed import first_fast
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import AsyncEnvPool
-from worker_envs import make_actor, make_push_reach, make_single
+from worker_envs import make_actor, make_push_reach, make_single, numbered
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:No explicit `?device", "ignore:This process .* is multi-threaded, use of fork:DeprecationWarning"
@@ -23,8 +23,8 @@ pytestmark = pytest.mark.filterwarnings(
 ROWS, STEPS = 2, 5  # of an environment of a worker, and of its episodes
 KINDS = {
     "one": (Collector, make_push_reach, {"auto_register_policy_transforms": False}),
-    "sync": (MultiSyncCollector, [make_push_reach] * 2, {"cat_results": "stack"}),
-    "async": (MultiAsyncCollector, [make_push_reach] * 2, {}),
+    "sync": (MultiSyncCollector, numbered(make_push_reach, 2), {"cat_results": "stack"}),
+    "async": (MultiAsyncCollector, numbered(make_push_reach, 2), {}),
 }
 
 
@@ -46,7 +46,7 @@ def make_collector(kind, actor, batches=None):
         from torchrl.collectors.distributed import RayCollector
 
         collector = RayCollector(
-            [make_push_reach] * 2,
+            numbered(make_push_reach, 2),
             actor,
             frames_per_batch=2 * ROWS * STEPS,
             total_frames=10_000 * ROWS * STEPS,
@@ -153,7 +153,7 @@ def test_one_that_was_killed_goes_on_with_the_next_episodes(kind, tmp_path):
 
 @pytest.mark.slow
 def test_a_pool_of_processes_with_a_policy():
-    pool = AsyncEnvPool([make_single] * 2, backend="multiprocessing", exchange="queue")
+    pool = AsyncEnvPool(numbered(make_single, 2), backend="multiprocessing", exchange="queue")
     with torch.no_grad():
         data = pool.rollout(4, make_actor())
     pool.close()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torchrl.envs import SerialEnv, TransformedEnv
 
@@ -12,25 +14,31 @@ def make_env(**options) -> lw.LanguageWorldEnv:
     return lw.LanguageWorldEnv("reach", **{"num_envs": 2, "seed": 3, "max_steps": 2, "num_threads": 1} | options)
 
 
-def make_transformed() -> TransformedEnv:
-    return TransformedEnv(make_env(), lw.QAFTransform(lw.load_plans("MT10")))
+def make_transformed(**options) -> TransformedEnv:
+    return TransformedEnv(make_env(**options), lw.QAFTransform(lw.load_plans("MT10")))
 
 
-def make_serial() -> SerialEnv:
-    return SerialEnv(2, make_env)
+def make_serial(worker=(0, 1)) -> SerialEnv:
+    return SerialEnv(2, numbered(make_env, 2, worker))
+
+
+def numbered(make, of, worker=(0, 1), **options):
+    """A factory for each of some workers, which may be workers of a worker themselves."""
+    rank, outer = worker
+    return [partial(make, worker=(rank * of + w, of * outer), **options) for w in range(of)]
 
 
 def still(tensordict):
     return tensordict.set("action", torch.zeros(*tensordict.batch_size, 4))
 
 
-def make_push_reach() -> TransformedEnv:
-    env = lw.LanguageWorldEnv(["push", "reach"], num_envs=2, max_steps=5, num_threads=1)
+def make_push_reach(worker=(0, 1)) -> TransformedEnv:
+    env = lw.LanguageWorldEnv(["push", "reach"], num_envs=2, max_steps=5, num_threads=1, worker=worker)
     return TransformedEnv(env, lw.QAFTransform(lw.load_plans("MT10")))
 
 
-def make_single() -> TransformedEnv:
-    env = make_env(num_envs=1, max_steps=5, batch_size=())
+def make_single(**options) -> TransformedEnv:
+    env = make_env(num_envs=1, max_steps=5, batch_size=(), **options)
     return TransformedEnv(env, lw.QAFTransform(lw.load_plans("MT10")))
 
 

@@ -138,7 +138,7 @@ def test_imitation_is_of_demonstrated_rows_alone():
 def test_missing_is_demonstration_is_named(kind):
     loss, batch = make(kind)[0], make_batch()
     batch["is_target"] = batch.pop("is_demonstration")  # of co-learning, which is another thing
-    with pytest.raises(ValueError, match=r"the batch lacks 'is_demonstration', .*: LanguageWorldExperienceReplay and"):
+    with pytest.raises(ValueError, match=r"the batch lacks 'is_demonstration', .*: load_demonstrations writes"):
         loss(batch)
     batch["is_demonstration"] = torch.zeros(24)
     with pytest.raises(

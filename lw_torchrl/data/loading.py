@@ -1,0 +1,265 @@
+"""load_demonstrations: the rows of demonstration datasets as a TensorDict."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+
+from lw_torchrl._checks import Natural, check_int, check_path, check_probability, checked, unknown_name
+from lw_torchrl._devices import check_device
+from lw_torchrl._files import AnyPath
+from lw_torchrl.data.dataset import DatasetError, Demonstrations, read_metadata
+from lw_torchrl.data.memory_map import load_rows, verify
+from lw_torchrl.data.replay_checks import check_behaviours, check_label
+from lw_torchrl.data.rewards import REWARDS, RewardName
+from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, Label, choose_episodes, kept_rows, returns_of
+from lw_torchrl.data.storage import DATASET, DEMONSTRATION, DONE, REWARD, STEPS, TRAJECTORY, column_name
+from lw_torchrl.language.value_checks import finite
+
+_FLAGS = ("done", "terminated", "truncated")
+ROLLOUT: tuple[NestedKey, ...] = (
+    "observation", "task_id", "episode", "action", *_FLAGS, ("next", "observation"), ("next", "task_id"),
+    ("next", "reward"), ("next", "success"), *(("next", flag) for flag in _FLAGS),
+)  # fmt: skip
+"""The columns of a dataset that rollouts of :class:`LanguageWorldEnv` have too."""
+
+
+def n_step_returns(rollout: TensorDictBase, n_steps: int, gamma: float) -> TensorDictBase:
+    """Look n steps ahead in each row of a rollout, or fewer where its trajectory ends or the rollout is cut.
+
+    All entries under ``"next"`` become those of the last step on the way, the ends of episodes too (TorchRL's
+    ``MultiStep`` leaves those of the first step). ``("next", "reward")`` becomes the discounted sum, and
+    ``steps_to_next_obs``, int64 of the rollout's shape, the number of steps, which TorchRL's value estimators read.
+
+    Args:
+        rollout: (..., T) with ("next", "reward") and ("next", "done"), (..., T, 1); a trajectory also ends where
+            ("collector", "traj_ids") changes, if it is there.
+        n_steps: at least 1.
+        gamma: the discount, in (0, 1]; the loss must use the same.
+
+    Example:
+        >>> done = torch.tensor([False, False, True, False])[:, None]
+        >>> after = TensorDict(reward=torch.ones(4, 1), done=done, x=torch.arange(4))
+        >>> rollout = TensorDict(next=after).auto_batch_size_(1)
+        >>> ahead = n_step_returns(rollout, 2, gamma=0.5)
+        >>> ahead["next", "reward"].flatten().tolist(), ahead["next", "x"].tolist()
+        ([1.5, 1.5, 1.0, 1.0], [1, 2, 2, 3])
+    """
+    check_int("n_steps", n_steps, minimum=1)
+    if not check_probability("gamma", gamma):
+        raise ValueError("gamma must be above 0, got 0")
+    rows = rollout.reshape(-1)
+    end = rows.get(DONE).reshape(-1).clone()
+    end[rollout.shape[-1] - 1 :: rollout.shape[-1]] = True
+    if (trajectory := rows.get(TRAJECTORY, None)) is not None:
+        end[:-1] |= trajectory[1:] != trajectory[:-1]
+    row = torch.arange(len(end), device=end.device)
+    next_end = torch.where(end, row, len(end) - 1).flip(0).cummin(0).values.flip(0)
+    last = torch.minimum(row + n_steps - 1, next_end)
+    reward = rows.get(REWARD)
+    earned = reward.clone()
+    for ahead in range(1, n_steps):  # summed in the order of time
+        inside = (row + ahead <= last).nonzero().flatten()
+        earned[inside] += gamma**ahead * reward[inside + ahead]
+    later = rows.get("next")[last].set("reward", earned)
+    return rows.exclude("next").update({"next": later, STEPS: last - row + 1}).reshape(rollout.shape)
+
+
+def _read_part(
+    whole: Demonstrations, chosen: Demonstrations, label: Label, reward: RewardName, after: int | None, terminate: bool
+) -> TensorDict:
+    """The rows of a dataset's chosen episodes, memory-mapped as far as they are as in the files."""
+    rows = load_rows(whole)
+    if label == "executed":
+        kind = REWARDS[reward]
+        source, success = rows.get(("next", f"reward_{kind.source}")), rows.get(("next", "success"))
+        rows.set(REWARD, kind.of(source, success))
+    else:
+        taken, other = ("expert_action", "unclipped_action")[:: 1 if label == "expert" else -1]
+        rows = rows.exclude("next", "action", other).rename_key_(taken, "action")
+    if not finite(rows.get("action")):
+        raise DatasetError(f"root: {str(whole.root)!r} holds an action that is NaN or infinite, for label={label!r}")
+    if chosen.episodes == whole.episodes and after is None:
+        return rows
+    kept, lengths = kept_rows(chosen.episodes, after)
+    rows = rows[kept]
+    if label == "executed" and after is not None:
+        ends = torch.zeros(len(kept), 1, dtype=torch.bool)
+        ends[lengths.cumsum(0) - 1] = True
+        rows.set(DONE, ends)
+        if terminate:
+            rows.set(("next", "terminated"), ends & rows.get(("next", "success")))
+            rows.set(("next", "truncated"), ends & ~rows.get(("next", "success")))
+        else:
+            rows.set(("next", "truncated"), ends)
+    return rows
+
+
+def _choose_keys(rows: TensorDict, keys: Literal["rollout"] | Iterable[NestedKey]) -> TensorDict:
+    """Some columns, with those that begin every step of a rollout, which no file holds."""
+    for flag in _FLAGS:
+        rows.set(flag, torch.zeros(len(rows), 1, dtype=torch.bool))
+    known = list(rows.keys(True, True))
+    for key in (chosen := list(ROLLOUT if keys == "rollout" else keys)):
+        if key not in known:
+            raise unknown_name("keys", column_name(key), sorted(map(column_name, known)))
+    return rows.select(*chosen)
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """Rows (R,), and the description of each folder with the episodes that are shown."""
+
+    rows: TensorDict
+    parts: tuple[Demonstrations, ...]
+    behaviours: tuple[str, ...]  # the labels of the collecting policies, sorted
+    is_joined: bool  # folders are joined or episodes chosen
+
+
+def load(
+    root: AnyPath | Iterable[AnyPath],
+    *,
+    episodes: EpisodeChoice | Sequence[EpisodeChoice] = None,
+    keep: EpisodeFilter | None = None,
+    label: Label = "expert",
+    reward: RewardName = "sparse",
+    after_success: int | None = None,
+    terminate_on_success: bool = False,
+    n_steps: int = 1,
+    gamma: float | None = None,
+    keys: Literal["rollout"] | Iterable[NestedKey] | None = None,
+    device: str | torch.device | None = None,
+    check: bool = True,
+) -> Loaded:
+    """Load rows with their descriptions; see :func:`load_demonstrations`."""
+    if check_int("n_steps", n_steps, minimum=1) > 1 and gamma is None:
+        raise ValueError(f"n_steps={n_steps} needs gamma, the loss's discount")
+    if n_steps == 1 and gamma is not None:
+        raise ValueError(f"gamma needs n_steps of 2 or more, got gamma={gamma!r} with n_steps=1")
+    if (n_steps > 1 or terminate_on_success or keys == "rollout") and label != "executed":
+        raise ValueError(f"n_steps, terminate_on_success and keys='rollout' need label='executed', got {label!r}")
+    if terminate_on_success and after_success is not None:
+        raise ValueError("terminate_on_success ends episodes at success; leave out after_success")
+    joined = not isinstance(root, (str, os.PathLike))
+    folders: list[Any] = list(root) if joined else [root]  # type: ignore[arg-type]
+    for folder in folders:
+        check_path("root", folder)
+    twice = episodes is None and len({Path(folder).resolve() for folder in folders}) < len(folders)
+    if not folders or twice:
+        raise ValueError(f"root must be a folder, or a list that names each folder once, got {root}")
+    if joined and episodes is not None:
+        if not isinstance(episodes, Sequence) or len(episodes) != len(folders):
+            raise ValueError(
+                f"episodes must be a list of a choice for each of the {len(folders)} folders, got {episodes!r}"
+            )
+        choices: list[Any] = list(episodes)
+    else:
+        choices = [episodes] * len(folders)
+    whole = [read_metadata(folder) for folder in folders]
+    check_label(label, whole)
+    check_behaviours(whole)
+    parts = [
+        choose_episodes(found, choice, f"episodes[{number}]" if joined else "episodes")
+        for number, (found, choice) in enumerate(zip(whole, choices, strict=True))
+    ]
+    for found, chosen in zip(whole, parts, strict=True) if check else ():
+        verify(found, chosen.episodes)
+    sizes = [(part.config.layout.size, part.config.layout.action_size) for part in parts]
+    if len(set(sizes)) > 1:
+        raise ValueError(f"root: the folders must have rows of one layout, got observation and action sizes {sizes}")
+    after = 0 if terminate_on_success else after_success
+    if keep is not None:
+        returns = [returns_of(found, chosen, reward, after) for found, chosen in zip(whole, parts, strict=True)]
+        parts = keep.choose(parts, returns)
+    behaviours = tuple(sorted({part.config.behaviour for part in whole}))
+    read, trajectories = [], 0
+    for number, (found, chosen) in enumerate(zip(whole, parts, strict=True)):
+        rows = _read_part(found, chosen, label, reward, after, terminate_on_success)
+        rows.set("behaviour", torch.full(rows.batch_size, behaviours.index(found.config.behaviour)))
+        rows.set(DEMONSTRATION, torch.ones(rows.batch_size, dtype=torch.bool))
+        if len(whole) > 1:
+            rows.set(TRAJECTORY, rows.get(TRAJECTORY) + trajectories)
+            rows.set(DATASET, torch.full(rows.batch_size, number))
+        read.append(rows if keys is None or n_steps > 1 else _choose_keys(rows, keys))
+        trajectories += len(found.episodes)
+    rows = read[0] if len(read) == 1 else torch.cat(read)
+    if n_steps > 1:
+        assert gamma is not None
+        rows = n_step_returns(rows, n_steps, gamma)
+        rows = rows if keys is None else _choose_keys(rows, keys if keys != "rollout" else (*ROLLOUT, STEPS))
+    if device is not None:
+        rows = rows.to(check_device("device", device))
+    return Loaded(rows, tuple(parts), behaviours, joined or episodes is not None or keep is not None)
+
+
+@checked
+def load_demonstrations(
+    root: AnyPath | Iterable[AnyPath],
+    *,
+    episodes: EpisodeChoice | Sequence[EpisodeChoice] = None,
+    keep: EpisodeFilter | None = None,
+    label: Label = "expert",
+    reward: RewardName = "sparse",
+    after_success: Natural | None = None,
+    terminate_on_success: bool = False,
+    n_steps: int = 1,
+    gamma: float | None = None,
+    keys: Literal["rollout"] | Iterable[NestedKey] | None = None,
+    device: str | torch.device | None = None,
+    check: bool = True,
+) -> TensorDict:
+    """Load the rows of datasets of :func:`collect_demonstrations`, for a :class:`torchrl.data.TensorStorage`.
+
+    The rows of one folder stay in its files, memory-mapped, as long as nothing is selected; changes to them never reach
+    the files. Several folders, or a selection of rows, are copied into memory.
+
+    Rows (R,) hold observation (R, 39) float32, action (R, 4) float32, task_id and episode (R,) int64, and the columns
+    of ``label``. collector/traj_ids (R,) int64 is unique for each episode of all datasets; behaviour (R,) int64 is the
+    rank of the collecting policy's label among those of all folders. is_demonstration (R,) bool is true. dataset (R,)
+    int64 is the index of the folder, if there are several.
+
+    Args:
+        root: the dataset's folder, or a list of folders.
+        episodes: the episodes to use. None: all; a number: the first ones of each task; a mapping: for each task to
+            use, the number of first episodes, or a list of indices. For a list of folders, a list of such choices.
+        keep: selects among these: successes, the best tenth, one behaviour, ...; see :class:`EpisodeFilter`.
+        label: the content of ``action``. "executed": the executed action, with reward and next; required for datasets
+            that were collected by other policies than an expert. "expert": the expert's action, in [-1, 1];
+            "unclipped": the same before it was clipped, up to 25; both without reward and next, which belong to the
+            executed action.
+        reward: the content of ``("next", "reward")`` with label="executed", a name in ``REWARDS``: "sparse" (success as
+            0 and 1), "dense" (Meta-World's), "cost" or "dense_cost".
+        after_success: drop steps more than N steps after an episode's first success.
+        terminate_on_success: end each episode at its first success, with ``("next", "terminated")``, as
+            ``LanguageWorldEnv(terminate_on_success=True)`` does; with label="executed".
+        n_steps, gamma: look N steps ahead with this discount, as :func:`n_step_returns`; with label="executed".
+        keys: the columns to load; "rollout" for those that rollouts of :class:`LanguageWorldEnv` have too, so that
+            TorchRL's ``OfflineToOnlineReplayBuffer`` can join both; None for all.
+        device: memory to copy the rows to: "cuda", "mps" or "auto"; None to leave them where they are.
+        check: compare the episodes with their checksums, once in a process while the files stay the same. It takes one
+            to three seconds a gigabyte.
+
+    Raises:
+        ValueError: an episode or a column that the dataset lacks, or options that exclude each other.
+        DatasetError: (a ValueError) the dataset is unfinished, damaged, or of another version.
+
+    Example:
+        >>> import tempfile, lw_torchrl as lw
+        >>> from torchrl.data import TensorDictReplayBuffer, TensorStorage
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     _ = lw.collect_demonstrations("reach", episodes_per_task=1, root=root + "/demos", max_steps=80)
+        ...     rows = lw.load_demonstrations(root + "/demos")
+        ...     replay = TensorDictReplayBuffer(storage=TensorStorage(rows), batch_size=8)
+        ...     replay.sample()["action"].shape
+        torch.Size([8, 4])
+
+    Source: the datasets of ``torchrl.data.datasets``, which keep their rows in memory-mapped tensordicts.
+    """
+    options = {name: value for name, value in locals().items() if name != "root"}
+    return load(root, **options).rows

@@ -1,0 +1,146 @@
+"""load_demonstrations: rows for TorchRL's own buffers, which refuse nothing that TorchRL's tools ask for."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from collecting import collect, tree
+from tensordict import TensorDict
+from torch.utils.data import DataLoader
+from torchrl.data import (
+    LazyTensorStorage,
+    OfflineToOnlineReplayBuffer,
+    RandomSampler,
+    TensorDictReplayBuffer,
+    TensorStorage,
+    prefill_replay_buffer,
+)
+from torchrl.envs import TransformedEnv
+from torchrl.trainers.algorithms.offline_to_online import OfflineToOnlineReplayBufferHook
+
+import lw_torchrl as lw
+from lw_torchrl.data import ROLLOUT
+from lw_torchrl.data.memory_map import MappedColumn
+
+
+@pytest.fixture(scope="module")
+def roots(tmp_path_factory):
+    root = tmp_path_factory.mktemp("made")
+    return [collect(root / "a").root, collect(root / "b", seed=6).root]
+
+
+def open_replay(roots, **options):
+    return lw.LanguageWorldExperienceReplay(roots[0], **{"label": "executed", "batch_size": 8, **options})
+
+
+def test_rows_of_one_folder_stay_in_its_files_and_changes_stay_in_memory(roots):
+    before = tree(roots[0])
+    rows = lw.load_demonstrations(roots[0])
+    assert type(rows) is TensorDict
+    assert isinstance(rows["observation"], MappedColumn)
+    assert (rows == lw.LanguageWorldExperienceReplay(roots[0])[:]).all()
+    rows.zero_()
+    assert tree(roots[0]) == before
+
+
+def test_several_folders_are_concatenated(roots):
+    parts = [lw.load_demonstrations(root, label="executed") for root in roots]
+    rows = lw.load_demonstrations(roots, label="executed")
+    assert torch.equal(rows["observation"], torch.cat([part["observation"] for part in parts]))
+    assert rows["dataset"].bincount().tolist() == [len(part) for part in parts]
+    ids = rows["collector", "traj_ids"]
+    assert len(ids.unique_consecutive()) == len(ids.unique()) == sum(len(p["episode"].unique()) * 2 for p in parts)
+
+
+@pytest.mark.parametrize("damage", ["a byte", "shorter", "no metadata"])
+def test_a_damaged_or_unfinished_dataset_is_refused(tmp_path, damage):
+    root = collect(tmp_path / "demos").root
+    path = root / "data" / "action.memmap"
+    content = path.read_bytes()
+    if damage == "no metadata":
+        (root / "metadata.json").unlink()
+    else:
+        path.write_bytes(content[:-4] if damage == "shorter" else bytes([content[0] ^ 1]) + content[1:])
+    with pytest.raises(lw.data.DatasetError, match="is not a dataset" if damage == "no metadata" else "damaged"):
+        lw.load_demonstrations(root)
+
+
+def test_torchrls_buffer_balances_tasks_and_mixes_a_target(roots):
+    rows = lw.load_demonstrations(roots, episodes=[None, {"push": 1}])
+    for sampler in (lw.TaskBalancedSampler(), lw.CoLearningSampler("push")):
+        batch = TensorDictReplayBuffer(storage=TensorStorage(rows), sampler=sampler, batch_size=8).sample()
+        assert batch["task_id"].unique(return_counts=True)[1].tolist() == [4, 4]
+    assert batch["dataset"][batch["is_target"]].unique().tolist() == [1]
+
+
+def test_a_loader_takes_the_rows(roots):
+    rows = lw.load_demonstrations(roots[0])
+    (seen,) = DataLoader(rows, batch_size=len(rows), shuffle=True, collate_fn=lambda batch: batch)
+    assert torch.equal(seen["observation"].sort(0).values, rows["observation"].sort(0).values)
+    assert len(next(iter(DataLoader(rows, batch_size=4, collate_fn=lambda batch: batch)))) == 4
+
+
+def double(batch):
+    return batch.set("twice", 2 * batch["action"])
+
+
+def test_a_transform_is_any_function_and_a_sampler_a_factory(roots):
+    appended = open_replay(roots)
+    appended.append_transform(double)
+    for replay in (open_replay(roots, transform=double), open_replay(roots, transform=double, sampler=RandomSampler)):
+        batch = replay.sample()
+        assert torch.equal(batch["twice"], 2 * batch["action"])
+        assert "twice" in replay[:].keys()
+        assert "twice" not in replay.storage[:].keys()
+    assert "twice" in appended.sample().keys()
+    shared = TensorDictReplayBuffer(storage=open_replay(roots).storage, batch_size=5)
+    assert shared.sample().shape == (5,)
+
+
+@pytest.mark.filterwarnings("ignore:Got conflicting batch_sizes")
+def test_torchrls_tools_draw_odd_batches_from_a_balanced_buffer(roots):
+    replay = open_replay(roots, sampler=lw.TaskBalancedSampler())
+    assert replay.sample(1).shape == (1,)
+    filled = prefill_replay_buffer(TensorDictReplayBuffer(storage=LazyTensorStorage(200)), replay, n_samples=51)
+    assert len(filled) == 51
+    with pytest.raises(ValueError, match="batch_size must be a multiple of 2, the number of tasks, got 1; the nearest"):
+        open_replay(roots, sampler=lw.TaskBalancedSampler(exact=True)).sample(1)
+
+
+@pytest.fixture(scope="module")
+def rollout():
+    plans = lw.load_plans("MT10")
+    env = TransformedEnv(lw.LanguageWorldEnv(["push", "reach"], num_envs=2, max_steps=20), lw.QAFTransform(plans))
+    rows = env.rollout(12, lw.PlanConditionedActor(plans)).detach()
+    env.close()
+    return rows
+
+
+@pytest.mark.filterwarnings("ignore:Got conflicting batch_sizes")
+@pytest.mark.parametrize("n_steps", [1, 3])
+def test_rows_join_with_rollouts_of_the_environment(roots, rollout, n_steps):
+    ahead = {"n_steps": n_steps, "gamma": 0.9} if n_steps > 1 else {}
+    sampler, plans = lw.TaskBalancedSampler(), lw.load_plans("MT10")
+    offline = open_replay(roots, keys="rollout", sampler=sampler, transform=lw.QAFTransform(plans), **ahead)
+    keys = offline.sample(1).keys(True, True)
+    rows = lw.data.n_step_returns(rollout, 3, 0.9) if ahead else rollout
+    assert set(ROLLOUT) <= set(keys) <= set(rows.keys(True, True))
+    replay = OfflineToOnlineReplayBuffer(offline, online_capacity=100, batch_size=8)
+    replay.extend(rows.reshape(-1).select(*keys))
+    batch = replay.sample()
+    assert batch.shape == (8,)
+    assert set(batch.keys(True, True)) == set(keys)
+    for key in keys:
+        assert batch[key].dtype == rollout[key].dtype if key in rollout.keys(True, True) else torch.int64
+    hook = OfflineToOnlineReplayBufferHook(OfflineToOnlineReplayBuffer(offline, online_capacity=100), batch_size=8)
+    assert hook.extend(rows).shape == (24,)
+    assert hook.sample(rows).shape == (8,)
+
+
+def test_chosen_keys_are_all_there_is(roots):
+    rows = lw.load_demonstrations(roots, keys=["action", "is_demonstration"])
+    assert set(rows.keys(True, True)) == {"action", "is_demonstration"}
+    with pytest.raises(ValueError, match=r"keys must be one of .* got 'next/reward'"):
+        lw.load_demonstrations(roots, keys=[("next", "reward")])
+    with pytest.raises(ValueError, match="keys='rollout' need label='executed', got 'expert'"):
+        lw.load_demonstrations(roots, keys="rollout")
