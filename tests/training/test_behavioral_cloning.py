@@ -181,9 +181,10 @@ def test_nan_leaves_weights_and_checkpoint_as_they_were(demos, tmp_path):
 
 
 def test_a_batch_the_tasks_do_not_divide_is_refused(demos):
+    config = BehavioralCloningConfig(steps=1, batch_size=7)
+    trainer = make_trainer(demos, sampler=TaskBalancedSampler(exact=True), config=config)
     with pytest.raises(ValueError, match=r"batch_size must be a multiple of 2, the number of tasks, got 7.* 6 and 8"):
-        config = BehavioralCloningConfig(steps=1, batch_size=7)
-        make_trainer(demos, sampler=TaskBalancedSampler(exact=True), config=config).train()
+        trainer.train()
 
 
 @pytest.mark.parametrize(
