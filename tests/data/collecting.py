@@ -53,12 +53,13 @@ def interrupt_after(monkeypatch, episodes):
     monkeypatch.setattr(EpisodeFiles, "put", stopping)
 
 
-def trained(kind="plan", seed=0, **options):
+def trained(kind="plan", seed=0, squash=True, **options):
     """A tiny policy; of other weights for another seed."""
     torch.manual_seed(seed)
+    options["decoder"] = lw.modules.MLPDecoder(width=8, depth=1, squash=squash)
     if kind == "plan":
-        return lw.PlanConditionedActor(PLANS, width=8, depth=1, **options)
-    return lw.DescriptorConditionedActor(("push", "reach"), width=8, depth=1, **options)
+        return lw.PlanConditionedActor(PLANS, **options)
+    return lw.DescriptorConditionedActor(("push", "reach"), **options)
 
 
 def same_rows(one, other):

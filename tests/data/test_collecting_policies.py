@@ -6,13 +6,14 @@ import pytest
 import torch
 from collecting import PLANS, SEED, STEPS, collect, interrupt_after, same_rows, trained, tree
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 
 import lw_torchrl as lw
 from lw_torchrl.data import Behaviour, DatasetError
 from lw_torchrl.data.behaviours import policy_fingerprint
 from lw_torchrl.data.dataset import read_metadata
 from lw_torchrl.data.memory_map import load_rows
+from lw_torchrl.modules.policy import with_plans
 
 
 @pytest.mark.parametrize("kind", ["plan", "description"])
@@ -39,7 +40,7 @@ def test_a_policy_acts_as_in_an_evaluation(tmp_path, kind):
 
 
 def test_a_policy_with_a_distribution_acts_without_exploring(tmp_path):
-    actor = trained(distribution="tanh_normal").train()
+    actor = trained().stochastic("tanh_normal").train()
     one = collect(tmp_path / "one", policy=actor, behaviour="tiny")
     torch.manual_seed(99)
     assert tree(collect(tmp_path / "other", policy=actor, behaviour="tiny", num_envs=2).root) == tree(one.root)
@@ -87,20 +88,18 @@ def nan(policy):
     return policy
 
 
-class Odd(lw.Policy):
+class Odd(TensorDictModuleBase):
     """Writes another action than it should."""
 
     def __init__(self, wrong):
         super().__init__()
-        self.tasks, self.config, self.wrong = ("push", "reach"), {}, wrong
+        self.wrong = wrong
         self.in_keys, self.out_keys = ["observation"], ["deed" if wrong == "key" else "action"]
 
-    def prepare(self, tensordict):
-        return tuple(self.read(tensordict))
-
-    def act(self, observation):
+    def forward(self, tensordict):
         dtype = torch.float64 if self.wrong == "dtype" else torch.float32
-        return (observation[..., : 3 if self.wrong == "shape" else 4].to(dtype),)
+        action = tensordict["observation"][..., : 3 if self.wrong == "shape" else 4].to(dtype)
+        return tensordict.set(self.out_keys[0], action)
 
 
 @pytest.mark.parametrize(
@@ -127,7 +126,6 @@ class Odd(lw.Policy):
         (Odd("shape"), {}, ValueError, r"must be float32 of shape \(2, 4\), got torch.float32 of shape \(2, 3\)"),
         (lw.ScriptedSkillActor(PLANS, "random"), {}, ValueError, "would depend on num_envs and on interruptions"),
         (lw.modules.ActorEnsemble([lw.ScriptedSkillActor(PLANS, "random")]), {}, ValueError, "draws in the order"),
-        (lw.ScriptedSkillActor(PLANS, skills=lw.load_skills()), {}, TypeError, "skills of your own"),
     ],
 )
 def test_what_is_refused(tmp_path, policy, options, error, message):
@@ -176,8 +174,15 @@ def test_a_module_and_a_function_act_as_the_same_policy_does(tmp_path):
 def test_a_fingerprint_is_of_all_that_a_policy_does():
     base = policy_fingerprint(trained())
     assert policy_fingerprint(trained()) == base
-    others = [trained(seed=1), trained(squash=False), trained(features="raw"), trained("description")]
-    others.append(trained().with_plans({**PLANS, "reach": PLANS["reach"].__class__("reach", PLANS["reach"].steps[:1])}))
+    others = [
+        trained(seed=1),
+        trained(squash=False),
+        trained(features=lw.modules.ObservationFeatures("raw")),
+        trained("description"),
+    ]
+    others.append(
+        with_plans(trained(), {**PLANS, "reach": PLANS["reach"].__class__("reach", PLANS["reach"].steps[:1])})
+    )
     others.append(trained(text_encoder=lambda texts: torch.randn(len(texts), 384, generator=torch.Generator())))
     found = [base, *map(policy_fingerprint, others)]
     assert len(set(found)) == len(found)
