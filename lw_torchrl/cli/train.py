@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,13 +19,19 @@ _METHOD = (
     "what the policy is conditioned on: pcbc (plans), dc (task descriptions), one-hot (task numbers), or the name of "
     "your own policy class"
 )
+_LOSS = (
+    "bc (imitate the expert); on any data with rewards: advantage (learn a value, then imitate each row as much as its "
+    "advantage says), iql, td3-bc or cql"
+)
 
 
 @dataclass(kw_only=True)
 class Train:
-    """Train a policy on demonstrations. If it is stopped, the same command resumes it.
+    """Train a policy on demonstrations, or offline on any data. If it is stopped, the same command resumes it.
 
-    Example: lw-torchrl train demos/mt10 --out runs/mt10.safetensors
+    Example: lw-torchrl train demos/mt10 --out runs/mt10.safetensors --evaluate-every 2000
+
+    Example: lw-torchrl train data/spoilt --out runs/iql.safetensors --loss iql
 
     Example: lw-torchrl train demos/mt10 --out runs/tuned.safetensors --begin runs/mt10.safetensors --steps 2000
     """
@@ -34,22 +42,27 @@ class Train:
     plans: options.PlanSources = ("MT10",)
     task_file: options.TaskFile = None
     text_encoder: options.Encoder = None
+    loss: Annotated[Literal["bc", "advantage", "iql", "td3-bc", "cql"], arg(help=_LOSS)] = "bc"
     method: Annotated[str, arg(help=_METHOD)] = "pcbc"
     features: Literal["raw", "differences", "relative", "both"] | None = None
     """what the network sees: the raw observation; differences between hand, objects and goal; relative (differences
     without the hand's height and the gripper's opening); or both (raw and differences). None for differences"""
     width: int | None = None  # units of each hidden layer; None for the method's, 256
     depth: int | None = None  # number of hidden layers; None for the method's, 3
-    after_success: int = 20  # drop steps more than N steps after the first success
+    after_success: int = 20  # with --loss bc, drop steps more than N steps after the first success
+    reward: Literal["sparse", "dense", "cost", "dense_cost"] = "dense_cost"  # reward of the losses other than bc
     begin: Path | None = None  # fine-tune this policy file, with its plans, network and normalisation
     evaluator: options.Evaluator = None
-    answers: Literal["logit", "tanh", "hard"] | None = None
-    """how the evaluator's answers enter the attention (docs/evaluators.md); None for tanh, or with --begin for hard"""
+    answers: Literal["soft", "hard"] | None = None
+    """how the evaluator answers: by probabilities, or by 0 and 1; None for soft, or with --begin for hard"""
     qaf_anchor: float = 0.0  # weight of the cross entropy with the exact answers; use 1 for a new evaluator
-    steps: int = 8000  # number of minibatches
-    batch_size: int = 500  # rows of a minibatch, equally many of each task
+    steps: int | None = None  # number of minibatches; None for 8000, with another loss than bc 4000
+    batch_size: int | None = None  # rows of a minibatch, equally many of each task; None for 500 (250)
     learning_rate: float = 1e-3  # at the start; a cosine brings it to 0
     seed: int = 0  # random seed of initial weights and minibatches
+    evaluate_every: int | None = None  # evaluate every N steps and at the end, and log the success rate
+    evaluate_episodes: int = 5  # episodes of each task in such an evaluation
+    evaluate_seed: int = 1000  # random seed of these episodes (not one that the demonstrations used)
     logger: Literal["csv", "tensorboard", "wandb", "rerun"] | None = None  # log the training in logs/ beside OUT
     device: options.Device = "cpu"
     json: options.Json = False
@@ -58,66 +71,153 @@ class Train:
         import torch
 
         from lw_torchrl.data.dataset import read_metadata
+        from lw_torchrl.training.losses import DISTRIBUTIONS
 
-        if self.begin is not None and self.out.resolve() == self.begin.resolve():
-            raise ValueError("--out must be a different file from --begin")
+        self._check()
         options.use_one_thread()
         dataset = read_metadata(self.data).config
+        if self.evaluate_every is not None and self.evaluate_seed == dataset.seed:
+            raise ValueError(f"--evaluate-seed {dataset.seed} is the seed of the demonstrations; use a different one")
         known = options.read_tasks(self.task_file, dataset.tasks)
         plans = options.read_plans(self.plans, known)
         tasks = options.select_tasks(self.tasks or dataset.tasks, known)
         if missing := set(tasks) - set(dataset.tasks):
             raise ValueError(f"the dataset {str(self.data)!r} has no demonstrations of {', '.join(sorted(missing))}")
-        rows: dict[str, Any] = {"after_success": self.after_success, "device": self.device}
+        rows: dict[str, Any] = {"device": self.device}
         rows["episodes"] = dict.fromkeys(tasks, dataset.episodes_per_task) if self.tasks else None
-        replay = lw.LanguageWorldExperienceReplay(self.data, sampler=lw.TaskBalancedSampler(exact=True), **rows)
         torch.manual_seed(self.seed)
-        actor = self._new_actor(plans, replay.tasks) if self.begin is None else self._begun_actor(plans)
-        _read_transform(actor, replay, self.data)
-        names = ("batch_size", "learning_rate", "seed", "qaf_anchor")
-        numbers: dict[str, Any] = {name: getattr(self, name) for name in names} | {"normalize": self.begin is None}
-        config = lw.BehavioralCloningConfig(self.steps, **numbers)
+        actor = self._new_actor(plans, tuple(sorted(tasks))) if self.begin is None else self._begun_actor(plans)
         logger = None if self.logger is None else make_logger(self.logger, self.out)
-        where: dict[str, Any] = {"checkpoint": self.out, "logger": logger, "device": self.device}
-        loss = lw.BehavioralCloningTrainer(actor, replay, config, **where).train()
-        output = Output(self.json).show("policy", self.out).show("steps", self.steps)
+        run: dict[str, Any] = {"checkpoint": self.out, "logger": logger}
+        if self.loss == "bc":
+            trainer = self._clone(actor, rows, run | self._evaluation(actor, tasks))
+        else:
+            if (distribution := DISTRIBUTIONS[self.loss]) is not None:
+                actor = actor.stochastic(distribution)
+            trainer = self._learn(actor, plans, rows, run | self._evaluation(actor, tasks))
+        loss, steps = trainer.train(), trainer.config.steps
+        output = Output(self.json).show("policy", self.out).show("steps", steps)
         trained = "" if loss != loss else f", loss {loss:.4f}"  # nan: nothing was left to train
-        return output.show("loss", loss, f"trained to step {self.steps}{trained}: {self.out}")
+        return output.show("loss", loss, f"trained to step {steps}{trained}: {self.out}")
+
+    def _check(self) -> None:
+        if self.begin is not None and self.out.resolve() == self.begin.resolve():
+            raise ValueError("--out must be a different file from --begin")
+        if self.loss != "bc" and (self.evaluator is not None or self.qaf_anchor):
+            raise ValueError("--evaluator and --qaf-anchor only apply to --loss bc")
+        if self.answers is not None and self.evaluator is None:
+            raise ValueError("--answers requires --evaluator")
+
+    @property
+    def _numbers(self) -> dict[str, Any]:
+        """The options of the trainers' configs, where they are given."""
+        numbers: dict[str, Any] = {"learning_rate": self.learning_rate, "seed": self.seed}
+        numbers |= {"steps": self.steps or 8000, "batch_size": self.batch_size or 500}
+        if self.loss != "bc":
+            numbers |= {"steps": self.steps or 4000, "batch_size": self.batch_size or 250}
+        return numbers
+
+    def _clone(self, actor: Any, rows: Mapping[str, Any], run: Mapping[str, Any]) -> Any:
+        sampler = lw.TaskBalancedSampler()
+        replay = lw.LanguageWorldExperienceReplay(self.data, after_success=self.after_success, sampler=sampler, **rows)
+        _read_transform(actor, replay, self.data)
+        more: dict[str, Any] = {"qaf_anchor": self.qaf_anchor, "normalize": self.begin is None}
+        config = lw.BehavioralCloningConfig(**self._numbers, **more)
+        return lw.BehavioralCloningTrainer(actor, replay, config, device=self.device, **run)
+
+    def _learn(self, actor: Any, plans: lw.Plans, rows: Mapping[str, Any], run: Mapping[str, Any]) -> Any:
+        """Return the trainer of a loss other than bc; for advantages, first train the value that they need."""
+        from lw_torchrl._devices import place
+        from lw_torchrl.modules.policy import plans_of
+        from lw_torchrl.training.losses import GAMMA, N_STEPS, learn_advantages, make_loss
+
+        plans = plans_of(actor) or plans
+        config = lw.OfflineConfig(**self._numbers)
+
+        def replay(**ahead: Any) -> lw.LanguageWorldExperienceReplay:
+            shown: dict[str, Any] = {"label": "executed", "terminate_on_success": True, "reward": self.reward}
+            shown |= {"transform": lw.QAFTransform(plans), "sampler": lw.TaskBalancedSampler()}
+            return lw.LanguageWorldExperienceReplay(self.data, **shown, **rows, **ahead)
+
+        data = ahead = replay(n_steps=N_STEPS, gamma=GAMMA)
+        device = place(actor, self.device)
+        if self.loss == "advantage":
+            file = self.out.with_name(f"{self.out.stem}.value.safetensors")
+            value: dict[str, Any] = {"checkpoint": file, "title": "training the value"}
+            advantage = learn_advantages(plans, ahead, config, device, **value)
+            data = replay()
+            data.add_column("advantage", advantage, of=ahead)
+        if self.begin is None:
+            lw.training.fit_normalization(actor, data)
+        loss = make_loss(self.loss, actor, plans, data).to(device)
+        config = lw.OfflineConfig(**self._numbers, normalize=False)
+        return lw.OfflineTrainer(loss, data, config, actor=actor, **run)
+
+    def _evaluation(self, actor: Any, tasks: list[str]) -> dict[str, Any]:
+        """Return the trainer's options that log the success rates on held-out seeds."""
+
+        def evaluate() -> dict[str, float]:
+            result = lw.evaluate(
+                actor, tasks=tasks, episodes_per_task=self.evaluate_episodes, seed=self.evaluate_seed,
+                stop_at_success=True, suite=options.read_suite(None, tasks), progress=False,
+            )  # fmt: skip
+            rates = {
+                "success": result.mean_success,
+                **{f"success/{task}": r for task, r in result.success_once.items()},
+            }
+            print(f"success {result.mean_success:.3f} on seed {self.evaluate_seed}", file=sys.stderr)
+            return {name: float(rate) for name, rate in rates.items() if rate is not None}
+
+        return {} if self.evaluate_every is None else {"evaluate": evaluate, "evaluate_every": self.evaluate_every}
 
     def _new_actor(self, plans: lw.Plans, tasks: tuple[str, ...]) -> Any:
+        from tensordict.nn import TensorDictSequential
+
         from lw_torchrl.modules.registry import find_method, make_policy
 
         network: dict[str, Any] = {"features": self.features, "width": self.width, "depth": self.depth}
         network = {name: value for name, value in network.items() if value is not None}
-        if self.evaluator is not None:
-            network["evaluator"] = read_evaluator(self.evaluator, plans, self.text_encoder)
-            network["answers"] = self.answers or "tanh"
         plans.require(tasks)
         if not find_method(self.method).reads_plans:
             plans = lw.Plans({task: plans[task] for task in tasks})
-        return make_policy(self.method, plans, text_encoder=options.read_encoder(self.text_encoder), **network)
+        evaluator = None if self.evaluator is None else self._read_evaluator(plans, self.answers or "soft")
+        actor = make_policy(self.method, plans, text_encoder=options.read_encoder(self.text_encoder), **network)
+        return actor if evaluator is None else TensorDictSequential(evaluator, actor)
 
     def _begun_actor(self, plans: lw.Plans) -> Any:
+        from tensordict.nn import TensorDictSequential
+
+        from lw_torchrl.modules.policy import plans_of
+
         assert self.begin is not None
         if self.method != "pcbc" or (self.features, self.width, self.depth) != (None, None, None):
             raise ValueError("--begin brings its own --method, --features, --width and --depth; leave them out")
         actor: Any = lw.load_actor(self.begin, text_encoder=options.read_encoder(self.text_encoder))
-        if self.evaluator is not None:
-            if not isinstance(actor, lw.PlanConditionedActor):
-                raise ValueError(f"--evaluator requires a PlanConditionedActor, --begin is a {type(actor).__name__}")
-            evaluator = read_evaluator(self.evaluator, actor.plans, self.text_encoder)
-            actor = actor.with_evaluator(evaluator, answers=self.answers or "hard")
-        return actor
+        if self.evaluator is None:
+            return actor
+        if "qaf" not in actor.in_keys or (own := plans_of(actor)) is None:
+            raise ValueError(f"--evaluator requires a policy that reads qaf, --begin is a {type(actor).__name__}")
+        return TensorDictSequential(self._read_evaluator(own, self.answers or "hard"), actor)
+
+    def _read_evaluator(self, plans: lw.Plans, answers: Literal["soft", "hard"]) -> lw.QueryEvaluator:
+        assert self.evaluator is not None
+        evaluator = read_evaluator(self.evaluator, plans, self.text_encoder)
+        evaluator.answers = answers
+        return evaluator
 
 
 def _read_transform(actor: Any, replay: Any, data: Path) -> None:
-    """Give the rows what the actor reads besides the observation: truths of conditions, or pictures."""
-    evaluator = getattr(actor, "evaluator", None)
-    if isinstance(evaluator, lw.modules.ImageQueryEvaluator):
-        pictures: dict[str, Any] = {name: getattr(evaluator, name) for name in ("cameras", "height", "width")}
-        lw.data.add_pictures(data, **pictures)
-        replay.add_column("pixels", lw.data.load_pictures(replay, **pictures))
-    elif (transform := actor.transform()) is not None:
+    """Make the rows hold what the actor reads besides the observation: answers to conditions, or pictures."""
+    from lw_torchrl.modules.policy import plans_of, transform_of
+    from lw_torchrl.modules.query_evaluator import evaluators_of
+
+    evaluators = evaluators_of(actor)
+    for evaluator in evaluators:
+        if isinstance(evaluator, lw.modules.ImageQueryEvaluator):
+            pictures: dict[str, Any] = {name: getattr(evaluator, name) for name in ("cameras", "height", "width")}
+            lw.data.add_pictures(data, **pictures)
+            replay.add_column("pixels", lw.data.load_pictures(replay, **pictures))
+    if not evaluators and (transform := transform_of(actor, plans_of(actor))) is not None:
         replay.append_transform(transform)
 
 

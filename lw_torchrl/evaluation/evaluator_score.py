@@ -12,7 +12,7 @@ from lw_torchrl._checks import checked
 from lw_torchrl._files import AnyPath, write_json
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.networks import evaluating
-from lw_torchrl.training.labelled_queries import Asked, LabelledQueries
+from lw_torchrl.training.labelled_queries import LabelledQueries, TaskQueries
 
 PARTS = {
     "states": "trained queries, held-out states",
@@ -125,7 +125,7 @@ def score_evaluator(evaluator: ClauseEvaluator, data: LabelledQueries) -> Evalua
     return EvaluatorScore(parts, data.describe())
 
 
-def _score(evaluator: ClauseEvaluator, part: list[Asked]) -> PartScore:
+def _score(evaluator: ClauseEvaluator, part: list[TaskQueries]) -> PartScore:
     right: dict[str, tuple[int, int]] = {}
     asked: dict[str, tuple[int, int]] = {}
     with torch.no_grad(), evaluating(evaluator):
@@ -139,11 +139,11 @@ def _score(evaluator: ClauseEvaluator, part: list[Asked]) -> PartScore:
     return PartScore(right, asked)
 
 
-def clause_logits(evaluator: ClauseEvaluator, asked: Asked) -> tuple[Tensor, Tensor]:
+def clause_logits(evaluator: ClauseEvaluator, queries: TaskQueries) -> tuple[Tensor, Tensor]:
     """Return logits (R, Q) that the clauses hold, and their truth (R, Q)."""
-    coded = evaluator.code([(asked.task, clause) for clause in asked.clauses])
+    coded = evaluator.code([(queries.task, clause) for clause in queries.clauses])
     chunks = [
         evaluator.network(rows, coded.pick(torch.arange(len(coded.predicate)).expand(len(rows), -1)))
-        for rows in asked.seen(str(evaluator.in_keys[0])).split(_ROWS)
+        for rows in queries.view(str(evaluator.in_keys[0])).split(_ROWS)
     ]
-    return torch.cat(chunks), asked.truth
+    return torch.cat(chunks), queries.truth

@@ -1,5 +1,4 @@
-"""Losses that TorchRL lacks: a value by expectile regression, imitation weighted by advantages, TD3 and SAC with
-demonstrations; and n-step returns for TorchRL's losses that do not see them."""
+"""Losses that TorchRL lacks: expectile values, advantage-weighted imitation, and TD3 and SAC with demonstrations."""
 
 import lw_torchrl._torchrl  # noqa: F401
 from lw_torchrl.objectives.advantage_weighted import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task

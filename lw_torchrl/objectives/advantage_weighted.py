@@ -1,4 +1,4 @@
-"""Learning without an environment: the value of a state, and imitation of the rows that did better than others."""
+"""Offline losses: the value of a state by expectile regression, and imitation weighted by advantages."""
 
 from __future__ import annotations
 
@@ -17,42 +17,42 @@ from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 from lw_torchrl._checks import check_positive, check_probability, check_scale, checked
 from lw_torchrl._keys import read
 from lw_torchrl.language.value_checks import check_finite
-from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.networks import evaluating
-from lw_torchrl.objectives.reduction import Reduction, let_go, priority_weight, set_reduction
+from lw_torchrl.objectives.reduction import Reduction, clear_references, priority_weight, set_reduction
 
 
 class ExpectileValueLoss(LossModule):
-    """The value V of a state, without a value of actions: |τ - 1(u < 0)|·u², where u is the target less V.
+    """Learns the value V of a state by expectile regression, without a value of actions.
 
-    The target is the reward, of n steps where ``steps_to_next_obs`` says so, and what the target network says of the
-    state behind them, the mean over a critic's ensemble. With an expectile over one half V follows what better rows
-    reach. A row's target less V is the advantage of what it did, by which :class:`AdvantageWeightedLoss` imitates.
+    The loss of a row is |τ - 1(u < 0)|·u². u is the target less V, and the target is the reward plus the discounted
+    value, by the target network, of the next state (n steps ahead where the rows have ``steps_to_next_obs``). With an
+    expectile above one half, V follows the better rows. :class:`AdvantageWeightedLoss` imitates rows by u.
 
-    Reads what the network reads, here and in ``next``, ``("next", "reward")`` (B, 1) float32, ``("next", "done")`` and
-    ``("next", "terminated")`` (B, 1) bool, and, where they are, ``steps_to_next_obs`` (B,) int64 and
-    ``priority_weight`` (B,) float32. Gives ``loss_value`` () float32, (B,) by ``reduction="none"``, and ``value`` ()
-    float32, the mean of V, detached; writes ``td_error`` (B,) float32, a row's largest u², into what it is given.
+    Reads what the network reads, also in ``next``; ``("next", "reward")`` (B, 1) float32; ``("next", "done")`` and
+    ``("next", "terminated")`` (B, 1) bool; and, if present, ``steps_to_next_obs`` (B,) int64 and ``priority_weight``
+    (B,) float32. Returns ``loss_value`` () float32, (B,) with ``reduction="none"``, and ``value`` () float32, the
+    detached mean of V. Writes ``td_error`` (B,) float32, a row's largest u², into its input.
 
     Args:
-        value_network: writes ``state_value`` (B, 1) float32. Where it writes ``state_values`` (B, E) float32, as
-            :class:`PlanConditionedValue` with an ensemble does, each member learns by itself: their losses are added.
+        value_network: writes ``state_value`` (B, 1) float32. If it also writes ``state_values`` (B, E) float32, as
+            :class:`PlanConditionedValue` with an ensemble does, each member learns by itself, and losses are added.
         expectile: τ, from 0 to 1.
-        delay_value: targets by a network of their own, which :class:`torchrl.objectives.SoftUpdate` moves.
-        reduction: "mean", "none" or "sum" of the rows' losses.
+        delay_value: compute targets by a target network, which :class:`torchrl.objectives.SoftUpdate` updates.
+        reduction: "mean", "none" or "sum" over the rows.
 
     Raises:
-        ValueError: at call time, keys that the network does not write, or rows that lack one.
+        ValueError: at call time, keys that the network does not write, or rows without a key.
 
     Example:
         >>> import lw_torchrl as lw, torch
         >>> from tensordict import TensorDict
         >>> from torchrl.objectives import SoftUpdate
-        >>> from lw_torchrl.modules import DescriptorEncoder, Value
-        >>> loss = lw.objectives.ExpectileValueLoss(Value(DescriptorEncoder("MT10"), ensemble=2), expectile=0.7)
+        >>> plans = lw.load_plans("MT10")
+        >>> loss = lw.objectives.ExpectileValueLoss(lw.PlanConditionedValue(plans, ensemble=2), expectile=0.7)
         >>> loss = loss.make_value_estimator(gamma=0.99)
         >>> targets = SoftUpdate(loss, eps=0.995)
         >>> state = {"observation": torch.rand(5, 39), "task_id": torch.full((5,), lw.task_id("reach"))}
+        >>> state["qaf"] = torch.rand(5, plans.num_steps) > 0.5
         >>> ended = torch.zeros(5, 1, dtype=torch.bool)
         >>> next = TensorDict(**state, reward=torch.ones(5, 1), done=ended, terminated=ended)
         >>> batch = TensorDict(**state, next=next).auto_batch_size_(1)
@@ -60,7 +60,7 @@ class ExpectileValueLoss(LossModule):
         (torch.Size([]), torch.Size([5, 1]))
 
     Source: Kostrikov, Nair, Levine, "Offline Reinforcement Learning with Implicit Q-Learning", 2021, equation 5, of
-    which this keeps V alone; on n steps as Sutton, Barto, "Reinforcement Learning", section 7.1.
+    which this keeps only V; n steps as in Sutton, Barto, "Reinforcement Learning", section 7.1.
     """
 
     @dataclass
@@ -106,12 +106,12 @@ class ExpectileValueLoss(LossModule):
         return list(dict.fromkeys([*own, *(unravel_key(("next", key)) for key in following)]))
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> ExpectileValueLoss:
-        """Set how targets are estimated, and return the loss.
+        """Set the estimator of the targets, and return the loss.
 
         Args:
-            value_type: an estimator as an object or a class, or ``ValueEstimators.TD0``, or None for it; others, which
-                need rows in the order of time, are a :class:`NotImplementedError`.
-            **hyperparams: ``gamma``, the discount of a step, 0.99 by default.
+            value_type: an estimator, its class, or ``ValueEstimators.TD0``, which None stands for. Others need rows in
+                the order of time and raise :class:`NotImplementedError`.
+            **hyperparams: ``gamma``, the discount of a step, by default 0.99.
         """
         value_type = self.default_value_estimator if value_type is None else value_type
         if not isinstance(value_type, (str, ValueEstimators)):
@@ -122,13 +122,13 @@ class ExpectileValueLoss(LossModule):
         return self
 
     def train(self, mode: bool = True) -> ExpectileValueLoss:
-        """Reach the network too, whose noise is on targets as well."""
+        """Set the mode of the network too."""
         self.value_network.train(mode)
         return super().train(mode)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The loss; ``td_error`` is written."""
+        """Return the losses, and write ``td_error``."""
         target = self._target(tensordict)
         values = self._values(tensordict, self.value_network_params)
         error = target - values
@@ -136,14 +136,16 @@ class ExpectileValueLoss(LossModule):
         tensordict.set(self.tensor_keys.priority, error.detach().square().amax(-1))
         by_row = (weight * error.square()).sum(-1)
         loss = self._reduce_loss(by_row, tensordict, weights=priority_weight(self, tensordict))
-        found = TensorDict(loss_value=loss, value=values.detach().mean())
-        let_go(tensordict, found, self.value_network_params, self.target_value_network_params)
-        return found
+        losses = TensorDict(loss_value=loss, value=values.detach().mean())
+        clear_references(tensordict, losses, self.value_network_params, self.target_value_network_params)
+        return losses
 
     @torch.no_grad()
     def advantage(self, tensordict: TensorDictBase) -> Tensor:
-        """How much more a row's steps gave than its state is worth, (B, 1) float32: the target less the mean value,
-        both of the target network, without noise on its features."""
+        """Return each row's advantage, (B, 1) float32: the target less the mean value.
+
+        Both are of the target network in eval mode.
+        """
         with evaluating(self.value_network):
             value = self._values(tensordict, self.target_value_network_params).mean(-1, keepdim=True)
             return self._target(tensordict) - value
@@ -151,44 +153,42 @@ class ExpectileValueLoss(LossModule):
     @torch.no_grad()
     def _target(self, tensordict: TensorDictBase) -> Tensor:
         next_value = self._values(tensordict.get("next"), self.target_value_network_params).mean(-1, keepdim=True)
-        # A copy, since one that averages rewards writes them.
+        # The estimator may write averaged rewards into its input, so it gets a copy.
         return self.value_estimator.value_estimate(tensordict.copy(), next_value=next_value)
 
     def _values(self, tensordict: TensorDictBase, params: TensorDictParams) -> Tensor:
-        """(B, E), each member's."""
+        """Return the value of each member, (B, E)."""
         network, keys = self.value_network, self.tensor_keys
         key = keys.values if unravel_key(keys.values) in network.out_keys else keys.value
-        several = isinstance(network, Value) and len(network.heads) > 1
-        if unravel_key(key) not in network.out_keys or (several and key != keys.values):
+        is_ensemble = len(getattr(network, "heads", ())) > 1
+        if unravel_key(key) not in network.out_keys or (is_ensemble and key != keys.values):
             what = f"lack {keys.value!r} or, of an ensemble, {keys.values!r}: name them by loss.set_keys(value=...)"
             raise ValueError(f"the value network writes {network.out_keys}, which {what}")
         with params.to_module(network, preserve_module_state=False):
-            (found,) = read(network(tensordict.select(*network.in_keys, strict=False)), [key])
-        return found
+            (values,) = read(network(tensordict.select(*network.in_keys, strict=False)), [key])
+        return values
 
 
 class AdvantageWeightedLoss(LossModule):
-    """Imitation of a batch's actions, each row as much as its advantage A says: weight exp(β·A), at most
-    ``max_weight``, and the mean over the batch by these weights.
+    """Imitates a batch's actions with weights exp(β·A), at most ``max_weight``, where A is a row's advantage.
 
-    Reads what the actor reads, ``action`` (B, 4) float32, the action to imitate, and ``advantage`` (B, 1) float32,
-    which :meth:`ExpectileValueLoss.advantage` gives and :func:`standardize_by_task` makes comparable. Gives
-    ``loss_actor`` () float32, (B,) by ``reduction="none"``, and, detached, ``weight_clipped`` () float32, the share of
-    rows whose weight is the largest that may be, and ``ESS`` () float32, in (0, 1], the effective sample size over B,
-    as TorchRL's PPO gives.
+    Reads what the actor reads, ``action`` (B, 4) float32, and ``advantage`` (B, 1) float32, which
+    :meth:`ExpectileValueLoss.advantage` returns and :func:`standardize_by_task` makes comparable. Returns
+    ``loss_actor`` () float32, (B,) with ``reduction="none"``, and detached ``weight_clipped`` () float32, the fraction
+    of rows with the maximum weight, and ``ESS`` () float32 in (0, 1], the effective sample size over B.
 
     Args:
-        actor_network: an actor; its mode is compared where it has a distribution.
-        beta: β, in one over the advantage's unit. With 0 this is :class:`torchrl.objectives.BCLoss`.
-        max_weight: the largest weight, over 0.
-        loss_function: "l2", "l1" or "smooth_l1", the distance to the action, the mean over its numbers, or "log_prob",
-            less the action's log-probability, for an actor with a distribution.
-        reduction: "mean", by the weights; "none", each row's distance times its weight; or "sum", the sum of these.
+        actor_network: an actor; one with a distribution is compared by its mode.
+        beta: β, in units of 1 / advantage. With 0 this is :class:`torchrl.objectives.BCLoss`.
+        max_weight: maximum weight, above 0.
+        loss_function: "l2", "l1" or "smooth_l1", the mean distance to the action's numbers; or "log_prob", minus the
+            action's log-probability, for an actor with a distribution.
+        reduction: "mean", weighted; "none", each row's distance times its weight; or "sum", their sum.
 
     Raises:
-        ValueError: at call time, a missing key, an advantage that is not (B, 1) or not finite.
+        ValueError: at call time, a missing key, or an advantage that is not (B, 1) or not finite.
         RuntimeError: the actor's action has another shape than the one to imitate.
-        TypeError: "log_prob" for an actor of ours without a distribution.
+        TypeError: "log_prob" for an actor without a distribution.
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -201,7 +201,7 @@ class AdvantageWeightedLoss(LossModule):
         ['ESS', 'loss_actor', 'weight_clipped']
 
     Source: Peng, Kumar, Zhang, Levine, "Advantage-Weighted Regression", 2019, equation 10 and section 3.3; Nair et al.,
-    "AWAC", 2020, for the mean by weights.
+    "AWAC", 2020, for the weighted mean.
     """
 
     @dataclass
@@ -241,27 +241,27 @@ class AdvantageWeightedLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The loss; what is given stays as it is."""
+        """Return the loss; the input stays as it is."""
         action, advantage = read(tensordict, [self.tensor_keys.action, self.tensor_keys.advantage])
         if advantage.shape != (*tensordict.batch_size, 1) or advantage.dtype != action.dtype:
             got = f"shape {tuple(advantage.shape)} in {advantage.dtype}"
             raise ValueError(f"advantage must be {(*tensordict.batch_size, 1)} in {action.dtype}, got {got}")
         check_finite("advantage", advantage)
         logs, most = self.beta * advantage.detach().squeeze(-1), math.log(self.max_weight)
-        # In a mean only the weights' ratios count: over the largest of the batch they cannot all vanish.
+        # A mean depends only on the weights' ratios. Divided by the largest, they cannot all underflow.
         largest = logs.max().clamp(max=most) if self.reduction == "mean" else 0.0
         weights = (logs.clamp(max=most) - largest).exp()
         loss = self._reduce_loss(self._distance(tensordict, action), tensordict, weights=weights)
-        found = TensorDict(
+        losses = TensorDict(
             loss_actor=loss,
             weight_clipped=(logs > most).to(weights.dtype).mean(),
             ESS=weights.sum().square() / weights.square().sum() / weights.numel(),
         )
-        let_go(tensordict, found, self.actor_network_params)
-        return found
+        clear_references(tensordict, losses, self.actor_network_params)
+        return losses
 
     def _distance(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
-        """(B,)"""
+        """Return the distance of each row, (B,)."""
         seen = tensordict.exclude(self.tensor_keys.action)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             if self.loss_function == "log_prob":
@@ -272,19 +272,19 @@ class AdvantageWeightedLoss(LossModule):
 
 @checked
 def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
-    """Advantages in standard deviations of their task, about its mean.
+    """Standardise advantages to mean 0 and standard deviation 1 over the rows of each task.
 
-    Rewards of tasks differ in scale, and a mean weight should be no task's alone.
+    Without this, tasks with large rewards would get all the weight.
 
     Args:
         advantage: (R, 1) float32, finite.
         task_id: (R,) int64, the task of each row.
 
     Returns:
-        (R, 1) float32, of each task with mean 0 and standard deviation 1 (over its rows); 0 where all are the same.
+        (R, 1) float32; 0 for a task whose advantages are all equal.
 
     Raises:
-        ValueError: other shapes or types, NaN or infinity.
+        ValueError: another shape or dtype, NaN or infinity.
 
     Example:
         >>> import torch
@@ -296,10 +296,10 @@ def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
     if task_id.dtype != torch.int64 or task_id.shape != advantage.shape[:1]:
         raise ValueError(f"task_id must be ({len(advantage)},) int64, got {tuple(task_id.shape)} {task_id.dtype}")
     check_finite("advantage", advantage)
-    found = torch.zeros_like(advantage)
+    standardized = torch.zeros_like(advantage)
     for task in task_id.unique():
         rows = task_id == task
         own = advantage[rows].detach().double()
-        if own.max() > own.min():  # else the mean's rounding would be all there is
-            found[rows] = ((own - own.mean()) / own.std(correction=0)).to(found.dtype)
-    return found
+        if own.max() > own.min():  # otherwise only the rounding of the mean would be left
+            standardized[rows] = ((own - own.mean()) / own.std(correction=0)).to(advantage.dtype)
+    return standardized

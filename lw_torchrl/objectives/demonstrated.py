@@ -16,7 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss, TD3BCLoss
 
 from lw_torchrl._checks import check_scale, checked, shown
-from lw_torchrl.objectives.reduction import Reduction, let_go, priority_weight
+from lw_torchrl.objectives.reduction import Reduction, clear_references, priority_weight
 
 
 def imitation(action: Tensor, demonstrated: Tensor, is_demonstration: Tensor) -> Tensor:
@@ -131,7 +131,7 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
         scale = self.alpha / value.abs().mean().detach().clamp(min=1e-6)
         weights = priority_weight(self, tensordict)
         loss = self._reduce_loss(self.bc_weight * bc - scale * value, tensordict=tensordict, weights=weights)
-        let_go(tensordict, self.actor_network_params, self.qvalue_network_params)
+        clear_references(tensordict, self.actor_network_params, self.qvalue_network_params)
         return loss, {"state_action_value_actor": value.detach(), "bc_loss": bc.mean().detach(), "lmbd": scale}
 
     def _judged(self, seen: TensorDictBase) -> Tensor:

@@ -1,4 +1,4 @@
-"""What losses do with a minibatch's rows: see n steps, take a sampler's weights, make one number of them."""
+"""How losses read a minibatch: n-step rows, a sampler's weights, and the reduction over rows."""
 
 from __future__ import annotations
 
@@ -16,36 +16,36 @@ _STEPS = "steps_to_next_obs"
 
 
 def set_reduction(loss: LossModule, reduction: Reduction | None) -> None:
-    """Set a reduction other than the class's "mean", which files of trainings do not hold."""
+    """Set a reduction other than the class's "mean"; checkpoints describe only what differs from the class."""
     if reduction not in (None, loss.reduction):
         loss.reduction = reduction
 
 
 def priority_weight(loss: LossModule, tensordict: TensorDictBase) -> Tensor | None:
-    """The weights that a ``PrioritizedSampler`` gave the rows, (B,); None where there are none or none are wanted."""
+    """Return the weights (B,) of a ``PrioritizedSampler``; None without them, or if the loss ignores them."""
     return tensordict.get(loss.tensor_keys.priority_weight, None) if loss.use_prioritized_weights else None
 
 
-def let_go(*tensordicts: TensorDictBase) -> None:
-    """Drop the references that tensordicts keep to modules, which ``torch.compile`` cannot make again."""
+def clear_references(*tensordicts: TensorDictBase) -> None:
+    """Drop the references of tensordicts to modules, which ``torch.compile`` cannot trace."""
     if torch.compiler.is_compiling():
-        for one in tensordicts:
-            one.clear_refs_for_compile_()
+        for tensordict in tensordicts:
+            tensordict.clear_refs_for_compile_()
 
 
 @checked
 def with_n_steps(loss: LossModule, batch: TensorDictBase) -> TensorDictBase:
-    """A minibatch whose n steps the loss's value estimator sees: ``loss(with_n_steps(loss, batch))``.
+    """Make a loss's value estimator read n-step rows: ``loss(with_n_steps(loss, batch))``.
 
-    TorchRL's :class:`~torchrl.objectives.IQLLoss` and :class:`~torchrl.objectives.REDQLoss` show it only what is under
-    ``"next"``, where this sets ``steps_to_next_obs`` too. For other losses, and rows without it, nothing happens.
+    TorchRL's :class:`~torchrl.objectives.IQLLoss` and :class:`~torchrl.objectives.REDQLoss` only pass ``next`` to the
+    estimator, so this copies ``steps_to_next_obs`` there. Other losses and rows are left alone.
 
     Args:
         loss: any loss; call ``make_value_estimator`` before.
-        batch: rows of a buffer, ``steps_to_next_obs`` (B,) int64 among them.
+        batch: rows of a buffer, with ``steps_to_next_obs`` (B,) int64.
 
     Returns:
-        ``batch`` itself, with ``("next", "steps_to_next_obs")`` (B,) int64 where it is needed.
+        ``batch``, with ``("next", "steps_to_next_obs")`` (B,) int64 if the loss needs it.
 
     Example:
         >>> import lw_torchrl as lw, torch

@@ -1,9 +1,9 @@
 """Training: behavioral cloning, any loss over a replay buffer, query evaluators, and their files."""
 
 import lw_torchrl._torchrl  # noqa: F401
-from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.training.checkpoint import load_actor, load_evaluator, save_actor, save_evaluator
-from lw_torchrl.training.evaluator_training import ImageQueryEvaluatorTrainer, QueryEvaluatorTrainer
+from lw_torchrl.training.cloning import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.training.evaluator import ImageQueryEvaluatorTrainer, QueryEvaluatorTrainer
 from lw_torchrl.training.labelled_queries import ImageQueryEvaluatorConfig, LabelledQueries, QueryEvaluatorConfig
 from lw_torchrl.training.normalization import fit_normalization
 from lw_torchrl.training.offline import OfflineConfig, OfflineTrainer

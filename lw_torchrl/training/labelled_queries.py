@@ -1,4 +1,4 @@
-"""LabelledQueries: the base queries of tasks in a dataset's states, with the query answering function's answers."""
+"""LabelledQueries: all base queries of tasks in a dataset's states, with their exact answers."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.tasks import Task, task_id
 from lw_torchrl.suites.suite import find_suite
 
-_FAR = 0.02  # metres that a hand does not move unseen
+_MOVED = 0.02  # metres; a hand that moves further between two pictures must look different
 
 
 @dataclass(frozen=True)
 class QueryEvaluatorConfig:
-    """How a query evaluator is trained, by AdamW, and what is held out; else as :class:`BehavioralCloningConfig`.
+    """Hyperparameters of a query evaluator's training by AdamW, and what is held out.
 
     Attributes:
+        steps, weight_decay, checkpoint_every: as of :class:`BehavioralCloningConfig`.
         batch_size: pairs of a state and a clause in a minibatch.
         learning_rate: at the start; a cosine brings it to 0.
-        states_per_task: at most so many of each task are labelled to train on, drawn from its rows.
-        every: of each episode, only each so-many-th state is asked: as many steps as pictures are apart.
-        held_out_states: the share of a task's episodes, by their numbers, whose states are not trained on.
-        held_out_pairs: the share of pairs of objects of which nothing is trained, by their names, in all tasks alike.
-        held_out_tasks: of which nothing is trained: names, or a number of tasks to draw.
+        states_per_task: maximum number of states of a task to train on, drawn from its rows.
+        every: use every N-th state of an episode; for pictures, the steps from one picture to the next.
+        held_out_states: fraction of a task's episodes whose states are not trained on.
+        held_out_pairs: fraction of the pairs of object names that are not trained on, in any task.
+        held_out_tasks: tasks that are not trained on: names, or a number of tasks to draw.
         seed: of what is held out, the states and the minibatches.
     """
 
@@ -66,12 +67,12 @@ class QueryEvaluatorConfig:
 
 @dataclass(frozen=True)
 class ImageQueryEvaluatorConfig(QueryEvaluatorConfig):
-    """How an evaluator of pictures is trained, as :class:`QueryEvaluatorConfig`, but that a minibatch is of states.
+    """Hyperparameters of an :class:`ImageQueryEvaluator`'s training; others are those of :class:`QueryEvaluatorConfig`.
 
     Attributes:
-        batch_size: states in a minibatch, each asked all clauses of its task.
-        position_weight: of the error in the things' positions, in units of 5 cm, and in how far the gripper is open, in
-            the loss: the simulator knows them. 0 to learn only from answers.
+        batch_size: states in a minibatch; each is asked all clauses of its task.
+        position_weight: weight of the error of the objects' positions, in units of 5 cm, and of how far the gripper is
+            open, which the simulator knows; 0 to learn only from answers.
     """
 
     batch_size: Count = 48
@@ -81,9 +82,14 @@ class ImageQueryEvaluatorConfig(QueryEvaluatorConfig):
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Q clauses, none negated, that are asked of R states of a task: ``observation`` (R, 39) float32, ``truth`` (R, Q)
-    bool, and ``pixels`` (R, H, W, 3) uint8 where the rows have pictures."""
+class TaskQueries:
+    """Exact answers to Q clauses, none negated, in R states of a task.
+
+    Attributes:
+        observation: (R, 39) float32.
+        truth: (R, Q) bool.
+        pixels: (R, H, W, 3) uint8; None for rows without pictures.
+    """
 
     task: Task
     clauses: tuple[Clause, ...]
@@ -91,36 +97,36 @@ class Asked:
     truth: Tensor
     pixels: Tensor | None = None
 
-    def seen(self, key: str) -> Tensor:
-        """What an evaluator sees of the states, by the key that it reads."""
+    def view(self, key: str) -> Tensor:
+        """Return what an evaluator that reads ``key`` sees of the states."""
         if key == "observation":
             return self.observation
         if key != "pixels" or self.pixels is None:
             raise ValueError(
-                f"data must have the column {key!r}, which the evaluator reads, as lw.data.add_pictures(root, ...) and "
-                "replay.add_column('pixels', lw.data.load_pictures(replay, ...)) give it"
+                f"data must have the column {key!r}, which the evaluator reads; make it by lw.data.add_pictures(root, "
+                "...) and replay.add_column('pixels', lw.data.load_pictures(replay, ...))"
             )
         return self.pixels
 
 
 class LabelledQueries:
-    """All base queries of a dataset's tasks, not only those of plans, and which of them are trained.
+    """Exact answers to all base queries of a dataset's tasks, not only those of plans, some of them held out.
 
     Attributes:
-        tasks: those that are trained.
-        held_out_tasks: those that are not.
-        held_out_pairs: pairs of names, each sorted, of which nothing is trained.
-        parts: what is asked, by name: "training"; "states", the same clauses in held-out states; "queries", clauses on
-            held-out pairs, in these states; "tasks", all clauses of held-out tasks. One may be empty.
+        tasks, held_out_tasks: the tasks that are trained on, and those that are not.
+        held_out_pairs: pairs of object names, each sorted, that are not trained on.
+        parts: the queries by name: "training"; "states", the same clauses in held-out states; "queries", clauses about
+            held-out pairs, in these states; "tasks", all clauses of held-out tasks. Each may be empty.
 
     Args:
         replay: its rows hold ``observation`` (R, 39) float32, ``task_id`` and ``episode`` (R,) int64, and, for an
             evaluator of pictures, ``pixels`` (R, H, W, 3) uint8.
         config: what is held out.
-        tasks: what is known of its tasks; the shipped ones by default.
+        tasks: definitions of its tasks; None for the shipped ones.
 
     Raises:
-        ValueError: a row or held-out tasks of none of ``tasks``, or all held out; pictures held while the hand moves.
+        ValueError: a row's or held-out task is not among the tasks; everything is held out; a picture stays the same
+            while the hand moves.
     """
 
     @checked
@@ -137,44 +143,44 @@ class LabelledQueries:
         ids = rows.get("task_id")
         if other := sorted({*ids.unique().tolist()} - {*known}):
             raise ValueError(f"tasks must have all tasks of the rows, they lack those of the ids {other[:8]}")
-        found = [known[number] for number in ids.unique().tolist()]
-        _check_pictures(rows, found[0].layout)
+        present = [known[number] for number in ids.unique().tolist()]
+        _check_pictures(rows, present[0].layout)
         generator = torch.Generator().manual_seed(config.seed)
-        self.held_out_tasks = _drawn_tasks(config.held_out_tasks, [task.name for task in found], generator)
-        trained = [task for task in found if task.name not in self.held_out_tasks]
+        self.held_out_tasks = _draw_tasks(config.held_out_tasks, [task.name for task in present], generator)
+        trained = [task for task in present if task.name not in self.held_out_tasks]
         self.tasks = tuple(task.name for task in trained)
-        self.held_out_pairs = _drawn_pairs(config.held_out_pairs, trained, generator)
-        kept = _held_out_rows(rows.get("episode"), ids, config.held_out_states)
-        self.parts: dict[str, list[Asked]] = {"training": [], "states": [], "queries": [], "tasks": []}
-        for task in found:
-            own = ids == task_id(task.name)
+        self.held_out_pairs = _draw_pairs(config.held_out_pairs, trained, generator)
+        held_out = _held_out_rows(rows.get("episode"), ids, config.held_out_states)
+        self.parts: dict[str, list[TaskQueries]] = {"training": [], "states": [], "queries": [], "tasks": []}
+        for task in present:
+            own, most = ids == task_id(task.name), config.states_per_task
             clauses = [clause for clause in base_clauses(task, tuple(PREDICATES)) if not clause.negated]
-            train = _some((own & ~kept).nonzero().flatten(), config.states_per_task, generator)
-            test = _some((own & kept).nonzero().flatten(), config.states_per_task, generator)
+            train = _at_most(most, (own & ~held_out).nonzero().flatten(), generator)
+            test = _at_most(most, (own & held_out).nonzero().flatten(), generator)
             if task.name in self.held_out_tasks:
-                self._ask("tasks", task, clauses, rows[torch.cat((train, test))])
+                self._add("tasks", task, clauses, rows[torch.cat((train, test))])
                 continue
             new = [clause for clause in clauses if _pair(clause) in self.held_out_pairs]
             old = [clause for clause in clauses if _pair(clause) not in self.held_out_pairs]
-            self._ask("training", task, old, rows[train])
-            self._ask("states", task, old, rows[test])
-            self._ask("queries", task, new, rows[test])
+            self._add("training", task, old, rows[train])
+            self._add("states", task, old, rows[test])
+            self._add("queries", task, new, rows[test])
 
-    def _ask(self, part: str, task: Task, clauses: Sequence[Clause], rows: TensorDictBase) -> None:
+    def _add(self, part: str, task: Task, clauses: Sequence[Clause], rows: TensorDictBase) -> None:
         if clauses and len(rows):
             observation = rows.get("observation").float()
             program = QueryProgram({task: [Query((clause,)) for clause in clauses]})
             truth = program(observation, torch.full((len(rows),), task_id(task.name)))
-            self.parts[part].append(Asked(task, tuple(clauses), observation, truth, rows.get("pixels", None)))
+            self.parts[part].append(TaskQueries(task, tuple(clauses), observation, truth, rows.get("pixels", None)))
 
     def describe(self) -> dict[str, Any]:
-        """What is trained and what is held out, as JSON."""
+        """Describe what is trained on and what is held out, as JSON."""
         return {
             "tasks": list(self.tasks),
             "held_out_tasks": list(self.held_out_tasks),
             "held_out_pairs": [list(pair) for pair in self.held_out_pairs],
-            "states": {part: sum(len(asked.observation) for asked in found) for part, found in self.parts.items()},
-            "queries": {part: sum(len(asked.clauses) for asked in found) for part, found in self.parts.items()},
+            "states": {part: sum(len(task.observation) for task in tasks) for part, tasks in self.parts.items()},
+            "queries": {part: sum(len(task.clauses) for task in tasks) for part, tasks in self.parts.items()},
         }
 
 
@@ -183,49 +189,53 @@ def _pair(clause: Clause) -> tuple[str, str]:
     return min(pair), max(pair)
 
 
-def _some(rows: Tensor, most: int, generator: torch.Generator) -> Tensor:
-    if len(rows) <= most:
+def _at_most(number: int, rows: Tensor, generator: torch.Generator) -> Tensor:
+    """Draw ``number`` of the rows; return all if there are fewer."""
+    if len(rows) <= number:
         return rows
-    return rows[torch.randperm(len(rows), generator=generator)[:most].sort().values]
+    return rows[torch.randperm(len(rows), generator=generator)[:number].sort().values]
 
 
 def _check_pictures(rows: TensorDictBase, layout: Layout) -> None:
-    """Raise where a picture stays while the hand moves on: it is of an earlier state, whose answers are others."""
+    """Raise if a picture stays the same while the hand moves: it shows an earlier state, with other answers."""
     pixels, hand = rows.get("pixels", None), rows.get("observation")[:, layout.positions[0]]
     if pixels is None or len(rows) < 2:
         return
-    far = (hand[1:] - hand[:-1]).norm(dim=-1) > _FAR
-    same = rows.get(("collector", "traj_ids"))[1:] == rows.get(("collector", "traj_ids"))[:-1]
-    for row in (far & same).nonzero().flatten().tolist():
+    moved = (hand[1:] - hand[:-1]).norm(dim=-1) > _MOVED
+    same_episode = rows.get(("collector", "traj_ids"))[1:] == rows.get(("collector", "traj_ids"))[:-1]
+    for row in (moved & same_episode).nonzero().flatten().tolist():
         if torch.equal(pixels[row], pixels[row + 1]):
             raise ValueError("every must be as many steps as the pictures are apart: one stays while the hand moves")
 
 
-def _drawn_tasks(asked: int | tuple[str, ...], names: Sequence[str], generator: torch.Generator) -> tuple[str, ...]:
-    number = asked if isinstance(asked, int) else len(asked)
+def _draw_tasks(held_out: int | tuple[str, ...], names: Sequence[str], generator: torch.Generator) -> tuple[str, ...]:
+    number = held_out if isinstance(held_out, int) else len(held_out)
     if number >= len(names):
         raise ValueError(f"held_out_tasks must leave tasks to train on, got {number} of {len(names)}")
-    if isinstance(asked, int):
+    if isinstance(held_out, int):
         drawn = torch.randperm(len(names), generator=generator)[:number].tolist()
         return tuple(sorted(names[place] for place in drawn))
-    return tuple(sorted({check_choice("held_out_tasks", name, names) for name in asked}))
+    return tuple(sorted({check_choice("held_out_tasks", name, names) for name in held_out}))
 
 
-def _drawn_pairs(share: float, tasks: Sequence[Task], generator: torch.Generator) -> tuple[tuple[str, str], ...]:
-    """Of the pairs of different objects so large a share, and at least one if any are asked for."""
+def _draw_pairs(fraction: float, tasks: Sequence[Task], generator: torch.Generator) -> tuple[tuple[str, str], ...]:
+    """Draw a fraction of the pairs of different objects, at least one unless the fraction is 0."""
     clauses = chain.from_iterable(base_clauses(task, ("near",)) for task in tasks)
     pairs = sorted({_pair(clause) for clause in clauses if clause.object is not None})
-    number = min(len(pairs) - 1, max(1, round(share * len(pairs)))) if share else 0
+    number = min(len(pairs) - 1, max(1, round(fraction * len(pairs)))) if fraction else 0
     return tuple(sorted(pairs[place] for place in torch.randperm(len(pairs), generator=generator)[:number].tolist()))
 
 
-def _held_out_rows(episode: Tensor, ids: Tensor, share: float) -> Tensor:
-    """(R,) bool, the rows of a share of each task's episodes, spread over all of them: at least one, unless ``share``
-    is 0 or no other is left. Episodes of one number begin alike, whoever acts: they go together."""
-    held = torch.zeros_like(ids, dtype=torch.bool)
+def _held_out_rows(episode: Tensor, ids: Tensor, fraction: float) -> Tensor:
+    """Return a mask (R,) bool of the rows of a fraction of each task's episodes, spread evenly over them.
+
+    It holds at least one episode of a task that has others, unless the fraction is 0. Episodes of the same number start
+    in the same state in every dataset, so they are held out together.
+    """
+    held_out = torch.zeros_like(ids, dtype=torch.bool)
     for number in ids.unique().tolist():
         own = episode[ids == number].unique()
-        many = min(len(own) - 1, max(1, round(share * len(own)))) if share else 0
-        places = ((torch.arange(many) + 0.5) * len(own) / max(1, many)).long()
-        held |= torch.isin(episode, own[places]) & (ids == number)
-    return held
+        count = min(len(own) - 1, max(1, round(fraction * len(own)))) if fraction else 0
+        places = ((torch.arange(count) + 0.5) * len(own) / max(1, count)).long()
+        held_out |= torch.isin(episode, own[places]) & (ids == number)
+    return held_out

@@ -63,11 +63,11 @@ def everything(trainer):
         {
             "actor": dict(trainer.actor.state_dict()),
             "optimizer": trainer.optimizer.state_dict(),
-            "schedule": trainer.schedule.state_dict(),
-            "state": trainer.states[0].state_dict(trainer.steps),
+            "minibatches": trainer.minibatches[0].state_dict(),
         }
     )
-    return found | {("next batch",): trainer.replay.sample(8)["observation"]}
+    with trainer.minibatches[0].drawing(trainer.device):
+        return found | {("next batch",): trainer.replay.sample(8)["observation"]}
 
 
 def assert_same(found, expected):

@@ -35,9 +35,9 @@ def test_the_loss_falls(demos):
 def test_the_first_loss_is_the_named_distance_to_the_experts_action(demos, loss_function):
     config = BehavioralCloningConfig(steps=1, batch_size=8, loss_function=loss_function)
     trainer = make_trainer(demos, config=config, actor=make_actor(feature_noise=0.0))
-    replay = make_replay(demos)
-    replay.set_rng(torch.Generator().manual_seed(0))
-    batch = replay.sample(8)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        batch = make_replay(demos).sample(8)
     with torch.no_grad():
         action = trainer.actor(batch.exclude("action"))["action"]
     expected = getattr(nn.functional, {"l1": "l1_loss", "l2": "mse_loss"}.get(loss_function, "smooth_l1_loss"))

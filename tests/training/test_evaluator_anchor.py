@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from small_training import CONFIG, PLANS, SMALL, Stopping, assert_same, collect_demos, everything, make_actor
+from tensordict.nn import TensorDictSequential
 
 import lw_torchrl as lw
 from benchmarks.evaluator_report import condition_drift
@@ -20,7 +21,7 @@ def root(tmp_path_factory):
 def tuned(root, weight, steps=12, path=None, stop_at=None):
     torch.manual_seed(0)
     evaluator = lw.StateQueryEvaluator(PLANS, width=16, depth=1)
-    actor = lw.PlanConditionedActor(PLANS, evaluator=evaluator, answers="tanh", **SMALL)
+    actor = TensorDictSequential(evaluator, lw.PlanConditionedActor(PLANS, **SMALL))
     replay = lw.LanguageWorldExperienceReplay(root, sampler=lw.TaskBalancedSampler())
     config = replace(CONFIG, qaf_anchor=weight, steps=steps)
     trainer = Stopping(actor, replay, config, checkpoint=path, progress=False)
@@ -44,9 +45,9 @@ def test_the_anchor_holds_conditions_to_their_words(root):
 
 def test_training_moves_the_evaluator_and_goes_on_to_the_bit(root, tmp_path):
     whole = tuned(root, 0.5)
-    start = {name: one.detach().clone() for name, one in whole.actor.evaluator.named_parameters()}
+    start = {name: one.detach().clone() for name, one in whole.actor[0].named_parameters()}
     whole.train()
-    assert not torch.equal(start["network.trunk.0.weight"], whole.actor.evaluator.network.trunk[0].weight)
+    assert not torch.equal(start["network.trunk.0.weight"], whole.actor[0].network.trunk[0].weight)
     with pytest.raises(KeyboardInterrupt):
         tuned(root, 0.5, path=tmp_path / "p.safetensors", stop_at=7).train()
     again = tuned(root, 0.5, path=tmp_path / "p.safetensors")
@@ -60,5 +61,7 @@ def test_training_moves_the_evaluator_and_goes_on_to_the_bit(root, tmp_path):
 
 def test_what_has_no_evaluator_is_refused(root):
     replay = lw.LanguageWorldExperienceReplay(root, transform=lw.QAFTransform(PLANS))
-    with pytest.raises(ValueError, match="qaf_anchor is for a policy with an evaluator, this PlanConditionedActor"):
+    with pytest.raises(
+        ValueError, match=r"qaf_anchor needs a policy with one learned evaluator.* this PlanConditionedActor has none"
+    ):
         lw.BehavioralCloningTrainer(make_actor(), replay, replace(CONFIG, qaf_anchor=1.0))

@@ -97,12 +97,10 @@ def test_the_seed_says_what_is_held_out(replay):
 
 
 def test_a_minibatch_has_equally_many_of_each_predicate_and_truth(replay):
-    trainer = make_trainer(replay)
-    minibatches = trainer._minibatches
-    groups = len(minibatches.sizes)
-    minibatches.size = groups * 7
-    _, clauses, truth = minibatches.draw(0, torch.Generator())
-    kinds = torch.stack((clauses.predicate[:, 0], truth[:, 0].long()), -1)
+    queries = make_trainer(replay).minibatches[0].source
+    groups = len(queries.sizes)
+    batch = queries.sample(groups * 7)
+    kinds = torch.stack((batch["clauses", "predicate"][:, 0], batch["truth"][:, 0].long()), -1)
     _, counts = kinds.unique(dim=0, return_counts=True)
     assert len(counts) == groups >= 24
     assert (counts == 7).all()

@@ -9,7 +9,7 @@ import torch
 from small_training import CONFIG, PLANS, collect_demos, make_actor, make_replay, make_trainer
 
 import lw_torchrl as lw
-from lw_torchrl.training.behavioral_cloning import bc_loss
+from lw_torchrl.training.cloning import bc_loss
 
 OFFLINE = lw.OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
 EVALUATOR = lw.training.QueryEvaluatorConfig(steps=12, batch_size=8, held_out_pairs=0.0)

@@ -1,0 +1,177 @@
+"""Behavioral cloning with TorchRL's BCLoss: AdamW, a cosine schedule, checkpoints that resume bit for bit."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, NamedTuple, Unpack
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.objectives import BCLoss
+
+from lw_torchrl._checks import Count, Positive, Scale, check_fields, checked, passes_on
+from lw_torchrl._devices import place
+from lw_torchrl.data.replay_checks import check_replay
+from lw_torchrl.language.task_index import PlanTables, TaskTables
+from lw_torchrl.modules.query_evaluator import evaluators_of
+from lw_torchrl.training.checkpoint import check_can_be_saved
+from lw_torchrl.training.descriptions import describe_data, describe_replay
+from lw_torchrl.training.loop import Training, TrainingOptions
+from lw_torchrl.training.minibatches import Minibatches
+from lw_torchrl.training.normalization import check_contacts, fit_normalization, has_statistics
+from lw_torchrl.training.optimizer import make_optimizer
+from lw_torchrl.transforms.qaf import plan_program
+
+
+@dataclass(frozen=True)
+class BehavioralCloningConfig:
+    """Hyperparameters of behavioral cloning.
+
+    Attributes:
+        steps: number of minibatches.
+        batch_size: rows of a minibatch; with a :class:`TaskBalancedSampler`, a multiple of the number of tasks.
+        learning_rate: at the start.
+        optimizer: "adamw" or "sgd".
+        weight_decay: of the optimizer.
+        momentum: of "sgd".
+        schedule: of the learning rate, "cosine" to 0 or "constant".
+        normalize: before the first step, fit the statistics of the observation's features to the demonstrations.
+        loss_function: distance between the actor's action and the demonstrated one: "l1", "l2" or "smooth_l1".
+        max_grad_norm: gradients are clipped to this norm.
+        seed: of the minibatches, and of what the buffer's transforms and the actor draw while training.
+        checkpoint_every: steps between checkpoints; the last step always writes one.
+        qaf_anchor: weight of the cross entropy between a learned evaluator's answers and the exact ones. It keeps
+            conditions true to their words while imitation trains the evaluator.
+    """
+
+    steps: Count = 8000
+    batch_size: Count = 500
+    learning_rate: Scale = 1e-3
+    optimizer: Literal["adamw", "sgd"] = "adamw"
+    weight_decay: Scale = 1e-4
+    momentum: Scale = 0.9
+    schedule: Literal["cosine", "constant"] = "cosine"
+    normalize: bool = True
+    loss_function: Literal["l1", "l2", "smooth_l1"] = "l2"
+    max_grad_norm: Positive = 1.0
+    seed: int = 0
+    checkpoint_every: Count = 500
+    qaf_anchor: Scale = 0.0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the options, as JSON."""
+        return asdict(self)
+
+
+def bc_loss(actor: nn.Module, distance: str) -> BCLoss:
+    """Return TorchRL's BCLoss, without its warning about target networks."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
+        return BCLoss(actor, loss_function=distance)
+
+
+class _Steps(NamedTuple):
+    mask: Tensor  # (T, S) bool, the steps of each task's plan
+
+
+class EvaluatorAnchor:
+    """The cross entropy between the answers of the evaluator in a sequence of modules and the exact answers."""
+
+    def __init__(self, actor: nn.Module) -> None:
+        evaluators = evaluators_of(actor)
+        if len(evaluators) != 1:
+            raise ValueError(
+                "qaf_anchor needs a policy with one learned evaluator, TensorDictSequential(evaluator, actor); this "
+                f"{type(actor).__name__} has {len(evaluators) or 'none'}"
+            )
+        self.evaluator, plans = evaluators[0], evaluators[0].plans
+        self.program, tables = plan_program(plans), PlanTables(plans)
+        self.steps = TaskTables(tables.index, _Steps(tables.mask), f"tasks without a plan in {plans!r}")
+
+    def __call__(self, batch: TensorDictBase) -> Tensor:
+        """Return () float32 for rows of ``observation``, ``task_id`` and the keys that the evaluator reads."""
+        observation, task = batch.get("observation"), batch.get("task_id")
+        logits = self.evaluator.logits_of(batch)
+        truth = self.program(observation, task).to(logits.dtype)
+        mask = self.steps.select(task, observation).mask.to(logits.dtype)
+        errors = nn.functional.binary_cross_entropy_with_logits(logits, truth, reduction="none")
+        return (errors * mask).sum() / mask.sum()
+
+
+class BehavioralCloningTrainer(Training):
+    """Trains an actor to give the demonstrated actions.
+
+    Any TensorDict module that writes ``action`` can be trained, for example ``TensorDictSequential(evaluator, actor)``,
+    which trains both.
+
+    Args:
+        actor: it is trained in place.
+        replay: its samples hold what the actor reads and ``action`` (B, 4) float32.
+        config: hyperparameters; None for the defaults.
+        device: where to train: "cpu", "cuda", "cuda:1", "mps", or "auto" for the GPU if there is one. The actor is
+            moved there and stays there. None leaves it where it is. Make the buffer with the same ``device``; otherwise
+            each minibatch is copied.
+        **options: of :class:`~lw_torchrl.training.loop.Training`, with its errors.
+
+    Raises:
+        ValueError: the actor does not write ``action``, or has no evaluator for ``qaf_anchor``.
+        TypeError: there is a ``checkpoint``, and the actor cannot be saved.
+
+    Example:
+        >>> import lw_torchrl as lw, tempfile
+        >>> plans = lw.load_plans("MT10")
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     _ = lw.collect_demonstrations("reach", episodes_per_task=1, root=root + "/demos", max_steps=80)
+        ...     replay = lw.LanguageWorldExperienceReplay(root + "/demos", transform=lw.QAFTransform(plans))
+        ...     config = lw.BehavioralCloningConfig(steps=5, batch_size=16)
+        ...     lw.BehavioralCloningTrainer(lw.PlanConditionedActor(plans), replay, config).train() < 1.0
+        True
+
+    Source: paper section 'Conditional Plan Experiments'; ``torchrl.objectives.BCLoss``.
+    """
+
+    part = "actor"
+
+    @passes_on(Training.__init__)
+    @checked
+    def __init__(
+        self,
+        actor: TensorDictModuleBase,
+        replay: TensorDictReplayBuffer,
+        config: BehavioralCloningConfig | None = None,
+        *,
+        device: str | torch.device | None = None,
+        **options: Unpack[TrainingOptions],
+    ) -> None:
+        config = config or BehavioralCloningConfig()
+        super().__init__(config, **options)
+        self.actor, self.module, self.replay, self.networks = actor, actor, replay, [actor]
+        self.device = place(actor, device)
+        check_replay(actor, replay, config.batch_size)
+        self._anchor = EvaluatorAnchor(actor) if config.qaf_anchor else None
+        if self.checkpoint is not None:
+            self.description = {"actor": check_can_be_saved(actor).describe(), "training": config.describe()}
+            self.description |= {"data": describe_data(replay), "replay": describe_replay(replay)}
+        self.loss = bc_loss(actor, config.loss_function)
+        self.optimizer = make_optimizer([(self.loss.parameters(), config.learning_rate)], config, self.device)
+        self.minibatches = [Minibatches(replay, config.batch_size, config.seed)]
+        if self.resume():
+            return
+        if config.normalize and has_statistics(actor):
+            fit_normalization(actor, replay)
+        else:
+            check_contacts(actor)
+
+    def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:
+        loss = self.loss(batch)["loss_bc"]
+        if self._anchor is None:
+            return {"loss": loss}
+        return {"loss_bc": loss, "loss_qaf": self.config.qaf_anchor * self._anchor(batch)}

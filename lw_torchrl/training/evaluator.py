@@ -1,0 +1,244 @@
+"""QueryEvaluatorTrainer and ImageQueryEvaluatorTrainer: networks learn the exact answers to queries."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from hashlib import blake2b
+from typing import Any, ClassVar, Unpack
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from lw_torchrl._checks import checked, passes_on
+from lw_torchrl._devices import place
+from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
+from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
+from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
+from lw_torchrl.training.checkpoint import check_evaluator_can_be_saved
+from lw_torchrl.training.labelled_queries import (
+    ImageQueryEvaluatorConfig,
+    LabelledQueries,
+    QueryEvaluatorConfig,
+    TaskQueries,
+)
+from lw_torchrl.training.loop import Training, TrainingOptions
+from lw_torchrl.training.minibatches import Minibatches
+from lw_torchrl.training.optimizer import make_optimizer
+
+_MOST_WEIGHT = 20.0  # maximum weight of a rare answer, as a multiple of the median
+
+
+class _StateQueries:
+    """Pairs of a state and a clause, with equally many of each predicate and truth in a minibatch."""
+
+    def __init__(self, evaluator: ClauseEvaluator, tasks: list[TaskQueries]) -> None:
+        self.observation = torch.cat([task.observation for task in tasks])
+        self.clauses = evaluator.code([(task.task, clause) for task in tasks for clause in task.clauses])
+        predicate = 2 * self.clauses.predicate.to(torch.uint8)
+        groups: dict[int, list[Tensor]] = {}
+        row = first = 0
+        for task in tasks:
+            rows, clauses = task.truth.shape
+            code = predicate[first : first + clauses] + task.truth
+            for number in code.unique().tolist():
+                pairs = (code == number).nonzero().int()
+                groups.setdefault(number, []).append(pairs + torch.tensor([row, first], dtype=torch.int32))
+            row, first = row + rows, first + clauses
+        parts = [torch.cat(groups[number]) for number in sorted(groups)]
+        self.pairs, self.sizes = torch.cat(parts), torch.tensor([len(part) for part in parts])
+        self.starts = self.sizes.cumsum(0) - self.sizes
+        self.truths = torch.tensor([number % 2 == 1 for number in sorted(groups)])
+        self.digest = _digest((self.observation, self.pairs, self.sizes))
+
+    def sample(self, size: int) -> TensorDictBase:
+        """Draw ``observation`` (B, 39) float32, ``clauses`` (B, 1) and their ``truth`` (B, 1) float32."""
+        group = (torch.arange(size) + torch.randint(len(self.sizes), ())) % len(self.sizes)
+        place = (torch.rand(size, dtype=torch.float64) * self.sizes[group]).long()
+        row, clause = self.pairs[self.starts[group] + place].long().unbind(-1)
+        truth, clauses = self.truths[group][:, None].float(), self.clauses.pick(clause[:, None])
+        return TensorDict(observation=self.observation[row], truth=truth, clauses=_as_tensordict(clauses))
+
+
+class _PictureQueries:
+    """Pictures of states, equally many of each task, with all clauses of the task and the objects' positions."""
+
+    def __init__(self, evaluator: ImageQueryEvaluator, tasks: list[TaskQueries]) -> None:
+        for task in tasks:
+            evaluator.check_seen(task.view("pixels"))
+        self.tasks = tasks
+        self.clauses = [evaluator.code([(task.task, clause) for clause in task.clauses]) for task in tasks]
+        self.weights = [_answer_weights(task) for task in tasks]
+        self.positions = [_known_positions(task, evaluator.names) for task in tasks]
+        self.digest = _digest(part for task in tasks for part in (task.observation, task.truth, task.view("pixels")))
+
+    def sample(self, size: int) -> TensorDictBase:
+        """Draw ``size`` states in all, as a TensorDict for each task."""
+        each = max(1, size // len(self.tasks))
+        drawn = TensorDict()
+        for number, task in enumerate(self.tasks):
+            rows, clauses = torch.randint(len(task.observation), (each,)), self.clauses[number]
+            objects, positions, known = self.positions[number]
+            drawn[task.task.name] = TensorDict(
+                pixels=task.view("pixels")[rows],
+                truth=task.truth[rows].float(),
+                weights=self.weights[number].gather(0, task.truth[rows].long()),
+                clauses=_as_tensordict(clauses.pick(torch.arange(len(clauses.predicate)).expand(each, -1))),
+                objects=objects,
+                positions=positions[rows],
+                known=known,
+            )
+        return drawn
+
+
+def _as_tensordict(clauses: Clauses) -> TensorDict:
+    return TensorDict(dict(zip(Clauses._fields[:7], clauses[:7], strict=True)))
+
+
+def _known_positions(queries: TaskQueries, names: tuple[str, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a task's objects (n,) int64, their positions and how far each is open (R, n, 4), and a mask (n, 4) of the
+    numbers that are known."""
+    own = [name for name in queries.task.object_names if name in names]
+    positions, openings = queries.task.positions(queries.observation), queries.task.openings
+    values, known = torch.zeros(len(queries.observation), len(own), 4), torch.ones(len(own), 4)
+    for number, name in enumerate(own):
+        values[:, number, :3] = positions[name]
+        known[number, 3] = name in openings
+        if name in openings:
+            values[:, number, 3] = queries.observation[:, openings[name]]
+    return torch.tensor([names.index(name) for name in own], dtype=torch.int64), values, known
+
+
+def _answer_weights(queries: TaskQueries) -> Tensor:
+    """Return weights (2, Q) float32 of a clause's false and true answers, which balance each predicate and truth."""
+    true = queries.truth.double().mean(0)
+    predicates = [clause.predicate for clause in queries.clauses]
+    weights = torch.zeros(2, len(predicates))
+    for predicate in {*predicates}:
+        own = torch.tensor([other == predicate for other in predicates])
+        for value, share in ((0, (1 - true)[own].sum()), (1, true[own].sum())):
+            weights[value, own] = float(1.0 / share) if share > 0 else 0.0
+    return weights.clamp(max=_MOST_WEIGHT * weights.median().item())
+
+
+def _digest(tensors: Iterable[Tensor]) -> str:
+    digest = blake2b(digest_size=8)
+    for tensor in tensors:
+        digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
+class QueryEvaluatorTrainer(Training):
+    """Trains an evaluator on the exact answers to all base queries of tasks.
+
+    A minibatch has equally many pairs of a state and a clause of each predicate and truth.
+
+    Args:
+        evaluator: it is trained in place; its plans do not matter.
+        data: the queries and their answers, some of them held out.
+        config: hyperparameters, those that the data were made with.
+        device: where to train: "cpu", "cuda", "cuda:1", "mps", or "auto" for the GPU if there is one. The evaluator is
+            moved there; None leaves it where it is.
+        **options: of :class:`~lw_torchrl.training.loop.Training`, with its errors. :func:`load_evaluator` reads the
+            checkpoint.
+
+    Raises:
+        TypeError: the evaluator is not a :class:`StateQueryEvaluator`.
+
+    Example:
+        >>> import lw_torchrl as lw, tempfile
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     _ = lw.collect_demonstrations("reach", episodes_per_task=2, root=root + "/demos", max_steps=80)
+        ...     replay = lw.LanguageWorldExperienceReplay(root + "/demos", label="executed")
+        ...     config = lw.training.QueryEvaluatorConfig(steps=200, batch_size=64, held_out_pairs=0.0)
+        ...     data = lw.training.LabelledQueries(replay, config)
+        ...     evaluator = lw.StateQueryEvaluator(lw.load_plans("MT10"))
+        ...     lw.training.QueryEvaluatorTrainer(evaluator, data, config).train() < 0.65
+        True
+    """
+
+    part = "evaluator"
+    evaluator_class: ClassVar[type[ClauseEvaluator]] = StateQueryEvaluator
+    queries_class: ClassVar[Any] = _StateQueries
+
+    @passes_on(Training.__init__)
+    @checked
+    def __init__(
+        self,
+        evaluator: ClauseEvaluator,
+        data: LabelledQueries,
+        config: QueryEvaluatorConfig | None = None,
+        *,
+        device: str | torch.device | None = None,
+        **options: Unpack[TrainingOptions],
+    ) -> None:
+        if not isinstance(evaluator, self.evaluator_class):
+            expected, got = self.evaluator_class.__name__, type(evaluator).__name__
+            raise TypeError(f"evaluator must be of class {expected}, got {got}")
+        config = config or QueryEvaluatorConfig()
+        options.setdefault("title", "training the evaluator")
+        super().__init__(config, **options)
+        self.evaluator, self.module, self.networks = evaluator, evaluator, [evaluator]
+        self.device = place(evaluator, device)
+        if not data.parts["training"]:
+            raise ValueError("data must have states and queries to train on, all are held out")
+        queries = self.queries_class(evaluator, data.parts["training"])
+        self.minibatches = [Minibatches(queries, config.batch_size, config.seed)]
+        trained = [parameter for parameter in evaluator.parameters() if parameter.requires_grad]
+        self.optimizer = make_optimizer([(trained, config.learning_rate)], config, self.device)
+        if self.checkpoint is not None:
+            check_evaluator_can_be_saved(evaluator)
+            described = data.describe() | {"labels": queries.digest}
+            self.description = {"evaluator": evaluator.describe(), "training": asdict(config), "data": described}
+        self.resume()
+
+    def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:
+        logits = self.evaluator.network(batch["observation"], Clauses(**batch["clauses"]))
+        return {"loss": nn.functional.binary_cross_entropy_with_logits(logits, batch["truth"])}
+
+
+class ImageQueryEvaluatorTrainer(QueryEvaluatorTrainer):
+    """Trains an evaluator of pictures, as :class:`QueryEvaluatorTrainer` does one of states.
+
+    A minibatch has equally many states of each task, with all of its clauses; each predicate and truth weighs the same.
+
+    Raises:
+        TypeError: the evaluator is not an :class:`ImageQueryEvaluator`, or the config is of another class.
+        ValueError: the rows have no pictures.
+
+    Example:
+        >>> import lw_torchrl as lw, tempfile
+        >>> with tempfile.TemporaryDirectory() as root:
+        ...     _ = lw.collect_demonstrations("reach", episodes_per_task=2, root=root, max_steps=40, progress=False)
+        ...     lw.data.add_pictures(root, "corner", every=5)
+        ...     replay = lw.LanguageWorldExperienceReplay(root, label="executed")
+        ...     replay.add_column("pixels", lw.data.load_pictures(replay, "corner", every=5))
+        ...     config = ImageQueryEvaluatorConfig(steps=2, batch_size=4, held_out_pairs=0.0)
+        ...     data = lw.training.LabelledQueries(replay, config)
+        ...     evaluator = lw.modules.ImageQueryEvaluator(lw.load_plans("MT10"), cameras="corner")
+        ...     ImageQueryEvaluatorTrainer(evaluator, data, config).train() < 100.0
+        True
+    """
+
+    evaluator_class = ImageQueryEvaluator
+    queries_class = _PictureQueries
+
+    def __init__(self, evaluator: Any, data: LabelledQueries, config: Any = None, **options: Any) -> None:
+        if not isinstance(config, ImageQueryEvaluatorConfig):
+            raise TypeError(f"config must be an ImageQueryEvaluatorConfig, got {type(config).__name__}")
+        super().__init__(evaluator, data, config, **options)
+
+    def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:
+        losses = [self._loss(states) for states in batch.values()]
+        return {"loss": torch.stack(losses).mean()}
+
+    def _loss(self, states: TensorDictBase) -> Tensor:
+        network: Any = self.evaluator.network
+        places, _ = network.places(states["pixels"], network.names.weight)
+        logits = network.judge_at(places, Clauses(**states["clauses"]))
+        errors = nn.functional.binary_cross_entropy_with_logits(logits, states["truth"], reduction="none")
+        answers = (errors * states["weights"]).sum() / states["weights"].sum()
+        located, known = places.index_select(1, states["objects"]), states["known"]
+        errors = nn.functional.smooth_l1_loss(located / 0.05, states["positions"] / 0.05, reduction="none")
+        return answers + self.config.position_weight * (errors * known).sum() / (known.sum() * len(errors))
