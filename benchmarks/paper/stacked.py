@@ -8,6 +8,7 @@ from hashlib import sha256
 from typing import Any, Unpack
 
 import torch
+from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig, make_optimizer
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 from torchrl.data import TensorDictReplayBuffer
@@ -18,12 +19,9 @@ from lw_torchrl._devices import place
 from lw_torchrl.data.replay_checks import check_replay
 from lw_torchrl.modules.policy import Policy
 from lw_torchrl.training.checkpoint import check_can_be_saved, text_vectors
-from lw_torchrl.training.cloning import BehavioralCloningConfig
 from lw_torchrl.training.descriptions import describe_data, describe_replay
-from lw_torchrl.training.loop import Training, TrainingOptions
-from lw_torchrl.training.minibatches import Minibatches
+from lw_torchrl.training.loop import ReplayState, Training, TrainingOptions, make_schedule
 from lw_torchrl.training.normalization import check_contacts, fit_normalization
-from lw_torchrl.training.optimizer import make_optimizer
 
 
 class _Act(nn.Module):
@@ -83,7 +81,7 @@ class StackedBehavioralCloning(Training):
         if not actors or len(replays) != len(actors):
             raise ValueError(f"replays must be as many as actors, at least one, got {len(replays)} and {len(actors)}")
         options.setdefault("title", f"training {len(actors)} models")
-        super().__init__(config, **options)
+        super().__init__(config, replays, **options)
         self.actors = list(actors)
         self.networks = [*actors]
         _check_actors(actors)
@@ -94,7 +92,7 @@ class StackedBehavioralCloning(Training):
         self.device = place(actors[0], device)
         if self.checkpoint is not None:
             described = [json.dumps(actor.describe(), sort_keys=True).encode() for actor in actors]
-            self.description = {
+            self.described = {
                 "actor": check_can_be_saved(actors[0]).describe() | {"number": len(actors)},
                 "actors": {str(number): sha256(one).hexdigest()[:16] for number, one in enumerate(described)},
                 "training": config.describe(),
@@ -104,7 +102,7 @@ class StackedBehavioralCloning(Training):
         for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
             actor.to(self.device)
             check_replay(actor, replay, config.batch_size)
-            self.minibatches.append(Minibatches(replay, config.batch_size, config.seed + number))
+            self.states.append(ReplayState(replay, config.seed + number))
             if config.normalize:
                 fit_normalization(actor, replay)
             else:
@@ -117,7 +115,8 @@ class StackedBehavioralCloning(Training):
             raise ValueError(f"actors must be of one architecture ({error})") from error
         self._parameters = {name: nn.Parameter(value.detach()) for name, value in parameters.items()}
         self._act = vmap(lambda p, b, prepared: functional_call(modules[0], (p, b), prepared))
-        self.optimizer = make_optimizer([(self._parameters.values(), config.learning_rate)], config, self.device)
+        self.optimizer = make_optimizer(self._parameters.values(), config)
+        self.schedule = make_schedule(config.schedule, self.optimizer, config.steps)
         self.resume()
 
     def parameters(self) -> dict[str, Tensor]:
@@ -129,18 +128,15 @@ class StackedBehavioralCloning(Training):
     def step(self) -> Tensor:
         """Train every actor on one minibatch and return their losses, (M,) float32, on the device."""
         prepared, targets = [], []
-        for actor, minibatches in zip(self.actors, self.minibatches, strict=True):
-            with minibatches.drawing(self.device):
-                batch = minibatches.draw(self.device)
+        for actor, state in zip(self.actors, self.states, strict=True):
+            with state.drawing(self.device):
+                batch = state.minibatch(self.config.batch_size, self.device)
                 prepared.append(actor.prepare(batch))
             targets.append(batch.get("action"))
         inputs = tuple(torch.stack(column) for column in zip(*prepared, strict=True))
-        return self.train_on((inputs, torch.stack(targets)))
-
-    def losses(self, batch: Any) -> dict[str, Tensor]:
-        inputs, targets = batch
         actions = self._act(self._parameters, self._buffers, inputs)
-        return {"loss": distance_loss(actions, targets, self.config.loss_function).flatten(1).mean(1)}
+        losses = distance_loss(actions, torch.stack(targets), self.config.loss_function).flatten(1).mean(1)
+        return self.descend(losses)
 
     def clip_gradients(self) -> None:
         gradients = [p.grad for p in self._parameters.values() if p.grad is not None]
@@ -149,15 +145,15 @@ class StackedBehavioralCloning(Training):
         for gradient in gradients:
             gradient.mul_(factor.reshape(-1, *[1] * (gradient.ndim - 1)))
 
-    def train(self, until: int | None = None) -> Tensor:  # type: ignore[override]
+    def train(self, until: int | None = None) -> Tensor:
         """Train to the last step and give the actors their weights; Ctrl-C as in :class:`BehavioralCloningTrainer`.
 
         Returns:
-            (M,) float32, each actor's mean loss over the latest 100 steps; NaN if there were none left.
+            (M,) float32, each actor's mean loss over the last 100 steps made; NaN if there were none left to make.
         """
-        losses = self.run(until)
+        found = self.run(until)
         self.write_back()
-        return losses.mean(0) if len(losses) else torch.full((len(self.actors),), torch.nan)
+        return found.mean(0) if len(found) else torch.full((len(self.actors),), torch.nan)
 
     @torch.no_grad()
     def write_back(self) -> None:

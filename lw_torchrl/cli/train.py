@@ -17,7 +17,7 @@ from lw_torchrl.cli.output import Output
 
 _METHOD = (
     "what the policy is conditioned on: pcbc (plans), dc (task descriptions), one-hot (task numbers), or the name of "
-    "your own policy class"
+    "your own method"
 )
 _LOSS = (
     "bc (imitate the expert); on any data with rewards: advantage (learn a value, then imitate each row as much as its "
@@ -171,18 +171,27 @@ class Train:
         return {} if self.evaluate_every is None else {"evaluate": evaluate, "evaluate_every": self.evaluate_every}
 
     def _new_actor(self, plans: lw.Plans, tasks: tuple[str, ...]) -> Any:
+        import torch
         from tensordict.nn import TensorDictSequential
 
-        from lw_torchrl.modules.registry import find_method, make_policy
+        from lw_torchrl.modules import MLPDecoder, ObservationFeatures, make_policy, plans_of
 
-        network: dict[str, Any] = {"features": self.features, "width": self.width, "depth": self.depth}
-        network = {name: value for name, value in network.items() if value is not None}
         plans.require(tasks)
-        if not find_method(self.method).reads_plans:
-            plans = lw.Plans({task: plans[task] for task in tasks})
-        evaluator = None if self.evaluator is None else self._read_evaluator(plans, self.answers or "soft")
-        actor = make_policy(self.method, plans, text_encoder=options.read_encoder(self.text_encoder), **network)
-        return actor if evaluator is None else TensorDictSequential(evaluator, actor)
+        encoder, parts = options.read_encoder(self.text_encoder), dict[str, Any]()
+        if encoder is not None:
+            parts["text_encoder"] = encoder
+        if self.features is not None:
+            parts["features"] = ObservationFeatures(self.features, 0.05, plans.layout)
+        if (self.width, self.depth) != (None, None):
+            width, depth = self.width or 256, 3 if self.depth is None else self.depth
+            parts["decoder"] = MLPDecoder(width=width, depth=depth, actions=plans.layout.action_size)
+        actor = make_policy(self.method, plans, **parts)
+        if plans_of(actor) is None and len(plans) > len(tasks):  # only the tasks that are trained
+            torch.manual_seed(self.seed)
+            actor = make_policy(self.method, lw.Plans({task: plans[task] for task in tasks}), **parts)
+        if self.evaluator is None:
+            return actor
+        return TensorDictSequential(self._read_evaluator(plans, self.answers or "soft"), actor)
 
     def _begun_actor(self, plans: lw.Plans) -> Any:
         from tensordict.nn import TensorDictSequential
@@ -208,17 +217,16 @@ class Train:
 
 def _read_transform(actor: Any, replay: Any, data: Path) -> None:
     """Make the rows hold what the actor reads besides the observation: answers to conditions, or pictures."""
-    from lw_torchrl.modules.policy import plans_of, transform_of
+    from lw_torchrl.modules.policy import plans_of
     from lw_torchrl.modules.query_evaluator import evaluators_of
 
-    evaluators = evaluators_of(actor)
-    for evaluator in evaluators:
+    for evaluator in evaluators_of(actor):
         if isinstance(evaluator, lw.modules.ImageQueryEvaluator):
             pictures: dict[str, Any] = {name: getattr(evaluator, name) for name in ("cameras", "height", "width")}
             lw.data.add_pictures(data, **pictures)
             replay.add_column("pixels", lw.data.load_pictures(replay, **pictures))
-    if not evaluators and (transform := transform_of(actor, plans_of(actor))) is not None:
-        replay.append_transform(transform)
+    if "qaf" in actor.in_keys and (plans := plans_of(actor)) is not None:
+        replay.append_transform(lw.QAFTransform(plans))
 
 
 def make_logger(kind: str, out: Path) -> Any:

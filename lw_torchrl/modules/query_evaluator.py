@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, checked
@@ -34,10 +34,8 @@ class QueryEvaluator(TensorDictModuleBase):
     Args:
         plans: the plans whose conditions it answers.
         answers: "soft": ``qaf`` is the probability, the sigmoid of the logit. "hard": ``qaf`` is 1 where the logit is
-            positive and 0 elsewhere, with the gradient of "soft"; for a policy that was trained on exact answers.
-
-    Attributes:
-        config: the keyword arguments that rebuild it, as JSON.
+            positive and 0 elsewhere, with the gradient of "soft"; for a policy that was trained on exact answers. A
+            subclass with a constructor of its own must accept ``answers`` to be "hard".
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -59,19 +57,34 @@ class QueryEvaluator(TensorDictModuleBase):
     def __init__(self, plans: Plans, *, answers: Answers = "soft") -> None:
         super().__init__()
         self.plans, self.tasks, self.layout = plans, tuple(plans), plans.layout
-        self.config: dict[str, Any] = {"answers": answers}
+        self.config, self.answers = {}, answers
         self.in_keys: list[NestedKey] = ["observation", "task_id"]
         self.out_keys: list[NestedKey] = ["qaf", "qaf_logits"]
 
     @property
+    def _accepts_answers(self) -> bool:
+        parameters = signature(type(self)).parameters.values()
+        return any(each.name == "answers" or each.kind is each.VAR_KEYWORD for each in parameters)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it, as JSON."""
+        return {**self._config, "answers": self.answers} if self._accepts_answers else self._config
+
+    @config.setter
+    def config(self, config: dict[str, Any]) -> None:
+        self._config = config
+
+    @property
     def answers(self) -> Answers:
         """Whether ``qaf`` is "soft" or "hard"; it can be set."""
-        answers: Answers = self.config["answers"]
-        return answers
+        return self._answers
 
     @answers.setter
     def answers(self, answers: Answers) -> None:
-        self.config["answers"] = check_choice("answers", answers, ("soft", "hard"))
+        self._answers: Answers = check_choice("answers", answers, ("soft", "hard"))
+        if answers != "soft" and not self._accepts_answers:  # a file would lose it
+            raise TypeError(f"the constructor of {type(self).__name__} must accept answers=, got answers={answers!r}")
 
     def logits(self, *read: Any, **_: Any) -> Tensor:  # a subclass may have any signature
         """Return (B, S) float32 from the tensors of ``in_keys``."""
@@ -110,3 +123,9 @@ class QueryEvaluator(TensorDictModuleBase):
         if "text_encoder" in signature(type(self)).parameters:
             options["text_encoder"] = self.text_encoder
         return with_weights_of(self, type(self)(as_plans(plans), **options))
+
+
+def evaluators_of(policy: Any) -> list[QueryEvaluator]:
+    """Return the evaluators inside a policy, for example in a TensorDictSequential."""
+    modules = policy.modules() if isinstance(policy, nn.Module) else ()
+    return [module for module in modules if isinstance(module, QueryEvaluator)]

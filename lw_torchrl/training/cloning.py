@@ -18,12 +18,13 @@ from lw_torchrl._checks import Count, Positive, Scale, check_fields, checked, pa
 from lw_torchrl._devices import place
 from lw_torchrl.data.replay_checks import check_replay
 from lw_torchrl.language.task_index import PlanTables, TaskTables
+from lw_torchrl.modules.describe import describe
 from lw_torchrl.modules.query_evaluator import evaluators_of
 from lw_torchrl.training.checkpoint import check_can_be_saved
 from lw_torchrl.training.descriptions import describe_data, describe_replay
 from lw_torchrl.training.loop import Training, TrainingOptions
 from lw_torchrl.training.minibatches import Minibatches
-from lw_torchrl.training.normalization import check_contacts, fit_normalization, has_statistics
+from lw_torchrl.training.normalization import check_contacts, fit_normalization, statistics_of
 from lw_torchrl.training.optimizer import make_optimizer
 from lw_torchrl.transforms.qaf import plan_program
 
@@ -158,14 +159,15 @@ class BehavioralCloningTrainer(Training):
         check_replay(actor, replay, config.batch_size)
         self._anchor = EvaluatorAnchor(actor) if config.qaf_anchor else None
         if self.checkpoint is not None:
-            self.description = {"actor": check_can_be_saved(actor).describe(), "training": config.describe()}
+            check_can_be_saved(actor)
+            self.description = {"actor": describe(actor), "training": config.describe()}
             self.description |= {"data": describe_data(replay), "replay": describe_replay(replay)}
         self.loss = bc_loss(actor, config.loss_function)
         self.optimizer = make_optimizer([(self.loss.parameters(), config.learning_rate)], config, self.device)
         self.minibatches = [Minibatches(replay, config.batch_size, config.seed)]
         if self.resume():
             return
-        if config.normalize and has_statistics(actor):
+        if config.normalize and statistics_of(actor):
             fit_normalization(actor, replay)
         else:
             check_contacts(actor)

@@ -14,9 +14,10 @@ from torch import Tensor, nn
 from lw_torchrl._checks import checked, passes_on
 from lw_torchrl._devices import place
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
+from lw_torchrl.modules.describe import describe
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
-from lw_torchrl.training.checkpoint import check_evaluator_can_be_saved
+from lw_torchrl.training.checkpoint import check_can_be_saved
 from lw_torchrl.training.labelled_queries import (
     ImageQueryEvaluatorConfig,
     LabelledQueries,
@@ -188,9 +189,9 @@ class QueryEvaluatorTrainer(Training):
         trained = [parameter for parameter in evaluator.parameters() if parameter.requires_grad]
         self.optimizer = make_optimizer([(trained, config.learning_rate)], config, self.device)
         if self.checkpoint is not None:
-            check_evaluator_can_be_saved(evaluator)
+            check_can_be_saved(evaluator, "evaluator")
             described = data.describe() | {"labels": queries.digest}
-            self.description = {"evaluator": evaluator.describe(), "training": asdict(config), "data": described}
+            self.description = {"evaluator": describe(evaluator), "training": asdict(config), "data": described}
         self.resume()
 
     def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:

@@ -1,35 +1,32 @@
-"""Normalisation of what policies, critics and whole losses see, from the rows of a replay buffer."""
+"""Fit the statistics of features, in policies, critics and losses, to the rows of a replay buffer."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any
+import copy
+from collections.abc import Iterator
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import LossModule
 
 from lw_torchrl._checks import checked
-from lw_torchrl.language.layout import Layout
-from lw_torchrl.modules.features import Features, ObservationFeatures
-from lw_torchrl.modules.relative_features import RoleFeatures
+from lw_torchrl.modules.features import Features
 
 
 @checked
 def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None:
-    """Give a policy, a critic, or all that a loss holds, copies and targets too, the statistics of a buffer's rows.
+    """Call :meth:`Features.fit` of all features in a module, or in the networks of a loss, with a buffer's rows.
 
-    Each row counts as often as :class:`CoLearningSampler` draws it: a target's few rows would not count otherwise.
+    The statistics reach every copy of a network that the loss holds, and its target networks. Rows are weighted as the
+    sampler draws them: with a :class:`CoLearningSampler` half of the weight is on the target task's few rows.
 
     Args:
-        target: an actor, a critic, any module with :class:`Features` in it, or a loss of such.
-        replay: rows of ``observation`` (D,) float32.
+        target: an actor, a critic, any module with :class:`~lw_torchrl.modules.Features` in it, or a loss.
+        replay: its rows hold what the features read.
 
     Raises:
-        ValueError: there is nothing in it to normalise, or a row holds NaN or infinity, or no ``observation``; a loss
-            has an actor with ``roles`` that has taken no contacts yet, by this function.
+        ValueError: the module holds no features, or a row lacks a key or holds NaN or infinity.
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -47,72 +44,69 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
 
     Source: ``torchrl.envs.ObservationNorm``.
     """
-    weigh = getattr(replay.sampler, "row_weights", None)
-    weights = None if weigh is None else weigh(replay.storage)
-    rows = replay.storage.get(slice(0, len(replay)))
-    if rows.get("observation", None) is None:
-        raise ValueError(f"replay must hold 'observation', its rows hold {', '.join(map(str, rows.keys(True, True)))}")
-    if not isinstance(target, LossModule):
-        features = [part for part in target.modules() if isinstance(part, Features)]
-        if not features:
-            raise ValueError(f"{type(target).__name__} holds no Features: there is nothing to normalise")
-        for part in features:
-            part.fit(rows.cpu(), weights)
+    features = [(path, part) for path, part in _modules(target) if isinstance(part, Features)]
+    if not features:
+        raise ValueError(f"{type(target).__name__} holds no Features: there is nothing to normalise")
+    row_weights = getattr(replay.sampler, "row_weights", None)
+    weights = None if row_weights is None else row_weights(replay.storage)
+    keys = {key for _, part in features for key in part.in_keys}
+    rows = replay.storage.get(slice(0, len(replay))).select(*keys, strict=False).cpu()  # the same sums on every device
+    held = statistics_of(target) if isinstance(target, LossModule) else {}
+    for path, part in features:
+        fitted = copy.deepcopy(part).cpu() if held else part
+        fitted.fit(rows, weights)
+        for name, value in fitted.state_dict().items() if held else ():
+            for copied in _copies(f"{path}.{name}"):
+                if copied in held:
+                    held[copied].copy_(value)
+
+
+def statistics_of(module: nn.Module) -> dict[str, Tensor]:
+    """Return the buffers that :func:`fit_normalization` fits, by name; of a loss, those of all copies and targets."""
+    features = [(path, part) for path, part in _modules(module) if isinstance(part, Features)]
+    names = [f"{path}.{name}".lstrip(".") for path, part in features for name in part.state_dict()]
+    buffers = dict(module.named_buffers())
+    if isinstance(module, LossModule):
+        names = [copied for name in names for copied in _copies(name)]
+    return {name: buffers[name].data for name in names if name in buffers}
+
+
+def _modules(module: nn.Module) -> Iterator[tuple[str, nn.Module]]:
+    """Yield the modules in a module with their paths; in a loss, those in its networks, which are not its children."""
+    if not isinstance(module, LossModule):
+        yield from module.named_modules()
         return
-    check_contacts(target)
-    known: dict[tuple[str, Layout], ObservationFeatures] = {}
-    for features, of in _held(target, ObservationFeatures):
-        kind = features.kind, features.layout
-        if kind not in known:
-            known[kind] = ObservationFeatures(features.kind, layout=features.layout)
-            known[kind].fit(rows.cpu(), weights)
-        with torch.no_grad():
-            of("mean").copy_(known[kind].mean)
-            of("std").copy_(known[kind].std)
-    if not known:
-        raise ValueError(f"{type(target).__name__} holds no ObservationFeatures: there is nothing to normalise")
+    for name, network in vars(module).items():
+        if isinstance(network, nn.Module):
+            yield from network.named_modules(prefix=name)
 
 
-def check_contacts(actor: nn.Module) -> None:
-    """Raise :class:`ValueError` if an actor with ``roles`` would be trained without contacts."""
-    if any(not of("fitted") for _, of in _held(actor, RoleFeatures)):
+def _copies(name: str) -> list[str]:
+    """Return the names of a loss's copies of a network's buffer: ``actor_network.features.mean``, say."""
+    network, _, path = name.partition(".")
+    return [f"{network}_params.{path}", f"target_{network}_params.{path}"]
+
+
+def check_contacts(module: nn.Module) -> None:
+    """Raise :class:`ValueError` if role features would be trained before they know where objects are touched."""
+    if any(name.endswith("fitted") and not fitted.all() for name, fitted in statistics_of(module).items()):
         raise ValueError(
-            "roles want to know where the demonstrations touch things; call fit_normalization(actor, replay) of "
-            "lw_torchrl.training, as normalize=True does; with roles: do so before the loss is made of the actor"
+            "RoleFeatures need the points where demonstrations touch objects: use normalize=True, or call "
+            "lw.training.fit_normalization(actor, replay)"
         )
 
 
 def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
-    """As :func:`fit_normalization`; :class:`ValueError` if a network was trained with other statistics."""
-    held = [(of("mean"), of("std")) for _, of in _held(loss, ObservationFeatures)]
-    before = [(mean, mean.clone(), std, std.clone()) for mean, std in held]
+    """Call :func:`fit_normalization`; raise :class:`ValueError` if a network was trained with other statistics."""
+    held = statistics_of(loss)
+    before = {name: buffer.clone() for name, buffer in held.items()}
     fit_normalization(loss, replay)
-    for mean, old_mean, std, old_std in before:
-        untrained = not old_mean.any() and bool((old_std == 1).all())
-        if not untrained and not (torch.allclose(mean, old_mean) and torch.allclose(std, old_std)):
-            for row in before:
-                row[0].copy_(row[1])
-                row[2].copy_(row[3])
+    for name, old in before.items():
+        is_fresh = bool((old == 1).all()) if name.endswith(".std") else not old.any()
+        if not is_fresh and not torch.allclose(held[name].double(), old.double()):
+            for restored, value in before.items():
+                held[restored].copy_(value)
             raise ValueError(
                 "normalize: a network of the loss has the statistics of other rows, with which it was trained: give "
                 "normalize=False to keep them, and fresh networks theirs by fit_normalization(network, replay)"
             )
-
-
-def _held(target: nn.Module, kind: type[nn.Module]) -> Iterator[tuple[Any, Callable[[str], Tensor]]]:
-    """Each module of a kind, and what gives a buffer of it by name; of a loss, those of every copy."""
-    if not isinstance(target, LossModule):
-        for module in target.modules():
-            if isinstance(module, kind):
-                yield module, module.get_buffer
-        return
-    held = dict(target.named_children())  # asked for by name, targets warn where nothing moves them yet
-    for name, network in vars(target).items():  # a loss keeps its networks there, without their parameters
-        if not isinstance(network, nn.Module):
-            continue
-        for path, module in network.named_modules():
-            if isinstance(module, kind):
-                for copy in (f"{name}_params", f"target_{name}_params"):
-                    params: Any = held.get(copy)
-                    if isinstance(params, TensorDictBase):
-                        yield module, params.get(tuple(path.split("."))).data.get

@@ -16,12 +16,13 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from lw_torchrl._checks import Count, Positive, Probability, Scale, check_fields, checked, passes_on
 from lw_torchrl.data.replay_checks import check_minibatches
+from lw_torchrl.modules.describe import describe
 from lw_torchrl.objectives.reduction import with_n_steps
 from lw_torchrl.training.checkpoint import check_can_be_saved
 from lw_torchrl.training.descriptions import describe_data, describe_replay, plain_options
 from lw_torchrl.training.loop import Training, TrainingOptions
 from lw_torchrl.training.minibatches import Minibatches
-from lw_torchrl.training.normalization import fit_untrained
+from lw_torchrl.training.normalization import fit_untrained, statistics_of
 from lw_torchrl.training.optimizer import make_optimizer
 
 _REPLACED = {"loss_actor_bc"}  # CQL's first steps of the actor minimise it instead of another entry
@@ -125,7 +126,8 @@ class OfflineTrainer(Training):
             self.description = {"loss": describe_loss(loss), "training": asdict(config)}
             self.description |= {"data": describe_data(replay), "replay": describe_replay(replay)}
             if actor is not None:
-                self.description["actor"] = check_can_be_saved(actor).describe()
+                check_can_be_saved(actor)
+                self.description["actor"] = describe(actor)
         if config.normalize:
             fit_untrained(loss, replay)
         self.resume()
@@ -177,11 +179,10 @@ def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
 
 def describe_loss(loss: LossModule) -> dict[str, Any]:
     """Describe a loss as JSON, without its trained weights: class, options, networks, and a digest of its constants."""
-    digest = sha256()
+    digest, fitted = sha256(), statistics_of(loss)
     for name, tensor in sorted(loss.named_buffers()):
-        fixed = not name.startswith("target_") and not name.endswith(("features.mean", "features.std"))
         digest.update(f"{name} {tuple(tensor.shape)}".encode())
-        if fixed:
+        if not name.startswith("target_") and name not in fitted:
             digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     return {
         "class": type(loss).__name__,

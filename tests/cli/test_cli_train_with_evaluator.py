@@ -25,15 +25,11 @@ def trained(demos, tmp_path_factory):
     path = tmp_path_factory.mktemp("trained")
     plans = lw.load_plans("MT10")
     replay = lw.LanguageWorldExperienceReplay(demos, transform=lw.QAFTransform(plans), sampler=lw.TaskBalancedSampler())
-    actor = lw.PlanConditionedActor(plans, width=8, depth=1)
+    actor = lw.PlanConditionedActor(plans, decoder=lw.modules.MLPDecoder(width=8, depth=1))
     config = lw.BehavioralCloningConfig(steps=5, batch_size=8)
     lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=path / "policy.safetensors", progress=False).train()
     lw.training.save_evaluator(lw.StateQueryEvaluator(plans, width=8), path / "evaluator.safetensors")
     return path
-
-
-def weights(path, part="head"):
-    return {name: value for name, value in lw.load_actor(path).state_dict().items() if name.startswith(part)}
 
 
 def test_a_new_one_is_trained_with_the_policy(capsys, demos, tmp_path):
@@ -41,8 +37,8 @@ def test_a_new_one_is_trained_with_the_policy(capsys, demos, tmp_path):
     args = "train", demos, "--out", out, "--evaluator", "StateQueryEvaluator", "--qaf-anchor", 1, *SMALL, *NET
     assert document(capsys, *args)["steps"] == 4
     actor = lw.load_actor(out)
-    assert isinstance(actor.evaluator, lw.StateQueryEvaluator)
-    assert actor.config["answers"] == "tanh"
+    assert isinstance(actor[0], lw.StateQueryEvaluator)
+    assert actor[0].answers == "soft"
     assert "qaf" not in actor.in_keys
 
 
@@ -58,16 +54,14 @@ def test_a_trained_policy_is_tuned_with_one(capsys, demos, trained, tmp_path):
     ]
     run(capsys, "train", demos, "--out", out, *args, *SMALL)
     actor = lw.load_actor(out)
-    assert actor.config["answers"] == "hard"
-    before, after = weights(trained / "policy.safetensors"), weights(out)
+    assert actor[0].answers == "hard"
+    before, after = lw.load_actor(trained / "policy.safetensors").state_dict(), actor[1].state_dict()
     assert before.keys() == after.keys()
     for name, value in before.items():
         assert torch.equal(after[name], value), name
-    features = lw.load_actor(trained / "policy.safetensors").encoder.features.state_dict()
-    assert all(torch.equal(actor.encoder.features.state_dict()[name], value) for name, value in features.items())
     again = tmp_path / "again.safetensors"
     run(capsys, "train", demos, "--out", again, "--begin", out, "--qaf-anchor", 0.1, *SMALL)
-    moved, kept = lw.load_actor(again).evaluator.state_dict(), actor.evaluator.state_dict()
+    moved, kept = lw.load_actor(again)[0].state_dict(), actor[0].state_dict()
     assert any(not torch.equal(moved[name], kept[name]) for name in kept)
 
 
@@ -76,9 +70,9 @@ def test_an_evaluator_that_does_not_fit_is_named(capsys, demos, trained, tmp_pat
     file = ["--evaluator", trained / "evaluator.safetensors"]
     assert "no file" in fails(capsys, "train", demos, *out, "--evaluator", tmp_path / "none.safetensors")
     assert "no file" in fails(capsys, "train", demos, *out, "--begin", tmp_path / "none.safetensors")
-    lw.save_actor(lw.DescriptorConditionedActor(["reach"], width=8), tmp_path / "dc.safetensors")
+    lw.save_actor(lw.DescriptorConditionedActor(["reach"]), tmp_path / "dc.safetensors")
     error = fails(capsys, "train", demos, *out, "--begin", tmp_path / "dc.safetensors", *file)
-    assert "--evaluator requires a PlanConditionedActor, --begin is a DescriptorConditionedActor" in error
+    assert "--evaluator requires a policy that reads qaf, --begin is a DescriptorConditionedActor" in error
     assert not (tmp_path / "x.safetensors").exists()
 
 

@@ -6,12 +6,13 @@ import pytest
 import torch
 from evaluator_rows import assert_a_logit_for_each_step
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
-from lw_torchrl.evaluation.counterfactuals import with_true_answers
 from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.language.relations import RELATIONS, Comparison
+from lw_torchrl.modules import transform_of, with_plans
 from lw_torchrl.modules.clause_evaluator import conjunction
 
 PLANS = lw.load_plans("MT10")
@@ -26,9 +27,8 @@ def make(plans=PLANS, seed=0, **options):
     return lw.StateQueryEvaluator(plans, width=8, depth=1, **options)
 
 
-def make_actor(**options):
-    evaluator = make()
-    return lw.PlanConditionedActor(PLANS, evaluator=evaluator, width=8, text_encoder=letters, **options).eval()
+def make_policy(**options):
+    return TensorDictSequential(make(**options), lw.PlanConditionedActor(PLANS, text_encoder=letters)).eval()
 
 
 def states(rows=20, plans=PLANS):
@@ -81,103 +81,63 @@ def test_a_conjunction_has_a_gradient_everywhere():
     assert (logits.grad[2] == 0).all()
 
 
-@pytest.mark.parametrize("answers", ["logit", "tanh", "hard"])
+@pytest.mark.parametrize("answers", ["soft", "hard"])
 @pytest.mark.filterwarnings("ignore:.*target_actor_network_params")
 def test_the_loss_of_imitation_reaches_the_evaluator(answers):
-    actor = make_actor(answers=answers).train()
-    loss = BCLoss(actor, loss_function="l2")
+    policy = make_policy(answers=answers).train()
+    loss = BCLoss(policy, loss_function="l2")
     loss(states())["loss_bc"].backward()
-    found = dict(actor.evaluator.named_parameters())
+    found = dict(policy[0].named_parameters())
     assert len(found) >= 3
     for name, parameter in found.items():
         assert parameter.grad is not None, name
         assert parameter.grad.abs().sum() > 0, name
 
 
-def test_hard_answers_act_as_exact_truth_does():
-    class Truth(lw.QueryEvaluator):
-        def __init__(self, plans):
-            super().__init__(plans)
-            self.qaf = lw.QAFTransform(plans)
-
-        def logits(self, observation, task_id):
-            told = self.qaf(TensorDict(observation=observation, task_id=task_id, batch_size=task_id.shape))
-            return torch.where(told["qaf"], 0.3, -12.0)
-
-    actor = lw.PlanConditionedActor(PLANS, width=8).eval()
-    found = states()
-    with_qaf = actor(lw.QAFTransform(PLANS)(found.clone()))
-    hard = actor.with_evaluator(Truth(PLANS))(found.clone())
-    assert torch.equal(hard["skill_weights"], with_qaf["skill_weights"])
-    assert torch.equal(hard["action"], with_qaf["action"])
-    soft = actor.with_evaluator(Truth(PLANS), answers="tanh")(found.clone())
-    assert not torch.equal(soft["skill_weights"], with_qaf["skill_weights"])
-
-
-def test_tanh_is_the_papers_ten_times_the_probability_less_five():
-    from lw_torchrl.modules.plan_attention import attention_logits
-
-    logits = torch.linspace(-8, 8, 33)
-    assert torch.allclose(attention_logits(logits, "tanh"), 10 * logits.sigmoid() - 5, atol=1e-5)
-    assert torch.equal(attention_logits(logits, "logit"), logits)
-
-
-def test_with_evaluator_shares_the_weights():
-    actor = lw.PlanConditionedActor(PLANS, width=8)
-    other = actor.with_evaluator(make())
-    own = {id(one) for one in other.evaluator.parameters()}
-    assert {id(one) for one in actor.parameters()} == {id(one) for one in other.parameters()} - own
-    assert other.config["answers"] == "hard"
-    with pytest.raises(TypeError, match="DescriptorConditionedActor has none"):
-        lw.DescriptorConditionedActor("MT10").with_evaluator(make())
+def test_soft_answers_are_the_papers_ten_times_the_probability_less_five():
+    policy, rows = make_policy(), states()
+    found = policy(rows)
+    steps = [len(PLANS[lw.MT50[task]].steps) for task in rows["task_id"].tolist()]
+    mask = torch.arange(PLANS.num_steps) < torch.tensor(steps)[:, None]
+    logits = torch.where(mask, 10 * found["qaf_logits"].sigmoid() - 5, -torch.inf)
+    assert torch.allclose(found["skill_weights"], logits.softmax(-1), atol=1e-6)
 
 
 def test_with_plans_shares_the_network_alone():
-    actor, other = make_actor(), lw.Plans([PLANS["push"]])
-    found = actor.with_plans(other)
-    assert {id(one) for one in actor.evaluator.parameters()} == {id(one) for one in found.evaluator.parameters()}
+    policy, other = make_policy(), lw.Plans([PLANS["push"]])
+    found = with_plans(policy, other)
+    assert {id(one) for one in policy[0].parameters()} == {id(one) for one in found[0].parameters()}
     rows = states(4, other)
-    assert torch.allclose(found(rows.clone())["action"], actor(rows.clone())["action"], atol=1e-6)
+    assert torch.allclose(found(rows.clone())["action"], policy(rows.clone())["action"], atol=1e-6)
 
 
 def test_saved_and_loaded_with_the_policy_to_the_bit(tmp_path):
-    actor = make_actor(answers="tanh")
-    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    policy = make_policy(answers="hard")
+    lw.save_actor(policy, tmp_path / "policy.safetensors")
     loaded = lw.load_actor(tmp_path / "policy.safetensors", text_encoder=letters)
-    assert loaded.config["answers"] == "tanh"
-    for key in actor.out_keys:
-        assert torch.equal(loaded(states())[key], actor(states())[key]), key
+    assert loaded[0].answers == "hard"
+    for key in policy.out_keys:
+        assert torch.equal(loaded(states())[key], policy(states())[key]), key
 
 
 def test_scripted_skills_act_on_its_answers(tmp_path):
-    plans = lw.load_plans("MT10")
-    evaluator = make(plans)
-    actor = lw.ScriptedSkillActor(plans, evaluator=evaluator)
-    assert actor.in_keys == ["observation", "task_id"]
-    assert actor.transform() is None
-    found = actor(states())
-    told = evaluator(states())["qaf_logits"] > 0
-    by_truth = lw.ScriptedSkillActor(plans)(states().set("qaf", told))
+    evaluator = make()
+    policy = TensorDictSequential(evaluator, lw.ScriptedSkillActor(PLANS))
+    assert policy.in_keys == ["observation", "task_id"]
+    assert transform_of(policy) is None
+    found = policy(states())
+    answers = evaluator(states())["qaf_logits"] > 0
+    by_truth = lw.ScriptedSkillActor(PLANS)(states().set("qaf", answers))
     for key in ("action", "skill_weights"):
         assert torch.equal(found[key], by_truth[key])
     assert found["skill_weights"][:, 1:].any()
-    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    lw.save_actor(policy, tmp_path / "policy.safetensors")
     assert torch.equal(lw.load_actor(tmp_path / "policy.safetensors")(states())["action"], found["action"])
-    other = actor.with_plans(lw.Plans([PLANS["push"]]))
-    assert other.evaluator.network.predicates.weight is evaluator.network.predicates.weight
-    assert lw.ScriptedSkillActor(plans).with_evaluator(evaluator)(states())["action"].equal(found["action"])
+    other = with_plans(policy, lw.Plans([PLANS["push"]]))
+    assert other[0].network.predicates.weight is evaluator.network.predicates.weight
 
 
-def test_true_answers_in_its_place_are_worth_what_exact_truth_is():
-    actor = make_actor(answers="tanh")
-    plain = lw.PlanConditionedActor(PLANS, width=8, text_encoder=letters).eval()
-    plain.encoder.texts, plain.encoder.features, plain.head = actor.encoder.texts, actor.encoder.features, actor.head
-    found = with_true_answers(actor)(states())
-    assert torch.equal(found["skill_weights"], plain(lw.QAFTransform(PLANS)(states()))["skill_weights"])
-    assert actor.encoder.config["answers"] == "tanh"
-
-
-def test_as_an_evaluator_of_an_evaluation_its_sign_counts():
+def test_scripted_skills_are_evaluated_on_its_answers():
     class Never(lw.QueryEvaluator):
         def logits(self, observation, task_id):
             return torch.full((*task_id.shape, self.plans.num_steps), -1.0)
@@ -194,7 +154,7 @@ def test_as_an_evaluator_of_an_evaluation_its_sign_counts():
         also_record=["qaf"],
         on_episode=seen.append,
     )
-    assert not seen[0].steps["qaf"].any()
+    assert not (seen[0].steps["qaf"] > 0.5).any()
 
 
 # ---- refusals
@@ -205,6 +165,9 @@ def test_a_relation_that_it_was_not_made_for_is_refused(monkeypatch):
     monkeypatch.setitem(RELATIONS, "beside", (Comparison("xyz", "<", 0.05),))
     step = PlanStep(lw.parse_query("the gripper is beside the puck", "push"), "grasp the puck")
     plans = lw.Plans([lw.ConditionalPlan("push", (step,))])
-    with pytest.raises(ValueError, match=r"predicate of .*beside the puck\", in push.*make and train one that has it"):
+    with pytest.raises(
+        ValueError,
+        match=r"predicate of .*beside the puck\", in push.*make and train an evaluator",
+    ):
         made.with_plans(plans)
     assert "beside" in make(plans).predicates

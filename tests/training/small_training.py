@@ -6,11 +6,16 @@ import torch
 
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
 from lw_torchrl.language.plan_files import load_plans
-from lw_torchrl.modules import PlanConditionedActor
+from lw_torchrl.modules import (
+    DescriptorConditionedActor,
+    MLPDecoder,
+    ObservationFeatures,
+    PlanConditionedActor,
+    SkillEncoder,
+)
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.transforms import QAFTransform
 
-SMALL = dict(latent_size=4, width=16, depth=1, encoder_width=8)
 CONFIG = BehavioralCloningConfig(steps=12, batch_size=8, checkpoint_every=5, learning_rate=1e-2)
 PLANS = load_plans("MT10")
 
@@ -26,9 +31,23 @@ def make_replay(root, sampler=None):
     return LanguageWorldExperienceReplay(root, sampler=sampler or TaskBalancedSampler(), transform=QAFTransform(PLANS))
 
 
-def make_actor(seed=0, **options):
+def make_parts(kind="differences", noise=0.05, *, latent_size=4, width=16, depth=1):
+    return {
+        "features": ObservationFeatures(kind, noise),
+        "skill_encoder": SkillEncoder(latent_size, width=8),
+        "decoder": MLPDecoder(width=width, depth=depth),
+    }
+
+
+def make_actor(seed=0, plans=PLANS, **options):
     torch.manual_seed(seed)
-    return PlanConditionedActor(PLANS, **{**SMALL, **options})
+    return PlanConditionedActor(plans, **make_parts(**options))
+
+
+def make_descriptor_actor(tasks="MT10"):
+    torch.manual_seed(0)
+    parts = make_parts()
+    return DescriptorConditionedActor(tasks, task_encoder=parts.pop("skill_encoder"), **parts)
 
 
 class Stopping(BehavioralCloningTrainer):

@@ -6,15 +6,15 @@ import math
 
 import pytest
 import torch
-from small_training import CONFIG, SMALL, assert_same, everything, make_actor, make_replay, make_trainer
+from small_training import CONFIG, assert_same, everything, make_actor, make_descriptor_actor, make_replay, make_trainer
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.record.loggers import Logger
 
+import lw_torchrl as lw
 from lw_torchrl.data import TaskBalancedSampler
-from lw_torchrl.modules import DescriptorConditionedActor
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 
 
@@ -34,7 +34,7 @@ def test_the_loss_falls(demos):
 @pytest.mark.parametrize("loss_function", ["l1", "l2", "smooth_l1"])
 def test_the_first_loss_is_the_named_distance_to_the_experts_action(demos, loss_function):
     config = BehavioralCloningConfig(steps=1, batch_size=8, loss_function=loss_function)
-    trainer = make_trainer(demos, config=config, actor=make_actor(feature_noise=0.0))
+    trainer = make_trainer(demos, config=config, actor=make_actor(noise=0.0))
     with torch.random.fork_rng():
         torch.manual_seed(0)
         batch = make_replay(demos).sample(8)
@@ -86,14 +86,13 @@ def test_it_trains_the_networks_and_nothing_else(demos):
 def test_the_normalisation_is_fitted_to_the_demonstrations(demos):
     trainer = make_trainer(demos)
     expected = make_actor()
-    expected.fit_normalization(make_replay(demos)[:]["observation"])
-    assert torch.equal(trainer.actor.encoder.features.mean, expected.encoder.features.mean)
-    assert torch.equal(trainer.actor.encoder.features.std, expected.encoder.features.std)
+    expected.features.fit(make_replay(demos)[:])
+    assert torch.equal(trainer.actor.features.mean, expected.features.mean)
+    assert torch.equal(trainer.actor.features.std, expected.features.std)
 
 
 def test_the_baseline_trains_too(demos):
-    torch.manual_seed(0)
-    actor = DescriptorConditionedActor("MT10", **SMALL)
+    actor = make_descriptor_actor()
     config = BehavioralCloningConfig(steps=200, batch_size=32, learning_rate=3e-3)
     trainer = BehavioralCloningTrainer(actor, make_replay(demos), config, progress=False)
     before = trainer.step()
@@ -105,9 +104,17 @@ def test_any_module_that_writes_an_action_can_be_trained(demos, tmp_path):
         torch.manual_seed(0)
         return TensorDictModule(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
 
-    assert make_trainer(demos, None, actor=make()).train() < 1.0
-    with pytest.raises(TypeError, match="actor must be a Policy to be kept in a file"):
-        make_trainer(demos, tmp_path / "c.safetensors", actor=make())
+    class Mine(nn.Linear):
+        """A network without a config."""
+
+    path = tmp_path / "policy.safetensors"
+    trainer = make_trainer(demos, path, actor=make())
+    assert trainer.train() < 1.0
+    rows = trainer.replay[:].select("observation")
+    assert torch.equal(lw.load_actor(path)(rows.clone())["action"], trainer.actor(rows)["action"])
+    actor = TensorDictModule(Mine(39, 4), in_keys=["observation"], out_keys=["action"])
+    with pytest.raises(TypeError, match=r"is a .*Mine, which cannot be saved: give it an attribute config"):
+        make_trainer(demos, tmp_path / "other.safetensors", actor=actor)
 
 
 def test_the_seed_fixes_the_training(demos, undisturbed):
@@ -119,27 +126,30 @@ def test_the_seed_fixes_the_training(demos, undisturbed):
     assert not torch.equal(everything(other)["next batch",], undisturbed["next batch",])
 
 
+class Kept(Logger):
+    """Keeps what is logged."""
+
+    def __init__(self):
+        self.scalars = []
+        super().__init__("kept", "")
+
+    def _create_experiment(self):
+        return None
+
+    def log_scalar(self, name, value, step=None):
+        self.scalars.append((name, step, value))
+
+    def log_video(self, *args, **kwargs): ...
+
+    def log_hparams(self, *args, **kwargs): ...
+
+    def log_histogram(self, *args, **kwargs): ...
+
+    def __repr__(self):
+        return "Kept()"
+
+
 def test_a_logger_gets_loss_and_learning_rate(demos):
-    class Kept(Logger):
-        def __init__(self):
-            self.scalars = []
-            super().__init__("kept", "")
-
-        def _create_experiment(self):
-            return None
-
-        def log_scalar(self, name, value, step=None):
-            self.scalars.append((name, step, value))
-
-        def log_video(self, *args, **kwargs): ...
-
-        def log_hparams(self, *args, **kwargs): ...
-
-        def log_histogram(self, *args, **kwargs): ...
-
-        def __repr__(self):
-            return "Kept()"
-
     logger = Kept()
     config = BehavioralCloningConfig(steps=130, batch_size=8)
     final = make_trainer(demos, config=config, logger=logger).train()
@@ -150,6 +160,24 @@ def test_a_logger_gets_loss_and_learning_rate(demos):
         ("train/learning_rate", 130),
     ]
     assert logger.scalars[2][2] == pytest.approx(final)
+
+
+def test_evaluations_are_logged_and_change_nothing(demos, undisturbed):
+    logger, modes = Kept(), []
+
+    def evaluate():
+        modes.append(trainer.actor.training)
+        torch.rand(3)  # draws of an evaluation are not those of the training
+        return {"success": 0.25 * len(modes)}
+
+    trainer = make_trainer(demos, logger=logger, evaluate=evaluate, evaluate_every=5)
+    trainer.train()
+    found = [row for row in logger.scalars if row[0] == "evaluation/success"]
+    assert found == [("evaluation/success", 5, 0.25), ("evaluation/success", 10, 0.5), ("evaluation/success", 12, 0.75)]
+    assert modes == [False, False, False]
+    assert_same(everything(trainer), undisturbed)
+    with pytest.raises(ValueError, match="evaluate and evaluate_every must be given together"):
+        make_trainer(demos, evaluate_every=5)
 
 
 def test_nan_in_the_demonstrations_is_reported(demos):

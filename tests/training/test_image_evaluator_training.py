@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 from pictures import why_no_pictures
-from small_training import flat
+from small_training import flat, make_actor
+from tensordict.nn import TensorDictSequential
 
 import lw_torchrl as lw
 
@@ -69,7 +70,7 @@ def test_training_that_was_stopped_goes_on_bit_for_bit(replay, tmp_path):
 def test_a_policy_that_sees_is_tuned_and_goes_on_bit_for_bit(replay, tmp_path):
     def train(path, stop=None):
         torch.manual_seed(1)
-        actor = lw.PlanConditionedActor(PLANS, evaluator=make(), answers="hard", width=8, depth=1)
+        actor = TensorDictSequential(make(answers="hard"), make_actor(plans=PLANS))
         config = lw.BehavioralCloningConfig(steps=6, batch_size=8, qaf_anchor=0.1, checkpoint_every=2)
         buffer = lw.LanguageWorldExperienceReplay(replay.root, sampler=lw.TaskBalancedSampler())
         buffer.add_column("pixels", lw.data.load_pictures(buffer, **PICTURES, every=5))
@@ -81,7 +82,7 @@ def test_a_policy_that_sees_is_tuned_and_goes_on_bit_for_bit(replay, tmp_path):
 
     whole = train(tmp_path / "whole.safetensors")
     begun = train(tmp_path / "begun.safetensors", stop=4)
-    eye = next(name for name in whole if "encoder.evaluator.network.key" in name)
+    eye = next(name for name in whole if "network.key" in name)
     assert not torch.equal(begun[eye], whole[eye])
     resumed = train(tmp_path / "begun.safetensors")
     for name, value in whole.items():

@@ -10,11 +10,11 @@ from itertools import pairwise
 
 import pytest
 import torch
+from small_training import make_descriptor_actor
 from torchrl.envs import Transform
 
 import lw_torchrl as lw
 
-SMALL = {"width": 16, "depth": 1}
 CONFIG = lw.BehavioralCloningConfig(steps=40, batch_size=20, checkpoint_every=30)
 
 
@@ -42,8 +42,7 @@ class PressCtrlC(Transform):
 def make(demos, checkpoint, *, times=0):
     replay = lw.LanguageWorldExperienceReplay(demos, sampler=lw.TaskBalancedSampler())
     replay.append_transform(PressCtrlC(times))
-    torch.manual_seed(0)
-    actor = lw.DescriptorConditionedActor(["push", "reach"], **SMALL)
+    actor = make_descriptor_actor(["push", "reach"])
     return lw.BehavioralCloningTrainer(actor, replay, CONFIG, checkpoint=checkpoint, progress=False)
 
 

@@ -12,12 +12,12 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import CQLLoss, DDPGLoss, IQLLoss, REDQLoss, SACLoss, TD3Loss
 
 import lw_torchrl as lw
-from lw_torchrl.modules import ObservationFeatures
+from lw_torchrl.modules import MLPDecoder, ObservationFeatures, RoleFeatures
 from lw_torchrl.training import fit_normalization
+from lw_torchrl.training.normalization import check_contacts
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 PLANS = lw.load_plans("MT10")
-SMALL = dict(width=8, depth=1)
 
 
 @pytest.fixture(scope="module")
@@ -34,14 +34,15 @@ def expected(replay):
     found = {}
     for kind in ("differences", "raw"):
         found[kind] = ObservationFeatures(kind)
-        found[kind].fit(replay[:]["observation"])
+        found[kind].fit(replay[:])
     return found
 
 
-def make(kind="differences", distribution=None, **options):
-    options |= SMALL | {"features": kind}
-    actor = lw.PlanConditionedActor(PLANS, distribution=distribution, **options)
-    return actor, lw.PlanConditionedQValue(PLANS, **options), lw.PlanConditionedValue(PLANS, **options)
+def make(kind="differences", distribution=None):
+    actor = lw.PlanConditionedActor(PLANS, features=ObservationFeatures(kind), decoder=MLPDecoder(width=8, depth=1))
+    actor = actor if distribution is None else actor.stochastic(distribution)
+    critics = (lw.PlanConditionedQValue, lw.PlanConditionedValue)
+    return actor, *(critic(PLANS, features=ObservationFeatures(kind), width=8, depth=1) for critic in critics)
 
 
 def losses(kind="differences"):
@@ -95,7 +96,29 @@ def test_of_modules(replay, expected):
                 assert torch.equal(module.mean, expected["differences"].mean)
     other = TensorDictReplayBuffer(storage=LazyTensorStorage(4), batch_size=2)
     other.extend(TensorDict(seen=torch.rand(4, 39), batch_size=[4]))
-    with pytest.raises(ValueError, match="replay must hold 'observation', its rows hold seen"):
-        fit_normalization(nn.Linear(1, 1), other)
-    with pytest.raises(ValueError, match="Linear holds no ObservationFeatures: there is nothing to normalise"):
+    with pytest.raises(ValueError, match="observation"):
+        fit_normalization(actor, other)
+    with pytest.raises(ValueError, match="Linear holds no Features: there is nothing to normalise"):
         fit_normalization(nn.Linear(2, 2), replay)
+
+
+def test_role_features_in_a_loss_get_their_contacts():
+    plans = lw.canonical_plans(PLANS)
+    generator = torch.Generator().manual_seed(0)
+    rows = TensorDict(
+        observation=0.1 * torch.rand(200, 39, generator=generator), task_id=torch.full((200,), lw.task_id("push"))
+    ).auto_batch_size_(1)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(200), batch_size=8)
+    buffer.extend(rows)
+    expected = RoleFeatures(plans)
+    expected.fit(rows)
+    actor = lw.PlanConditionedActor(plans, features=RoleFeatures(plans))
+    loss = TD3Loss(actor, lw.PlanConditionedQValue(plans, features=RoleFeatures(plans)), bounds=(-1.0, 1.0))
+    with pytest.raises(ValueError, match="RoleFeatures need the points where demonstrations touch objects"):
+        check_contacts(loss)
+    fit_normalization(loss, buffer)
+    check_contacts(loss)
+    assert torch.equal(actor.features.contact, expected.contact)
+    assert expected.demonstrated.any()
+    contact = loss.qvalue_network_params["trunk", "module", "features", "contact"]
+    assert torch.equal(contact, expected.contact.expand_as(contact))

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_training import PLANS, SMALL, assert_same, collect_demos, flat
+from small_training import PLANS, assert_same, collect_demos, flat, make_parts
 from torch.nn.utils import clip_grad_norm_
 from torchrl.data import PrioritizedSampler, RandomSampler
 from torchrl.envs import Transform
@@ -49,11 +49,13 @@ class Networks:
     def __init__(self, noise, device):
         self.noise, self.device = noise, device
 
-    def actor(self, **options):
-        return lw.PlanConditionedActor(PLANS, **{**SMALL, "feature_noise": self.noise, **options}).to(self.device)
+    def actor(self, distribution=None):
+        actor = lw.PlanConditionedActor(PLANS, **make_parts(noise=self.noise))
+        return (actor if distribution is None else actor.stochastic(distribution)).to(self.device)
 
     def value(self, ensemble=1):
-        return lw.PlanConditionedValue(PLANS, ensemble=ensemble, feature_noise=self.noise, **CRITIC).to(self.device)
+        features = lw.modules.ObservationFeatures(noise=self.noise)
+        return lw.PlanConditionedValue(PLANS, ensemble=ensemble, features=features, **CRITIC).to(self.device)
 
     def qvalue(self):
         return lw.PlanConditionedQValue(PLANS, **CRITIC).to(self.device)
@@ -273,6 +275,28 @@ def test_what_the_loss_gives_is_logged_as_means_of_a_hundred_steps(demos):
     assert trainer.last["value"] == note.noted["train/value"][-1][1]
 
 
+def test_with_its_actor_the_checkpoint_is_the_policys_file(demos, tmp_path):
+    path = tmp_path / "policy.safetensors"
+
+    def trainer(seed=0, stop_at=None):
+        torch.manual_seed(seed)
+        actor = Networks(0.0, "cpu").actor(distribution="tanh_normal")
+        loss = CQLLoss(actor, Networks(0.0, "cpu").qvalue(), num_random=2)
+        loss.make_value_estimator(gamma=GAMMA)
+        made = Stopping(loss, make_replay(demos), CONFIG, actor=actor, checkpoint=path, progress=False)
+        made.stop_at = stop_at
+        return made, actor
+
+    with pytest.raises(KeyboardInterrupt):
+        trainer(stop_at=7)[0].train()
+    resumed, actor = trainer(seed=9)
+    assert resumed.steps == 5
+    resumed.train()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["policy.safetensors", "policy.training.safetensors"]
+    rows = make_replay(demos)[:].select("observation", "task_id", "qaf")
+    assert torch.equal(lw.load_actor(path)(rows.clone())["action"], actor(rows)["action"])
+
+
 # ---- what is refused
 
 
@@ -303,9 +327,8 @@ def test_a_checkpoint_of_another_training_is_refused(demos, checkpoint, change, 
     torch.manual_seed(0)
     loss = make_loss(change.get("name", "value"))
     if {"expectile", "gamma", "width"} & set(change):
-        value = lw.PlanConditionedValue(
-            PLANS, ensemble=2, feature_noise=0.05, **{**CRITIC, "width": change.get("width", 16)}
-        )
+        critic = {**CRITIC, "width": change.get("width", 16), "features": lw.modules.ObservationFeatures(noise=0.05)}
+        value = lw.PlanConditionedValue(PLANS, ensemble=2, **critic)
         loss = lw.objectives.ExpectileValueLoss(value, expectile=change.get("expectile", 0.7))
         loss.make_value_estimator(gamma=change.get("gamma", GAMMA))
     shown = ("sampler", "episodes", "reward", "n_steps", "terminate_on_success", "advantage")
@@ -318,7 +341,7 @@ def test_a_checkpoint_of_another_training_is_refused(demos, checkpoint, change, 
 
 def test_a_checkpoint_of_other_plans_is_refused(demos, checkpoint):
     others = lw.Plans([lw.ConditionalPlan(plan.task, plan.steps[::-1]) for plan in PLANS.values()])
-    loss = lw.objectives.ExpectileValueLoss(lw.PlanConditionedValue(others, ensemble=2, feature_noise=0.02, **CRITIC))
+    loss = lw.objectives.ExpectileValueLoss(lw.PlanConditionedValue(others, ensemble=2, **CRITIC))
     loss.make_value_estimator(gamma=GAMMA)
     with pytest.raises(ValueError, match=r"its loss differs in fixed|replay differs"):
         OfflineTrainer(loss, make_replay(demos, others), CONFIG, checkpoint=checkpoint, progress=False)
@@ -327,7 +350,7 @@ def test_a_checkpoint_of_other_plans_is_refused(demos, checkpoint):
 def test_a_file_of_another_kind_is_refused(demos, checkpoint, tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     lw.save_actor(Networks(0.0, "cpu").actor(), path)
-    with pytest.raises(ValueError, match=r"must be a training state of version 1, got format 'lw_torchrl\.actor'"):
+    with pytest.raises(ValueError, match=r"must be a training state of version 2, got format 'lw_torchrl\.actor'"):
         make_trainer(demos, "value", path)
     whole = checkpoint.read_bytes()
     for content in (b"", b"words", whole[: len(whole) // 2]):

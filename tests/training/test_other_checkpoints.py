@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-from small_training import CONFIG, PLANS, SMALL, collect_demos, make_actor, make_trainer
+from small_training import CONFIG, PLANS, collect_demos, make_actor, make_descriptor_actor, make_trainer
 from torchrl.data import RandomSampler
 from torchrl.envs import Compose
 
 from lw_torchrl._tensor_files import read_tensors, write_tensors
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
-from lw_torchrl.modules import DescriptorConditionedActor, PlanConditionedActor
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.training.checkpoint import training_file
 from lw_torchrl.transforms import QAFTransform, RandomYaw
@@ -69,12 +68,12 @@ def test_a_checkpoint_of_other_plans_or_another_kind_is_refused(demos, checkpoin
     refused(
         checkpoint,
         r"of another architecture, its actor differs in plans.button-press-topdown, .*plans.window-open;",
-        lambda: make_trainer(demos, checkpoint, actor=PlanConditionedActor(plans, **SMALL)),
+        lambda: make_trainer(demos, checkpoint, actor=make_actor(plans=plans)),
     )
     refused(
         checkpoint,
         "of another architecture, its actor differs in kind",
-        lambda: make_trainer(demos, checkpoint, actor=DescriptorConditionedActor("MT10", **SMALL)),
+        lambda: make_trainer(demos, checkpoint, actor=make_descriptor_actor()),
     )
 
 

@@ -44,7 +44,7 @@ def test_what_a_transform_draws_hangs_on_the_seed_and_resumes_too(demos, tmp_pat
     assert_same(flat(resumed.actor.state_dict()), flat(whole.actor.state_dict()))
     unturned = make_trainer(demos)
     unturned.train()
-    assert not torch.equal(unturned.actor.head.network[0].weight, whole.actor.head.network[0].weight)
+    assert not torch.equal(unturned.actor.decoder.network[0].weight, whole.actor.decoder.network[0].weight)
 
 
 @pytest.mark.parametrize("sampler", [RandomSampler, SamplerWithoutReplacement])
@@ -145,7 +145,7 @@ KILLER = """
 
     def train(path, seed):
         torch.manual_seed(seed)
-        actor = lw.PlanConditionedActor(plans, latent_size=4, width=16, depth=1, encoder_width=8)
+        actor = lw.PlanConditionedActor(plans, decoder=lw.modules.MLPDecoder(width=16, depth=1))
         replay = lw.LanguageWorldExperienceReplay(
             root, sampler=lw.TaskBalancedSampler(), transform=lw.QAFTransform(plans)
         )
