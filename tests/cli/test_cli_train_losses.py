@@ -40,7 +40,7 @@ def test_success_on_held_out_seeds_is_logged(capsys, data, tmp_path):
     options = ["--loss", "td3-bc", "--evaluate-every", 2, "--evaluate-episodes", 1, "--logger", "csv"]
     run(capsys, "train", data, "--out", out, *options, *SMALL)
     (file,) = (tmp_path / "logs").rglob("evaluation/success.csv")
-    rows = list(csv.reader(file.open()))
+    rows = list(csv.reader(file.read_text().splitlines()))
     assert [int(step) for step, _ in rows] == [2, 4]
     assert all(0.0 <= float(rate) <= 1.0 for _, rate in rows)
     error = fails(capsys, "train", data, "--out", tmp_path / "x", "--evaluate-every", 2, "--evaluate-seed", 0)
