@@ -118,7 +118,7 @@ class Train:
         return numbers
 
     def _clone(self, actor: Any, rows: Mapping[str, Any], run: Mapping[str, Any]) -> Any:
-        sampler = lw.TaskBalancedSampler()
+        sampler = lw.TaskBalancedSampler(exact=True)
         replay = lw.LanguageWorldExperienceReplay(self.data, after_success=self.after_success, sampler=sampler, **rows)
         _read_transform(actor, replay, self.data)
         more: dict[str, Any] = {"qaf_anchor": self.qaf_anchor, "normalize": self.begin is None}
@@ -136,7 +136,7 @@ class Train:
 
         def replay(**ahead: Any) -> lw.LanguageWorldExperienceReplay:
             shown: dict[str, Any] = {"label": "executed", "terminate_on_success": True, "reward": self.reward}
-            shown |= {"transform": lw.QAFTransform(plans), "sampler": lw.TaskBalancedSampler()}
+            shown |= {"transform": lw.QAFTransform(plans), "sampler": lw.TaskBalancedSampler(exact=True)}
             return lw.LanguageWorldExperienceReplay(self.data, **shown, **rows, **ahead)
 
         data = ahead = replay(n_steps=N_STEPS, gamma=GAMMA)

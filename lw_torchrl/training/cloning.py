@@ -35,7 +35,7 @@ class BehavioralCloningConfig:
 
     Attributes:
         steps: number of minibatches.
-        batch_size: rows of a minibatch; with a :class:`TaskBalancedSampler`, a multiple of the number of tasks.
+        batch_size: rows of a minibatch; with ``TaskBalancedSampler(exact=True)``, a multiple of the number of tasks.
         learning_rate: at the start.
         optimizer: "adamw" or "sgd".
         weight_decay: of the optimizer.

@@ -22,7 +22,6 @@ def describe_replay(replay: Any) -> dict[str, Any]:
     options = {name: getattr(replay, name) for name in _REPLAY_OPTIONS if hasattr(replay, name)}
     return options | {
         "rows": None if describe_data(replay) is None else len(replay),  # after_success leaves so many
-        "grow": getattr(replay.storage, "grow", None),
         "sampler": type(replay.sampler).__name__,
         "transforms": [
             {"class": type(one).__name__} | {name: repr(value) for name, value in plain_options(one).items()}
