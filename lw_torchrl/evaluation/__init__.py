@@ -1,10 +1,10 @@
 """Evaluation: exactly k episodes of each task, their results, statistics over seeds, and figures."""
 
 import lw_torchrl._torchrl  # noqa: F401
-from lw_torchrl.evaluation.attribution import attribute_failures
 from lw_torchrl.evaluation.card import describe_policy, policy_card
+from lw_torchrl.evaluation.diagnose.attribution import attribute_failures
+from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure, MendedEpisode
 from lw_torchrl.evaluation.evaluator_score import EvaluatorScore, score_evaluator
-from lw_torchrl.evaluation.failure_records import CAUSES, Failure, MendedEpisode
 from lw_torchrl.evaluation.figures import plot_failures, plot_sorted_tasks, plot_success
 from lw_torchrl.evaluation.hub import from_pretrained, push_to_hub, save_pretrained
 from lw_torchrl.evaluation.plan_use import PlanUse

@@ -10,7 +10,7 @@ import numpy as np
 
 from lw_torchrl._checks import checked, counted
 from lw_torchrl._files import AnyPath, replacing
-from lw_torchrl.evaluation.failure_records import CAUSES, count_causes
+from lw_torchrl.evaluation.diagnose.failure import CAUSES, count_causes
 from lw_torchrl.evaluation.result import EvaluationResult, attributed
 from lw_torchrl.evaluation.statistics import Array, check_rates, wilson_interval
 from lw_torchrl.evaluation.summary import Summary

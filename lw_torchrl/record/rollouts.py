@@ -22,11 +22,9 @@ from lw_torchrl._checks import checked, missing_keys, shown
 from lw_torchrl._devices import device_of
 from lw_torchrl._files import AnyPath
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import episode_seed
-from lw_torchrl.evaluation.failure_records import Failure
-from lw_torchrl.evaluation.protocol import actor_plans, named_tasks_of
-from lw_torchrl.evaluation.running import answered_by, make_env, running
+from lw_torchrl.evaluation.diagnose.failure import Failure
+from lw_torchrl.evaluation.rollout import actor_plans, rollout as run_rollout, suite_tasks
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, as_plans
@@ -41,7 +39,7 @@ from lw_torchrl.suites.suite import Suite, known_suite, load_suite
 from lw_torchrl.transforms.qaf import QAFTransform
 
 _KEYS: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next", "success"), ("next", "reward")]
-_PLAN_KEYS = {"qaf", "skill_weights", "action_corrected"}
+_PLAN_KEYS = ("qaf", "skill_weights", "action_corrected")
 
 
 @checked
@@ -251,42 +249,50 @@ def run_recorded(
     device: str | torch.device | None = None,
     progress: bool = False,
 ) -> list[FinishedEpisode]:
-    """Episodes with all that :func:`lw_torchrl.log_rollout` shows of them, run as :func:`lw_torchrl.evaluate` does.
+    """Run episodes as :func:`lw_torchrl.evaluate` does, with all keys that :func:`lw_torchrl.log_rollout` shows.
 
-    The arguments are as there, but for these.
+    The arguments are those of :func:`lw_torchrl.evaluate`, except for these.
 
     Args:
-        plans: whose queries to answer; None for the actor's own.
-        episodes: indices, of each task.
-        evaluator: a module; the episodes have its answers beside the exact ones.
-        progress: show a bar where it takes longer than a second.
+        plans: the plans whose conditions are answered; None for the actor's own.
+        episodes: indices of each task's episodes.
+        evaluator: a module; the episodes hold its answers and the exact ones.
+        progress: show a progress bar if it takes longer than a second.
 
     Returns:
-        By task, as they were given, and episode: TensorDicts of batch (T,).
+        The episodes, by task in the given order and episode, with steps of batch (T,).
     """
     answered = actor_plans(actor, plans)
-    found_suite, chosen = named_tasks_of(tasks, answered, suite)
-    options: dict[str, Any] = {"seed": seed, "max_steps": max_steps, "suite": found_suite, "engine": engine}
-    env = make_env(actor, answered, LanguageWorldEnv(list(chosen.values()), strict=True, **options), evaluator)
-    written = set() if answered is None else {"qaf", *actor.out_keys}
-    acting, exact = answered_by(actor, evaluator), None
-    if evaluator is None:
-        evaluator = getattr(actor, "evaluator", None)
-    elif answered is not None:
-        exact = QAFTransform(answered)  # the answers acted on take its place in an episode
-    read = getattr(evaluator, "in_keys", ())
-    seen = {"pixels"} & {*getattr(actor, "in_keys", ()), *read}
-    keys = list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *read, *seen]))
-    how: dict[str, Any] = {"noise_scale": noise_scale, "progress": progress, "keys": keys, "device": device}
-    how["after_success"] = 0 if stop_at_success else None
-    found = {}
-    with running("recording", env, acting, dict.fromkeys(chosen, episodes), **how) as finished:
-        for one in finished:
-            steps = one.steps
-            if evaluator is not None:
-                steps = evaluator(steps.to(device_of(evaluator))).cpu()
-            found[one.task, one.episode] = one._replace(steps=steps if exact is None else exact(steps))
-    return [found[task, episode] for task in chosen for episode in episodes]
+    own_suite, chosen = suite_tasks(tasks, answered, suite)
+    options: dict[str, Any] = {"seed": seed, "max_steps": max_steps, "suite": own_suite, "engine": engine}
+    exact = None if evaluator is None or answered is None else QAFTransform(answered)
+    inside = getattr(actor, "evaluator", None) if evaluator is None else evaluator
+    read = getattr(inside, "in_keys", ())
+    finished: dict[tuple[str, int], FinishedEpisode] = {}
+
+    def keep(one: FinishedEpisode) -> None:
+        steps = one.steps
+        if inside is not None:
+            steps = inside(steps.to(device_of(inside))).cpu()
+        finished[one.task, one.episode] = one._replace(steps=steps if exact is None else exact(steps))
+
+    run_rollout(
+        "recording",
+        actor,
+        chosen,
+        dict.fromkeys(chosen, episodes),
+        keep,
+        plans=answered,
+        evaluator=evaluator,
+        env_options=options,
+        keys=_KEYS,
+        optional=[*(_PLAN_KEYS if answered is not None else ()), *read, "pixels"],
+        noise_scale=noise_scale,
+        after_success=0 if stop_at_success else None,
+        device=device,
+        progress=progress,
+    )
+    return [finished[task, episode] for task in chosen for episode in episodes]
 
 
 @contextmanager

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.evaluation.failure_records import CAUSES, Failure, part_words
+from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure
+from lw_torchrl.evaluation.diagnose.sentences import replaced_text
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plan_text import one_line
 from lw_torchrl.record.entities import FALSE, STEEL, Color, changes, rr, step_color
@@ -138,7 +139,7 @@ def _why(failure: Failure, episode: RecordedEpisode) -> list[str]:
     seen = f"Seen at {episode.at(failure.at)} of {len(episode)}"
     if failure.step is not None and failure.step < len(episode.steps):
         seen += f", in {_step(episode, failure.step)}"
-    useless = [part_words(part) for part, worked in failure.counterfactuals.items() if not worked]
+    useless = [replaced_text(part) for part, worked in failure.counterfactuals.items() if not worked]
     helped = f" Replacing {' or '.join(useless)} did not help." if useless else ""
     return [*lines, f"{seen}.{helped}"]
 

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
-from lw_torchrl.evaluation.counterfactuals import with_true_answers
+from lw_torchrl.evaluation.diagnose.counterfactuals import with_true_answers
 from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.language.relations import RELATIONS, Comparison
 from lw_torchrl.modules.clause_evaluator import conjunction
