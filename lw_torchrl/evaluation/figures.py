@@ -106,7 +106,7 @@ def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, titl
         >>> from lw_torchrl.evaluation import EpisodeResult, Failure
         >>> config = {"tasks": ["reach"], "episodes_per_task": 1, "max_steps": 500, "seed": 0}
         >>> episode = EpisodeResult("reach", 0, False, None, None, None)
-        >>> failure = Failure("reach", 0, 0, "skill", None, 1, 40, "It missed.")
+        >>> failure = Failure("reach", 0, 0, "skill", None, 1, 40)
         >>> plot_failures(EvaluationResult(config, (episode,), failures=(failure,))).axes[0].get_title()
         '1 of 1 episode failed'
     """

@@ -77,7 +77,7 @@ def rollout(
     base = LanguageWorldEnv(list(tasks.values()), num_envs=rows, strict=True, **env_options)
     env = _with_transforms(base, first, transform_of(actor, plans), _transform_of_evaluator(evaluator))
     wanted = [unravel_key(key) for key in (optional(env) if callable(optional) else optional)]
-    written = {unravel_key(key) for key in getattr(actor, "out_keys", ())} | _written(env)
+    written = {unravel_key(key) for one in (actor, evaluator) for key in getattr(one, "out_keys", ())} | _written(env)
     recorded = list(dict.fromkeys([*map(unravel_key, keys), *(key for key in wanted if key in written)]))
     acting = actor if wrap is None else wrap(actor)
     if evaluator is not None and not isinstance(evaluator, Transform):
