@@ -161,7 +161,9 @@ def actor_plans(actor: Any, plans: AnyPlans | None) -> Plans | None:
     return own or given
 
 
-def suite_tasks(tasks: TaskList, plans: Plans | None, suite: str | Suite | None = None) -> tuple[Suite, dict[str, Task]]:
+def suite_tasks(
+    tasks: TaskList, plans: Plans | None, suite: str | Suite | None = None
+) -> tuple[Suite, dict[str, Task]]:
     """Return the suite, and the tasks by name; a name that only a plan defines stands for the plan's task."""
     tasks = listed_tasks(tasks)
     chosen = find_suite(tasks, suite)

@@ -54,6 +54,7 @@ class Page:
     frames: dict[str, str]  # as log_motion returns them
     pictures: float  # that the policy saw: width over height, 0 without any
     step_time: float  # seconds between two actions
+    bounded: bool  # whether all actions are in [-1, 1]
 
     def title(self, policy: bool = True) -> str:
         """Return the tab's title: the episode's name, the policy unless it is left out, and how it ended."""
@@ -127,6 +128,7 @@ class Page:
 
     def _curve(self, name: str) -> rrb.TimeSeriesView:
         title, limits = CURVES[name]
+        limits = None if name == "action" and not self.bounded else limits
         if name == "distance":  # a small view has no room for the axis' numbers
             limits, title = (-0.05 * self.farthest, 1.05 * self.farthest), f"{title} (up to {self.farthest:.0f})"
         return rrb.TimeSeriesView(
@@ -180,6 +182,7 @@ def send_page(
         frames=frames,
         pictures=log_pictures(stream, root, episode, drawn),
         step_time=episode.step_time,
+        bounded=bool((abs(episode.action) <= 1).all()),
     )
 
 

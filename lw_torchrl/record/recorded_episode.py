@@ -190,7 +190,9 @@ class RecordedEpisode:
             value = torch.zeros(length, 0) if value is None else value.reshape(length, -1).float()
             action = _array(value, "rollout['action']", (length, None))
         logits, pixels = optional("qaf_logits"), rollout.get("pixels", None)
-        written = [getattr(getattr(step, "role", None), "written", "") for step in plan.steps] if plan is not None else []
+        written = (
+            [getattr(getattr(step, "role", None), "written", "") for step in plan.steps] if plan is not None else []
+        )
         comments = [getattr(step, "reason", "") for step in plan.steps] if plan is not None else []
         read_as = [text if text and text != skill else "" for text, (_, skill) in zip(written, steps, strict=True)]
         return cls(
@@ -221,7 +223,7 @@ class MendedRecording:
     motion: Motion | None = None
 
     def parts_at(self, other: RecordedEpisode) -> int:
-        """Return the first row in which the hand or an object is elsewhere, by more than a centimetre, else the last."""
+        """Return the first row in which the hand or an object is elsewhere by over a centimetre, else the last."""
         length = min(len(self.episode), len(other))
         if self.episode.observation is None or other.observation is None or other.layout is None:
             return length - 1
@@ -233,7 +235,7 @@ class MendedRecording:
 
 
 def _array(value: Any, label: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
-    """Return ``value`` as an array of ``shape`` (None: any size); raise ValueError for another shape, NaN or infinity."""
+    """Return ``value`` as an array of ``shape`` (None: any size); another shape or NaN is a ValueError."""
     tensor = torch.as_tensor(value).detach().cpu()
     allowed = "×".join("S" if size is None else str(size) for size in shape)
     if tensor.ndim != len(shape) or any(s not in (None, n) for s, n in zip(shape, tensor.shape, strict=True)):

@@ -297,8 +297,8 @@ class RerunLogger(Logger):
         Args:
             rollout: batch size (T,). All keys are optional without a layout: "action" T×A, ("next", "success") T×1,
                 ("next", "reward") T×1 float32, "pixels" T×H×W×C or T×C×H×W. With a layout "observation" T×D float32
-                (metres) and "action" are required. More keys are those of :func:`lw_torchrl.log_rollout`. Columns beyond
-                the plan's S steps are padding and left out.
+                (metres) and "action" are required. More keys are those of :func:`lw_torchrl.log_rollout`. Columns
+                beyond the plan's S steps are padding and left out.
             task: the task's name.
             objects: name -> T×3 positions in metres; "robot's gripper" is added if the layout is known.
             plan: its ``steps`` each have a ``condition`` and a ``skill``; None shows numbered columns.

@@ -29,11 +29,11 @@ _AFTER = {"executed_action", "success", "reward"}
 class RolloutRecorder(Transform):
     """Record episodes of chosen rows of an environment while they run.
 
-    At the end of an episode it adds a page; an episode that is cut by a reset, or by closing the environment, is recorded
-    as far as it went. With a :class:`~lw_torchrl.LanguageWorldEnv` the page is like :func:`lw_torchrl.log_rollout`'s;
-    with any other TorchRL environment like :meth:`RerunLogger.log_episode`'s. Put the recorder after
-    :class:`~lw_torchrl.QAFTransform` and before transforms of the observation, and close the environment before the
-    logger. It cannot record a LanguageWorldEnv that runs in another process.
+    At the end of an episode it adds a page; an episode that is cut by a reset, or by closing the environment, is
+    recorded as far as it went. With a :class:`~lw_torchrl.LanguageWorldEnv` the page is like
+    :func:`lw_torchrl.log_rollout`'s; with any other TorchRL environment like :meth:`RerunLogger.log_episode`'s. Put the
+    recorder after :class:`~lw_torchrl.QAFTransform` and before transforms of the observation, and close the environment
+    before the logger. It cannot record a LanguageWorldEnv that runs in another process.
 
     Args:
         logger: the recording.
@@ -180,7 +180,7 @@ class _Row:
             task = recorder.task or type(self.env).__name__
             objects = {} if recorder.objects is None else recorder.objects(rollout)
             plan = None if recorder.plans is None else recorder.plans.get(task)
-            name = f"{task}-{number}" + (f", row {self.row}" if len(recorder.rows) > 1 else "")
+            name: str | None = f"{task}-{number}" + (f", row {self.row}" if len(recorder.rows) > 1 else "")
             name = None if name in recorder.logger.episodes else name
             recorder.logger.log_episode(rollout, task=task, objects=objects, plan=plan, name=name)
 

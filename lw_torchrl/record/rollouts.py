@@ -26,7 +26,8 @@ from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.diagnose.counterfactuals import own_evaluators
 from lw_torchrl.evaluation.diagnose.failure import Failure
 from lw_torchrl.evaluation.diagnose.sentences import replacement_text
-from lw_torchrl.evaluation.rollout import actor_plans, rollout as run_rollout, suite_tasks
+from lw_torchrl.evaluation.rollout import actor_plans, suite_tasks
+from lw_torchrl.evaluation.rollout import rollout as run_rollout
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, as_plans
@@ -60,8 +61,8 @@ def log_rollout(
     """Add a rollout to a recording: the robot in 3-D, a verdict, the plan at the cursor, the timeline and curves.
 
     With the environment's seed, the episode is simulated again from its task, ``seed``, ``episode`` and actions to show
-    the robot's motion. Its observations must be equal bit for bit; otherwise a warning says so, and a simple hand over a
-    table is drawn instead of the robot, as without a seed.
+    the robot's motion. Its observations must be equal bit for bit; otherwise a warning says so, and a simple hand over
+    a table is drawn instead of the robot, as without a seed.
 
     Args:
         logger: the recording.
@@ -207,15 +208,15 @@ def simulate_again(
 
 
 def _motion(heading: Heading, episode: RecordedEpisode, suite: Suite | None) -> Motion | None:
-    if heading.seed is None or heading.episode is None or suite is None:
+    if heading.seed is None or heading.episode is None or suite is None or episode.observation is None:
         return None
     try:
         return simulate_again(heading.task, heading.seed, heading.episode, episode.action, episode.observation, suite)
     except DiffersError as error:
         warnings.warn(
             f"simulating {heading.task}, episode {heading.episode} of seed {heading.seed}, again gives other numbers "
-            f"at {error}. Check the seed, and that these are the executed actions. A hand over a table is drawn instead "
-            "of the robot",
+            f"at {error}. Check the seed, and that these are the executed actions. A hand over a table is drawn "
+            "instead of the robot",
             stacklevel=3,
         )
         return None

@@ -94,7 +94,10 @@ def log_scene(
             point(f"names{entity_path(label)}", things[label] + away, label, 0.0005, color)
 
     def lines(path: str, strips: NDArray[np.float32], radius: float, color: Color) -> None:
-        look = {"colors": np.tile(np.array(color, np.uint8), (len(drawn), 1)), "radii": np.full(len(drawn), radius * size)}
+        look = {
+            "colors": np.tile(np.array(color, np.uint8), (len(drawn), 1)),
+            "radii": np.full(len(drawn), radius * size),
+        }
         stream.send_columns(f"{scene}/{path}", episode.times(drawn), rr.LineStrips3D.columns(strips=strips, **look))
 
     goal = episode.goal

@@ -99,8 +99,11 @@ def telling_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecor
 
 
 def drawn_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None) -> NDArray[np.int64]:
-    """Return the steps at which the scene is drawn: the steps to show, every other one if they are many; every eighth of
-    the rest; the decisive one, and the last."""
+    """Return the steps at which the scene is drawn.
+
+    These are the steps to show, every other one if they are many; every eighth of the rest; the decisive one, and the
+    last.
+    """
     first, last = telling_steps(heading, episode, ghost)
     every, stride = np.arange(len(episode)), 1 if last - first <= AROUND_FAILURE else 2
     drawn = (every >= first) & (every <= last) & (every % stride == 0) | (every % SELDOM == 0)

@@ -16,8 +16,8 @@ from lw_torchrl._devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.diagnose.counterfactuals import Counterfactuals, own_evaluators
 from lw_torchrl.evaluation.diagnose.decision import MARGIN, decide
-from lw_torchrl.evaluation.diagnose.failure import Difference, Failure, NotReproducible
-from lw_torchrl.evaluation.diagnose.rerun import EpisodeId, NullControl, Rerun, null_control
+from lw_torchrl.evaluation.diagnose.failure import Difference, Failure, Finding, NotReproducible
+from lw_torchrl.evaluation.diagnose.rerun import EpisodeId, Rerun, null_control
 from lw_torchrl.evaluation.diagnose.scripts import Scripts
 from lw_torchrl.evaluation.diagnose.states import EpisodeStates, Explanation, explain, stall_step, states_of
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
@@ -55,16 +55,17 @@ def attribute_failures(
     differs from the reference may succeed. Without a reference the rule recognises only wrong answers, a plan of which
     no condition holds, and a skill that stays far from its target. Without ``actor`` the rule is all there is.
 
-    **A counterfactual decides**, with ``actor``. First the null control: the same episode is re-run, with the same noise
-    and nothing replaced. If it succeeds, the failure is *not reproducible*, and the finding says what differs. Otherwise
-    it is re-run with one part replaced by a sound one: the observations, if the policy was shown wrong ones
+    **A counterfactual decides**, with ``actor``. First the null control: the same episode is re-run, with the same
+    noise and nothing replaced. If it succeeds, the failure is *not reproducible*, and the finding says what differs.
+    Otherwise it is re-run with one part replaced by a sound one: the observations, if the policy was shown wrong ones
     (*perception*); the answers, where they were wrong (*query*); the *plan*, by the reference; the policy's action, by
     that of scripted skills (where a text is no scripted skill, by the expert's), in one step of the plan (*skill*), for
-    the *gripper* or the hand's motion (*actuation*) only, or in all steps (*policy*); or twice the time (*out of time*).
-    If nothing helps, pairs are tried, which give ``cause`` and ``also``. If several replacements help, the one that
-    fixes most of the task's failed episodes counts, and of those about as good the smallest; but a skill does not count
-    if other steps have the same fault. One success may be luck, so ``shares`` holds the share of the task's failed
-    episodes that each replacement fixes, and "nothing" that of the null control. A policy without plans gets no step.
+    the *gripper* or the hand's motion (*actuation*) only, or in all steps (*policy*); or twice the time (*out of
+    time*). If nothing helps, pairs are tried, which give ``cause`` and ``also``. If several replacements help, the one
+    that fixes most of the task's failed episodes counts, and of those about as good the smallest; but a skill does not
+    count if other steps have the same fault. One success may be luck, so ``shares`` holds the share of the task's
+    failed episodes that each replacement fixes, and "nothing" that of the null control. A policy without plans gets no
+    step.
 
     Args:
         rollouts: episodes as :func:`evaluate` passes them to ``on_episode``, or TensorDicts of batch (T,), each one
@@ -88,8 +89,8 @@ def attribute_failures(
         A :class:`Failure` for each failed episode, in the order of the rollouts.
 
     Raises:
-        ValueError: a rollout lacks a key, an episode occurs twice, a task has no plan, the plans are not the actor's, or
-            an episode does not begin as (task, seed, episode) does.
+        ValueError: a rollout lacks a key, an episode occurs twice, a task has no plan, the plans are not the actor's,
+            or an episode does not begin as (task, seed, episode) does.
 
     Warns:
         UserWarning: the policy cannot carry out the reference; no plan is replaced.
@@ -233,13 +234,14 @@ def _by_counterfactuals(
     if cause == "undecided" and explanation.cause != "undecided":
         record |= {"suspect": explanation.cause, "suspect_finding": explanation.blames[explanation.cause].finding}
     step: int | None
-    step, at, finding = explanation.blames.get(cause, explanation.blames["undecided"])
+    shown: Finding | None
+    step, at, shown = explanation.blames.get(cause, explanation.blames["undecided"])
     if cause == "skill" and also is None:
         step, plan = tried.step[which] if only is None else only, tried.plans[one.task]
-        at, finding = stall_step(one, step, plan.definition.layout), one.active_time(plan, step)
+        at, shown = stall_step(one, step, plan.definition.layout), one.active_time(plan, step)
     elif cause == "perception":
-        finding = null.misled[which]
+        shown = null.misled[which]
     if plans_of(tried.actor) is None and cause != "query":
         step = None
-    shown = None if step is None and cause != "perception" else finding
+    shown = None if step is None and cause != "perception" else shown
     return Failure(one.task, seed, one.episode, cause, also, step, at, shown, **record)

@@ -63,8 +63,8 @@ class ScriptComparison(NamedTuple):
     def in_other_steps(self, step: int) -> bool | None:
         """Return whether the fault of a step is in the other steps too; None if that cannot be decided.
 
-        The fault is read off the axis with the largest error, as a factor of the script's action or as a shift. It is in
-        the other steps if it explains at least half of their error. It is undecided if neither describes the step's
+        The fault is read off the axis with the largest error, as a factor of the script's action or as a shift. It is
+        in the other steps if it explains at least half of their error. It is undecided if neither describes the step's
         error, if the fault would not show in the other steps, or if these are half as far off in another way.
         """
         known = self.wanted.isfinite().all(-1) & (self.active >= 0)

@@ -160,7 +160,7 @@ class Counterfactuals:
         return lambda actor: ScriptedControl(actor, plans, scripts, **where)
 
     def _run_scripts(self, seen: Sequence[EpisodeStates]) -> None:
-        """Give scripts control of one step, the likeliest steps in turn; of the gripper or the motion; of everything."""
+        """Give scripts control of one step, the likeliest steps in turn; of gripper or motion; of everything."""
         ranked = {}
         for one in seen:
             comparison = compare_with_scripts(self.actor, one, self.scripts)

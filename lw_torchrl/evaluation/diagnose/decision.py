@@ -24,10 +24,10 @@ def decide(mended: Collection[str], shares: Mapping[str, float], null: float = 0
     """Return the cause of a failed episode.
 
     Wrong observations and answers come first, if correcting them helps. Of the other replacements, the one that fixes
-    most of the task's failed episodes counts. Among those about as good, the first counts: the plan, unless scripts that
-    follow it succeed; a skill in one step; the gripper or the motion. It is the policy, without naming a part, if two
-    replacements that do not contain each other are about as good, or if none leads clearly over a plain re-run. Time
-    comes last, then pairs.
+    most of the task's failed episodes counts. Among those about as good, the first counts: the plan, unless scripts
+    that follow it succeed; a skill in one step; the gripper or the motion. It is the policy, without naming a part, if
+    two replacements that do not contain each other are about as good, or if none leads clearly over a plain re-run.
+    Time comes last, then pairs.
 
     Args:
         mended: the replacements with which the episode succeeds.

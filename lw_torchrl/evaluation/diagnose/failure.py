@@ -50,7 +50,7 @@ REPLACEMENTS: dict[str, tuple[Cause, ...]] = {
 
 @dataclass(frozen=True)
 class WrongAnswers:
-    """A condition of the plan, that of ``step``, was answered wrongly in ``states`` of ``of`` states, first at ``first``."""
+    """The condition of a step was answered wrongly in ``states`` of ``of`` states, first at ``first``."""
 
     step: Natural
     condition: str
@@ -69,7 +69,7 @@ class NoCondition:
 
 @dataclass(frozen=True)
 class PlanDeparts:
-    """The plan requested another action than the reference plan in ``states`` of ``of`` states, the last ones if ``late``.
+    """The plan requested another action than the reference in ``states`` of ``of`` states, the last ones if ``late``.
 
     ``step`` and ``skill`` are the plan's in most of these states, ``reference`` is the skill that the reference plan
     requests there; ``uncovered`` says that no condition of the plan held in most of them.
@@ -108,9 +108,9 @@ class Difference:
     """The first difference between two runs of an episode.
 
     Attributes:
-        kind: "length", of ``given`` and ``again`` steps; "actions", from step ``at`` on, there by ``size``; "environment",
-            the same action leads to another state ``at``; "states", from ``at`` on, in a rollout without actions;
-            "nothing" that was recorded.
+        kind: "length", of ``given`` and ``again`` steps; "actions", from step ``at`` on, there by ``size``;
+            "environment", the same action leads to another state ``at``; "states", from ``at`` on, in a rollout without
+            actions; "nothing" that was recorded.
         at: the state to look at.
     """
 
@@ -170,9 +170,9 @@ class Failure:
         suspect: the cause that the states alone suggest, if it is undecided.
         evidence: name to number, measured in the episode's states.
         counterfactuals: each replacement that was tried, and whether the same episode then succeeded. "perception"
-            replaces the observations; "query" the answers; "plan" the plan; "skill" the actions in one step of the plan;
-            "gripper" and "actuation" one part of the action in all steps; "policy" the whole action; "time" doubles the
-            time limit; pairs like "query + plan" replace both, with "skill" in all steps.
+            replaces the observations; "query" the answers; "plan" the plan; "skill" the actions in one step of the
+            plan; "gripper" and "actuation" one part of the action in all steps; "policy" the whole action; "time"
+            doubles the time limit; pairs like "query + plan" replace both, with "skill" in all steps.
         shares: each replacement, and the share of the task's failed episodes that succeed with it; "nothing" is a plain
             re-run.
         mended: the episode with the cause replaced, if it then succeeds; it is not saved.
@@ -223,7 +223,9 @@ def _read_finding(where: str, stated: Any) -> Any:
         return None
     kind = FINDINGS.get(str(stated.get("kind"))) if isinstance(stated, dict) else None
     if kind is None:
-        raise ValueError(f"{where} must be null or an object whose kind is one of {', '.join(FINDINGS)}, got {short(stated)}")
+        raise ValueError(
+            f"{where} must be null or an object whose kind is one of {', '.join(FINDINGS)}, got {short(stated)}"
+        )
     content = {name: value for name, value in stated.items() if name != "kind"}
     if kind is NotReproducible:
         content["difference"] = _read_record(f"{where}.difference", Difference, content.get("difference"))

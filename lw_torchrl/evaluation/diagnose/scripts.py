@@ -48,8 +48,8 @@ class Scripts:
 def attended(weights: Tensor, steps: Tensor) -> Tensor:
     """Return the active step (...) int64: the first of those with most attention.
 
-    ``weights`` (..., S) float32 is the attention over ``steps`` (..., S) bool. The result is -1 where all steps have the
-    same weight, since no condition holds or all do.
+    ``weights`` (..., S) float32 is the attention over ``steps`` (..., S) bool. The result is -1 where all steps have
+    the same weight, since no condition holds or all do.
     """
     most = weights.masked_fill(~steps, -1.0).amax(-1, keepdim=True)
     least = weights.masked_fill(~steps, 2.0).amin(-1, keepdim=True)

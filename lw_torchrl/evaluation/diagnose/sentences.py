@@ -119,7 +119,9 @@ def finding_text(finding: Finding) -> str:
             return f"no condition of the plan held in {states} of the last {of} states"
         case PlanDeparts():
             often = f"{finding.states} of {'the last ' if finding.late else ''}{finding.of}"
-            departs = f"the plan requests something else than the reference, in step {finding.step + 1}, '{finding.skill}'"
+            departs = (
+                f"the plan requests something else than the reference, in step {finding.step + 1}, '{finding.skill}'"
+            )
             departs = "no condition of the plan holds" if finding.uncovered else departs
             return f"in {often} states {departs}, where the reference requests '{finding.reference}'"
         case ActiveStep(step, skill, states, of, distance):
