@@ -184,7 +184,7 @@ def _answers(steps: TensorDictBase, actor: Any) -> Tensor | None:
         )
     with torch.no_grad(), evaluating(actor):
         device = device_of(actor)
-        logits = [one.answers(*(steps.get(key).to(device) for key in one.in_keys)) for one in evaluators]
+        logits = [one.logits(*(steps.get(key).to(device) for key in one.in_keys)) for one in evaluators]
     return torch.stack(logits).mean(0).cpu() > 0
 
 

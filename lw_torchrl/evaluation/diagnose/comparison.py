@@ -13,7 +13,7 @@ from lw_torchrl._devices import device_of
 from lw_torchrl.evaluation.diagnose.scripts import Scripts
 from lw_torchrl.evaluation.diagnose.states import OTHER, EpisodeStates
 from lw_torchrl.modules.networks import evaluating
-from lw_torchrl.modules.policy import plans_of
+from lw_torchrl.modules.policy import draws, plans_of
 
 _OFTEN, _BRIEF = 0.4, 5  # the smallest share of a step's states that is often; fewer states decide nothing
 _SAME = 0.02  # an action that differs less from the script's is the script's
@@ -94,7 +94,7 @@ def compare_with_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> S
     """
     keys = [key for key in getattr(actor, "in_keys", ()) if key != "qaf"]
     plans = plans_of(actor)
-    if _draws(actor) or any(seen.steps.get(key, None) is None for key in keys):
+    if not isinstance(actor, TensorDictModuleBase) or draws(actor) or any(seen.steps.get(key, None) is None for key in keys):
         return None
     states = seen.steps.select(*keys).clone()
     if "qaf" in actor.in_keys and plans is not None:
@@ -105,10 +105,3 @@ def compare_with_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> S
     wanted = (seen.weights.unsqueeze(-1) * program).sum(-2)
     unscripted = ~torch.tensor(scripts.known[seen.task])[seen.active]
     return ScriptComparison(action, wanted.masked_fill(unscripted.unsqueeze(-1), torch.inf), seen.active)
-
-
-def _draws(actor: Any) -> bool:
-    """Return whether an actor's actions may depend on random numbers; a module of unknown kind may draw some."""
-    if not isinstance(actor, TensorDictModuleBase):
-        return bool(getattr(actor, "draws", True))
-    return any(getattr(module, "draws", False) for module in actor.modules())

@@ -17,8 +17,9 @@ from lw_torchrl.evaluation.diagnose.rerun import EpisodeId, NullControl, Percept
 from lw_torchrl.evaluation.diagnose.scripts import ScriptedControl, Scripts
 from lw_torchrl.evaluation.diagnose.sentences import replacement_text
 from lw_torchrl.evaluation.diagnose.states import EpisodeStates, candidates, states_of
+from lw_torchrl.language.canonical import canonical_like
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.modules.policy import plans_of
+from lw_torchrl.modules.policy import plans_of, with_plans
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.transforms.qaf import plan_program
 
@@ -96,7 +97,7 @@ class Counterfactuals:
             return
         reference = Plans(different)
         try:
-            other = actor.with_plans(reference)
+            other = with_plans(actor, canonical_like(reference, plans_of(actor)))
             reference = plans_of(other) or reference  # a policy may complete its plans
             theirs = evaluator.with_plans(reference) if hasattr(evaluator, "with_plans") else evaluator
             self.other, self.other_evaluator, self.reference = other, theirs, reference

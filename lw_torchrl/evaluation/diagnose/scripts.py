@@ -15,7 +15,7 @@ from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.language.tasks import TASKS, task_id
-from lw_torchrl.modules.plan_encoder import IN_FORCE
+from lw_torchrl.modules.attention import ACTIVE_WEIGHT
 from lw_torchrl.suites.metaworld.experts import ExpertActor
 
 _REST = ScriptedSkill("", GRIPPER, gain=(0.0, 0.0, 0.0))  # stands for a text that no scripted skill has
@@ -123,4 +123,4 @@ class ScriptedControl(nn.Module):
         assert self._steps is not None
         episodes = zip(seen.get("task_id").tolist(), seen.get("episode").tolist(), strict=True)
         step = torch.tensor([self._steps.get(one, -1) for one in episodes], device=weights.device)
-        return (weights.gather(-1, step.clamp(min=0).unsqueeze(-1)).squeeze(-1) > IN_FORCE) & (step >= 0)
+        return (weights.gather(-1, step.clamp(min=0).unsqueeze(-1)).squeeze(-1) > ACTIVE_WEIGHT) & (step >= 0)
