@@ -121,18 +121,25 @@ def describe_policy(policy: AnyPath, result: EvaluationResult | None = None, *, 
     )
 
 
-def _tasks(actor: Mapping[str, Any]) -> set[str]:
-    """Return the tasks that an actor's description names, those of its members included."""
-    parts = [part for value in actor.values() for part in (value if isinstance(value, list) else [value])]
-    members = [_tasks(part) for part in parts if isinstance(part, dict) and "kind" in part]
-    return {*actor.get("plans", ()), *actor.get("tasks", ())}.union(*members)
+def _tasks(node: Any) -> set[str]:
+    """Return the tasks that a description names: those of its plans, and of the options of its parts."""
+    if isinstance(node, list):
+        return set().union(*map(_tasks, node))
+    if not isinstance(node, dict):
+        return set()
+    names = {task for plans in node["plans"] for task in plans} if isinstance(node.get("plans"), list) else set()
+    listed = node["tasks"] if isinstance(node.get("tasks"), list) else []
+    names |= {task if isinstance(task, str) else task["task"]["name"] for task in listed}
+    return names.union(*(_tasks(value) for key, value in node.items() if key not in ("plans", "tasks")))
 
 
 def _kind(actor: Mapping[str, Any]) -> str:
-    members = f" of {counted(len(actor['members']), 'network')}" if "members" in actor else ""
-    module = f" (import {actor['module']} first)" if "module" in actor else ""
-    conditioned = "conditioned on plans in English" if "plans" in actor else "of fixed tasks"
-    return f"{conditioned}: `{actor['kind']}`{members}{module}"
+    members = actor.get("options", {}).get("members", ())
+    networks = f" of {counted(len(members), 'network')}" if members else ""
+    module, _, kind = actor["class"].rpartition(":")
+    hint = f" (import {module} first)" if module else ""
+    conditioned = "conditioned on plans in English" if actor.get("plans") else "of fixed tasks"
+    return f"{conditioned}: `{kind}`{networks}{hint}"
 
 
 def _training(description: Mapping[str, Any], demonstrated: set[str]) -> str:

@@ -143,10 +143,7 @@ class EvaluatorInFront(nn.Module):
         self.evaluator, self.actor = evaluator, actor
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        answered = self.evaluator(tensordict)
-        if isinstance(self.evaluator, QueryEvaluator) and "qaf" not in self.evaluator.out_keys:
-            answered.set("qaf", answered.get("qaf_logits") > 0)
-        return self.actor(answered)
+        return self.actor(self.evaluator(tensordict))
 
 
 def actor_plans(actor: Any, plans: AnyPlans | None) -> Plans | None:

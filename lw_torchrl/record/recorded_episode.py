@@ -190,11 +190,6 @@ class RecordedEpisode:
             value = torch.zeros(length, 0) if value is None else value.reshape(length, -1).float()
             action = _array(value, "rollout['action']", (length, None))
         logits, pixels = optional("qaf_logits"), rollout.get("pixels", None)
-        written = (
-            [getattr(getattr(step, "role", None), "written", "") for step in plan.steps] if plan is not None else []
-        )
-        comments = [getattr(step, "reason", "") for step in plan.steps] if plan is not None else []
-        read_as = [text if text and text != skill else "" for text, (_, skill) in zip(written, steps, strict=True)]
         return cls(
             action=action,
             objects=places,
@@ -207,7 +202,7 @@ class RecordedEpisode:
             reward=optional(("next", "reward"), flat=True),
             corrected=optional("action_corrected", flat=True),
             steps=steps,
-            reasons=tuple(f"as written: {text}" if text else why for text, why in zip(read_as, comments, strict=True)),
+            reasons=() if plan is None else tuple(map(_reason, plan.steps)),
             confidence=getattr(plan, "confidence", None),
             pixels=None if pixels is None else np.stack([check_image("pixels", picture) for picture in pixels]),
             step_time=step_time,
@@ -232,6 +227,15 @@ class MendedRecording:
             apart = self.episode.observation[:length, place] - other.observation[:length, place]
             gap = np.maximum(gap, np.linalg.norm(apart, axis=1))
         return int((gap > APART).argmax()) if (gap > APART).any() else length - 1
+
+
+def _reason(step: Any) -> str:
+    """Return the comment of a plan's step, or of a canonical step how it was written."""
+    role = getattr(step, "role", None)
+    if role is None:
+        return str(getattr(step, "reason", ""))
+    written = f"as written: {role.written}" if role.written and role.written != step.skill else ""
+    return "fallback" if role.fallback else written
 
 
 def _array(value: Any, label: str, shape: tuple[int | None, ...]) -> NDArray[Any]:

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torch import nn
 
 import lw_torchrl as lw
@@ -230,14 +231,14 @@ def test_a_hole_in_the_plan_is_no_skill_s_fault():
 class Still(lw.PlanConditionedActor):
     """One whose hand does not move."""
 
-    def act(self, *prepared):
-        action, *rest = super().act(*prepared)
-        return (torch.zeros_like(action), *rest)
+    def forward(self, tensordict):
+        tensordict = super().forward(tensordict)
+        return tensordict.set("action", torch.zeros_like(tensordict["action"]))
 
 
-def still(plans=PLANS, **options):
+def still(plans=PLANS):
     torch.manual_seed(0)
-    return Still(plans, width=8, depth=1, **options)
+    return Still(plans, decoder=lw.modules.MLPDecoder(width=8, depth=1))
 
 
 ENSEMBLE = pytest.param(lambda actor: lw.modules.ActorEnsemble([actor, still()]), marks=pytest.mark.slow)
@@ -255,11 +256,11 @@ def test_a_network_s_skills_are_replaced_and_its_mode_stays(wrapped):
 
 
 def test_an_evaluator_inside_a_policy_is_replaced_by_the_truth():
-    actor = still(evaluator=Lie(PLANS))
+    actor = TensorDictSequential(Lie(PLANS), still())
     true = with_true_answers(actor)
     assert true is not actor
     assert len(own_evaluators(true)) == len(own_evaluators(actor)) == 1
-    assert isinstance(actor.evaluator, Lie)
+    assert isinstance(actor[0], Lie)
     state = rollout().exclude("next")
     exact = lw.PlanConditionedActor(PLANS)(lw.QAFTransform(PLANS)(state.copy()))["skill_weights"]
     assert torch.allclose(true(state.copy())["skill_weights"], exact)

@@ -103,7 +103,7 @@ def test_the_part_of_the_action_that_is_wrong(task, done, cause):
 
 def test_a_policy_without_plans_is_told_of_no_step():
     torch.manual_seed(0)
-    actor = lw.DescriptorConditionedActor(TASK, condition="one-hot", width=8, depth=1)
+    actor = lw.DescriptorConditionedActor(TASK, condition="one-hot", decoder=lw.modules.MLPDecoder(width=8, depth=1))
     result = lw.evaluate(
         actor, tasks=TASK, plans=PLANS, episodes_per_task=1, stop_at_success=True, attribute=True, **RUN
     )

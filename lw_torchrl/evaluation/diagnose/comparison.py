@@ -94,7 +94,8 @@ def compare_with_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> S
     """
     keys = [key for key in getattr(actor, "in_keys", ()) if key != "qaf"]
     plans = plans_of(actor)
-    if not isinstance(actor, TensorDictModuleBase) or draws(actor) or any(seen.steps.get(key, None) is None for key in keys):
+    is_known = isinstance(actor, TensorDictModuleBase) and not draws(actor)
+    if not is_known or any(seen.steps.get(key, None) is None for key in keys):
         return None
     states = seen.steps.select(*keys).clone()
     if "qaf" in actor.in_keys and plans is not None:

@@ -6,9 +6,11 @@ from copy import deepcopy
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from tensordict import TensorDictBase
+from torch import nn
 from torchrl.envs import Transform
 
+from lw_torchrl._keys import write
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.diagnose.comparison import ScriptComparison, compare_with_scripts
 from lw_torchrl.evaluation.diagnose.decision import Decision
@@ -27,15 +29,15 @@ _TRIED_STEPS = 3  # the number of steps in which a skill is replaced, one at a t
 
 
 class TrueAnswers(QueryEvaluator):
-    """An evaluator whose answers are exact: 5 where a condition holds, else -5."""
+    """An evaluator whose answers are exact: true or false, with logits of 5 and -5."""
 
     def __init__(self, plans: Plans) -> None:
         super().__init__(plans)
         self.program = plan_program(plans)
 
-    def logits(self, *read: Tensor) -> Tensor:
-        observation, task = read
-        return 10.0 * self.program(observation, task).to(torch.float32) - 5.0
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        truth = self.program(tensordict.get("observation"), tensordict.get("task_id"))
+        return write(tensordict, self, [truth, 10.0 * truth.to(torch.float32) - 5.0])
 
 
 def own_evaluators(actor: Any) -> list[QueryEvaluator]:
@@ -51,17 +53,10 @@ def with_true_answers(actor: Any) -> Any:
     if not own_evaluators(actor):
         return actor
     other = deepcopy(actor)
-    read = {key for evaluator in own_evaluators(actor) for key in evaluator.in_keys} - {"observation", "task_id"}
     for module in list(other.modules()):
-        if hasattr(module, "in_keys"):
-            module.in_keys = [key for key in module.in_keys if key not in read]  # pictures, say
-        if isinstance(module, QueryEvaluator):  # the evaluators inside it go with it
-            continue
         for name, child in list(module.named_children()):
             if isinstance(child, QueryEvaluator):
-                setattr(module, name, TrueAnswers(child.plans))
-                if "answers" in (config := getattr(module, "config", {})):
-                    module.config = {**config, "answers": "logit"}  # exact truth is worth what it is
+                module._modules[name] = TrueAnswers(child.plans)
     return other
 
 
