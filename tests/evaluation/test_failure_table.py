@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, Failure, plot_failures
-from lw_torchrl.evaluation.diagnose.failure import ActiveStep, Difference, NotReproducible, WrongAnswers
+from lw_torchrl.evaluation.diagnose.failure import ActiveStep, Difference, WrongAnswers
 
 CONFIG = {
     "tasks": ["push", "reach"],
@@ -23,7 +23,7 @@ WRONG = WrongAnswers(2, "the gripper is open", 40, 500, 31)
 FAILURES = (
     Failure("push", 1, 0, "query", "skill", 2, 31, WRONG, replaced="query + skill", succeeds_at=90,
             evidence={"wrong": 0.4}, counterfactuals={"query": False, "query + skill": True}, shares={"nothing": 0.0}),
-    Failure("push", 1, 1, "undecided", None, None, 499, suspect="skill", suspect_finding=ActiveStep(0, "push", 9, 100)),
+    Failure("push", 1, 1, "undecided", None, None, 499, ActiveStep(0, "push", 9, 100), suspect="skill"),
     Failure("reach", 1, 1, "skill", None, 0, 0, ActiveStep(0, "reach", 100, 100, 0.1), counterfactuals={"skill": True}),
 )  # fmt: skip
 
@@ -61,8 +61,8 @@ def test_a_damaged_finding_is_refused(tmp_path, name):
         EvaluationResult.load(tmp_path / "results.json")
 
 
-def test_a_finding_within_a_finding_reads_back(tmp_path):
-    other = NotReproducible(False, Difference("actions", 3, size=0.5))
+def test_a_difference_reads_back(tmp_path):
+    other = Difference("actions", 3, size=0.5)
     failures = (replace(FAILURES[0], cause="not reproducible", also=None, finding=other), *FAILURES[1:])
     make_result(failures).save(tmp_path / "results.json")
     assert EvaluationResult.load(tmp_path / "results.json").failures == failures
@@ -117,7 +117,6 @@ DAMAGE = {
     "at": [-1, 500, None],
     "finding": [3, "he fell", {}, {"kind": "Luck"}, {"kind": "WrongAnswers"}],
     "suspect": ["luck", 3],
-    "suspect_finding": [[], {"kind": "NotReproducible", "succeeded": True, "difference": 3}],
     "replaced": ["luck", 3],
     "rival": ["luck", True],
     "succeeds_at": [0, "1"],

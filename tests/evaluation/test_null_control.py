@@ -7,9 +7,9 @@ from tensordict import TensorDict
 import lw_torchrl as lw
 from benchmarks.planted import Altered, Jammed, Sensor, fingers, moved_thing, scaled
 from lw_torchrl.evaluation import attribute_failures
-from lw_torchrl.evaluation.diagnose.failure import Difference, Misled, NotReproducible
+from lw_torchrl.evaluation.diagnose.failure import Difference, Misled
 from lw_torchrl.evaluation.diagnose.rerun import difference
-from lw_torchrl.evaluation.diagnose.sentences import difference_text
+from lw_torchrl.evaluation.diagnose.sentences import finding_text
 
 TASK, SEED = "drawer-open", 7
 PLANS = lw.Plans({TASK: lw.load_plans("MT10")[TASK]})
@@ -35,7 +35,8 @@ def test_an_episode_that_was_cut_lacks_nothing_but_its_end():
     assert one.first_success > 30
     [failure] = attribute_failures([one._replace(steps=one.steps[:30])], PLANS, actor=scripted(), **RUN)
     assert (failure.cause, failure.step, failure.counterfactuals) == ("not reproducible", None, {})
-    assert failure.finding == NotReproducible(True, Difference("length", 29, 30, one.first_success))
+    assert failure.finding == Difference("length", 29, 30, one.first_success)
+    assert failure.succeeds_at == one.first_success
     assert f"the length: the rollout has 30 steps, the re-run {one.first_success}" in failure.why
     assert failure.shares["nothing"] == 1.0
 
@@ -47,7 +48,7 @@ def test_an_episode_that_was_cut_lacks_nothing_but_its_end():
 def test_another_environment_or_noise_is_nobody_s_fault(options):
     [failure] = attribute_failures(ran(scripted(), **options), PLANS, actor=scripted(), **RUN)
     assert failure.cause == "not reproducible"
-    assert (failure.finding.difference.kind, failure.finding.difference.at) == ("actions", 0)
+    assert (failure.finding.part, failure.finding.at) == ("actions", 0)
     assert failure.mended is None
 
 
@@ -63,10 +64,10 @@ def test_what_differs_between_two_runs():
     assert difference(rollout([0.0, 1.0, 3.0], [0.5, 0.5, 0.5]), one) == Difference("environment", 2)
     found = difference(rollout([0.0, 1.0, 3.0], [0.5, 0.2, 0.5]), one)
     assert found == Difference("actions", 1, size=pytest.approx(0.3))
-    assert difference_text(found).startswith("the executed actions, from step 1 on, there by 0.3")
+    assert "the executed actions, from step 1 on, there by 0.3" in finding_text(found)
     found = difference(rollout([0.0, 3.0], [0.5, 0.5]).exclude("action"), one)
     assert found == Difference("states", 1)
-    assert "holds no actions" in difference_text(found)
+    assert "holds no actions" in finding_text(found)
 
 
 @pytest.mark.parametrize("inside", [True, False])

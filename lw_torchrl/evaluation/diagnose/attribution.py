@@ -16,7 +16,7 @@ from lw_torchrl._devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.diagnose.counterfactuals import Counterfactuals, own_evaluators
 from lw_torchrl.evaluation.diagnose.decision import MARGIN, decide
-from lw_torchrl.evaluation.diagnose.failure import Difference, Failure, Finding, NotReproducible
+from lw_torchrl.evaluation.diagnose.failure import Difference, Failure, Finding
 from lw_torchrl.evaluation.diagnose.rerun import EpisodeId, Rerun, null_control
 from lw_torchrl.evaluation.diagnose.scripts import Scripts
 from lw_torchrl.evaluation.diagnose.states import EpisodeStates, Explanation, explain, stall_step, states_of
@@ -213,8 +213,8 @@ def _by_counterfactuals(
     record["shares"] = {"nothing": share, **shares}
     if null.succeeds(which) or (which in null.differs and share >= MARGIN):
         first = null.differs.get(which, Difference("nothing", len(one.steps) - 1))
-        finding = NotReproducible(null.succeeds(which), first)
-        return Failure(one.task, seed, one.episode, "not reproducible", None, None, first.at, finding, **record)
+        record["succeeds_at"] = null.episodes[which].first_success
+        return Failure(one.task, seed, one.episode, "not reproducible", None, None, first.at, first, **record)
     record["counterfactuals"] = {
         name: results[which] is not None for name, results in tried.results.items() if which in results
     }
@@ -231,8 +231,6 @@ def _by_counterfactuals(
             record["scripted_step"] = tried.step[which]
     elif explanation.cause == "query" and "query" not in tried_here and not (same and tried_here.get("plan")):
         cause = "query"
-    if cause == "undecided" and explanation.cause != "undecided":
-        record |= {"suspect": explanation.cause, "suspect_finding": explanation.blames[explanation.cause].finding}
     step: int | None
     shown: Finding | None
     step, at, shown = explanation.blames.get(cause, explanation.blames["undecided"])
@@ -241,6 +239,8 @@ def _by_counterfactuals(
         at, shown = stall_step(one, step, plan.definition.layout), one.active_time(plan, step)
     elif cause == "perception":
         shown = null.misled[which]
+    elif cause == "undecided" and explanation.cause != "undecided":
+        record["suspect"], shown = explanation.cause, explanation.blames[explanation.cause].finding
     if plans_of(tried.actor) is None and cause != "query":
         step = None
     shown = None if step is None and cause != "perception" else shown

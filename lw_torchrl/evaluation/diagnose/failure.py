@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from reprlib import repr as short
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 from lw_torchrl._checks import Count, Natural, Scale, check_fields
 from lw_torchrl.evaluation.records import is_number, read_records
@@ -108,31 +108,21 @@ class Difference:
     """The first difference between two runs of an episode.
 
     Attributes:
-        kind: "length", of ``given`` and ``again`` steps; "actions", from step ``at`` on, there by ``size``;
+        part: "length", of ``given`` and ``again`` steps; "actions", from step ``at`` on, there by ``size``;
             "environment", the same action leads to another state ``at``; "states", from ``at`` on, in a rollout without
             actions; "nothing" that was recorded.
         at: the state to look at.
     """
 
-    kind: Literal["length", "actions", "environment", "states", "nothing"]
+    part: Literal["length", "actions", "environment", "states", "nothing"]
     at: Natural
     given: Natural | None = None
     again: Natural | None = None
     size: Scale | None = None
 
 
-@dataclass(frozen=True)
-class NotReproducible:
-    """A plain re-run went another way; ``succeeded`` says whether it succeeded."""
-
-    succeeded: bool
-    difference: Difference
-
-
-Finding = WrongAnswers | NoCondition | PlanDeparts | ActiveStep | Misled | NotReproducible
-FINDINGS: dict[str, type[Any]] = {
-    kind.__name__: kind for kind in (WrongAnswers, NoCondition, PlanDeparts, ActiveStep, Misled, NotReproducible)
-}
+Finding = WrongAnswers | NoCondition | PlanDeparts | ActiveStep | Misled | Difference
+FINDINGS: dict[str, type[Any]] = {kind.__name__: kind for kind in get_args(Finding)}
 
 
 class MendedEpisode(NamedTuple):
@@ -162,10 +152,10 @@ class Failure:
         also: a second cause, if the episode succeeds only with both replaced.
         step: the step of the plan to which the failure belongs, from 0; None if it belongs to no step.
         at: the step of the episode to look at first, from 0.
-        finding: what the episode's states show of the cause.
+        finding: what the episode's states show of the cause, or of ``suspect``.
         replaced: the replacement that decided, one of :data:`REPLACEMENTS`; None without one.
         rival: the next best replacement.
-        succeeds_at: the step at which the episode succeeds with ``replaced``.
+        succeeds_at: the step at which the episode succeeds with ``replaced``, or in a plain re-run.
         scripted_step: a step in which a scripted skill also suffices, although other steps have the same fault.
         suspect: the cause that the states alone suggest, if it is undecided.
         evidence: name to number, measured in the episode's states.
@@ -191,7 +181,6 @@ class Failure:
     succeeds_at: Count | None = None
     scripted_step: Natural | None = None
     suspect: Cause | None = None
-    suspect_finding: Finding | None = None
     evidence: Mapping[str, float] = field(default_factory=dict)
     counterfactuals: Mapping[str, bool] = field(default_factory=dict)
     shares: Mapping[str, float] = field(default_factory=dict)
@@ -210,35 +199,23 @@ class Failure:
 
 
 def _to_json(value: Any) -> Any:
-    if type(value).__name__ in FINDINGS:
-        return {"kind": type(value).__name__, **_to_json(vars(value))}
-    if isinstance(value, Difference):
-        return vars(value)
-    return {name: _to_json(one) for name, one in value.items()} if isinstance(value, Mapping) else value
+    if isinstance(value, get_args(Finding)):
+        return {"kind": type(value).__name__, **vars(value)}
+    return dict(value) if isinstance(value, Mapping) else value
 
 
 def _read_finding(where: str, stated: Any) -> Any:
-    """Return the finding of a file; :class:`ValueError` if it is not one."""
+    """Return the finding of a file; raise :class:`ValueError` if it is not one."""
     if stated is None:
         return None
     kind = FINDINGS.get(str(stated.get("kind"))) if isinstance(stated, dict) else None
-    if kind is None:
+    if kind is None or set(stated) != {"kind", *(one.name for one in fields(kind))}:
         raise ValueError(
-            f"{where} must be null or an object whose kind is one of {', '.join(FINDINGS)}, got {short(stated)}"
+            f"{where} must be null, or a kind of {', '.join(FINDINGS)} with its fields, got {short(stated)}"
         )
-    content = {name: value for name, value in stated.items() if name != "kind"}
-    if kind is NotReproducible:
-        content["difference"] = _read_record(f"{where}.difference", Difference, content.get("difference"))
-    return _read_record(where, kind, content)
-
-
-def _read_record(where: str, kind: type[Any], stated: Any) -> Any:
-    if not isinstance(stated, dict) or set(stated) != {one.name for one in fields(kind)}:
-        names = ", ".join(one.name for one in fields(kind))
-        raise ValueError(f"{where} must be an object of {names}, got {short(stated)}")
-    record = kind(**stated)
-    check_fields(record, f"{where}: ")
-    return record
+    finding = kind(**{name: value for name, value in stated.items() if name != "kind"})
+    check_fields(finding, f"{where}: ")
+    return finding
 
 
 def read_failures(stated: Any, config: Mapping[str, Any], failed: Sequence[tuple[str, int]]) -> tuple[Failure, ...]:
@@ -262,7 +239,7 @@ def read_failures(stated: Any, config: Mapping[str, Any], failed: Sequence[tuple
             yield f"replaced and rival must be null or one of {', '.join(REPLACEMENTS)}"
 
     def parse(where: str, entry: dict[str, Any]) -> dict[str, Any]:
-        return entry | {name: _read_finding(f"{where}.{name}", entry[name]) for name in ("finding", "suspect_finding")}
+        return entry | {"finding": _read_finding(f"{where}.finding", entry["finding"])}
 
     found = read_records("failures", stated, Failure, faults, parse)
     if sorted(failed) != sorted((failure.task, failure.episode) for failure in found):

@@ -12,7 +12,6 @@ from lw_torchrl.evaluation.diagnose.failure import (
     Finding,
     Misled,
     NoCondition,
-    NotReproducible,
     PlanDeparts,
     WrongAnswers,
 )
@@ -62,7 +61,9 @@ def explain_failure(failure: Failure) -> str:
     """Return why an episode failed, in a few sentences."""
     parts = [] if failure.finding is None else [finding_text(failure.finding)]
     if failure.cause == "not reproducible":
-        pass
+        fails = "it fails in another way, and other episodes of the task succeed"
+        ended = fails if failure.succeeds_at is None else "it succeeds"
+        parts = [f"in a plain re-run {ended}", *parts]
     elif not failure.shares:  # only the rule: nothing was run again
         parts = ["The states alone do not tell", *parts] if failure.cause == "undecided" else parts
     else:
@@ -92,9 +93,7 @@ def _counterfactual_texts(failure: Failure) -> list[str]:
         parts = [f"it also fails with {listed([*map(replacement_text, failure.counterfactuals)], 'or with')}"]
     else:
         parts = ["there is nothing to replace"]
-    if failure.suspect is not None and failure.suspect_finding is not None:
-        parts.append(f"the states alone suggest the {failure.suspect}: {finding_text(failure.suspect_finding)}")
-    return parts
+    return parts if failure.suspect is None else [*parts, f"the states alone suggest the {failure.suspect}"]
 
 
 def _success_text(failure: Failure) -> str:
@@ -130,15 +129,13 @@ def finding_text(finding: Finding) -> str:
         case Misled(error, number):
             wrong = f"entry {number} was off by up to {error:.2g}"
             return f"the policy was shown another observation than the true one: {wrong}"
-        case NotReproducible(succeeded, difference):
-            ended = "it succeeds" if succeeded else "it fails in another way, and other episodes of the task succeed"
-            return f"in a plain re-run {ended}; the first difference is {difference_text(difference)}"
+        case Difference():
+            return f"the first difference is {_difference_text(finding)}"
 
 
-def difference_text(difference: Difference) -> str:
-    """Return what differs between two runs of an episode."""
+def _difference_text(difference: Difference) -> str:
     at = difference.at
-    match difference.kind:
+    match difference.part:
         case "length":
             return f"the length: the rollout has {difference.given} steps, the re-run {difference.again}"
         case "actions":
