@@ -1,6 +1,5 @@
 """The lanes of an episode over time: success, the active step, the truth of each condition, and the gripper."""
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.language.relations import PREDICATES, STATES
+from lw_torchrl.language.relations import STATES
 from lw_torchrl.record.entities import (
     FALSE,
     GOLD,
@@ -85,7 +84,7 @@ def log_lanes(
     for column in range(columns):
         number, believed = f"{column + 1:0{width}}", episode.believed
         if episode.qaf is not None:
-            condition = short(episode.steps[column][0]) if episode.steps else "condition"
+            condition = episode.short_conditions[column] if episode.steps else "condition"
             truth = np.where(episode.qaf[:, column], "true", "false")
             if believed is not None:
                 wrong = believed[:, column] != episode.qaf[:, column]
@@ -94,13 +93,16 @@ def log_lanes(
             lanes.conditions.append(lanes.send(stream, f"{number} {condition}", 0, truth, looks))
     if episode.opening is None:
         return lanes
-    states = np.where(episode.opening > STATES[OPEN][0].threshold, OPEN, CLOSED)
+    threshold = STATES[OPEN][0].threshold
+    states = np.where(episode.opening > threshold, OPEN, CLOSED)
     looks = {OPEN: STEEL, CLOSED: GOLD}
     if touched is not None:
-        things = np.array(touched[: len(episode)])
-        states = np.where(things == NOTHING, states, np.char.add(np.char.add(states, ", touches "), things))
+        objects = np.array(touched[: len(episode)])
+        states = np.where(objects == NOTHING, states, np.char.add(np.char.add(states, ", touches "), objects))
+        for state in np.unique(states[episode.opening > threshold]).tolist():
+            looks.setdefault(state, TOUCHES_OPEN)
         for state in np.unique(states).tolist():
-            looks.setdefault(state, TOUCHES_CLOSED if state.startswith(CLOSED) else TOUCHES_OPEN)
+            looks.setdefault(state, TOUCHES_CLOSED)
     lanes.send(stream, "gripper", 0, states, looks)
     return lanes
 
@@ -115,34 +117,3 @@ def _send_steps(stream: Any, lanes: Lanes, name: str, episode: RecordedEpisode, 
     nobody = np.where(np.broadcast_to(answered, len(episode)), EVENLY, NONE_HOLDS)
     states = np.where(episode.active == NOBODY, nobody, np.array([*looks, ""])[episode.active])
     lanes.send(stream, name, 0, states, looks | {NONE_HOLDS: FALSE, EVENLY: FALSE})
-
-
-def short(condition: str) -> str:
-    """Shorten a condition: drop the words that all conditions share, and name the same objects once.
-
-    "gripper above and not left or right of puck".
-    """
-    said: list[tuple[str, str, list[tuple[bool, str]]]] = []
-    for clause in condition.split(" and "):
-        subject, _, rest = re.sub(r"\b(the robot's|the) ", "", clause).partition(" is ")
-        negated, rest = rest.startswith("not "), rest.removeprefix("not ")
-        predicate = max((known for known in PREDICATES if f"{rest} ".startswith(f"{known} ")), key=len, default=rest)
-        thing = rest.removeprefix(predicate)
-        if not said or said[-1][:2] != (subject, thing) or not thing:
-            said.append((subject, thing, []))
-        said[-1][2].append((negated, predicate))
-    parts, before = [], ""
-    for subject, thing, predicates in said:
-        words = ""
-        for i, (negated, predicate) in enumerate(predicates):
-            follows = bool(i) and predicates[i - 1][0]
-            joint = ("or " if follows else "and not ") if negated else "but " if follows else "and "
-            last = i == len(predicates) - 1
-            words += f" {joint if i else 'not ' if negated else ''}" + (
-                predicate if last else re.sub(r" (of|with|to)$", "", predicate)
-            )
-        parts.append(f"{'' if subject == before else subject}{words}{thing}".strip())
-        before = subject
-    return re.sub(
-        r"\b(not )?touching table\b", lambda found: "off table" if found[1] else "on table", " and ".join(parts)
-    )

@@ -14,6 +14,8 @@ from tensordict import TensorDictBase
 
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.queries import Clause, Query
+from lw_torchrl.language.relations import TOUCHING
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.record.entities import STEP_TIME, time_columns
@@ -65,6 +67,7 @@ class RecordedEpisode:
     reward: NDArray[np.float32] | None = None  # T, likewise
     corrected: NDArray[np.float32] | None = None  # T, the weight of a correction
     steps: tuple[tuple[str, str], ...] = ()  # the S (condition, skill) texts; empty without a plan
+    short_conditions: tuple[str, ...] = ()  # of each step
     reasons: tuple[str, ...] = ()  # of each step, the plan's comment, or the skill as it was written
     confidence: float | None = None  # of a canonical plan
     target_poses: tuple[TargetPose | None, ...] = ()  # of each step; None if its skill is not a scripted one
@@ -202,6 +205,7 @@ class RecordedEpisode:
             reward=optional(("next", "reward"), flat=True),
             corrected=optional("action_corrected", flat=True),
             steps=steps,
+            short_conditions=() if plan is None else tuple(short_condition(step.condition) for step in plan.steps),
             reasons=() if plan is None else tuple(map(_reason, plan.steps)),
             confidence=getattr(plan, "confidence", None),
             pixels=None if pixels is None else np.stack([check_image("pixels", picture) for picture in pixels]),
@@ -227,6 +231,33 @@ class MendedRecording:
             apart = self.episode.observation[:length, place] - other.observation[:length, place]
             gap = np.maximum(gap, np.linalg.norm(apart, axis=1))
         return int((gap > APART).argmax()) if (gap > APART).any() else length - 1
+
+
+def short_condition(condition: Any) -> str:
+    """Shorten a condition: "gripper above and not left or right of puck"; a text that is not a query stays as it is."""
+    if not isinstance(condition, Query):
+        return str(condition)
+    groups: list[list[Clause]] = []  # consecutive clauses about the same two objects
+    for clause in condition.clauses:
+        same = groups and groups[-1][0].object == clause.object and groups[-1][0].subject == clause.subject
+        if not same or clause.object is None:
+            groups.append([])
+        groups[-1].append(clause)
+    parts, before = [], ""
+    for group in groups:
+        words = ["" if group[0].subject == before else group[0].subject.removeprefix("robot's ")]
+        before, negated = group[0].subject, False
+        for i, clause in enumerate(group):
+            joint = ("or" if negated else "and not") if clause.negated else "but" if negated else "and"
+            first, *rest = clause.predicate.split()
+            is_last = clause is group[-1] or not rest or rest[-1] not in ("of", "with", "to")
+            if clause.predicate == TOUCHING:
+                words.append("off table" if clause.negated else "on table")
+            else:
+                words += [joint if i else "not" if clause.negated else "", first, *(rest if is_last else rest[:-1])]
+            negated = clause.negated
+        parts.append(" ".join(filter(None, [*words, group[0].object])))
+    return " and ".join(parts)
 
 
 def _reason(step: Any) -> str:

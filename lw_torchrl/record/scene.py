@@ -110,7 +110,7 @@ def log_scene(
     things = {name: position for name, position in episode.objects.items() if name != GRIPPER}
     if goal is not None and goal.any() and not goals:
         things.setdefault("goal", goal)
-    offsets = beside({name: position[drawn] for name, position in things.items()}, eye)
+    offsets = name_offsets({name: position[drawn] for name, position in things.items()}, eye)
     trails = []
     for name, color in (colors | {name: GREEN for name in goals if name != GRIPPER}).items():
         part, position = entity_path(name), episode.objects[name]
@@ -172,7 +172,7 @@ def log_pictures(stream: Any, root: str, episode: RecordedEpisode, drawn: NDArra
     return width / height
 
 
-def beside(things: dict[str, NDArray[np.float32]], eye: tuple[Point, Point]) -> dict[str, NDArray[np.float32]]:
+def name_offsets(things: dict[str, NDArray[np.float32]], eye: tuple[Point, Point]) -> dict[str, NDArray[np.float32]]:
     """Return the offset of each name from its object, T×3 metres, as (3,) float32, so that names overlap least.
 
     They are seen from ``eye``, its place and the place it looks at, in the smallest window. A name has one offset.

@@ -12,7 +12,6 @@ from lw_torchrl.evaluation.diagnose.sentences import replaced_text
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plan_text import one_line
 from lw_torchrl.record.entities import FALSE, STEEL, Color, changes, rr, step_color
-from lw_torchrl.record.lanes import short
 from lw_torchrl.record.recorded_episode import NOBODY, MendedRecording, RecordedEpisode
 
 AFTER_SUCCESS, AROUND_FAILURE = 8, 60
@@ -189,7 +188,7 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
     """
     conditions = [condition for condition, _ in episode.steps]
     if _lines(conditions, episode) > PLAN_LINES:
-        conditions = [short(condition) for condition in conditions]
+        conditions = list(episode.short_conditions)
     length = len(episode)
     columns = [
         np.full((length, 1), -1) if episode.active is None else episode.active[:, None],

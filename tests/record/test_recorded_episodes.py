@@ -10,13 +10,16 @@ import torch
 from PIL import Image
 from recordings import PLAN, STEPS, Recording, make_objects, make_rollout, record
 
+from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.queries import Clause, Query
+from lw_torchrl.language.relations import TOUCHING
 from lw_torchrl.record import RerunLogger
-from lw_torchrl.record.lanes import EVENLY, NONE_HOLDS, short
-from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
-from lw_torchrl.record.scene import ROBOT_EYE, beside
+from lw_torchrl.record.lanes import EVENLY, NONE_HOLDS
+from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode, short_condition
+from lw_torchrl.record.scene import ROBOT_EYE, name_offsets
 from lw_torchrl.record.tabs import Tabs
 
-ROWS = [f"/e1/{i}_" + short(c).replace(" ", "_") for i, (c, _) in enumerate(STEPS, 1)]
+ROWS = [f"/e1/{i}_" + short_condition(step.condition).replace(" ", "_") for i, step in enumerate(PLAN.steps, 1)]
 
 
 def test_an_episode_survives_exactly(tmp_path):
@@ -209,28 +212,35 @@ def test_wrong_rollouts_are_named(tmp_path, change, message):
 
 
 @pytest.mark.parametrize(
-    ("condition", "said"),
+    ("clauses", "text"),
     [
-        ("the robot's gripper is near the peg and the robot's gripper is open", "gripper near peg and open"),
+        ([Clause(GRIPPER, "near", "peg"), Clause(GRIPPER, "open")], "gripper near peg and open"),
         (
-            "the robot's gripper is not left of the lid and the robot's gripper is not around the lid",
+            [Clause(GRIPPER, "left of", "lid", negated=True), Clause(GRIPPER, "around", "lid", negated=True)],
             "gripper not left or around lid",
         ),
         (
-            "the stick is not touching the table and the stick is not above the box and the stick is right of the box",
+            [
+                Clause("stick", TOUCHING, negated=True),
+                Clause("stick", "above", "box", negated=True),
+                Clause("stick", "right of", "box"),
+            ],
             "stick off table and not above but right of box",
         ),
-        ("the lid is near the lid box and the lid is not near the box", "lid near lid box and not near box"),
-        ("whatever you say", "whatever you say"),
+        (
+            [Clause("lid", "near", "lid box"), Clause("lid", "near", "box", negated=True)],
+            "lid near lid box and not near box",
+        ),
     ],
 )
-def test_a_condition_in_short_says_the_same(condition, said):
-    assert short(condition) == said
+def test_a_short_condition_says_the_same(clauses, text):
+    assert short_condition(Query(tuple(clauses))) == text
+    assert short_condition("whatever you say") == "whatever you say"
 
 
 def test_names_of_things_in_one_place_stand_apart():
     place = np.full((5, 3), 0.1, np.float32)
-    offsets = beside({"puck": place, "goal": place, "wall": place + 0.5}, ROBOT_EYE)
+    offsets = name_offsets({"puck": place, "goal": place, "wall": place + 0.5}, ROBOT_EYE)
     assert [name for name, offset in offsets.items() if offset.any()] == ["goal"]
     assert np.linalg.norm(offsets["goal"]) > 0.03
 
