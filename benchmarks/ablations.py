@@ -16,12 +16,12 @@ from lw_torchrl.modules.relative_positions import PlanRoles
 from torch import Tensor
 
 import lw_torchrl as lw
+from benchmarks.figures import markdown_table
 from benchmarks.paper.imitation import ImitationRun
 from benchmarks.paper.recipes import EXECUTIONS, PRESETS, SETTINGS, Member, Preset
 from benchmarks.paper.runs import execute_run
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import count_solved
-from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.task_objects import role_object
 from lw_torchrl.language.tasks import Task

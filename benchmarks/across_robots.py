@@ -13,8 +13,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 import lw_torchrl as lw
+from benchmarks.figures import markdown_table
 from lw_torchrl._files import write_json, write_text
-from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.modules import TransferredActor
 from lw_torchrl.suites import load_suite

@@ -15,10 +15,10 @@ import torch
 import tyro
 
 import lw_torchrl as lw
+from benchmarks.figures import markdown_table
 from benchmarks.finding_points import find_points
 from lw_torchrl._files import read_json, write_json, write_text
 from lw_torchrl.evaluation.statistics import mean_difference, mean_rate, wilson_interval
-from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.canonical import canonical_plan, fallback_plan, most_confident
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.training import load_evaluator

@@ -13,10 +13,10 @@ import tyro
 
 import lw_torchrl as lw
 from benchmarks.evaluator_report import condition_drift, drift_table, write_report
+from benchmarks.figures import markdown_table
 from lw_torchrl._files import write_text
 from lw_torchrl.cli.demo import DemoConfig
 from lw_torchrl.evaluation import EvaluationResult
-from lw_torchrl.evaluation.summary import markdown_table
 
 RECIPE = DemoConfig()
 WHO = ("expert", "scripted", "spoilt-30", "random")

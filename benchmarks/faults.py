@@ -16,12 +16,12 @@ from torchrl.envs import Transform
 
 import lw_torchrl as lw
 from benchmarks import planted
+from benchmarks.figures import markdown_table
 from benchmarks.planted import Altered, Done, InStep, Liar, Sensor, Shown
 from lw_torchrl._files import write_json, write_text
 from lw_torchrl.data import collect_demonstrations
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation import CAUSES, attribute_failures
-from lw_torchrl.evaluation.summary import markdown_table
 
 REFERENCE = Path(__file__).parent / "data" / "attribution_plans.json"
 BUILT_ON = (

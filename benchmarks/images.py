@@ -14,10 +14,10 @@ import tyro
 import lw_torchrl as lw
 from benchmarks.evaluator_report import plot_wrong_answers, write_report, wrong_answers
 from benchmarks.evaluators import WHO, demonstrations, evaluated
+from benchmarks.figures import markdown_table
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.evaluation.statistics import Estimate, wilson_interval
-from lw_torchrl.evaluation.summary import markdown_table
 
 
 @dataclass(frozen=True)

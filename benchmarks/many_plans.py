@@ -12,8 +12,8 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
-from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.evaluation.running import ROWS, running
+from lw_torchrl.envs.episodes import FinishedEpisode
+from lw_torchrl.evaluation.rollout import ROWS, rollout
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.skill_program import SkillProgram
@@ -63,31 +63,32 @@ def evaluate_plans(
     equal = {task: list(found.values()) for task, found in by_task.items()}
     different = {task: [plans[same[0]] for same in found] for task, found in equal.items()}
     policy = _PlanOfRow(different, episodes, seed, choose, skills)
-    most = max(len(listed) for listed in different.values()) * episodes
-    found = find_suite(list(different), suite)
-    env = LanguageWorldEnv(
-        [found.tasks.get(task, listed[0].definition) for task, listed in different.items()],
-        suite=found,
-        num_envs=len(different) * max(1, min(most, num_envs // len(different))),
-        seed=seed,
-        max_steps=max_steps,
-        num_threads=num_threads,
-        strict=True,
-    )
-    listed = {task: list(range(episodes)) * len(found) for task, found in different.items()}
-    how: dict[str, Any] = {"noise_scale": noise_scale, "progress": progress, "after_success": 0}
-    how |= {"keys": [_PLACE, ("next", "success")], "place": _PLACE}
+    suite = find_suite(list(different), suite)
     won: dict[int, dict[int, bool]] = {index: {} for index in range(len(plans))}
 
     def in_order(index: int) -> tuple[bool, ...]:
         return tuple(won[index][episode] for episode in range(episodes))
 
-    with running("carrying out plans", env, policy, listed, **how) as finished:
-        for one in finished:
-            for index in equal[one.task][int(one.steps.get(_PLACE)[0]) // episodes]:
-                won[index][one.episode] = one.first_success is not None
-                if len(won[index]) == episodes and on_plan is not None:
-                    on_plan(index, in_order(index))
+    def keep(one: FinishedEpisode) -> None:
+        for index in equal[one.task][int(one.steps.get(_PLACE)[0]) // episodes]:
+            won[index][one.episode] = one.first_success is not None
+            if len(won[index]) == episodes and on_plan is not None:
+                on_plan(index, in_order(index))
+
+    rollout(
+        "carrying out plans",
+        policy,
+        {task: suite.tasks.get(task, listed[0].definition) for task, listed in different.items()},
+        {task: list(range(episodes)) * len(listed) for task, listed in different.items()},
+        keep,
+        num_envs=max(len(different), num_envs),
+        env_options={"suite": suite, "seed": seed, "max_steps": max_steps, "num_threads": num_threads},
+        keys=[_PLACE, ("next", "success")],
+        noise_scale=noise_scale,
+        after_success=0,
+        place=_PLACE,
+        progress=progress,
+    )
     return [in_order(index) for index in range(len(plans))]
 
 

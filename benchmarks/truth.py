@@ -13,11 +13,11 @@ import torch
 import tyro
 
 import lw_torchrl as lw
+from benchmarks.figures import markdown_table
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import EvaluationResult, count_solved
 from lw_torchrl.evaluation.figures import COLORS, check_image, saved
 from lw_torchrl.evaluation.statistics import Estimate, wilson_interval
-from lw_torchrl.evaluation.summary import markdown_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,13 +17,14 @@ import tyro
 from tyro.conf import Positional, Suppress, subcommand
 
 import lw_torchrl as lw
+from benchmarks.figures import plot_sorted_tasks
 from benchmarks.paper import offline, recipes, runs
 from benchmarks.paper.comparison import compare, write_summary
 from benchmarks.paper.imitation import SCRIPTED, ImitationRun
 from benchmarks.paper.offline import OfflineRun
 from benchmarks.paper.published import published_curves
 from benchmarks.paper.schedule import Job, Schedule, execute
-from lw_torchrl.evaluation import EvaluationResult, plot_sorted_tasks
+from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.language.formats import PLAN_FORMATS
 
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.figures import markdown_table
 from benchmarks.paper.runs import Run
 from lw_torchrl._files import write_json, write_text
 from lw_torchrl.evaluation import EvaluationResult, Summary, statistics, summarize
 from lw_torchrl.evaluation.figures import new_figure, saved, trim
 from lw_torchrl.evaluation.statistics import Estimate
-from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.tasks import MT10
 
 

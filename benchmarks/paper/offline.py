@@ -10,6 +10,7 @@ from lw_torchrl.training.behavioral_cloning import bc_loss
 from torch import Tensor
 from torchrl.objectives import CQLLoss, IQLLoss, LossModule, TD3BCLoss
 
+from benchmarks.figures import markdown_table
 from benchmarks.paper import recipes
 from benchmarks.paper.comparison import compare, plot_methods, write_summary
 from benchmarks.paper.offline_losses import L1CQLLoss, L1IQLLoss, L1TD3BCLoss
@@ -20,7 +21,6 @@ from lw_torchrl._files import locked
 from lw_torchrl._tensor_files import read_tensors, write_tensors
 from lw_torchrl.data import BEHAVIOURS, LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.evaluation import EvaluationResult
-from lw_torchrl.evaluation.summary import markdown_table
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules import DescriptorEncoder, PlanEncoder, QValue, Value
 from lw_torchrl.modules.policy import Encoder, Policy

@@ -1,4 +1,4 @@
-"""Who acts in `lw-torchrl evaluate` and `record`, and how: policies, their plans and their evaluators."""
+"""The policy of `lw-torchrl evaluate` and `record`, with its plans and its evaluator."""
 
 from __future__ import annotations
 
@@ -62,13 +62,14 @@ class Acting:
         return options.read_plans(self.reference, self.known) if self.reference else None
 
     def policy(self, who: str, tasks: list[str]) -> tuple[Any, Plans | None, Any]:
-        """Return a policy, the plans to show, and an evaluator to run before it if it cannot contain one."""
+        """Return a policy, the plans to show, and the evaluator in front of the policy."""
         policy, plans = self._policy(who, tasks)
         if self.evaluator is None:
             return policy, plans, None
-        if plans_of(policy) is None:
+        if (own := plans_of(policy)) is None:
             raise ValueError(f"--evaluator requires a policy with plans; {who} has none")
-        evaluator = read_evaluator(self.evaluator, policy.plans, self.text_encoder)
+        evaluator = read_evaluator(self.evaluator, own, self.text_encoder)
+        evaluator.answers = "hard"  # the policy was trained on exact answers
         return policy, plans, evaluator
 
     def _policy(self, who: str, tasks: list[str]) -> tuple[Any, Plans | None]:

@@ -15,6 +15,7 @@ from lw_torchrl.cli import options
 from lw_torchrl.cli.acting import Acting, is_object, policy_name
 from lw_torchrl.cli.output import Output
 from lw_torchrl.language.plans import Plans
+from lw_torchrl.modules.policy import plans_of, tasks_of
 
 _TASKS = "MT10, MT50, a suite, or names of tasks; by default those of --plans or of the demonstrations"
 
@@ -48,8 +49,8 @@ class Evaluate:
             tasks = list(acting.own_plans or (lw.MT10 if suite is None else suite.plans or suite.tasks))
         policy, plans, evaluator = acting.policy(self.policy, tasks)
         if not tasks:
-            shown = set() if acting.plans or is_object(self.policy) else demonstrated_tasks(self.policy)
-            tasks = _default_tasks(policy, shown, suite)
+            demonstrated = set() if acting.plans or is_object(self.policy) else demonstrated_tasks(self.policy)
+            tasks = _default_tasks(policy, demonstrated, suite)
         use = lw.evaluation.PlanUse(plans) if plans and isinstance(policy, lw.ScriptedSkillActor) else None
         watching: dict[str, Any] = {"also_record": ["qaf", "skill_weights"], "on_episode": use} if use else {}
         more: dict[str, Any] = {
@@ -76,7 +77,7 @@ class Evaluate:
         from lw_torchrl.record.rollouts import run_recorded, write_recording
         from lw_torchrl.training.checkpoint import policy_file
 
-        plans = getattr(policy, "plans", None)
+        plans = plans_of(policy)
         origin: dict[str, Any] = {"plans": None if plans is None else plans.fingerprint}
         for name, file in (("checkpoint", policy_file(self.policy)), ("evaluator", Path(self.acting.evaluator or ""))):
             origin[name] = file if file.is_file() else None
@@ -108,13 +109,13 @@ def _default_tasks(policy: Any, demonstrated: set[str], suite: lw.suites.Suite |
     """Return the policy's demonstrated tasks, or all its tasks if none is recorded, that a suite simulates."""
     from lw_torchrl.suites.suite import known_suite
 
-    if (known := lw.modules.tasks_of(policy)) is None:
-        raise ValueError("--tasks is required: the policy does not state its tasks")
+    if (known := tasks_of(policy)) is None:
+        raise ValueError("--tasks is required: the policy has neither tasks nor plans")
     chosen = [task for task in known if task in demonstrated] or list(known)
     tasks = [task for task in chosen if (known_suite(task) if suite is None else task in suite.tasks)]
     if not tasks:
-        mend = "name others by --tasks, or the suite that has them: --import my_module or --suite my_module:suite"
-        raise ValueError(f"no simulator has the policy's tasks, {', '.join(chosen)}; {mend}")
+        hint = "name others by --tasks, or the suite that has them: --import my_module or --suite my_module:suite"
+        raise ValueError(f"no simulator has the policy's tasks, {', '.join(chosen)}; {hint}")
     if len(tasks) < len(known):
         print(f"evaluating {counted(len(tasks), 'task')} of the policy's {len(known)}; choose others by --tasks")
     return tasks

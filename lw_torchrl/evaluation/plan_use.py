@@ -1,4 +1,4 @@
-"""How plans fare: which steps hold in which states, which were chosen, and where failed episodes got stuck."""
+"""PlanUse: which steps of a plan are true and chosen in which states, and where failed episodes get stuck."""
 
 from __future__ import annotations
 
@@ -10,37 +10,34 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
-from torchrl.envs import TransformedEnv
 
-from lw_torchrl.envs.episodes import FinishedEpisode, run_episodes
-from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.envs.episodes import FinishedEpisode
+from lw_torchrl.evaluation.rollout import rollout, suite_tasks
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.suites.metaworld.experts import ExpertActor
-from lw_torchrl.transforms import QAFTransform
 
 _AFTER = 20  # steps after the first success that still count, as in training data
-_ROWS = 250  # or so, stepped together
-_A_WHILE = 5  # states in which a step must have been in charge for an episode to have reached it
-_LATE = 50  # the last steps of a failed episode, in which it got nowhere
+_A_WHILE = 5  # an episode has reached a step that was active in so many states
+_LATE = 50  # the last steps of a failed episode, in which it makes no progress
 
 
 @dataclass
 class TaskUse:
-    """How one task's plan was used, over all its episodes, to 20 steps after their first success."""
+    """How one task's plan was used in all its episodes, each up to 20 steps after its first success."""
 
-    states: int  # how many were seen
+    states: int  # number of states
     true: list[float]  # per step of the plan, the share of states in which its condition held
-    chosen: list[float]  # per step, the share of states in which it had the greatest weight; empty if no policy chose
-    covered: float  # the share of the states before the first success in which some condition held
-    gaps: list[tuple[int, int, int]]  # the others, as stretches: episode, first and last step of each
-    num_true: float  # the median number of conditions that held, before the first success
-    stuck: list[int]  # per step, in how many failed episodes it was chosen (or true) most in the last 50 steps
-    furthest: list[int]  # per step, in how many failed episodes it was the last chosen (or true) in 5 states
-    failed: int  # how many episodes failed
+    chosen: list[float]  # per step, the share of states in which it had the largest weight; empty without weights
+    covered: float  # the share of states before the first success in which a condition held
+    gaps: list[tuple[int, int, int]]  # the uncovered stretches: episode, first and last step
+    num_true: float  # the median number of conditions that held before the first success
+    stuck: list[int]  # per step, the failed episodes in which it was chosen (or true) most in the last 50 steps
+    furthest: list[int]  # per step, the failed episodes in which it was the last one chosen (or true) in 5 states
+    failed: int  # number of failed episodes
 
     def to_json(self) -> dict[str, Any]:
-        """As plain numbers and lists."""
+        """Return plain numbers and lists."""
         return asdict(self)
 
 
@@ -60,7 +57,7 @@ class _Episode(NamedTuple):
 
 
 class PlanUse:
-    """Collects how plans are used from finished episodes: pass it to :func:`evaluate` as ``on_episode``."""
+    """Collect how plans are used in finished episodes: pass it to :func:`evaluate` as ``on_episode``."""
 
     def __init__(self, plans: AnyPlans) -> None:
         self.plans = as_plans(plans)
@@ -77,13 +74,13 @@ class PlanUse:
         self._seen.setdefault(episode.task, []).append(one)
 
     def tasks(self) -> dict[str, TaskUse]:
-        """What was seen of each task."""
+        """Return the use of each task's plan."""
         return {task: _summed(seen) for task, seen in sorted(self._seen.items())}
 
 
-def where_stuck(in_charge: Tensor, window: int) -> tuple[int, int]:
-    """In the last ``window`` states: the step most often in charge, and the last one in charge for a while."""
-    states = in_charge[-window:].sum(0)
+def where_stuck(active: Tensor, window: int) -> tuple[int, int]:
+    """Return the step that was active most often in the last ``window`` states, and the last one active for a while."""
+    states = active[-window:].sum(0)
     reached = (states >= states.max().clamp(1, _A_WHILE)).nonzero()
     return int(states.argmax()), int(reached[-1]) if len(reached) else 0
 
@@ -95,9 +92,9 @@ def _summed(seen: list[_Episode]) -> TaskUse:
     stuck, furthest = [0] * steps, [0] * steps
     for one in seen:
         if not one.success:
-            in_charge = one.qaf.long() if one.chosen is None else one_hot(one.chosen, steps)
-            stuck[where_stuck(in_charge, _LATE)[0]] += 1
-            furthest[where_stuck(in_charge, len(in_charge))[1]] += 1
+            active = one.qaf.long() if one.chosen is None else one_hot(one.chosen, steps)
+            stuck[where_stuck(active, _LATE)[0]] += 1
+            furthest[where_stuck(active, len(active))[1]] += 1
     chosen = [one.chosen for one in seen if one.chosen is not None]
     counts = torch.bincount(torch.cat(chosen), minlength=steps) if len(chosen) == len(seen) else torch.zeros(0)
     return TaskUse(
@@ -120,8 +117,13 @@ def expert_use(
     episodes_per_task: int = 10,
     seed: int = 0,
 ) -> dict[str, TaskUse]:
-    """Which conditions of the plans hold in the states that Meta-World's experts visit, without action noise, in some
-    of the plans' tasks or all. An episode ends 20 steps after its first success.
+    """Return which conditions of the plans hold in the states that Meta-World's experts visit, without action noise.
+
+    Args:
+        plans: the plans.
+        tasks: some of the plans' tasks; None for all.
+        episodes_per_task: episodes of each task, which end 20 steps after their first success.
+        seed: the environment's seed.
 
     Example:
         >>> import lw_torchrl as lw
@@ -130,11 +132,16 @@ def expert_use(
     """
     use = PlanUse(plans)
     names = resolve_tasks(list(use.plans) if tasks is None else tasks)
-    rows = len(names) * min(episodes_per_task, -(-_ROWS // len(names)))
-    env = TransformedEnv(LanguageWorldEnv(names, num_envs=rows, seed=seed, strict=True), QAFTransform(use.plans))
-    episodes = {task: range(episodes_per_task) for task in names}
-    keys = ["qaf", ("next", "success")]
-    for finished in run_episodes(env, ExpertActor(names), episodes, keys=keys, after_success=_AFTER):
-        use(finished)
-    env.close()
+    suite, chosen = suite_tasks(names, None)
+    rollout(
+        "running experts",
+        ExpertActor(names),
+        chosen,
+        dict.fromkeys(names, range(episodes_per_task)),
+        use,
+        plans=use.plans,
+        env_options={"seed": seed, "suite": suite},
+        keys=["qaf", ("next", "success")],
+        after_success=_AFTER,
+    )
     return use.tasks()

@@ -1,4 +1,4 @@
-"""EvaluationResult: what an evaluation measured, episode by episode, as JSON."""
+"""EvaluationResult: the outcome of an evaluation, episode by episode, as JSON."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from torch import Tensor
 from lw_torchrl._checks import Count, Natural, check_flag, check_int, check_scale
 from lw_torchrl._files import AnyPath, read_json, write_json
 from lw_torchrl._versions import package_versions
-from lw_torchrl.evaluation.failure_records import Failure, failure_table, is_number, read_failures, read_records
+from lw_torchrl.evaluation.diagnose.failure import Failure, failure_table, read_failures
+from lw_torchrl.evaluation.records import is_number, read_records
 
 FORMAT = "lw_torchrl.evaluation"
 FORMAT_VERSION = 1
@@ -51,11 +52,9 @@ class EvaluationResult:
     Attributes:
         config: tasks, episodes_per_task, seed, noise_scale, stop_at_success, max_steps.
         episodes: one record each, by task and episode.
-        origin: what it came from, once it was saved: ``date`` (UTC, ISO 8601), ``versions`` of the packages and, if
-            they were told, ``checkpoint`` (``path`` and ``sha256``) and ``plans``. Results that differ in it alone are
-            equal.
-        failures: why each failed episode failed, by task and episode, where :func:`evaluate` was asked to attribute
-            them; None where it was not.
+        origin: provenance, once it was saved: ``date`` (UTC, ISO 8601), ``versions`` of the packages and, if given to
+            :meth:`save`, ``checkpoint`` (``path`` and ``sha256``) and ``plans``. It does not count in a comparison.
+        failures: why each failed episode failed, by task and episode; None unless :func:`evaluate` attributed them.
     """
 
     config: dict[str, Any]
@@ -122,13 +121,13 @@ class EvaluationResult:
                 origin[name] = {"path": str(given), "sha256": sha256(Path(given).read_bytes()).hexdigest()}
         if plans is not None:
             origin["plans"] = plans
-        told: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "origin": origin, "config": self.config}
-        told["mean_success_once"] = self.mean_success
-        told |= {k: getattr(self, k) for k in ("success_once", "success_at_end", "first_success", "mean_return")}
-        told["episodes"] = [{k: v for k, v in asdict(e).items() if k != "actions"} for e in self.episodes]
+        content: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "origin": origin, "config": self.config}
+        content["mean_success_once"] = self.mean_success
+        content |= {k: getattr(self, k) for k in ("success_once", "success_at_end", "first_success", "mean_return")}
+        content["episodes"] = [{k: v for k, v in asdict(e).items() if k != "actions"} for e in self.episodes]
         if self.failures is not None:
-            told["failures"] = [failure.to_json() for failure in self.failures]
-        write_json(path, told)
+            content["failures"] = [failure.to_json() for failure in self.failures]
+        write_json(path, content)
 
     @classmethod
     def load(cls, path: AnyPath) -> EvaluationResult:
@@ -161,7 +160,7 @@ class EvaluationResult:
             ) from error
 
     def table(self) -> str:
-        """The rates per task as text in columns."""
+        """Return the rates per task as text in columns."""
         lines = [f"{'task':28} {'any step':>8} {'at end':>8} {'first step':>10}"]
         ends, firsts = self.success_at_end, self.first_success
         rows = [(task, once, ends[task], firsts[task]) for task, once in self.success_once.items()]
@@ -171,13 +170,15 @@ class EvaluationResult:
         return "\n".join(lines)
 
     def failure_table(self) -> str:
-        """Numbers of failed episodes, as text: a row for each task, a column for each cause. :class:`ValueError` if the
-        failures were not attributed."""
+        """Return the numbers of failed episodes as text: a row for each task, a column for each cause.
+
+        Raise :class:`ValueError` if the failures were not attributed.
+        """
         return failure_table(self.config["tasks"], self.config["episodes_per_task"], attributed(self))
 
 
 def attributed(result: EvaluationResult) -> tuple[Failure, ...]:
-    """The failures; :class:`ValueError` where they were not attributed."""
+    """Return the failures; raise :class:`ValueError` if they were not attributed."""
     if result.failures is None:
         raise ValueError("the result has no failures: they are attributed by evaluate(..., attribute=True)")
     return result.failures

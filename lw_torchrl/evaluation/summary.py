@@ -175,10 +175,3 @@ def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResul
                 raise ValueError(f"results must share {key}, got {got}")
     rates: dict[str, Any] = {task: [result.success_once[task] for result in named.values()] for task in tasks}
     return summarize_rates(rates, seeds=list(named), **options)
-
-
-def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Text columns of even width, as Markdown."""
-    widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
-    lines = [head, ["-" * width for width in widths], *rows]
-    return "\n".join("| " + " | ".join(map(str.ljust, line, widths)) + " |" for line in lines)

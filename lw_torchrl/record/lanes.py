@@ -1,6 +1,5 @@
-"""The lanes of an episode: the step in force, what held, what the gripper did and touched, and success, over time."""
+"""The lanes of an episode over time: success, the active step, the truth of each condition, and the gripper."""
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.language.relations import PREDICATES, STATES
+from lw_torchrl.language.relations import STATES
 from lw_torchrl.record.entities import (
     FALSE,
     GOLD,
@@ -25,6 +24,7 @@ from lw_torchrl.record.recorded_episode import NOBODY, MendedRecording, Recorded
 
 NONE_HOLDS, EVENLY = "no condition holds", "evenly mixed"
 OPEN, CLOSED, NOTHING = "open", "closed", "nothing"
+_WRONG = "false, answered true", "true, answered false"
 FAILED: Color = (215, 75, 75)
 WRONG: Color = (200, 60, 140)
 TOUCHES_CLOSED, TOUCHES_OPEN = (225, 130, 60), (150, 165, 220)
@@ -34,18 +34,19 @@ TOUCHES_CLOSED, TOUCHES_OPEN = (225, 130, 60), (150, 165, 220)
 class Lanes:
     """Lanes below ``root``: one has an entry where its state changes, and an empty one at the end.
 
-    The viewer shows a lane's path as its title, with a backslash before whatever is no letter, digit or underscore, and
-    sorts the lanes; so paths are short, and names begin with numbers. ``states`` is what all lanes of a view have in
-    common: each state's words and colour.
+    The viewer shows a lane's path as its title, with a backslash before anything but letters, digits and underscores,
+    and sorts the lanes; so paths are short, and names begin with numbers. ``states`` holds the text and colour of each
+    state, shared by all lanes of a view; ``conditions`` are the paths of the lanes of conditions.
     """
 
     root: str
     step_time: float
     states: dict[str, tuple[str, Color]] = field(default_factory=dict)
     paths: list[str] = field(default_factory=list)
+    conditions: list[str] = field(default_factory=list)
 
-    def send(self, stream: Any, name: str, first: int, states: NDArray[np.str_], looks: Mapping[str, Any]) -> None:
-        """Add a lane whose first state is that of step ``first``; ``looks`` are colours, or words and colours."""
+    def send(self, stream: Any, name: str, first: int, states: NDArray[np.str_], looks: Mapping[str, Any]) -> str:
+        """Add a lane that begins at step ``first`` and return its path; ``looks`` are colours, or texts and colours."""
         for state, look in looks.items():
             self.states[state] = look if isinstance(look[0], str) else (state, look)
         rows = changes(states[:, None])
@@ -55,6 +56,7 @@ class Lanes:
         path = self.root + entity_path(name.replace("'", "\u02bc").replace(" ", "_"))
         stream.send_columns(path, times, rr.StateChange.columns(state=entries))
         self.paths.append(path)
+        return path
 
 
 def log_lanes(
@@ -65,78 +67,53 @@ def log_lanes(
     touched: Sequence[str] | None,
     ghost: MendedRecording | None,
 ) -> Lanes:
-    """The lanes of an episode below ``root``; ``ended`` is its verdict, ``touched`` what its fingers touched."""
+    """Log the lanes of an episode below ``root``; ``ended`` is its verdict, ``touched`` what its fingers touched."""
     lanes = Lanes(root, episode.step_time)
-    found = [a.shape[1] for a in (episode.qaf, episode.believed, episode.skill_weights) if a is not None]
-    columns = max([len(episode.steps), *found])
+    widths = [a.shape[1] for a in (episode.qaf, episode.believed, episode.skill_weights) if a is not None]
+    columns = max([len(episode.steps), *widths])
     width = len(str(columns))
     if episode.success is not None and episode.first_success is None:
         lanes.send(stream, f"{0:0{width}} verdict", 1, np.repeat(ended, len(episode)), {ended: FAILED})
     elif episode.success is not None:
         states = np.where(episode.success, "success", "not yet")
         lanes.send(stream, f"{0:0{width}} verdict", 1, states, {"success": TRUE, "not yet": FALSE})
-    if episode.in_force is not None:
+    if episode.active is not None:
         _send_steps(stream, lanes, f"{0:0{width}}b plan step", episode)
-    if ghost is not None and ghost.episode.in_force is not None:
+    if ghost is not None and ghost.episode.active is not None:
         _send_steps(stream, lanes, f"{0:0{width}}c ghost with {ghost.by}", ghost.episode, "ghost")
     for column in range(columns):
-        number, told = f"{column + 1:0{width}}", episode.believed
+        number, believed = f"{column + 1:0{width}}", episode.believed
         if episode.qaf is not None:
-            condition = short(episode.steps[column][0]) if episode.steps else "condition"
+            condition = episode.short_conditions[column] if episode.steps else "condition"
             truth = np.where(episode.qaf[:, column], "true", "false")
-            if told is not None:
-                wrong = told[:, column] != episode.qaf[:, column]
-                truth = np.where(wrong, np.where(told[:, column], "false, told true", "true, told false"), truth)
-            looks = {"true": TRUE, "false": FALSE, "false, told true": WRONG, "true, told false": WRONG}
-            lanes.send(stream, f"{number} {condition}", 0, truth, looks)
-    opening = episode.observation[:, episode.layout.opening]
-    states = np.where(opening > STATES[OPEN][0].threshold, OPEN, CLOSED)
+            if believed is not None:
+                wrong = believed[:, column] != episode.qaf[:, column]
+                truth = np.where(wrong, np.where(believed[:, column], *_WRONG), truth)
+            looks = {"true": TRUE, "false": FALSE, **dict.fromkeys(_WRONG, WRONG)}
+            lanes.conditions.append(lanes.send(stream, f"{number} {condition}", 0, truth, looks))
+    if episode.opening is None:
+        return lanes
+    threshold = STATES[OPEN][0].threshold
+    states = np.where(episode.opening > threshold, OPEN, CLOSED)
     looks = {OPEN: STEEL, CLOSED: GOLD}
     if touched is not None:
-        things = np.array(touched[: len(episode)])
-        states = np.where(things == NOTHING, states, np.char.add(np.char.add(states, ", touches "), things))
+        objects = np.array(touched[: len(episode)])
+        states = np.where(objects == NOTHING, states, np.char.add(np.char.add(states, ", touches "), objects))
+        for state in np.unique(states[episode.opening > threshold]).tolist():
+            looks.setdefault(state, TOUCHES_OPEN)
         for state in np.unique(states).tolist():
-            looks.setdefault(state, TOUCHES_CLOSED if state.startswith(CLOSED) else TOUCHES_OPEN)
+            looks.setdefault(state, TOUCHES_CLOSED)
     lanes.send(stream, "gripper", 0, states, looks)
     return lanes
 
 
 def _send_steps(stream: Any, lanes: Lanes, name: str, episode: RecordedEpisode, kind: str = "") -> None:
-    """The step in force, numbered from 1; steps of another ``kind`` of plan have names of their own."""
-    assert episode.in_force is not None
-    count = max(len(episode.steps), int(episode.in_force.max()) + 1)
+    """Log the active step, numbered from 1; the steps of another ``kind`` of plan have separate names."""
+    assert episode.active is not None
+    count = max(len(episode.steps), int(episode.active.max()) + 1)
     named = [f"{i} {skill}" for i, (_, skill) in enumerate(episode.steps, 1)] or map(str, range(1, count + 1))
     looks: dict[str, Any] = {f"{kind}{i}": (label, step_color(i)) for i, label in enumerate(named)}
     answered = True if episode.answers is None else episode.answers.any(axis=1)
     nobody = np.where(np.broadcast_to(answered, len(episode)), EVENLY, NONE_HOLDS)
-    states = np.where(episode.in_force == NOBODY, nobody, np.array([*looks, ""])[episode.in_force])
+    states = np.where(episode.active == NOBODY, nobody, np.array([*looks, ""])[episode.active])
     lanes.send(stream, name, 0, states, looks | {NONE_HOLDS: FALSE, EVENLY: FALSE})
-
-
-def short(condition: str) -> str:
-    """A condition without the words that all have; what is said of the same things names them once: "gripper above and
-    not left or right of puck"."""
-    said: list[tuple[str, str, list[tuple[bool, str]]]] = []
-    for clause in condition.split(" and "):
-        subject, _, rest = re.sub(r"\b(the robot's|the) ", "", clause).partition(" is ")
-        negated, rest = rest.startswith("not "), rest.removeprefix("not ")
-        predicate = max((known for known in PREDICATES if f"{rest} ".startswith(f"{known} ")), key=len, default=rest)
-        thing = rest.removeprefix(predicate)
-        if not said or said[-1][:2] != (subject, thing) or not thing:
-            said.append((subject, thing, []))
-        said[-1][2].append((negated, predicate))
-    parts, before = [], ""
-    for subject, thing, predicates in said:
-        words = ""
-        for i, (negated, predicate) in enumerate(predicates):
-            follows = bool(i) and predicates[i - 1][0]
-            joint = ("or " if follows else "and not ") if negated else "but " if follows else "and "
-            last = i == len(predicates) - 1
-            words += f" {joint if i else 'not ' if negated else ''}" + (
-                predicate if last else re.sub(r" (of|with|to)$", "", predicate)
-            )
-        parts.append(f"{'' if subject == before else subject}{words}{thing}".strip())
-        before = subject
-    return re.sub(
-        r"\b(not )?touching table\b", lambda found: "off table" if found[1] else "on table", " and ".join(parts)
-    )

@@ -1,8 +1,7 @@
-"""The page of an episode: what is logged of it, and its views, in a tab or in a column beside others."""
+"""The page of an episode: the data that is logged, and its views, in a tab or in a column next to others."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,7 +10,7 @@ from lw_torchrl.record.entities import EPISODE_TIMELINE, SECONDS_TIMELINE, Color
 from lw_torchrl.record.lanes import log_lanes
 from lw_torchrl.record.meshes import Known, Motion
 from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
-from lw_torchrl.record.scene import Point, log_pictures, log_scene, touched_things
+from lw_torchrl.record.scene import Point, eye_of, log_pictures, log_scene, touched_objects
 from lw_torchrl.record.verdict import (
     Heading,
     decisive_step,
@@ -23,12 +22,7 @@ from lw_torchrl.record.verdict import (
     verdict,
 )
 
-MANY_LANES = 9  # beside more, a small window has little room for the verdict
-_CONDITION = re.compile(r"/0*[1-9]\d*_[^/]*$")  # how lanes of conditions are called, as log_lanes has it
-
-# From behind the robot's right shoulder, over a table whose middle is at (0, 0.6, 0); with the arm, from the front.
-SIMPLE_EYE: tuple[Point, Point] = ((0.54, 0.23, 0.46), (0.03, 0.63, 0.10))
-ROBOT_EYE: tuple[Point, Point] = ((0.54, 0.18, 0.47), (-0.02, 0.62, 0.13))
+MANY_LANES = 9  # with more lanes, a small window has little room for the verdict
 
 CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
     "distance": ("Distance to the target, cm", None),
@@ -42,55 +36,59 @@ CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
 
 @dataclass(frozen=True)
 class Page:
-    """What was logged of an episode, as far as its views depend on it."""
+    """The part of an episode's data on which its views depend."""
 
     root: str
     trails: Collection[str]  # entities that are shown up to the cursor
-    eye: tuple[Point, Point]  # where the scene is seen from, and what is looked at
+    eye: tuple[Point, Point]  # the place from which the scene is seen, and the place looked at
+    has_scene: bool  # whether anything is drawn in 3-D
     shown: tuple[int, int]  # the first and last step worth a look
     decisive: int  # the step to open it at
     curves: Collection[str]
     lines: int  # of the plan's text, in a small window; 0 where there is no plan
     lanes: Sequence[str]  # their entities
-    states: dict[str, tuple[str, Color]]  # of the lanes: words and colour
+    conditions: Sequence[str]  # those of the lanes of conditions
+    states: dict[str, tuple[str, Color]]  # of the lanes: text and colour
     farthest: float  # of the distances, cm
     row: dict[str, Any]  # in the overview
-    frames: dict[str, str]  # as log_motion gives them
-    pictures: float  # what the policy saw: width over height, 0 where it saw none
+    frames: dict[str, str]  # as log_motion returns them
+    pictures: float  # that the policy saw: width over height, 0 without any
     step_time: float  # seconds between two actions
+    bounded: bool  # whether all actions are in [-1, 1]
 
     def title(self, policy: bool = True) -> str:
-        """The tab's: the episode's name, who acted if that is to be said, and how it ended, if that is known."""
+        """Return the tab's title: the episode's name, the policy unless it is left out, and how it ended."""
         ended = {"failed": "failed", "success": f"success at {self.row['at']}"}.get(self.row["ended"])
         if self.row["cause"]:
             ended = f"failed: {self.row['cause']}"
         return " · ".join(filter(None, [self.row["name"], self.row["policy"] if policy else None, ended]))
 
     def tab(self, title: str) -> rrb.Horizontal:
-        """Scene and curves on the left, words and lanes on the right."""
+        """Return a tab with scene and curves on the left, texts and lanes on the right."""
         # Shares are the pixels that a view needs in a window of 1100×700; what is longer scrolls.
         plan = 60 + 15 * self.lines if self.lines else 0
-        scene = self._scene()
-        if self.pictures:  # 0.3 of the width for one picture, 0.4 for two side by side
+        scene: Any = self._scene()
+        if not self.has_scene and self.pictures:
+            scene = self._pictures()
+        elif self.pictures:  # 0.3 of the width for one picture, 0.4 for two side by side
             seen = min(0.2 + 0.1 * self.pictures, 0.5)
             scene = rrb.Horizontal(scene, self._pictures(), column_shares=[1 - seen, seen])
-        left: list[tuple[float, Any]] = [(max(150, 500 - plan), scene)]
+        left: list[tuple[float, Any]] = [(max(150, 500 - plan), scene)] if self.has_scene or self.pictures else []
         left += [(plan, self._words("plan", "Plan"))] if plan else []
-        left.append((105, rrb.Tabs(*(self._curve(name) for name in CURVES if name in self.curves))))
+        left += [(105, rrb.Tabs(*(self._curve(name) for name in CURVES if name in self.curves)))] if self.curves else []
         right = self._lanes(self.lanes)
         right.insert(0, (max(100, 605 - sum(share for share, _ in right)), self._words("verdict", "Verdict")))
         return rrb.Horizontal(_stacked(left), _stacked(right), column_shares=[9, 10], name=title)
 
     def column(self, title: str, shown: tuple[int, int], farthest: float) -> rrb.Vertical:
-        """Verdict, scene, distance and main lanes in a column, beside others that show the same steps and centimetres.
+        """Return a column of verdict, scene, distance and main lanes, which shows the same steps as other columns.
 
-        What held is behind the scene.
+        The lanes of conditions are behind the scene.
         """
         page = replace(self, shown=shown, farthest=farthest)
-        conditions = [lane for lane in self.lanes if _CONDITION.search(lane)]
-        behind: list[Any] = [view for _, view in page._lanes(conditions, "What held")]
+        behind: list[Any] = [view for _, view in page._lanes(self.conditions, "What held")]
         below: list[tuple[float, Any]] = [(100, page._curve("distance"))] if "distance" in page.curves else []
-        below += page._lanes([lane for lane in self.lanes if lane not in conditions])
+        below += page._lanes([lane for lane in self.lanes if lane not in self.conditions])
         behind += [page._pictures()] if page.pictures else []
         scene = rrb.Tabs(page._scene(), *behind) if behind else page._scene()
         room = max(120, 487 - sum(share for share, _ in below))
@@ -130,6 +128,7 @@ class Page:
 
     def _curve(self, name: str) -> rrb.TimeSeriesView:
         title, limits = CURVES[name]
+        limits = None if name == "action" and not self.bounded else limits
         if name == "distance":  # a small view has no room for the axis' numbers
             limits, title = (-0.05 * self.farthest, 1.05 * self.farthest), f"{title} (up to {self.farthest:.0f})"
         return rrb.TimeSeriesView(
@@ -154,14 +153,14 @@ def send_page(
     ghost: MendedRecording | None,
     meshes: Known,
 ) -> Page:
-    """Log the recording's ``number``-th episode, under ``name``; returns what its views are to show.
+    """Log the recording's ``number``-th episode, under ``name``, and return its page.
 
-    ``meshes`` are those in the recording, as :func:`log_motion` has them.
+    ``meshes`` are the recording's, as for :func:`log_motion`.
     """
     root = entity_path(name)
-    touched = None if motion is None else touched_things(motion, episode)
+    touched = None if motion is None else touched_objects(motion, episode)
     lanes = log_lanes(stream, entity_path(f"e{number}"), episode, heading.ended(episode), touched, ghost)
-    eye = SIMPLE_EYE if motion is None else ROBOT_EYE
+    eye = eye_of(episode, motion)
     drawn = drawn_steps(heading, episode, ghost)
     trails, frames = log_scene(stream, root, episode, motion, meshes, drawn, eye, ghost)
     text = verdict(heading, episode, ghost, small=len(lanes.paths) > MANY_LANES)
@@ -170,17 +169,20 @@ def send_page(
         root,
         trails=trails,
         eye=eye,
+        has_scene=bool(episode.objects) or motion is not None,
         shown=telling_steps(heading, episode, ghost),
         decisive=decisive_step(heading, episode, ghost),
         curves=log_curves(stream, root, episode),
         lines=log_plan(stream, root, episode) if episode.steps else 0,
         lanes=lanes.paths,
+        conditions=lanes.conditions,
         states=lanes.states,
         farthest=farthest(episode),
         row=heading.row(episode, name),
         frames=frames,
         pictures=log_pictures(stream, root, episode, drawn),
         step_time=episode.step_time,
+        bounded=bool((abs(episode.action) <= 1).all()),
     )
 
 

@@ -1,4 +1,4 @@
-"""RecordedEpisode: one episode as checked arrays, and where its plan's skills move things to."""
+"""RecordedEpisode: one episode as checked arrays, and the targets of its plan's skills."""
 
 from __future__ import annotations
 
@@ -14,14 +14,17 @@ from tensordict import TensorDictBase
 
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.queries import Clause, Query
+from lw_torchrl.language.relations import TOUCHING
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import Task
 from lw_torchrl.record.entities import STEP_TIME, time_columns
 from lw_torchrl.record.meshes import Motion
+from lw_torchrl.record.metrics import check_image
 from lw_torchrl.suites.suite import Suite
 
-APART = 0.01  # metres between two episodes that have parted
-NOBODY = -1  # in the place of a step's number: no step is in force alone
+APART = 0.01  # two episodes have parted when something is more than this apart, metres
+NOBODY = -1  # instead of a step's number: no single step is active
 
 
 class PlanLike(Protocol):
@@ -32,9 +35,10 @@ class PlanLike(Protocol):
 
 
 class TargetPose(NamedTuple):
-    """What a scripted skill moves (``moved``) and where to (``position``), each T×3 float32, metres.
+    """The object that a scripted skill moves (``moved``) and its target (``position``), each T×3 float32, metres.
 
-    Equal on an axis that the skill leaves alone. A ``relative`` one goes by a distance from the hand: it never arrives.
+    They are equal on an axis that the skill does not control. A ``relative`` target moves with the hand, which never
+    reaches it.
     """
 
     position: NDArray[np.float32]
@@ -43,7 +47,7 @@ class TargetPose(NamedTuple):
 
     @property
     def distance(self) -> NDArray[np.float32]:
-        """T float32, metres; NaN for a relative one."""
+        """The distance between both, T float32, metres; NaN for a relative target."""
         gap = np.linalg.norm(self.position - self.moved, axis=1)
         return np.full_like(gap, np.nan) if self.relative else gap
 
@@ -52,20 +56,22 @@ class TargetPose(NamedTuple):
 class RecordedEpisode:
     """One episode of T rows as checked arrays on the CPU; S is the number of steps of its plan."""
 
-    observation: NDArray[np.float32]  # T×D, as the layout says; metres, gripper opening in [0,1]
-    action: NDArray[np.float32]  # T×A, of Meta-World displacement xyz and gripper effort, in [-1,1]
-    objects: dict[str, NDArray[np.float32]]  # name -> T×3 position in metres; the gripper is among them
-    qaf: NDArray[np.bool_] | None  # T×S, truth of each condition
-    believed: NDArray[np.bool_] | None  # T×S, what a learned evaluator takes for it
-    skill_weights: NDArray[np.float32] | None  # T×S, attention over the steps
-    success: NDArray[np.bool_] | None  # T, of the state that the row's action led to
-    reward: NDArray[np.float32] | None  # T, likewise
-    corrected: NDArray[np.float32] | None  # T, how much of a correction counts
-    steps: tuple[tuple[str, str], ...]  # the S (condition, skill) texts; empty where there is no plan
-    target_poses: tuple[TargetPose | None, ...] = ()  # of each step; None where its skill is no scripted one
-    layout: Layout = METAWORLD
-    reasons: tuple[str, ...] = ()  # what the plan says of each step, how it was written for one
-    pixels: NDArray[np.uint8] | None = None  # T×H×W×3, what the policy or its evaluator saw
+    action: NDArray[np.float32]  # T×A, of Meta-World displacement xyz and gripper effort, in [-1,1]; A may be 0
+    objects: dict[str, NDArray[np.float32]]  # name -> T×3 position in metres, with a layout also the gripper's
+    layout: Layout | None = METAWORLD  # None for a robot of unknown layout: only objects are drawn
+    observation: NDArray[np.float32] | None = None  # T×D, as the layout says; metres, gripper opening in [0,1]
+    qaf: NDArray[np.bool_] | None = None  # T×S, truth of each condition
+    believed: NDArray[np.bool_] | None = None  # T×S, the answers of a learned evaluator
+    skill_weights: NDArray[np.float32] | None = None  # T×S, attention over the steps
+    success: NDArray[np.bool_] | None = None  # T, in the state after the row's action
+    reward: NDArray[np.float32] | None = None  # T, likewise
+    corrected: NDArray[np.float32] | None = None  # T, the weight of a correction
+    steps: tuple[tuple[str, str], ...] = ()  # the S (condition, skill) texts; empty without a plan
+    short_conditions: tuple[str, ...] = ()  # of each step
+    reasons: tuple[str, ...] = ()  # of each step, the plan's comment, or the skill as it was written
+    confidence: float | None = None  # of a canonical plan
+    target_poses: tuple[TargetPose | None, ...] = ()  # of each step; None if its skill is not a scripted one
+    pixels: NDArray[np.uint8] | None = None  # T×H×W×C, what the policy or its evaluator saw
     step_time: float = STEP_TIME  # seconds between two actions
 
     def times(self, steps: NDArray[np.int64]) -> list[Any]:
@@ -73,17 +79,29 @@ class RecordedEpisode:
         return time_columns(steps, self.step_time)
 
     def at(self, step: int) -> str:
-        """Return the words for a time step, "t = 80 (1.00 s)", which differ from those for a plan's step."""
+        """Return a time step as text, "t = 80 (1.00 s)", unlike a plan's step."""
         return f"t = {step} ({step * self.step_time:.2f} s)"
 
     @property
     def answers(self) -> NDArray[np.bool_] | None:
-        """The truth that the policy used: the learned evaluator's if there is one."""
+        """The answers that the policy used: the learned evaluator's if there is one."""
         return self.qaf if self.believed is None else self.believed
 
+    @property
+    def goal(self) -> NDArray[np.float32] | None:
+        """The position of the task's target, T×3; None without a layout."""
+        if self.observation is None or self.layout is None:
+            return None
+        return np.ascontiguousarray(self.observation[:, self.layout.positions[-1]])
+
+    @property
+    def opening(self) -> NDArray[np.float32] | None:
+        """The gripper's opening, T, from 0 to 1; None without a layout."""
+        return None if self.observation is None or self.layout is None else self.observation[:, self.layout.opening]
+
     @cached_property
-    def in_force(self) -> NDArray[np.int64] | None:
-        """T, the step with the largest weight, or without weights the first that holds; -1 where none stands out."""
+    def active(self) -> NDArray[np.int64] | None:
+        """The active step, T: the one with the largest weight, or without weights the first true one; -1 for none."""
         if self.skill_weights is not None:
             weights = self.skill_weights
             if weights.shape[1] == 1:
@@ -96,26 +114,27 @@ class RecordedEpisode:
 
     @property
     def first_success(self) -> int | None:
-        """The step at which the task was first seen as done: one after the row whose action did it."""
+        """The first step at which the task is done: one after the row whose action did it."""
         if self.success is None or not self.success.any():
             return None
         return int(self.success.argmax()) + 1
 
     @cached_property
     def distance(self) -> NDArray[np.float32] | None:
-        """T float32, metres: how far what the skill in force moves is from where it goes; NaN where it goes nowhere."""
-        if self.in_force is None:
+        """The distance to the active skill's target, T float32, metres; NaN where it has none."""
+        if self.active is None:
             return None
-        found = np.full(len(self), np.nan, np.float32)
+        distance = np.full(len(self), np.nan, np.float32)
         for step, pose in enumerate(self.target_poses):
             if pose is not None:
-                rows = self.in_force == step
-                found[rows] = pose.distance[rows]
-        return None if np.isnan(found).all() else found
+                rows = self.active == step
+                distance[rows] = pose.distance[rows]
+        return None if np.isnan(distance).all() else distance
 
     def with_target_poses(self, task: Task, suite: Suite | None) -> RecordedEpisode:
         """Return the episode with the target poses of its plan's skills in ``task``."""
         scripted = load_skills() if suite is None or suite.skills is None else suite.skills
+        assert self.observation is not None
         positions = task.positions(torch.from_numpy(self.observation))
         poses: list[TargetPose | None] = [None] * len(self.steps)
         for step, (_, text) in enumerate(self.steps):
@@ -128,7 +147,7 @@ class RecordedEpisode:
         return replace(self, target_poses=tuple(poses))
 
     def __len__(self) -> int:
-        return len(self.observation)
+        return len(self.action)
 
     @classmethod
     def from_rollout(
@@ -136,7 +155,7 @@ class RecordedEpisode:
         rollout: TensorDictBase,
         objects: Mapping[str, Any],
         plan: PlanLike | None = None,
-        layout: Layout = METAWORLD,
+        layout: Layout | None = METAWORLD,
         step_time: float = STEP_TIME,
     ) -> RecordedEpisode:
         """Check a rollout; see :meth:`lw_torchrl.RerunLogger.log_episode` for the keys and the errors."""
@@ -153,26 +172,32 @@ class RecordedEpisode:
             return _array(value, f"rollout[{key!r}]", (length, size))
 
         def optional(key: Any, *, flat: bool = False, truth: bool = False) -> NDArray[Any] | None:
-            """A column for each step of the plan, or a flat one; what is beyond them is padding and dropped."""
+            """A column for each step of the plan without padding, or a flat one; truth above 0.5 if it is a number."""
             if rollout.get(key, None) is None:
                 return None
             array, needed = column(key, None), 1 if flat else len(steps)
             if array.shape[1] < max(needed, 1):
                 columns = f"a column for each of {needed} plan steps, got {array.shape[1]}"
                 raise ValueError(f"rollout[{key!r}] must have {columns}")
-            if truth and array.dtype != np.bool_:
-                raise ValueError(f"rollout[{key!r}] must be bool, got {rollout.get(key).dtype}")
+            array = array > 0.5 if truth and array.dtype != np.bool_ else array
             return array[:, 0] if flat else array[:, : needed or None]
 
-        logits, observation = optional("qaf_logits"), column("observation", layout.size)
+        executed: Any = ("next", "executed_action")
+        acted = "action" if rollout.get(executed, None) is None else executed
         places = {name: _array(value, f"objects[{name!r}]", (length, 3)) for name, value in objects.items()}
-        places.setdefault(GRIPPER, observation[:, layout.positions[0]])
-        pixels = rollout.get("pixels", None)
-        executed = ("next", "executed_action")
+        if layout is not None:
+            observation, action = column("observation", layout.size), column(acted, layout.action_size)
+            places.setdefault(GRIPPER, observation[:, layout.positions[0]])
+        else:
+            value, observation = rollout.get(acted, None), None
+            value = torch.zeros(length, 0) if value is None else value.reshape(length, -1).float()
+            action = _array(value, "rollout['action']", (length, None))
+        logits, pixels = optional("qaf_logits"), rollout.get("pixels", None)
         return cls(
-            observation=observation,
-            action=column("action" if rollout.get(executed, None) is None else executed, layout.action_size),
+            action=action,
             objects=places,
+            layout=layout,
+            observation=observation,
             qaf=optional("qaf", truth=True),
             believed=None if logits is None else logits > 0,
             skill_weights=optional("skill_weights"),
@@ -180,24 +205,27 @@ class RecordedEpisode:
             reward=optional(("next", "reward"), flat=True),
             corrected=optional("action_corrected", flat=True),
             steps=steps,
-            layout=layout,
+            short_conditions=() if plan is None else tuple(short_condition(step.condition) for step in plan.steps),
+            reasons=() if plan is None else tuple(map(_reason, plan.steps)),
+            confidence=getattr(plan, "confidence", None),
+            pixels=None if pixels is None else np.stack([check_image("pixels", picture) for picture in pixels]),
             step_time=step_time,
-            reasons=tuple(getattr(step, "reason", "") for step in plan.steps) if plan is not None else (),
-            pixels=None if pixels is None else pixels.numpy(force=True),
         )
 
 
 @dataclass(frozen=True)
 class MendedRecording:
-    """The same episode as it goes with a part replaced, ``by`` something: the ghost beside it."""
+    """The same episode after a part was replaced ``by`` something: the ghost in its scene."""
 
     by: str
     episode: RecordedEpisode
     motion: Motion | None = None
 
     def parts_at(self, other: RecordedEpisode) -> int:
-        """The first row in which the hand or a thing is elsewhere, by more than a centimetre; else the last of both."""
+        """Return the first row in which the hand or an object is elsewhere by over a centimetre, else the last."""
         length = min(len(self.episode), len(other))
+        if self.episode.observation is None or other.observation is None or other.layout is None:
+            return length - 1
         gap = np.zeros(length)
         for place in other.layout.positions:
             apart = self.episode.observation[:length, place] - other.observation[:length, place]
@@ -205,8 +233,44 @@ class MendedRecording:
         return int((gap > APART).argmax()) if (gap > APART).any() else length - 1
 
 
+def short_condition(condition: Any) -> str:
+    """Shorten a condition: "gripper above and not left or right of puck"; a text that is not a query stays as it is."""
+    if not isinstance(condition, Query):
+        return str(condition)
+    groups: list[list[Clause]] = []  # consecutive clauses about the same two objects
+    for clause in condition.clauses:
+        same = groups and groups[-1][0].object == clause.object and groups[-1][0].subject == clause.subject
+        if not same or clause.object is None:
+            groups.append([])
+        groups[-1].append(clause)
+    parts, before = [], ""
+    for group in groups:
+        words = ["" if group[0].subject == before else group[0].subject.removeprefix("robot's ")]
+        before, negated = group[0].subject, False
+        for i, clause in enumerate(group):
+            joint = ("or" if negated else "and not") if clause.negated else "but" if negated else "and"
+            first, *rest = clause.predicate.split()
+            is_last = clause is group[-1] or not rest or rest[-1] not in ("of", "with", "to")
+            if clause.predicate == TOUCHING:
+                words.append("off table" if clause.negated else "on table")
+            else:
+                words += [joint if i else "not" if clause.negated else "", first, *(rest if is_last else rest[:-1])]
+            negated = clause.negated
+        parts.append(" ".join(filter(None, [*words, group[0].object])))
+    return " and ".join(parts)
+
+
+def _reason(step: Any) -> str:
+    """Return the comment of a plan's step, or of a canonical step how it was written."""
+    role = getattr(step, "role", None)
+    if role is None:
+        return str(getattr(step, "reason", ""))
+    written = f"as written: {role.written}" if role.written and role.written != step.skill else ""
+    return "fallback" if role.fallback else written
+
+
 def _array(value: Any, label: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
-    """``value`` as an array of ``shape`` (None: any size) without NaN or infinity, or a ValueError."""
+    """Return ``value`` as an array of ``shape`` (None: any size); another shape or NaN is a ValueError."""
     tensor = torch.as_tensor(value).detach().cpu()
     allowed = "×".join("S" if size is None else str(size) for size in shape)
     if tensor.ndim != len(shape) or any(s not in (None, n) for s, n in zip(shape, tensor.shape, strict=True)):

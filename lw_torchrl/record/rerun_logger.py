@@ -283,42 +283,51 @@ class RerunLogger(Logger):
         rollout: TensorDictBase,
         *,
         task: str,
-        objects: Mapping[str, Any],
+        objects: Mapping[str, Any] | None = None,
         plan: PlanLike | None = None,
         name: str | None = None,
+        step_time: float | None = None,
     ) -> str:
-        """Add one episode of anything: a simple scene in 3-D, the verdict, the plan, the timeline and curves.
+        """Add one episode of any TorchRL environment: objects in 3-D, the verdict, the plan, the timeline and curves.
 
-        For a robot's own meshes, see :func:`lw_torchrl.log_rollout`. Row t stands at step t; success and reward, its
-        action's outcome, at t + 1. A step takes the step time of the suite that has the task, else 0.0125 s.
+        A hand and its gripper are drawn if the observation has a known layout: that of the plan's task, of the suite
+        that has the task, or Meta-World's 39 numbers. For a robot's own meshes, see :func:`lw_torchrl.log_rollout`. Row
+        t is drawn at step t; success and reward, which result from its action, at t + 1.
 
         Args:
-            rollout: batch size (T,). "observation" T×39 float32 (metres) and "action" T×4 float32 in [-1, 1]; optional
-                are what :func:`lw_torchrl.log_rollout` lists and ("next", "success") T×1 bool. Columns beyond the
-                plan's S steps are padding and left out.
+            rollout: batch size (T,). All keys are optional without a layout: "action" T×A, ("next", "success") T×1,
+                ("next", "reward") T×1 float32, "pixels" T×H×W×C or T×C×H×W. With a layout "observation" T×D float32
+                (metres) and "action" are required. More keys are those of :func:`lw_torchrl.log_rollout`. Columns
+                beyond the plan's S steps are padding and left out.
             task: the task's name.
-            objects: name -> T×3 positions in metres; without "robot's gripper" it is observation 0:3.
+            objects: name -> T×3 positions in metres; "robot's gripper" is added if the layout is known.
             plan: its ``steps`` each have a ``condition`` and a ``skill``; None shows numbered columns.
-            name: the entity that all lies under, and the tab's title; None takes ``task``, then "task-2".
+            name: the entity that contains everything, and the tab's title; None takes ``task``, then "task-2".
+            step_time: seconds per step; None for the suite's that has the task, else 0.0125.
 
         Returns:
             The name.
 
         Example:
             >>> import tempfile, torch
-            >>> from tensordict import TensorDict
-            >>> rollout = TensorDict({"observation": torch.rand(5, 39), "action": torch.rand(5, 4)}, [5])
-            >>> with RerunLogger(tempfile.mkdtemp() + "/reach.rrd") as logger:
-            ...     objects = {"puck": rollout["observation"][:, 4:7]}
-            ...     logger.log_episode(rollout, task="reach", objects=objects)
-            'reach'
+            >>> from torchrl.envs import PendulumEnv
+            >>> rollout = PendulumEnv().rollout(20)
+            >>> tip = torch.stack((rollout["th"].sin(), torch.zeros(20), rollout["th"].cos()), -1)
+            >>> with RerunLogger(tempfile.mkdtemp() + "/swing.rrd") as logger:
+            ...     logger.log_episode(rollout, task="swing", objects={"tip": tip}, step_time=0.05)
+            'swing'
         """
         if not isinstance(task, str) or not task.strip():
             raise ValueError(f"task must be a task's name, got {task!r}")
-        layout = plan.definition.layout if isinstance(plan, ConditionalPlan) else METAWORLD
         suite = known_suite(task)
-        step_time = STEP_TIME if suite is None else suite.step_time
-        episode = RecordedEpisode.from_rollout(rollout, objects, plan, layout, step_time)
+        observation = rollout.get("observation", None)
+        layout = None if suite is None else suite.layout
+        if isinstance(plan, ConditionalPlan):
+            layout = plan.definition.layout
+        elif layout is None and isinstance(observation, Tensor) and observation.shape[-1:] == (METAWORLD.size,):
+            layout = METAWORLD
+        step_time = step_time or (STEP_TIME if suite is None else suite.step_time)
+        episode = RecordedEpisode.from_rollout(rollout, objects or {}, plan, layout, step_time)
         return self.add_page(Heading(task), episode, name=name)
 
     def add_page(

@@ -1,4 +1,4 @@
-"""Rollouts as pages of a recording, with the robot as it moved, simulated again for it; and episodes run for them."""
+"""Log rollouts as pages of a recording, with the robot's motion from a second simulation; run episodes to record."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ from lw_torchrl._checks import checked, missing_keys, shown
 from lw_torchrl._devices import device_of
 from lw_torchrl._files import AnyPath
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import episode_seed
-from lw_torchrl.evaluation.failure_records import Failure
-from lw_torchrl.evaluation.protocol import actor_plans, named_tasks_of
-from lw_torchrl.evaluation.running import answered_by, make_env, running
+from lw_torchrl.evaluation.diagnose.counterfactuals import own_evaluators
+from lw_torchrl.evaluation.diagnose.failure import Failure
+from lw_torchrl.evaluation.diagnose.sentences import replacement_text
+from lw_torchrl.evaluation.rollout import actor_plans, suite_tasks
+from lw_torchrl.evaluation.rollout import rollout as run_rollout
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, as_plans
@@ -41,7 +42,7 @@ from lw_torchrl.suites.suite import Suite, known_suite, load_suite
 from lw_torchrl.transforms.qaf import QAFTransform
 
 _KEYS: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next", "success"), ("next", "reward")]
-_PLAN_KEYS = {"qaf", "skill_weights", "action_corrected"}
+_PLAN_KEYS = ("qaf", "qaf_logits", "skill_weights", "action_corrected")
 
 
 @checked
@@ -59,9 +60,9 @@ def log_rollout(
 ) -> Any:
     """Add a rollout to a recording: the robot in 3-D, a verdict, the plan at the cursor, the timeline and curves.
 
-    If the environment's seed is given, the episode is simulated again from its task, ``seed``, ``episode`` and actions,
-    and the robot is shown as it moved. Its observations must be equal bit for bit; otherwise a warning says so, and a
-    simple hand over a table stands for the robot, as without a seed.
+    With the environment's seed, the episode is simulated again from its task, ``seed``, ``episode`` and actions to show
+    the robot's motion. Its observations must be equal bit for bit; otherwise a warning says so, and a simple hand over
+    a table is drawn instead of the robot, as without a seed.
 
     Args:
         logger: the recording.
@@ -114,7 +115,7 @@ def log_rollout(
     if failure is not None and failure.mended is not None:
         by, plan, steps = failure.mended
         other, mended = read_rollout(steps, Plans([plan]), seed=seed, tasks=tasks, suite=suite)
-        ghost = MendedRecording(by, mended, None if motion is None else _motion(other, mended, suite))
+        ghost = MendedRecording(replacement_text(by), mended, None if motion is None else _motion(other, mended, suite))
     return logger.add_page(heading, episode, motion=motion, ghost=ghost, name=name)
 
 
@@ -127,8 +128,9 @@ def read_rollout(
     failure: Failure | None = None,
     tasks: Iterable[Task] = (),
     suite: Suite | None = None,
+    step_time: float | None = None,
 ) -> tuple[Heading, RecordedEpisode]:
-    """What a page shows of a rollout (T,), checked, as :func:`log_rollout` has it."""
+    """Return heading and episode of a rollout (T,), checked as :func:`log_rollout` describes it."""
     plans = None if plans is None else as_plans(plans)
     number = _single(rollout, "task_id", required=True)
     index = _single(rollout, "episode", required=seed is not None)
@@ -151,12 +153,12 @@ def read_rollout(
     observation = rollout.get("observation", None)
     objects: dict[str, Tensor] = {}
     if task is not None and observation is not None and observation.shape[1:] == (task.layout.size,):
-        told_of = [] if plan is None else [f"{step.condition} {step.skill}" for step in plan.steps]
+        texts = [] if plan is None else [f"{step.condition} {step.skill}" for step in plan.steps]
         for name, position in task.positions(observation).items():
-            if plan is None or name == GRIPPER or any(name in words for words in told_of):
+            if plan is None or name == GRIPPER or any(name in text for text in texts):
                 objects[name] = position
     layout, suite = METAWORLD if task is None else task.layout, suite or known_suite(label)
-    step_time = STEP_TIME if suite is None else suite.step_time
+    step_time = step_time or (STEP_TIME if suite is None else suite.step_time)
     episode = RecordedEpisode.from_rollout(rollout, objects, plan, layout, step_time)
     if task is not None and plan is not None:
         episode = episode.with_target_poses(task, suite)
@@ -164,7 +166,7 @@ def read_rollout(
 
 
 class DiffersError(ValueError):
-    """An episode that is simulated again comes out as another; the text says where they first differ, and how much."""
+    """A second simulation of an episode differs; the text says where first, and by how much."""
 
 
 def simulate_again(
@@ -175,7 +177,9 @@ def simulate_again(
     observation: NDArray[np.float32],
     suite: Suite | None = None,
 ) -> Motion | None:
-    """The motion in an episode, of T + 1 rows; None where the engine has no ``poses``; else :class:`DiffersError`.
+    """Return the motion in an episode, of T + 1 rows, or None if the engine has no ``poses``.
+
+    Raise :class:`DiffersError` if the observations differ.
 
     The simulation depends on the seed and the actions alone, so equal observations, bit for bit, mean equal motion.
     Actions are T×A float32 in [-1, 1], as executed; observations T×D float32, those from which they were taken.
@@ -189,31 +193,30 @@ def simulate_again(
         shape, active = (len(action) + 1, engine.model(0).model.nbody), np.ones(1, bool)
         positions, quaternions = np.empty((*shape, 3), np.float32), np.empty((*shape, 4), np.float32)
         positions[0], quaternions[0] = engine.poses(0)
-        tells = hasattr(engine, "touched")
-        touched = [engine.touched(0) if tells else None]
+        has_touch = hasattr(engine, "touched")
+        touched = [engine.touched(0) if has_touch else None]
         for step in range(len(action)):
             if not np.array_equal(seen, observation[step]):
                 off = np.abs(seen.astype(np.float64) - observation[step])
                 raise DiffersError(f"step {step}: number {off.argmax()} is {off.max():.3g} off")
             seen = engine.step(action[step : step + 1], active).observation[0].astype(np.float32)
             positions[step + 1], quaternions[step + 1] = engine.poses(0)
-            touched.append(engine.touched(0) if tells else None)
-        told = None if None in touched else tuple(map(str, touched))
-        return Motion(engine.model(0), positions, quaternions, told)
+            touched.append(engine.touched(0) if has_touch else None)
+        return Motion(engine.model(0), positions, quaternions, None if None in touched else tuple(map(str, touched)))
     finally:
         engine.close()
 
 
 def _motion(heading: Heading, episode: RecordedEpisode, suite: Suite | None) -> Motion | None:
-    if heading.seed is None or heading.episode is None or suite is None:
+    if heading.seed is None or heading.episode is None or suite is None or episode.observation is None:
         return None
     try:
         return simulate_again(heading.task, heading.seed, heading.episode, episode.action, episode.observation, suite)
     except DiffersError as error:
         warnings.warn(
             f"simulating {heading.task}, episode {heading.episode} of seed {heading.seed}, again gives other numbers "
-            f"at {error}. Was it the seed, and are these the executed actions? A hand over a table is drawn in the "
-            "place of the robot",
+            f"at {error}. Check the seed, and that these are the executed actions. A hand over a table is drawn "
+            "instead of the robot",
             stacklevel=3,
         )
         return None
@@ -229,10 +232,10 @@ def _single(rollout: TensorDictBase, key: str, *, required: bool) -> int | None:
     if column.is_floating_point() or tuple(column.shape) not in (length, (*length, 1)):
         given = f"{column.dtype} {tuple(column.shape)}"
         raise ValueError(f"rollout[{key!r}] must be integers of shape {length}, got {given}")
-    found = torch.unique(column).tolist()
-    if len(found) != 1:
-        raise ValueError(f"rollout must be one episode of one task, got {key!r} {found[:5]}; split it")
-    return int(found[0])
+    values = torch.unique(column).tolist()
+    if len(values) != 1:
+        raise ValueError(f"rollout must be one episode of one task, got {key!r} {values[:5]}; split it")
+    return int(values[0])
 
 
 def run_recorded(
@@ -251,42 +254,53 @@ def run_recorded(
     device: str | torch.device | None = None,
     progress: bool = False,
 ) -> list[FinishedEpisode]:
-    """Episodes with all that :func:`lw_torchrl.log_rollout` shows of them, run as :func:`lw_torchrl.evaluate` does.
+    """Run episodes as :func:`lw_torchrl.evaluate` does, with all keys that :func:`lw_torchrl.log_rollout` shows.
 
-    The arguments are as there, but for these.
+    The arguments are those of :func:`lw_torchrl.evaluate`, except for these.
 
     Args:
-        plans: whose queries to answer; None for the actor's own.
-        episodes: indices, of each task.
-        evaluator: a module; the episodes have its answers beside the exact ones.
-        progress: show a bar where it takes longer than a second.
+        plans: the plans whose conditions are answered; None for the actor's own.
+        episodes: indices of each task's episodes.
+        evaluator: a module; the episodes hold its answers and the exact ones.
+        progress: show a progress bar if it takes longer than a second.
 
     Returns:
-        By task, as they were given, and episode: TensorDicts of batch (T,).
+        The episodes, by task in the given order and episode, with steps of batch (T,).
     """
     answered = actor_plans(actor, plans)
-    found_suite, chosen = named_tasks_of(tasks, answered, suite)
-    options: dict[str, Any] = {"seed": seed, "max_steps": max_steps, "suite": found_suite, "engine": engine}
-    env = make_env(actor, answered, LanguageWorldEnv(list(chosen.values()), strict=True, **options), evaluator)
-    written = set() if answered is None else {"qaf", *actor.out_keys}
-    acting, exact = answered_by(actor, evaluator), None
-    if evaluator is None:
-        evaluator = getattr(actor, "evaluator", None)
-    elif answered is not None:
-        exact = QAFTransform(answered)  # the answers acted on take its place in an episode
-    read = getattr(evaluator, "in_keys", ())
-    seen = {"pixels"} & {*getattr(actor, "in_keys", ()), *read}
-    keys = list(dict.fromkeys([*_KEYS, *sorted(_PLAN_KEYS & written), *read, *seen]))
-    how: dict[str, Any] = {"noise_scale": noise_scale, "progress": progress, "keys": keys, "device": device}
-    how["after_success"] = 0 if stop_at_success else None
-    found = {}
-    with running("recording", env, acting, dict.fromkeys(chosen, episodes), **how) as finished:
-        for one in finished:
-            steps = one.steps
-            if evaluator is not None:
-                steps = evaluator(steps.to(device_of(evaluator))).cpu()
-            found[one.task, one.episode] = one._replace(steps=steps if exact is None else exact(steps))
-    return [found[task, episode] for task in chosen for episode in episodes]
+    own_suite, chosen = suite_tasks(tasks, answered, suite)
+    options: dict[str, Any] = {"seed": seed, "max_steps": max_steps, "suite": own_suite, "engine": engine}
+    learned = [evaluator] if isinstance(evaluator, QueryEvaluator) else own_evaluators(actor)
+    has_answers = answered is not None and (evaluator is not None or bool(learned))
+    finished: dict[tuple[str, int], FinishedEpisode] = {}
+
+    def keep(one: FinishedEpisode) -> None:
+        steps = one.steps
+        if learned and "qaf_logits" not in steps.keys():
+            steps = learned[0](steps.to(device_of(learned[0]))).cpu()
+        if has_answers and answered is not None:  # the exact answers, next to those that the policy acted on
+            if "qaf_logits" not in steps.keys():
+                steps.set("qaf_logits", 10.0 * steps.get("qaf").float() - 5.0)
+            steps = QAFTransform(answered)(steps)
+        finished[one.task, one.episode] = one._replace(steps=steps)
+
+    run_rollout(
+        "recording",
+        actor,
+        chosen,
+        dict.fromkeys(chosen, episodes),
+        keep,
+        plans=answered,
+        evaluator=evaluator,
+        env_options=options,
+        keys=_KEYS,
+        optional=[*(_PLAN_KEYS if answered is not None else ()), *(learned[0].in_keys if learned else ()), "pixels"],
+        noise_scale=noise_scale,
+        after_success=0 if stop_at_success else None,
+        device=device,
+        progress=progress,
+    )
+    return [finished[task, episode] for task in chosen for episode in episodes]
 
 
 @contextmanager
@@ -316,7 +330,7 @@ def write_recording(
 
 
 def active_skills(episode: FinishedEpisode, plan: ConditionalPlan) -> list[tuple[str, int]]:
-    """The skills, or "no condition holds", that had the largest weight, in order, and for how long, up to success."""
+    """Return the skills with the largest weight, or "no condition holds", in order, with their steps, up to success."""
     end = episode.first_success
     leading = episode.steps.get("skill_weights")[:end].argmax(-1).tolist()
     answered = episode.steps.get("qaf")[:end].any(-1).tolist()

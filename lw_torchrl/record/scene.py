@@ -1,6 +1,7 @@
-"""The 3-D scene of an episode: the robot, its task, what the plan names, and where the skill in force moves things to.
+"""The 3-D scene of an episode: the robot, the objects, and the target of the active skill.
 
-Meta-World's frame: metres, x to the robot's right, y away from the robot, z up, the table's top at z = 0.
+Meta-World's frame: metres, x to the robot's right, y away from the robot, z up, the table's top at z = 0. Of a robot of
+unknown layout only the objects are drawn, seen from a place that shows them all.
 """
 
 from __future__ import annotations
@@ -26,11 +27,31 @@ PALM_HALF, PALM_RISE = (0.018, 0.062, 0.014), 0.012
 WRIST_HALF, WRIST_RISE = (0.012, 0.012, 0.055), 0.081
 TABLE_CENTER, TABLE_HALF = (0.0, 0.6, -0.010), (0.7, 0.4, 0.010)
 TABLE, GRID = (58, 64, 74), (92, 99, 112)
-SAME_THING = 0.05  # metres between a body's origin and the place of the thing that it is
+SAME_PLACE = 0.05  # largest distance, metres, between the origin of a body and the position of its object
 FOCAL, LABEL, LETTER = 160.0, 26.0, 6.5
 """In pixels, of the scene in a window of 1100×700: of its camera, the height of a name, the width of a letter."""
 
 Point = tuple[float, float, float]
+# From behind the robot's right shoulder, over a table whose middle is at (0, 0.6, 0); with the arm, from the front.
+SIMPLE_EYE: tuple[Point, Point] = ((0.54, 0.23, 0.46), (0.03, 0.63, 0.10))
+ROBOT_EYE: tuple[Point, Point] = ((0.54, 0.18, 0.47), (-0.02, 0.62, 0.13))
+
+
+def scene_size(episode: RecordedEpisode) -> float:
+    """Return the size of a scene in metres: about 1 of a robot at its table, else the extent of its objects."""
+    if episode.layout is not None or not episode.objects:
+        return 1.0
+    places = np.concatenate([*episode.objects.values()])
+    return max(float(np.ptp(places, axis=0).max()), 1e-3)
+
+
+def eye_of(episode: RecordedEpisode, motion: Motion | None) -> tuple[Point, Point]:
+    """Return the place from which a scene is seen, and the place that is looked at."""
+    if episode.layout is not None or not episode.objects:
+        return SIMPLE_EYE if motion is None else ROBOT_EYE
+    places, size = np.concatenate([*episode.objects.values()]), scene_size(episode)
+    x, y, z = ((places.min(axis=0) + places.max(axis=0)) / 2).tolist()
+    return (x + 0.7 * size, y - 1.4 * size, z + 0.9 * size), (x, y, z)
 
 
 def log_scene(
@@ -45,45 +66,51 @@ def log_scene(
 ) -> tuple[list[str], dict[str, str]]:
     """Draw robot, objects, goal, the hand's path and the target pose under ``root``/scene, seen from ``eye``.
 
-    Returns the trails' paths and what :func:`log_motion` does. A trail is one short line per row that is ``drawn``,
-    shown up to the cursor. Without a motion, the robot is a hand over a table.
+    Return the trails' paths and the result of :func:`log_motion`. A trail is one short line per row that is ``drawn``,
+    shown up to the cursor. Without a motion, the robot is a hand over a table; without a layout, it is not drawn.
     """
     frames: dict[str, str] = {}
-    scene = f"{root}/scene"
+    scene, size = f"{root}/scene", scene_size(episode)
     stream.log(scene, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    if motion is None:
+    if motion is None and episode.layout is not None:
         _log_simple_robot(stream, scene, episode, drawn)
-    else:
+    elif motion is not None:
         frames = log_motion(stream, f"{scene}/bodies", motion, known, episode.step_time, drawn)
 
     def point(path: str, position: NDArray[np.float32], label: str | None, radius: float, color: Color) -> None:
         labels = None if label is None else [label]
         rows = drawn[changes(position[drawn])]
         still = position[rows] if len(rows) == 1 else None
-        style = rr.Points3D.from_fields(positions=still, radii=[radius], colors=[color], labels=labels)
+        style = rr.Points3D.from_fields(positions=still, radii=[radius * size], colors=[color], labels=labels)
         stream.log(f"{scene}/{path}", style, static=True)
         if still is None:
             stream.send_columns(f"{scene}/{path}", episode.times(rows), rr.Points3D.columns(positions=position[rows]))
 
     def named(path: str, label: str, radius: float, color: Color) -> None:
-        """A point with its name, which stands beside it if it would cover another there."""
+        """A point with its name, which is moved away if it would cover another name."""
         away = offsets[label]
         point(path, things[label], None if away.any() else label, radius, color)
         if away.any():
             point(f"names{entity_path(label)}", things[label] + away, label, 0.0005, color)
 
     def lines(path: str, strips: NDArray[np.float32], radius: float, color: Color) -> None:
-        look = {"colors": np.tile(np.array(color, np.uint8), (len(drawn), 1)), "radii": np.full(len(drawn), radius)}
+        look = {
+            "colors": np.tile(np.array(color, np.uint8), (len(drawn), 1)),
+            "radii": np.full(len(drawn), radius * size),
+        }
         stream.send_columns(f"{scene}/{path}", episode.times(drawn), rr.LineStrips3D.columns(strips=strips, **look))
 
-    goal = np.ascontiguousarray(episode.observation[:, episode.layout.positions[-1]])
+    goal = episode.goal
     # Objects that stand for the goal, like "target location", have its colour, and their own label.
-    goals = [name for name, position in episode.objects.items() if np.allclose(goal, position, atol=1e-3)]
+    goals = [] if goal is None else [name for name, at in episode.objects.items() if np.allclose(goal, at, atol=1e-3)]
     others = [name for name in episode.objects if name != GRIPPER]
-    colors = {GRIPPER: GOLD} | dict(zip(others, cycle(OBJECT_COLORS), strict=False))
+    colors = dict(zip(others, cycle(OBJECT_COLORS), strict=False))
+    if GRIPPER in episode.objects:
+        colors = {GRIPPER: GOLD} | colors
     things = {name: position for name, position in episode.objects.items() if name != GRIPPER}
-    things |= {"goal": goal} if goal.any() and not goals and "goal" not in things else {}
-    offsets = beside({name: position[drawn] for name, position in things.items()}, eye)
+    if goal is not None and goal.any() and not goals:
+        things.setdefault("goal", goal)
+    offsets = name_offsets({name: position[drawn] for name, position in things.items()}, eye)
     trails = []
     for name, color in (colors | {name: GREEN for name in goals if name != GRIPPER}).items():
         part, position = entity_path(name), episode.objects[name]
@@ -91,7 +118,7 @@ def log_scene(
             named(f"objects{part}", name, 0.016 if motion is None else 0.008, color)
         elif motion is None:
             point(f"objects{part}", position, None, 0.005, color)
-        if motion is None:  # from each row straight down, or up, to the table's top
+        if motion is None and episode.layout is not None:  # from each row straight down, or up, to the table's top
             onto = position * np.array([1, 1, 0], np.float32)
             lines(f"heights{part}", np.stack([position, onto], axis=1)[drawn], 0.0012, (*color, 150))
         if motion is None or name == GRIPPER:
@@ -111,8 +138,8 @@ def log_scene(
     return trails, frames
 
 
-def touched_things(motion: Motion, episode: RecordedEpisode) -> tuple[str, ...] | None:
-    """What the fingers touched in each row: the thing that the touched body is, if one is, or else the body's name."""
+def touched_objects(motion: Motion, episode: RecordedEpisode) -> tuple[str, ...] | None:
+    """Return what the fingers touched in each row: the object at the touched body's place, else the body's name."""
     if motion.touched is None:
         return None
     touched = np.array(motion.touched[: len(episode)])
@@ -127,14 +154,16 @@ def touched_things(motion: Motion, episode: RecordedEpisode) -> tuple[str, ...] 
             if name != GRIPPER
         }
         nearest = min(away, key=away.__getitem__, default=None)
-        if nearest is not None and away[nearest] < SAME_THING:
+        if nearest is not None and away[nearest] < SAME_PLACE:
             names[body] = nearest
     return tuple(names.get(body, body) for body in touched.tolist())
 
 
 def log_pictures(stream: Any, root: str, episode: RecordedEpisode, drawn: NDArray[np.int64]) -> float:
-    """What the policy saw, in ``root``/seen, where it changed in rows that are ``drawn``; returns its width over its
-    height, 0 where there is none."""
+    """Log the pictures that the policy saw to ``root``/seen, where they change in rows that are ``drawn``.
+
+    Return their width over their height, 0 without pictures.
+    """
     if episode.pixels is None:
         return 0.0
     rows = drawn[changes(episode.pixels[drawn].reshape(len(drawn), -1))]
@@ -143,10 +172,10 @@ def log_pictures(stream: Any, root: str, episode: RecordedEpisode, drawn: NDArra
     return width / height
 
 
-def beside(things: dict[str, NDArray[np.float32]], eye: tuple[Point, Point]) -> dict[str, NDArray[np.float32]]:
-    """How far from its thing, T×3 metres, each name stands (3, float32), so that names cover one another least.
+def name_offsets(things: dict[str, NDArray[np.float32]], eye: tuple[Point, Point]) -> dict[str, NDArray[np.float32]]:
+    """Return the offset of each name from its object, T×3 metres, as (3,) float32, so that names overlap least.
 
-    They are seen from ``eye``, its place and where it looks, in the smallest window; there is one place an episode.
+    They are seen from ``eye``, its place and the place it looks at, in the smallest window. A name has one offset.
     """
     place, ahead = np.array(eye[0], np.float32), np.subtract(eye[1], eye[0]).astype(np.float32)
     ahead /= np.linalg.norm(ahead)
@@ -172,7 +201,8 @@ def beside(things: dict[str, NDArray[np.float32]], eye: tuple[Point, Point]) -> 
 
 
 def _log_simple_robot(stream: Any, scene: str, episode: RecordedEpisode, drawn: NDArray[np.int64]) -> None:
-    times = episode.times(drawn)
+    times, opening = episode.times(drawn), episode.opening
+    assert opening is not None
 
     def box(path: str, centers: Any, half_sizes: Any, color: Color, labels: list[str] | None = None) -> None:
         size = {"centers": centers, "half_sizes": half_sizes}
@@ -191,7 +221,7 @@ def _log_simple_robot(stream: Any, scene: str, episode: RecordedEpisode, drawn: 
     box("gripper/wrist", [(0.0, 0.0, WRIST_RISE)], [WRIST_HALF], STEEL, [GRIPPER])
     box("gripper/fingers", None, [FINGER_HALF] * 2, GOLD)
     stream.send_columns(f"{scene}/gripper", times, rr.Transform3D.columns(translation=episode.objects[GRIPPER][drawn]))
-    half = episode.observation[drawn, episode.layout.opening] * FINGER_TRAVEL / 2 + FINGER_HALF[1]
+    half = opening[drawn] * FINGER_TRAVEL / 2 + FINGER_HALF[1]
     zero, drop = np.zeros_like(half), np.full_like(half, -FINGER_DROP)
     centers = np.stack([zero, half, drop, zero, -half, drop], axis=1).reshape(-1, 3)  # of two fingers, row by row
     fingers = rr.Boxes3D.columns(centers=centers.astype(np.float32))
@@ -199,15 +229,15 @@ def _log_simple_robot(stream: Any, scene: str, episode: RecordedEpisode, drawn: 
 
 
 def _log_target(stream: Any, scene: str, episode: RecordedEpisode, drawn: NDArray[np.int64]) -> None:
-    """An arrow from what the scripted skill in force moves to where it goes, in the step's colour."""
-    if episode.in_force is None or not any(episode.target_poses):
+    """Draw an arrow from what the active scripted skill moves to its target, in the step's colour."""
+    if episode.active is None or not any(episode.target_poses):
         return
     start, end = np.zeros((2, len(episode), 3), np.float32)
     colors = np.zeros((len(episode), 4), np.uint8)
     shown = np.zeros(len(episode), bool)
     for step, pose in enumerate(episode.target_poses):
         if pose is not None:
-            rows = episode.in_force == step
+            rows = episode.active == step
             start[rows], end[rows] = pose.moved[rows], pose.position[rows]
             colors[rows], shown[rows] = (*step_color(step), 255), True
     rows = drawn[changes(np.concatenate([start, end, colors, shown[:, None]], axis=1)[drawn])]

@@ -1,4 +1,4 @@
-"""What a page says of an episode: heading and verdict, the plan at the cursor, and the curves."""
+"""The texts and curves of an episode's page: heading, verdict, and the plan at the cursor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,24 +7,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.evaluation.failure_records import CAUSES, Failure, part_words
+from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure
+from lw_torchrl.evaluation.diagnose.sentences import replaced_text
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plan_text import one_line
 from lw_torchrl.record.entities import FALSE, STEEL, Color, changes, rr, step_color
-from lw_torchrl.record.lanes import short
 from lw_torchrl.record.recorded_episode import NOBODY, MendedRecording, RecordedEpisode
 
 AFTER_SUCCESS, AROUND_FAILURE = 8, 60
-"""How many steps after a first success are worth a look, and how many on both sides of where a failure is seen."""
-LONGEST = 200  # steps from where a ghost parts to where the failure is seen that are shown at once
+"""The number of steps to show after a first success, and on both sides of the step at which a failure is seen."""
+LONGEST = 200  # the largest number of steps, from where a ghost parts to where the failure is seen, to show at once
 PLAN_LINES, LINE = 13, 78
-"""How many lines of a plan leave room for the scene in a window of 1100×700, and the letters of one."""
-SELDOM = 8  # steps between two pictures of the scene where nothing is worth a look: a tenth of a second
+"""The number of lines of a plan that leave room for the scene in a window of 1100×700, and the letters of a line."""
+SELDOM = 8  # steps between two pictures of the scene where nothing happens: a tenth of a second
 
 
 @dataclass(frozen=True)
 class Heading:
-    """What a page says of its episode: which it is, of which environment's seed, who acted, and why it failed."""
+    """The heading of a page: the episode, the environment's seed, the policy, and why it failed."""
 
     task: str
     episode: int | None = None
@@ -34,17 +34,17 @@ class Heading:
 
     @property
     def name(self) -> str:
-        """What the episode is called in a recording if no other is: "push", or "push-7"."""
+        """The episode's default name in a recording: "push", or "push-7"."""
         return self.task if self.episode is None else f"{self.task}-{self.episode}"
 
     def parts(self) -> list[str]:
-        """Task, episode, seed and policy, those that there are."""
+        """Return task, episode, seed and policy, as far as they are known."""
         numbers = {"episode": self.episode, "seed": self.seed}
         known = [f"{name} {number}" for name, number in numbers.items() if number is not None]
         return [self.task, *known, *([] if self.policy is None else [self.policy])]
 
     def row(self, episode: RecordedEpisode, name: str) -> dict[str, Any]:
-        """What an overview says of the episode that is called ``name``, with its own parts for filters."""
+        """Return the row of an episode called ``name`` in the overview, with separate parts for filters."""
         at = episode.first_success or len(episode)
         ended = "" if episode.success is None else "failed" if episode.first_success is None else "success"
         cause = self.failure.cause if self.failure is not None and ended == "failed" else None
@@ -53,7 +53,7 @@ class Heading:
         return known | {"ended": ended, "cause": cause, "at": at, "seconds": at * episode.step_time}
 
     def ended(self, episode: RecordedEpisode) -> str:
-        """How it ended, in a few words."""
+        """Return how it ended, in a few words."""
         if episode.first_success is not None:
             return f"SUCCESS at {episode.at(episode.first_success)} of {len(episode)}"
         if self.failure is None:
@@ -62,9 +62,9 @@ class Heading:
 
 
 def decisive_step(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None) -> int:
-    """The step to look at first: the failure's, else the first success, else the last; one of :func:`telling_steps`.
+    """Return the step to look at first: the failure's, else the first success, else the last.
 
-    Where a ghost that succeeds has not parted yet, or is gone, it is that of its success.
+    If a ghost that succeeds has not parted at that step, or is gone, it is the step of its success.
     """
     (_, last), seen = telling_steps(heading, episode, ghost), _decisive(heading, episode)
     if ghost is None or ghost.episode.first_success is None or ghost.parts_at(episode) < seen <= last:
@@ -79,9 +79,10 @@ def _decisive(heading: Heading, episode: RecordedEpisode) -> int:
 
 
 def telling_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None) -> tuple[int, int]:
-    """The first and last step worth a look: up to a success, around where a failure is seen, or all.
+    """Return the first and last step to show: up to a success, around the step at which a failure is seen, or all.
 
-    With a ghost, from where the two part; if that is long before the failure is seen, until the ghost has succeeded.
+    With a ghost, the steps begin where the two part; if that is long before the failure is seen, they end with the
+    ghost's success.
     """
     at, length = _decisive(heading, episode), len(episode)
     if ghost is not None:
@@ -97,27 +98,32 @@ def telling_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecor
 
 
 def drawn_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None) -> NDArray[np.int64]:
-    """The steps at which the scene is drawn: those worth a look, or of many every other, 40 in a second; every few of
-    the rest; the one that tells, and the last."""
+    """Return the steps at which the scene is drawn.
+
+    These are the steps to show, every other one if they are many; every eighth of the rest; the decisive one, and the
+    last.
+    """
     first, last = telling_steps(heading, episode, ghost)
     every, stride = np.arange(len(episode)), 1 if last - first <= AROUND_FAILURE else 2
-    told = (every >= first) & (every <= last) & (every % stride == 0) | (every % SELDOM == 0)
-    told[[min(decisive_step(heading, episode, ghost), len(episode) - 1), -1]] = True
-    return np.flatnonzero(told)
+    drawn = (every >= first) & (every <= last) & (every % stride == 0) | (every % SELDOM == 0)
+    drawn[[min(decisive_step(heading, episode, ghost), len(episode) - 1), -1]] = True
+    return np.flatnonzero(drawn)
 
 
 def verdict(
     heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None, small: bool = False
 ) -> str:
-    """The verdict, in Markdown, with a ``small`` heading or a large one; without a :class:`Failure` a failed episode
-    gets the plain facts."""
+    """Return the verdict in Markdown, with a ``small`` heading or a large one.
+
+    Without a :class:`Failure`, a failed episode gets the plain facts.
+    """
     length = len(episode)
     lines = [f"{length} steps"] if episode.success is None else [heading.ended(episode)]
     if episode.first_success is not None:
         assert episode.success is not None
         if not episode.success[-1]:
             held = int(episode.success.sum())
-            lines.append(f"It did not last: the task stood done in {held} steps, and at the end no more.")
+            lines.append(f"It did not last: the task was done in {held} steps, but not in the last one.")
     elif heading.failure is not None:
         lines += _why(heading.failure, episode)
     elif episode.success is not None:
@@ -138,33 +144,33 @@ def _why(failure: Failure, episode: RecordedEpisode) -> list[str]:
     seen = f"Seen at {episode.at(failure.at)} of {len(episode)}"
     if failure.step is not None and failure.step < len(episode.steps):
         seen += f", in {_step(episode, failure.step)}"
-    useless = [part_words(part) for part, worked in failure.counterfactuals.items() if not worked]
+    useless = [replaced_text(part) for part, worked in failure.counterfactuals.items() if not worked]
     helped = f" Replacing {' or '.join(useless)} did not help." if useless else ""
     return [*lines, f"{seen}.{helped}"]
 
 
 def _facts(episode: RecordedEpisode) -> list[str]:
-    if episode.in_force is None or not episode.steps:
+    if episode.active is None or not episode.steps:
         return []
     facts = []
-    last = int(episode.in_force[-1])
+    last = int(episode.active[-1])
     if last == NOBODY:
-        facts.append("At the end no plan step was in force alone.")
+        facts.append("At the end no single plan step was active.")
     else:
-        steps = int((episode.in_force == last).sum())
-        facts.append(f"At the end {_step(episode, last)}, was in force, as in {steps} of {len(episode)} steps.")
+        steps = int((episode.active == last).sum())
+        facts.append(f"At the end {_step(episode, last)}, was active, as in {steps} of {len(episode)} steps.")
         pose = episode.target_poses[last] if episode.target_poses else None
         if pose is not None and not pose.relative:
-            distance = np.where(episode.in_force == last, pose.distance, np.inf)
+            distance = np.where(episode.active == last, pose.distance, np.inf)
             nearest = int(distance.argmin())
             facts.append(
-                f"What it moves came within **{distance[nearest] * 100:.1f} cm** of where it goes, at "
+                f"It came within **{distance[nearest] * 100:.1f} cm** of its target, at "
                 f"{episode.at(nearest)}; at the end it was {pose.distance[-1] * 100:.1f} cm away."
             )
     answers = episode.answers
     never = [] if answers is None else [i for i in range(len(episode.steps)) if not answers[:, i].any()]
     if never:
-        facts.append("Never held: " + "; ".join(f"condition {i + 1}, “{episode.steps[i][0]}”" for i in never) + ".")
+        facts.append("Never true: " + "; ".join(f"condition {i + 1}, “{episode.steps[i][0]}”" for i in never) + ".")
     return facts
 
 
@@ -176,34 +182,34 @@ MARKS = {True: "✓", False: "✗", None: "·"}
 
 
 def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
-    """The plan in ``root``/plan, with a text in Markdown wherever truth or the step in force change.
+    """Log the plan in ``root``/plan, as a text in Markdown wherever truth or the active step change.
 
-    Returns how many lines it takes in a small window. Where these are too many, conditions are told in short.
+    Return the number of lines that it takes in a small window. If these are too many, conditions are shortened.
     """
-    told = [condition for condition, _ in episode.steps]
-    if _lines(told, episode) > PLAN_LINES:
-        told = [short(condition) for condition in told]
+    conditions = [condition for condition, _ in episode.steps]
+    if _lines(conditions, episode) > PLAN_LINES:
+        conditions = list(episode.short_conditions)
     length = len(episode)
     columns = [
-        np.full((length, 1), -1) if episode.in_force is None else episode.in_force[:, None],
+        np.full((length, 1), -1) if episode.active is None else episode.active[:, None],
         *(answers for answers in (episode.qaf, episode.believed) if answers is not None),
     ]
     states = np.concatenate(columns, axis=1)
     changed = changes(states)
-    trust = [f"*{said.split(';')[0]}*" for said in episode.reasons[:1] if said.startswith("confidence ")]
+    confidence = [] if episode.confidence is None else [f"*confidence {episode.confidence:.2f}*"]
     texts = []
     for row in changed.tolist():
-        parts = list(trust)
-        if episode.in_force is not None and episode.in_force[row] == NOBODY:
+        parts = list(confidence)
+        if episode.active is not None and episode.active[row] == NOBODY:
             answers = episode.answers
             none = answers is None or not answers[row].any()
             parts.append(f"**{'No condition holds' if none else 'No step stands out'}: all steps mixed**")
         for step, (_, skill) in enumerate(episode.steps):
             truth = None if episode.qaf is None else bool(episode.qaf[row, step])
-            line = f"{MARKS[truth]}  {step + 1}.  if {told[step]}"
+            line = f"{MARKS[truth]}  {step + 1}.  if {conditions[step]}"
             if episode.believed is not None and (believed := bool(episode.believed[row, step])) != truth:
                 line += f"  (evaluator: {MARKS[believed]})"
-            leads = episode.in_force is not None and episode.in_force[row] == step
+            leads = episode.active is not None and episode.active[row] == step
             reason = one_line(episode.reasons[step]) if episode.reasons else ""
             parts.append(
                 f"**{line}**  \n\u2003\u2003**→ {skill}**" + (f"  \n\u2003*{reason}*" if reason else "")
@@ -213,33 +219,35 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
         texts.append("  \n".join(parts))
     documents = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
     stream.send_columns(f"{root}/plan", episode.times(changed), documents)
-    return _lines(told, episode)
+    return _lines(conditions, episode)
 
 
 def _lines(conditions: Sequence[str], episode: RecordedEpisode) -> int:
-    """The lines that a plan takes with these conditions, and the longest reason, in a small window."""
-    told = "  (evaluator: x)" if episode.believed is not None else ""
-    texts = [f"x  1.  if {condition}{told}" for condition in conditions] + [skill for _, skill in episode.steps]
+    """Return the lines that a plan takes with these conditions, and the longest reason, in a small window."""
+    answer = "  (evaluator: x)" if episode.believed is not None else ""
+    texts = [f"x  1.  if {condition}{answer}" for condition in conditions] + [skill for _, skill in episode.steps]
     texts += [max(episode.reasons, key=len, default="")]
     return sum(-(-len(text) // LINE) for text in texts)
 
 
 def farthest(episode: RecordedEpisode) -> float:
-    """The largest distance of what a skill moves from where it goes, cm; 1 where there is none."""
+    """Return the largest distance to a skill's target, cm; 1 without targets."""
     distance = episode.distance
     return 1.0 if distance is None else max(1.0, 100 * float(np.nanmax(distance)))
 
 
 def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
-    """``root``/action, and, where there is any, /distance (cm), /reward, /skill_weights, /corrected; returns which."""
-    rows = np.arange(len(episode))
-    sent = ["action"]
-    _send(stream, f"{root}/action", episode.times(rows), episode.action, action_names(episode.layout))
+    """Log ``root``/action, /distance (cm), /reward, /skill_weights and /corrected, and return those that exist."""
+    rows, sent = np.arange(len(episode)), []
+    if numbers := episode.action.shape[1]:
+        names = [str(number) for number in range(numbers)] if episode.layout is None else action_names(episode.layout)
+        _send(stream, f"{root}/action", episode.times(rows), episode.action, names)
+        sent.append("action")
     if (distance := episode.distance) is not None:
-        # One line in centimetres, in the colour of the step in force.
-        assert episode.in_force is not None
-        steps = range(int(episode.in_force.max()) + 1)
-        colors = np.array([*map(step_color, steps), FALSE], np.uint8)[episode.in_force]  # NOBODY, -1, takes the last
+        # One line in centimetres, in the colour of the active step.
+        assert episode.active is not None
+        steps = range(int(episode.active.max()) + 1)
+        colors = np.array([*map(step_color, steps), FALSE], np.uint8)[episode.active]  # NOBODY, -1, takes the last
         columns = [*rr.Scalars.columns(scalars=distance * 100), *rr.SeriesLines.columns(colors=colors)]
         stream.send_columns(f"{root}/distance", episode.times(rows), columns)
         sent.append("distance")

@@ -38,7 +38,9 @@ def test_a_random_policy_acts_the_same_each_time(capsys, tmp_path, who):
 
 def test_two_policies_side_by_side(capsys, tmp_path):
     policy, out = tmp_path / "mine.safetensors", tmp_path / "x.rrd"
-    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=16, depth=1), policy)
+    lw.save_actor(
+        lw.PlanConditionedActor(lw.load_plans("MT10"), decoder=lw.modules.MLPDecoder(width=16, depth=1)), policy
+    )
     printed = run(capsys, "record", "reach", "--policy", policy, "--compare", "scripted", *SHORT, "--out", out)
     assert "reach, episode 0, mine: failed" in printed
     assert "reach, episode 0, scripted: success at step " in printed
@@ -75,8 +77,8 @@ def test_policies_and_evaluators_of_your_own(capsys, tmp_path, monkeypatch):
     torch.manual_seed(0)
     lw.training.save_evaluator(lw.StateQueryEvaluator(lw.load_plans("MT10"), width=8), "evaluator.safetensors")
     reach = lw.Plans({"reach": lw.load_plans("MT10")["reach"]})
-    lw.save_actor(lw.PlanConditionedActor(reach, roles=True, width=8), "roles.safetensors")  # reads exact truth too
-    for policy in ("scripted", "roles.safetensors"):
+    lw.save_actor(lw.PlanConditionedActor(reach, decoder=lw.modules.MLPDecoder(width=8)), "mine.safetensors")
+    for policy in ("scripted", "mine.safetensors"):
         for evaluator in ("evaluator.safetensors", "my_parts:never", "my_parts:Never"):
             options = ("--policy", policy, "--evaluator", evaluator, "--max-steps", 20, "--out", "x.rrd")
             assert "reach, episode 0" in run(capsys, "record", "reach", *options)

@@ -8,15 +8,18 @@ from types import SimpleNamespace
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torch import nn
 
 import lw_torchrl as lw
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation import attribute_failures
-from lw_torchrl.evaluation.beside_scripts import BesideScripts
-from lw_torchrl.evaluation.counterfactuals import Counterfactuals, own_evaluators, with_true_answers
-from lw_torchrl.evaluation.deciding import choose_pair, decide
-from lw_torchrl.evaluation.explanation import attended, chosen, last_stay_start, stall_step
+from lw_torchrl.evaluation.diagnose.comparison import ScriptComparison
+from lw_torchrl.evaluation.diagnose.counterfactuals import Counterfactuals, own_evaluators, with_true_answers
+from lw_torchrl.evaluation.diagnose.decision import choose_pair, decide
+from lw_torchrl.evaluation.diagnose.failure import ActiveStep, PlanDeparts, WrongAnswers
+from lw_torchrl.evaluation.diagnose.scripts import attended
+from lw_torchrl.evaluation.diagnose.states import chosen, last_stay_start, stall_step
 from lw_torchrl.record.rollouts import simulate_again
 from lw_torchrl.transforms.qaf import plan_program
 
@@ -86,8 +89,10 @@ def test_a_clumsy_skill_and_the_step_it_is_in():
     [failure] = evaluated(clumsy(), reference=REFERENCE).failures
     assert (failure.cause, failure.also, failure.step) == ("skill", None, 1)
     assert failure.counterfactuals == {"skill": True, "plan": False}
-    assert "lower the gripper around the drawer handle" in failure.why
-    assert failure.evidence["mended_by_skill"] == 1.0
+    assert isinstance(failure.finding, ActiveStep)
+    assert failure.finding.skill == "lower the gripper around the drawer handle"
+    assert failure.finding.skill in failure.why
+    assert (failure.replaced, failure.shares) == ("skill", {"nothing": 0.0, "skill": 1.0, "plan": 0.0})
     assert 0 <= failure.at < STEPS
 
 
@@ -118,18 +123,19 @@ def test_a_motion_that_is_wrong_in_all_steps_is_no_skill(step, cause):
     ).failures  # fmt: skip
     assert failure.cause == cause
     assert failure.counterfactuals["skill"] is True
-    assert ("as wrong in other steps" in failure.why) == (step is None)
+    assert (failure.scripted_step is not None) == (step is None)
+    assert ("the motion is as wrong in other steps" in failure.why) == (step is None)
 
 
 def test_a_fault_is_looked_for_in_other_steps():
     wanted = torch.randn(60, 3, generator=torch.Generator().manual_seed(0)).clamp(-1.0, 1.0)
     noise = 0.05 * torch.randn(60, 3, generator=torch.Generator().manual_seed(1))
-    in_force = (torch.arange(60) >= 30).long()
-    here = (in_force == 0).unsqueeze(-1)
+    active = (torch.arange(60) >= 30).long()
+    here = (active == 0).unsqueeze(-1)
 
     def told(fault):
-        in_all = BesideScripts(fault(wanted) + noise, wanted, in_force).in_other_steps(0)
-        in_one = BesideScripts(torch.where(here, fault(wanted), wanted) + noise, wanted, in_force).in_other_steps(0)
+        in_all = ScriptComparison(fault(wanted) + noise, wanted, active).in_other_steps(0)
+        in_one = ScriptComparison(torch.where(here, fault(wanted), wanted) + noise, wanted, active).in_other_steps(0)
         return in_all, in_one
 
     assert told(lambda action: action * torch.tensor([-1.0, 1.0, 1.0])) == (True, False), "a factor"
@@ -137,22 +143,22 @@ def test_a_fault_is_looked_for_in_other_steps():
     assert told(torch.zeros_like) == (True, False), "at rest"
     assert told(lambda action: action.roll(1, 0)) == (None, None), "neither"
     nothing = torch.where(here, wanted, 0.0)
-    hidden = BesideScripts(nothing * -1.0, nothing, in_force).in_other_steps(0)
+    hidden = ScriptComparison(nothing * -1.0, nothing, active).in_other_steps(0)
     assert hidden is None, "a factor does not show where the script does nothing"
-    assert BesideScripts(noise, wanted, torch.zeros(60)).in_other_steps(0) is None, "there are no others"
+    assert ScriptComparison(noise, wanted, torch.zeros(60)).in_other_steps(0) is None, "there are no others"
 
 
 def test_a_gripper_that_is_wrong_is_told_from_a_motion_that_is_not_quite_the_script_s():
     """Motion that is a little off fails with the gripper open; scripts for either part mend that."""
-    in_force = torch.zeros(20, dtype=torch.int64)
+    active = torch.zeros(20, dtype=torch.int64)
     wanted = torch.tensor([0.5, 0.0, 0.0, 1.0]).expand(20, 4)
 
     def told(motion, effort):
         done = torch.tensor([motion, 0.0, 0.0, effort]).expand(20, 4)
         tried = Counterfactuals.__new__(Counterfactuals)
         tried.plans, tried.step, tried.with_script = PLANS, {}, {}
-        tried.found = {name: {(TASK, 0): object()} for name in ("gripper", "actuation")}
-        tried.beside = {(TASK, 0): BesideScripts(done, wanted, in_force)}
+        tried.results = {name: {(TASK, 0): object()} for name in ("gripper", "actuation")}
+        tried.comparisons = {(TASK, 0): ScriptComparison(done, wanted, active)}
         return tried.mending(SimpleNamespace(which=(TASK, 0), truth=torch.ones(20, 1)))
 
     assert told(0.4, -1.0) == ["gripper"]
@@ -165,13 +171,16 @@ def test_a_plan_that_leads_astray():
     assert (failure.cause, failure.step) == ("plan", 1)
     assert failure.counterfactuals == {"plan": True}, "its skills are the scripts, so there is none to replace"
     assert failure.evidence["plan_departs_late"] > 0.5
+    assert isinstance(failure.finding, PlanDeparts)
+    assert (failure.finding.step, failure.finding.late) == (1, True)
 
 
 def test_a_lie_and_the_condition_it_is_about():
     [failure] = evaluated(lw.ScriptedSkillActor(PLANS), evaluator=lie, reference=REFERENCE).failures
     assert (failure.cause, failure.step) == ("query", 1)
     assert failure.counterfactuals["query"] is True
-    assert str(PLANS[TASK].steps[1].condition) in failure.why
+    assert failure.finding == WrongAnswers(1, str(PLANS[TASK].steps[1].condition), STEPS, STEPS, 0)
+    assert failure.finding.condition in failure.why
     assert failure.evidence["answers_wrong"] == 1.0
 
 
@@ -180,7 +189,7 @@ def test_two_faults_at_once_are_both_named():
     assert (failure.cause, failure.also) == ("query", "skill")
     assert failure.counterfactuals["query + skill"] is True
     assert not any(bit for name, bit in failure.counterfactuals.items() if "+" not in name)
-    assert "both together" in failure.why
+    assert "Neither the true answers nor scripted skills is enough" in failure.why
 
 
 def test_what_lacks_time_alone_is_out_of_time():
@@ -222,14 +231,14 @@ def test_a_hole_in_the_plan_is_no_skill_s_fault():
 class Still(lw.PlanConditionedActor):
     """One whose hand does not move."""
 
-    def act(self, *prepared):
-        action, *rest = super().act(*prepared)
-        return (torch.zeros_like(action), *rest)
+    def forward(self, tensordict):
+        tensordict = super().forward(tensordict)
+        return tensordict.set("action", torch.zeros_like(tensordict["action"]))
 
 
-def still(plans=PLANS, **options):
+def still(plans=PLANS):
     torch.manual_seed(0)
-    return Still(plans, width=8, depth=1, **options)
+    return Still(plans, decoder=lw.modules.MLPDecoder(width=8, depth=1))
 
 
 ENSEMBLE = pytest.param(lambda actor: lw.modules.ActorEnsemble([actor, still()]), marks=pytest.mark.slow)
@@ -247,11 +256,11 @@ def test_a_network_s_skills_are_replaced_and_its_mode_stays(wrapped):
 
 
 def test_an_evaluator_inside_a_policy_is_replaced_by_the_truth():
-    actor = still(evaluator=Lie(PLANS))
+    actor = TensorDictSequential(Lie(PLANS), still())
     true = with_true_answers(actor)
     assert true is not actor
     assert len(own_evaluators(true)) == len(own_evaluators(actor)) == 1
-    assert isinstance(actor.evaluator, Lie)
+    assert isinstance(actor[0], Lie)
     state = rollout().exclude("next")
     exact = lw.PlanConditionedActor(PLANS)(lw.QAFTransform(PLANS)(state.copy()))["skill_weights"]
     assert torch.allclose(true(state.copy())["skill_weights"], exact)
@@ -346,8 +355,8 @@ def test_the_step_in_force():
 def test_a_stay_is_seen_where_the_hand_gets_no_further():
     observation = torch.zeros(60, 39)
     observation[:, 0] = torch.cat((torch.arange(25) * 0.02, torch.full((35,), 0.5)))  # at rest from state 25 on
-    in_force = torch.cat((torch.zeros(20), torch.ones(40))).long()
-    seen = SimpleNamespace(in_force=in_force, steps=TensorDict(observation=observation, batch_size=[60]))
+    active = torch.cat((torch.zeros(20), torch.ones(40))).long()
+    seen = SimpleNamespace(active=active, steps=TensorDict(observation=observation, batch_size=[60]))
     assert stall_step(seen, 1) == 25
     assert stall_step(seen, 0) == 0, "it moves all the while"
 
@@ -421,7 +430,7 @@ def test_where_nothing_failed_there_is_nothing_to_say():
 def test_the_mended_episode_is_kept_and_can_be_simulated_again():
     [failure] = evaluated(lw.ScriptedSkillActor(hopeless()), reference=REFERENCE).failures
     mended = failure.mended
-    assert (mended.by, mended.plan) == ("the reference plan", REFERENCE[TASK])
+    assert (mended.by, mended.plan) == ("plan", REFERENCE[TASK])
     success = mended.steps["next", "success"].flatten().tolist()
     assert success == [False] * (len(success) - 1) + [True]
     assert mended.steps["qaf"].shape == mended.steps["skill_weights"].shape == (len(success), 3)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, Failure, plot_failures
+from lw_torchrl.evaluation.diagnose.failure import ActiveStep, Difference, WrongAnswers
 
 CONFIG = {
     "tasks": ["push", "reach"],
@@ -18,10 +19,12 @@ CONFIG = {
     "reward": "sparse",
     "max_steps": 500,
 }
+WRONG = WrongAnswers(2, "the gripper is open", 40, 500, 31)
 FAILURES = (
-    Failure("push", 1, 0, "query", "skill", 2, 31, "Wrong.", {"wrong": 0.4}, {"query": False, "query + skill": True}),
-    Failure("push", 1, 1, "undecided", None, None, 499, "Nothing told."),
-    Failure("reach", 1, 1, "skill", None, 0, 0, "Clumsy.", {}, {"skill": True}),
+    Failure("push", 1, 0, "query", "skill", 2, 31, WRONG, replaced="query + skill", succeeds_at=90,
+            evidence={"wrong": 0.4}, counterfactuals={"query": False, "query + skill": True}, shares={"nothing": 0.0}),
+    Failure("push", 1, 1, "undecided", None, None, 499, ActiveStep(0, "push", 9, 100), suspect="skill"),
+    Failure("reach", 1, 1, "skill", None, 0, 0, ActiveStep(0, "reach", 100, 100, 0.1), counterfactuals={"skill": True}),
 )  # fmt: skip
 
 
@@ -43,6 +46,26 @@ def test_failures_read_back(tmp_path):
     assert found.failures == FAILURES
     found.save(tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "results.json").read_bytes()
+
+
+WRONG_FINDINGS = {"step": -1, "condition": 3, "states": None, "of": 0, "first": 1.5, "more": 1}
+
+
+@pytest.mark.parametrize("name", WRONG_FINDINGS)
+def test_a_damaged_finding_is_refused(tmp_path, name):
+    make_result().save(tmp_path / "results.json")
+    found = json.loads((tmp_path / "results.json").read_text())
+    found["failures"][0]["finding"][name] = WRONG_FINDINGS[name]
+    (tmp_path / "results.json").write_text(json.dumps(found))
+    with pytest.raises(ValueError, match=r"failures\[0\].finding"):
+        EvaluationResult.load(tmp_path / "results.json")
+
+
+def test_a_difference_reads_back(tmp_path):
+    other = Difference("actions", 3, size=0.5)
+    failures = (replace(FAILURES[0], cause="not reproducible", also=None, finding=other), *FAILURES[1:])
+    make_result(failures).save(tmp_path / "results.json")
+    assert EvaluationResult.load(tmp_path / "results.json").failures == failures
 
 
 def test_a_result_without_failures_says_nothing_of_them(tmp_path):
@@ -92,9 +115,15 @@ DAMAGE = {
     "also": ["query", "undecided", 1],
     "step": [-1, 1.5, True],
     "at": [-1, 500, None],
-    "why": [None, 3],
+    "finding": [3, "he fell", {}, {"kind": "Luck"}, {"kind": "WrongAnswers"}],
+    "suspect": ["luck", 3],
+    "replaced": ["luck", 3],
+    "rival": ["luck", True],
+    "succeeds_at": [0, "1"],
+    "scripted_step": [-1, 0.5],
     "evidence": [[], {"x": "1"}, {"x": 1e301}, {"x": True}],
     "counterfactuals": [[], {"luck": True}, {"query": 1}, {"": True}],
+    "shares": [[], {"x": "1"}, {"x": True}],
 }
 
 

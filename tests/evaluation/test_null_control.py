@@ -7,7 +7,9 @@ from tensordict import TensorDict
 import lw_torchrl as lw
 from benchmarks.planted import Altered, Jammed, Sensor, fingers, moved_thing, scaled
 from lw_torchrl.evaluation import attribute_failures
-from lw_torchrl.evaluation.repeating import difference
+from lw_torchrl.evaluation.diagnose.failure import Difference, Misled
+from lw_torchrl.evaluation.diagnose.rerun import difference
+from lw_torchrl.evaluation.diagnose.sentences import finding_text
 
 TASK, SEED = "drawer-open", 7
 PLANS = lw.Plans({TASK: lw.load_plans("MT10")[TASK]})
@@ -33,21 +35,20 @@ def test_an_episode_that_was_cut_lacks_nothing_but_its_end():
     assert one.first_success > 30
     [failure] = attribute_failures([one._replace(steps=one.steps[:30])], PLANS, actor=scripted(), **RUN)
     assert (failure.cause, failure.step, failure.counterfactuals) == ("not reproducible", None, {})
-    assert f"the length: it was given 30 steps and has {one.first_success}" in failure.why
-    assert failure.evidence["mended_by_nothing"] == 1.0
+    assert failure.finding == Difference("length", 29, 30, one.first_success)
+    assert failure.succeeds_at == one.first_success
+    assert f"the length: the rollout has 30 steps, the re-run {one.first_success}" in failure.why
+    assert failure.shares["nothing"] == 1.0
 
 
 @pytest.mark.parametrize(
-    ("options", "what"),
-    [
-        ({"evaluator": Jammed(1.0, 1.0, 0.1, 1.0)}, "the executed actions, from step 0 on"),
-        ({"noise_scale": 1.0}, "the executed actions, from step 0 on"),
-    ],
+    "options",
+    [{"evaluator": Jammed(1.0, 1.0, 0.1, 1.0)}, {"noise_scale": 1.0}],
 )
-def test_another_environment_or_noise_is_nobody_s_fault(options, what):
+def test_another_environment_or_noise_is_nobody_s_fault(options):
     [failure] = attribute_failures(ran(scripted(), **options), PLANS, actor=scripted(), **RUN)
     assert failure.cause == "not reproducible"
-    assert what in failure.why
+    assert (failure.finding.part, failure.finding.at) == ("actions", 0)
     assert failure.mended is None
 
 
@@ -59,13 +60,14 @@ def rollout(states, actions):
 def test_what_differs_between_two_runs():
     one = rollout([0.0, 1.0, 2.0], [0.5, 0.5, 0.5])
     assert difference(one, one) is None
-    assert difference(one[:2], one) == (1, "the length: it was given 2 steps and has 3")
-    at, what = difference(rollout([0.0, 1.0, 3.0], [0.5, 0.5, 0.5]), one)
-    assert (at, what) == (2, "the environment: from state 1 the same action leads to another state")
-    at, what = difference(rollout([0.0, 1.0, 3.0], [0.5, 0.2, 0.5]), one)
-    assert (at, what.startswith("the executed actions, from step 1 on, there by 0.3")) == (1, True)
-    at, what = difference(rollout([0.0, 3.0], [0.5, 0.5]).exclude("action"), one)
-    assert (at, "holds no actions" in what) == (1, True)
+    assert difference(one[:2], one) == Difference("length", 1, 2, 3)
+    assert difference(rollout([0.0, 1.0, 3.0], [0.5, 0.5, 0.5]), one) == Difference("environment", 2)
+    found = difference(rollout([0.0, 1.0, 3.0], [0.5, 0.2, 0.5]), one)
+    assert found == Difference("actions", 1, size=pytest.approx(0.3))
+    assert "the executed actions, from step 1 on, there by 0.3" in finding_text(found)
+    found = difference(rollout([0.0, 3.0], [0.5, 0.5]).exclude("action"), one)
+    assert found == Difference("states", 1)
+    assert "holds no actions" in finding_text(found)
 
 
 @pytest.mark.parametrize("inside", [True, False])
@@ -75,9 +77,10 @@ def test_a_policy_that_is_shown_another_state_is_told(inside):
     run = {**RUN, "evaluator": evaluator}
     [failure] = attribute_failures(ran(actor, evaluator=evaluator), PLANS, actor=actor, **run)
     assert (failure.cause, failure.counterfactuals) == ("perception", {"perception": True})
-    assert "policy was shown another observation than the true one: number " in failure.why
+    assert isinstance(failure.finding, Misled)
+    assert failure.finding.error == pytest.approx(0.1, abs=1e-3)
     assert "was off by up to 0.1" in failure.why
-    assert failure.mended.by == "the true observations"
+    assert failure.mended.by == "perception"
     assert not any(module._forward_pre_hooks for module in actor.modules()), "nothing stays on the policy"
 
 
@@ -95,13 +98,13 @@ def test_the_part_of_the_action_that_is_wrong(task, done, cause):
     result = lw.evaluate(actor, tasks=task, episodes_per_task=1, stop_at_success=True, attribute=True, **RUN)
     [failure] = result.failures
     assert failure.cause == cause
-    assert "it mends 100% of the task's failed episodes" in failure.why
-    assert "nothing replaced 0%" in failure.why
+    assert "this fixes 100% of the task's failed episodes" in failure.why
+    assert "a plain re-run 0%" in failure.why
 
 
 def test_a_policy_without_plans_is_told_of_no_step():
     torch.manual_seed(0)
-    actor = lw.DescriptorConditionedActor(TASK, condition="one-hot", width=8, depth=1)
+    actor = lw.DescriptorConditionedActor(TASK, condition="one-hot", decoder=lw.modules.MLPDecoder(width=8, depth=1))
     result = lw.evaluate(
         actor, tasks=TASK, plans=PLANS, episodes_per_task=1, stop_at_success=True, attribute=True, **RUN
     )
@@ -109,4 +112,4 @@ def test_a_policy_without_plans_is_told_of_no_step():
     assert failure.cause in ("actuation", "policy")
     assert failure.step is None
     assert "skill" not in failure.counterfactuals
-    assert "in force" not in failure.why
+    assert failure.finding is None

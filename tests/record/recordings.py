@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
+from lw_torchrl.language.queries import parse_query
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.record.recorded_episode import GRIPPER
 from lw_torchrl.record.tabs import Tabs
@@ -20,7 +21,7 @@ STEPS = (
     ("the robot's gripper is not near the puck", "place the gripper above the puck"),
     ("the robot's gripper is near the puck", "close the gripper around the puck"),
 )
-PLAN = SimpleNamespace(steps=[SimpleNamespace(condition=c, skill=s) for c, s in STEPS])
+PLAN = SimpleNamespace(steps=[SimpleNamespace(condition=parse_query(c, "push"), skill=s) for c, s in STEPS])
 
 
 def make_rollout(length=20, columns=3, seed=0):

@@ -15,7 +15,7 @@ from recordings import Recording, run
 import lw_torchrl as lw
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
-from lw_torchrl.evaluation.failure_records import Failure, MendedEpisode
+from lw_torchrl.evaluation.diagnose.failure import ActiveStep, Failure, MendedEpisode
 from lw_torchrl.record.tabs import Tabs
 from lw_torchrl.record.viewer import open_viewer
 from lw_torchrl.suites.metaworld.engines import MetaWorldEngine
@@ -147,10 +147,10 @@ def test_the_executed_action_counts(tmp_path, pushed):
 def test_the_target_pose_is_the_skills(tmp_path, pushed):
     _, found = logged(tmp_path / "a.rrd", pushed, plans=PLANS, seed=SEED)
     steps = PLANS["push"].steps
-    in_force = pushed["skill_weights"].argmax(-1)
+    active = pushed["skill_weights"].argmax(-1)
     observation = pushed["observation"]
     for row in (0, 30, 59):
-        skill = lw.load_skills()[steps[in_force[row]].skill].for_task("push")
+        skill = lw.load_skills()[steps[active[row]].skill].for_task("push")
         positions = lw.TASKS["push"].positions(observation[row])
         aimed = positions[skill.target] + torch.tensor(skill.offset)
         expected = torch.where(torch.tensor(skill.gain) > 0, aimed, positions[skill.moved])
@@ -163,14 +163,15 @@ def test_the_target_pose_is_the_skills(tmp_path, pushed):
 
 def test_objects_that_the_plan_speaks_of_are_named(tmp_path, pushed):
     _, found = logged(tmp_path / "a.rrd", pushed, plans=PLANS)
-    told = " ".join(f"{step.condition} {step.skill}" for step in PLANS["push"].steps)
+    texts = " ".join(f"{step.condition} {step.skill}" for step in PLANS["push"].steps)
     shown = {e.split("/")[4].replace("\\", "") for e in found.entities() if e.startswith("/push-0/scene/objects/")}
-    assert shown == {name for name in lw.TASKS["push"].object_names if name in told}
+    assert shown == {name for name in lw.TASKS["push"].object_names if name in texts}
 
 
 def failure_of(rollout, **changes):
-    found = Failure("push", SEED, 0, "skill", None, 1, 33, "It came to rest 10 cm away.", {}, {"skill": True})
-    return dataclasses.replace(found, **changes)
+    finding = ActiveStep(1, PLANS["push"].steps[1].skill, 60, 60, 0.1)
+    failure = Failure("push", SEED, 0, "skill", None, 1, 33, finding, counterfactuals={"skill": True})
+    return dataclasses.replace(failure, **changes)
 
 
 def test_a_failure_is_the_verdict(tmp_path, pushed):
@@ -179,7 +180,8 @@ def test_a_failure_is_the_verdict(tmp_path, pushed):
     why = failure_of(failed, counterfactuals={"skill": True, "plan": False, "query": False})
     _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS, seed=SEED, policy="mine", failure=why)
     verdict = found.text("/push-0/verdict")
-    assert verdict.startswith("#### FAILED: skill, a skill was clumsy\n\nIt came to rest 10 cm away.  \n")
+    assert verdict.startswith("#### FAILED: skill, the policy executed a skill badly\n\nStep 2, ")
+    assert "was active in 60 of the last 60 states and ended 10 cm from its target.  \n" in verdict
     skill = PLANS["push"].steps[1].skill
     assert f"Seen at t = 33 (0.41 s) of 60, in plan step 2, **“{skill}”**." in verdict
     assert "Replacing the plan or the answers did not help." in verdict
@@ -195,7 +197,7 @@ def test_what_mends_a_failure_is_a_ghost_beside_it(tmp_path, pushed):
     failed["next", "success"][:] = False
     mended["observation"][30:, 0] += 0.02  # what parts them
     mended["next", "success"][40] = True
-    ghost = MendedEpisode("the reference plan", PLANS["push"], mended[:41].exclude("qaf_plan"))
+    ghost = MendedEpisode("plan", PLANS["push"], mended[:41].exclude("qaf_plan"))
     why = failure_of(failed, mended=ghost)
     _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS, failure=why)
     verdict = found.text("/push-0/verdict")
@@ -241,7 +243,7 @@ def test_an_overview_lists_failures_first_and_counts_causes(tmp_path, pushed):
 def test_a_ghost_of_the_robot_moves_what_moves(tmp_path, pushed):
     failed = pushed.clone()
     failed["next", "success"][:] = False
-    why = failure_of(failed, mended=MendedEpisode("scripts", PLANS["push"], pushed))
+    why = failure_of(failed, mended=MendedEpisode("policy", PLANS["push"], pushed))
     _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS, seed=SEED, failure=why)
     frames = Tabs.read(found.reader).pages["push-0"].frames
     ghosts = {mesh: body for mesh, body in frames.items() if mesh.startswith("/ghosts/")}
@@ -269,7 +271,7 @@ def test_without_a_failure_the_verdict_tells_facts(tmp_path, pushed):
     verdict = found.text("/push-0/verdict")
     assert verdict.startswith("#### FAILED in 60 steps (0.75 s)")
     last = int(pushed["skill_weights"][-1].argmax())
-    assert f"At the end plan step {last + 1}, **“{PLANS['push'].steps[last].skill}”**, was in force" in verdict
+    assert f"At the end plan step {last + 1}, **“{PLANS['push'].steps[last].skill}”**, was active" in verdict
     assert f"condition 2, “{PLANS['push'].steps[1].condition}”" in verdict
     assert Tabs.read(found.reader).opening_step() == 60
 
@@ -280,7 +282,7 @@ def test_a_success_is_the_verdict(tmp_path, pushed):
     _, found = logged(tmp_path / "a.rrd", succeeded)
     verdict = found.text("/push-0/verdict")
     assert verdict.startswith("#### SUCCESS at t = 41 (0.51 s) of 60")
-    assert "did not last: the task stood done in 1 steps" in verdict
+    assert "did not last: the task was done in 1 steps" in verdict
     assert Tabs.read(found.reader).opening_step() == 41
 
 

@@ -10,14 +10,16 @@ import torch
 from PIL import Image
 from recordings import PLAN, STEPS, Recording, make_objects, make_rollout, record
 
+from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.queries import Clause, Query
+from lw_torchrl.language.relations import TOUCHING
 from lw_torchrl.record import RerunLogger
-from lw_torchrl.record.lanes import EVENLY, NONE_HOLDS, short
-from lw_torchrl.record.page import ROBOT_EYE
-from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode
-from lw_torchrl.record.scene import beside
+from lw_torchrl.record.lanes import EVENLY, NONE_HOLDS
+from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode, short_condition
+from lw_torchrl.record.scene import ROBOT_EYE, name_offsets
 from lw_torchrl.record.tabs import Tabs
 
-ROWS = [f"/e1/{i}_" + short(c).replace(" ", "_") for i, (c, _) in enumerate(STEPS, 1)]
+ROWS = [f"/e1/{i}_" + short_condition(step.condition).replace(" ", "_") for i, step in enumerate(PLAN.steps, 1)]
 
 
 def test_an_episode_survives_exactly(tmp_path):
@@ -43,7 +45,7 @@ def test_an_episode_survives_exactly(tmp_path):
     assert found.states("/e1/0_verdict", 20, first=1) == ["not yet"] * 10 + ["success"] * 10
     lanes = {"0_verdict", "0b_plan_step", *(row[4:] for row in ROWS), "gripper"}
     assert {entity[4:] for entity in found.entities() if entity.startswith("/e1/")} == lanes
-    opening = ["open" if told > 0.75 else "closed" for told in rollout["observation"][:, 3].tolist()]
+    opening = ["open" if width > 0.75 else "closed" for width in rollout["observation"][:, 3].tolist()]
     assert found.states("/e1/gripper", 20) == opening
 
 
@@ -66,7 +68,7 @@ def test_the_plan_follows_the_cursor(tmp_path):
     assert f"**→ {two}**" in texts[1]
 
 
-def test_the_step_in_force_has_a_timeline(tmp_path):
+def test_the_active_step_has_a_timeline(tmp_path):
     rollout = make_rollout()
     found = record(tmp_path / "a.rrd", rollout)
     names = [f"{i} {skill}" for i, (_, skill) in enumerate(STEPS, 1)]
@@ -93,7 +95,7 @@ def test_a_learned_evaluators_truth_stands_beside(tmp_path):
     rollout["qaf_logits"][5:, 0] *= -1
     found = record(tmp_path / "a.rrd", rollout)
     exact = ["true" if true else "false" for true in rollout["qaf"][:, 0]]
-    wrong = {"true": "true, told false", "false": "false, told true"}
+    wrong = {"true": "true, answered false", "false": "false, answered true"}
     assert found.states(ROWS[0], 20) == exact[:5] + [wrong[true] for true in exact[5:]]
     texts = [row[0] for row in found.values("/push/plan", "TextDocument:text")]
     assert ["(evaluator:" in text for text in texts] == [
@@ -134,7 +136,7 @@ def test_without_a_plan_every_column_is_numbered(tmp_path):
     assert "/e1/3_condition" in found.entities()
 
 
-def test_without_a_plan_nor_a_condition_that_holds_no_step_is_in_force(tmp_path):
+def test_without_a_plan_nor_a_condition_that_holds_no_step_is_active(tmp_path):
     rollout = make_rollout(5).exclude("skill_weights")
     rollout["qaf"] = torch.zeros(5, 3, dtype=torch.bool)
     found = record(tmp_path / "a.rrd", rollout, plan=None)
@@ -149,14 +151,14 @@ def test_a_goal_that_is_an_object_has_one_label(tmp_path):
     assert found.values("/push/scene/objects/target\\ location", "Points3D:labels")[0] == ["target location"]
 
 
-def test_in_force():
+def test_the_active_step():
     rollout = make_rollout(3, columns=2)
     rollout["skill_weights"] = torch.tensor([[0.9, 0.1], [0.5, 0.5], [0.2, 0.8]])
-    assert RecordedEpisode.from_rollout(rollout, {}, PLAN).in_force.tolist() == [0, NOBODY, 1]
+    assert RecordedEpisode.from_rollout(rollout, {}, PLAN).active.tolist() == [0, NOBODY, 1]
     rollout["qaf"] = torch.tensor([[True, True], [False, True], [False, False]])
     without = RecordedEpisode.from_rollout(rollout.exclude("skill_weights"), {}, PLAN)
-    assert without.in_force.tolist() == [0, 1, NOBODY]
-    assert RecordedEpisode.from_rollout(rollout.exclude("skill_weights", "qaf"), {}, PLAN).in_force is None
+    assert without.active.tolist() == [0, 1, NOBODY]
+    assert RecordedEpisode.from_rollout(rollout.exclude("skill_weights", "qaf"), {}, PLAN).active is None
 
 
 def test_several_episodes_and_their_names(tmp_path):
@@ -201,7 +203,6 @@ def test_the_layout_is_in_the_file(tmp_path):
         (lambda r: r.set("observation", torch.rand(20, 38)), r"'observation'\] must have shape 20×39, got 20×38"),
         (lambda r: r.set("action", torch.full((20, 4), float("nan"))), r"'action'\] must be finite, .* row 0"),
         (lambda r: r.set("qaf_logits", torch.rand(20, 1)), r"'qaf_logits'.* each of 2 plan steps, got 1"),
-        (lambda r: r.set("qaf", torch.rand(20, 3)), r"'qaf'\] must be bool, got torch.float32"),
     ],
 )
 def test_wrong_rollouts_are_named(tmp_path, change, message):
@@ -211,28 +212,35 @@ def test_wrong_rollouts_are_named(tmp_path, change, message):
 
 
 @pytest.mark.parametrize(
-    ("condition", "said"),
+    ("clauses", "text"),
     [
-        ("the robot's gripper is near the peg and the robot's gripper is open", "gripper near peg and open"),
+        ([Clause(GRIPPER, "near", "peg"), Clause(GRIPPER, "open")], "gripper near peg and open"),
         (
-            "the robot's gripper is not left of the lid and the robot's gripper is not around the lid",
+            [Clause(GRIPPER, "left of", "lid", negated=True), Clause(GRIPPER, "around", "lid", negated=True)],
             "gripper not left or around lid",
         ),
         (
-            "the stick is not touching the table and the stick is not above the box and the stick is right of the box",
+            [
+                Clause("stick", TOUCHING, negated=True),
+                Clause("stick", "above", "box", negated=True),
+                Clause("stick", "right of", "box"),
+            ],
             "stick off table and not above but right of box",
         ),
-        ("the lid is near the lid box and the lid is not near the box", "lid near lid box and not near box"),
-        ("whatever you say", "whatever you say"),
+        (
+            [Clause("lid", "near", "lid box"), Clause("lid", "near", "box", negated=True)],
+            "lid near lid box and not near box",
+        ),
     ],
 )
-def test_a_condition_in_short_says_the_same(condition, said):
-    assert short(condition) == said
+def test_a_short_condition_says_the_same(clauses, text):
+    assert short_condition(Query(tuple(clauses))) == text
+    assert short_condition("whatever you say") == "whatever you say"
 
 
 def test_names_of_things_in_one_place_stand_apart():
     place = np.full((5, 3), 0.1, np.float32)
-    offsets = beside({"puck": place, "goal": place, "wall": place + 0.5}, ROBOT_EYE)
+    offsets = name_offsets({"puck": place, "goal": place, "wall": place + 0.5}, ROBOT_EYE)
     assert [name for name, offset in offsets.items() if offset.any()] == ["goal"]
     assert np.linalg.norm(offsets["goal"]) > 0.03
 

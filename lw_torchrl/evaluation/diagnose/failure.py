@@ -1,0 +1,270 @@
+"""Failure: why one episode failed, as typed data, and its form in JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from reprlib import repr as short
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+
+from lw_torchrl._checks import Count, Natural, Scale, check_fields
+from lw_torchrl.evaluation.records import is_number, read_records
+
+if TYPE_CHECKING:
+    from tensordict import TensorDictBase
+
+    from lw_torchrl.language.plans import ConditionalPlan
+
+Blamed = Literal["not reproducible", "perception", "query", "plan", "skill", "gripper", "actuation", "policy"]
+Cause = Literal[Blamed, "out of time", "undecided"]
+
+CAUSES: dict[str, str] = {
+    "not reproducible": "a plain re-run succeeds",
+    "perception": "the policy was shown a wrong state",
+    "query": "a condition was answered wrongly",
+    "plan": "the plan is wrong",
+    "skill": "the policy executed a skill badly",
+    "gripper": "the gripper opened or closed wrongly",
+    "actuation": "the hand moved wrongly in several steps",
+    "policy": "the policy, unclear which part of it",
+    "out of time": "it succeeds with more time",
+    "undecided": "no replacement helps",
+}
+"""Each cause and its meaning."""
+
+REPLACEMENTS: dict[str, tuple[Cause, ...]] = {
+    "perception": ("perception",),
+    "query": ("query",),
+    "plan": ("plan",),
+    "skill": ("skill",),
+    "gripper": ("gripper",),
+    "actuation": ("actuation",),
+    "policy": ("policy",),
+    "time": ("out of time",),
+    "query + skill": ("query", "skill"),
+    "query + plan": ("query", "plan"),
+    "plan + skill": ("plan", "skill"),
+}
+"""The name of each replacement, and the causes to blame if an episode succeeds with it."""
+
+
+@dataclass(frozen=True)
+class WrongAnswers:
+    """The condition of a step was answered wrongly in ``states`` of ``of`` states, first at ``first``."""
+
+    step: Natural
+    condition: str
+    states: Natural
+    of: Count
+    first: Natural
+
+
+@dataclass(frozen=True)
+class NoCondition:
+    """No condition of the plan held in ``states`` of the last ``of`` states."""
+
+    states: Natural
+    of: Count
+
+
+@dataclass(frozen=True)
+class PlanDeparts:
+    """The plan requested another action than the reference in ``states`` of ``of`` states, the last ones if ``late``.
+
+    ``step`` and ``skill`` are the plan's in most of these states, ``reference`` is the skill that the reference plan
+    requests there; ``uncovered`` says that no condition of the plan held in most of them.
+    """
+
+    step: Natural
+    skill: str
+    reference: str
+    states: Natural
+    of: Count
+    late: bool
+    uncovered: bool
+
+
+@dataclass(frozen=True)
+class ActiveStep:
+    """A step was active in ``states`` of the last ``of`` states, and at the end ``distance`` metres from its target."""
+
+    step: Natural
+    skill: str
+    states: Natural
+    of: Count
+    distance: Scale | None = None
+
+
+@dataclass(frozen=True)
+class Misled:
+    """The observation that the policy was shown differed from the true one, most in entry ``number``, by ``error``."""
+
+    error: Scale
+    number: Natural
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The first difference between two runs of an episode.
+
+    Attributes:
+        part: "length", of ``given`` and ``again`` steps; "actions", from step ``at`` on, there by ``size``;
+            "environment", the same action leads to another state ``at``; "states", from ``at`` on, in a rollout without
+            actions; "nothing" that was recorded.
+        at: the state to look at.
+    """
+
+    part: Literal["length", "actions", "environment", "states", "nothing"]
+    at: Natural
+    given: Natural | None = None
+    again: Natural | None = None
+    size: Scale | None = None
+
+
+Finding = WrongAnswers | NoCondition | PlanDeparts | ActiveStep | Misled | Difference
+FINDINGS: dict[str, type[Any]] = {kind.__name__: kind for kind in get_args(Finding)}
+
+
+class MendedEpisode(NamedTuple):
+    """A failed episode that succeeds when it is re-run with a part replaced.
+
+    Attributes:
+        by: the replacement, one of :data:`REPLACEMENTS`.
+        plan: the plan that was carried out, whose conditions ``steps["qaf"]`` answers.
+        steps: of batch (T,), up to the first success: ``observation`` (T, 39) float32, ``action`` (T, 4) float32 as
+            executed, ``task_id`` (T,) and ``episode`` (T,) int64, ``("next", "success")`` (T, 1) bool and
+            ``("next", "reward")`` (T, 1) float32; where they exist, ``qaf`` (T, S) bool and ``skill_weights`` (T, S)
+            float32.
+    """
+
+    by: str
+    plan: ConditionalPlan
+    steps: TensorDictBase
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why one episode failed. Every field is data; :attr:`why` writes it in English.
+
+    Attributes:
+        task, seed, episode: which episode; ``episode_seed(task, seed, episode)`` is its seed.
+        cause: one of :data:`CAUSES`.
+        also: a second cause, if the episode succeeds only with both replaced.
+        step: the step of the plan to which the failure belongs, from 0; None if it belongs to no step.
+        at: the step of the episode to look at first, from 0.
+        finding: what the episode's states show of the cause, or of ``suspect``.
+        replaced: the replacement that decided, one of :data:`REPLACEMENTS`; None without one.
+        rival: the next best replacement.
+        succeeds_at: the step at which the episode succeeds with ``replaced``, or in a plain re-run.
+        scripted_step: a step in which a scripted skill also suffices, although other steps have the same fault.
+        suspect: the cause that the states alone suggest, if it is undecided.
+        evidence: name to number, measured in the episode's states.
+        counterfactuals: each replacement that was tried, and whether the same episode then succeeded. "perception"
+            replaces the observations; "query" the answers; "plan" the plan; "skill" the actions in one step of the
+            plan; "gripper" and "actuation" one part of the action in all steps; "policy" the whole action; "time"
+            doubles the time limit; pairs like "query + plan" replace both, with "skill" in all steps.
+        shares: each replacement, and the share of the task's failed episodes that succeed with it; "nothing" is a plain
+            re-run.
+        mended: the episode with the cause replaced, if it then succeeds; it is not saved.
+    """
+
+    task: str
+    seed: int
+    episode: Natural
+    cause: Cause
+    also: Cause | None
+    step: Natural | None
+    at: Natural
+    finding: Finding | None = None
+    replaced: str | None = None
+    rival: str | None = None
+    succeeds_at: Count | None = None
+    scripted_step: Natural | None = None
+    suspect: Cause | None = None
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    counterfactuals: Mapping[str, bool] = field(default_factory=dict)
+    shares: Mapping[str, float] = field(default_factory=dict)
+    mended: MendedEpisode | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def why(self) -> str:
+        """The failure in a few English sentences."""
+        from lw_torchrl.evaluation.diagnose.sentences import explain_failure
+
+        return explain_failure(self)
+
+    def to_json(self) -> dict[str, Any]:
+        """All fields except :attr:`mended`, as JSON."""
+        return {one.name: _to_json(getattr(self, one.name)) for one in fields(self) if one.compare}
+
+
+def _to_json(value: Any) -> Any:
+    if isinstance(value, get_args(Finding)):
+        return {"kind": type(value).__name__, **vars(value)}
+    return dict(value) if isinstance(value, Mapping) else value
+
+
+def _read_finding(where: str, stated: Any) -> Any:
+    """Return the finding of a file; raise :class:`ValueError` if it is not one."""
+    if stated is None:
+        return None
+    kind = FINDINGS.get(str(stated.get("kind"))) if isinstance(stated, dict) else None
+    if kind is None or set(stated) != {"kind", *(one.name for one in fields(kind))}:
+        raise ValueError(
+            f"{where} must be null, or a kind of {', '.join(FINDINGS)} with its fields, got {short(stated)}"
+        )
+    finding = kind(**{name: value for name, value in stated.items() if name != "kind"})
+    check_fields(finding, f"{where}: ")
+    return finding
+
+
+def read_failures(stated: Any, config: Mapping[str, Any], failed: Sequence[tuple[str, int]]) -> tuple[Failure, ...]:
+    """Return the failures of a file: one for each failed episode, (task, episode); otherwise :class:`ValueError`."""
+
+    def faults(one: Failure) -> Iterator[str]:
+        if one.seed != config["seed"]:
+            yield "seed must be config's"
+        if one.also is not None and (one.also == one.cause or "undecided" in (one.also, one.cause)):
+            yield "also must be null or another cause than the first"
+        if one.at >= config["max_steps"]:
+            yield "at must be a step of the episode"
+        for name in ("evidence", "shares"):
+            numbers = getattr(one, name)
+            if not isinstance(numbers, dict) or not all(map(is_number, numbers.values())):
+                yield f"{name} must be names and numbers"
+        tried = one.counterfactuals.items() if isinstance(one.counterfactuals, dict) else [("", 0)]
+        if not all(name in REPLACEMENTS and type(value) is bool for name, value in tried):
+            yield f"counterfactuals must be some of {', '.join(REPLACEMENTS)}, to true or false"
+        if not {one.replaced, one.rival} <= {None, *REPLACEMENTS}:
+            yield f"replaced and rival must be null or one of {', '.join(REPLACEMENTS)}"
+
+    def parse(where: str, entry: dict[str, Any]) -> dict[str, Any]:
+        return entry | {"finding": _read_finding(f"{where}.finding", entry["finding"])}
+
+    found = read_records("failures", stated, Failure, faults, parse)
+    if sorted(failed) != sorted((failure.task, failure.episode) for failure in found):
+        raise ValueError("failures must be one for each episode without success")
+    return found
+
+
+def count_causes(tasks: Sequence[str], failures: Sequence[Failure]) -> dict[str, dict[str, int]]:
+    """Return the number of failures of each cause, by task."""
+    counts = {task: dict.fromkeys(CAUSES, 0) for task in tasks}
+    for failure in failures:
+        counts[failure.task][failure.cause] += 1
+    return counts
+
+
+def failure_table(tasks: Sequence[str], episodes_per_task: int, failures: Sequence[Failure]) -> str:
+    """Return the numbers of failures as text: a row for each task, a column for each cause that occurs."""
+    causes = [cause for cause in CAUSES if any(failure.cause == cause for failure in failures)]
+    width = max(len("task"), len("all"), *map(len, tasks))
+    lines = [f"{'task':{width}}  {'failed':>10}  " + "  ".join(f"{cause:>5}" for cause in causes)]
+    counts = count_causes(tasks, failures)
+    if len(tasks) > 1:
+        counts["all"] = {cause: sum(row[cause] for row in counts.values()) for cause in causes}
+    for task, row in counts.items():
+        trials = episodes_per_task * (len(tasks) if task == "all" and len(tasks) > 1 else 1)
+        cells = "  ".join(f"{number:>{max(5, len(cause))}}" for cause, number in row.items() if cause in causes)
+        lines.append(f"{task:{width}}  {f'{sum(row.values())} of {trials}':>10}  {cells}")
+    return "\n".join(lines)

@@ -1,0 +1,201 @@
+"""Read the states of a failed episode: wrong answers, departures of the plan from a reference, the step it ended in."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from lw_torchrl.evaluation.diagnose.failure import ActiveStep, Cause, Finding, NoCondition, PlanDeparts, WrongAnswers
+from lw_torchrl.evaluation.diagnose.scripts import Scripts, attended
+from lw_torchrl.evaluation.plan_use import where_stuck
+from lw_torchrl.language.layout import METAWORLD, Layout
+from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.transforms.qaf import plan_program
+
+_LATE = 100  # the last states, in which a failed episode got nowhere
+_AHEAD, _STILL = 10, 0.01  # the hand stands still if it moves less than a centimetre in 10 states
+_AWAY = 25  # a stay in a step may be interrupted for so many states: two alternating steps are one stay
+_WRONG = 0.01  # the smallest share of states with wrong answers that counts
+OTHER = 0.3  # two actions that differ by more, on some axis, pursue different things
+
+
+class EpisodeStates(NamedTuple):
+    """A failed episode: its T states under a plan of S steps."""
+
+    task: str
+    episode: int
+    steps: TensorDictBase  # of batch (T,)
+    truth: Tensor  # (T, S) bool, the exact answers
+    given: Tensor  # (T, S) bool, the answers that the policy acted on
+    weights: Tensor  # (T, S) float32, the policy's attention over the plan's steps
+    active: Tensor  # (T,) int64, the step with most attention; -1 where all steps have the same
+
+    @property
+    def which(self) -> tuple[str, int]:
+        return self.task, self.episode
+
+    def active_time(self, plan: ConditionalPlan, step: int, distance: float | None = None) -> ActiveStep:
+        """Return how long a step was active late in the episode."""
+        late = min(_LATE, len(self.active))
+        states = int((self.active == step)[-late:].sum())
+        return ActiveStep(step, plan.steps[step].skill, states, late, distance)
+
+
+class Blame(NamedTuple):
+    """The step of the plan and the state at which a cause shows, and what shows there."""
+
+    step: int
+    at: int
+    finding: Finding
+
+
+class Explanation(NamedTuple):
+    """What the states alone show."""
+
+    cause: Cause  # "undecided" if they do not decide
+    blames: Mapping[str, Blame]  # by possible cause
+    evidence: Mapping[str, float]
+
+
+def chosen(truth: Tensor, steps: int) -> Tensor:
+    """Return (T,) int64: the first of ``steps`` steps whose condition holds in (T, S) bool, else the last step."""
+    here = truth[..., :steps]
+    return torch.where(here.any(-1), here.int().argmax(-1), steps - 1)
+
+
+def states_of(task: str, episode: int, steps: TensorDictBase, plans: Plans, given: Tensor | None) -> EpisodeStates:
+    """Return an episode's states under the policy's plan; ``given`` are its answers, None for the recorded ones."""
+    number = len(plans[task].steps)
+    truth = plan_program(Plans([plans[task]]))(steps.get("observation"), steps.get("task_id"))[:, :number]
+    if (logits := steps.get("qaf_logits", None)) is not None:
+        given = logits > 0
+    elif given is None and (recorded := steps.get("qaf", None)) is not None:
+        given = recorded > 0.5
+    given = truth if given is None else given[:, :number]
+    weights = steps.get("skill_weights", None)
+    weights = one_hot(chosen(given, number), number).float() if weights is None else weights[:, :number]
+    active = attended(weights, torch.ones_like(weights, dtype=torch.bool))
+    return EpisodeStates(task, episode, steps, truth, given, weights, active)
+
+
+def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
+    """Return the steps that may be to blame for a failure, the likeliest first.
+
+    Among the steps that were active late in the episode these are the furthest and the most frequent one, then the
+    furthest of all, then the others. ``among`` (T,) bool restricts the states.
+    """
+    counted = seen.active >= 0 if among is None else (seen.active >= 0) & among
+    if not counted.any():
+        return []
+    active = one_hot(seen.active.clamp(min=0), seen.truth.shape[1]) * counted.unsqueeze(-1)
+    ranked: list[int] = []
+    for window in (_LATE, len(active)):
+        if counted[-window:].any():
+            ranked += reversed(where_stuck(active, window))
+    ranked += torch.bincount(seen.active[counted]).argsort(descending=True).tolist()
+    return [step for step in dict.fromkeys(ranked) if step in seen.active[counted]]
+
+
+def last_stay_start(states: Tensor) -> int:
+    """Return where the last stay in ``states`` (T,) bool begins; an interruption of up to 25 states does not end it."""
+    places = states.nonzero().flatten()
+    if not len(places):
+        return len(states) - 1
+    gaps = (places.diff() > _AWAY + 1).nonzero()
+    return int(places[gaps[-1] + 1] if len(gaps) else places[0])
+
+
+def stall_step(seen: EpisodeStates, step: int, layout: Layout = METAWORLD) -> int:
+    """Return the first state of the last stay in a step from which the hand stands still, else the stay's beginning."""
+    inside = seen.active == step
+    begin = last_stay_start(inside)
+    hand = seen.steps.get("observation")[begin:, layout.positions[0]]
+    still = ((hand[_AHEAD:] - hand[:-_AHEAD]).norm(dim=-1) < _STILL) & inside[begin : begin + len(hand[_AHEAD:])]
+    return begin + (int(still.int().argmax()) if still.any() else 0)
+
+
+def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) -> Explanation:
+    """Apply the rule of :func:`attribute_failures` to an episode's states.
+
+    Without a reference, the plan is to blame if no condition holds, and a skill that stays active far from its target.
+    """
+    plan, length = scripts.plans[seen.task], len(seen.active)
+    late = min(_LATE, length)
+    stuck = next(iter(candidates(seen)), len(plan.steps) - 1)
+    stalled = stall_step(seen, stuck, scripts.plans.layout)
+    blames, evidence = {}, {"states": float(length)}
+
+    wrong = seen.given != seen.truth
+    share = evidence["answers_wrong"] = float(wrong.any(-1).float().mean())
+    if share:
+        changes = chosen(seen.given, len(plan.steps)) != chosen(seen.truth, len(plan.steps))
+        matter = wrong & changes.unsqueeze(-1) if changes.any() else wrong
+        column = int(matter.sum(0).argmax())
+        evidence["answers_wrong_late"] = float(wrong[-late:].any(-1).float().mean())
+        here = wrong[:, column].int()
+        condition = str(plan.steps[column].condition)
+        answers = WrongAnswers(column, condition, int(here.sum()), length, int(here.argmax()))
+        blames["query"] = Blame(column, int(matter[:, column].int().argmax()), answers)
+
+    none = ~seen.truth.any(-1)
+    evidence["no_condition_late"] = float(none[-late:].float().mean())
+    if reference is None or seen.task not in reference.plans:
+        uncovered = NoCondition(int(none[-late:].sum()), late)
+        blames["plan"] = Blame(stuck, last_stay_start(none) if none.any() else stalled, uncovered)
+    else:
+        other = reference.plans[seen.task]
+        departs, ours, theirs = _departs(seen, plan, scripts, other, reference)
+        evidence["plan_departs"] = float(departs.float().mean())
+        evidence["plan_departs_late"] = float(departs[-late:].float().mean())
+        recent, where, step, asked = int(departs[-late:].sum()), departs.clone(), stuck, other.steps[0].skill
+        where[:-late] &= not recent
+        if where.any():
+            step = int(torch.bincount(ours[where]).argmax())
+            asked = other.steps[int(torch.bincount(theirs[where & (ours == step)]).argmax())].skill
+        uncovers = bool(where.any()) and bool(none[where].float().mean() > 0.5)
+        states, of = (recent, late) if recent else (int(departs.sum()), length)
+        at = last_stay_start(departs & (ours == step)) if departs.any() else stalled
+        finding = PlanDeparts(step, plan.steps[step].skill, asked, states, of, bool(recent), uncovers)
+        blames["plan"] = Blame(step, at, finding)
+
+    evidence["in_step_late"] = float((seen.active == stuck)[-late:].float().mean())
+    if scripts.known[seen.task][stuck]:
+        last = seen.steps[-1:]
+        distance = float(scripts.distance(last.get("observation"), last.get("task_id"), stuck))
+        evidence["distance_at_end"] = distance
+    time = seen.active_time(plan, stuck, evidence.get("distance_at_end"))
+    blames["skill"] = blames["undecided"] = Blame(stuck, stalled, time)
+    blames["out of time"] = Blame(stuck, length - 1, time)
+
+    cause: Cause = "undecided"
+    if share >= _WRONG:
+        cause = "query"
+    elif "plan_departs_late" in evidence:
+        cause = "plan" if evidence["plan_departs_late"] > 0.5 else "skill"
+    elif evidence["no_condition_late"] > 0.5:
+        cause = "plan"
+    elif evidence["in_step_late"] > 0.9 and evidence.get("distance_at_end", 0.0) > 0.05:
+        cause = "skill"
+    return Explanation(cause, blames, evidence)
+
+
+def _departs(
+    seen: EpisodeStates, plan: ConditionalPlan, scripts: Scripts, other: ConditionalPlan, other_scripts: Scripts
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return (T,) bool, where the plan's true step requests another action than the reference's, and both steps.
+
+    Skills without a script differ if their texts do.
+    """
+    observation, task_id = seen.steps.get("observation"), seen.steps.get("task_id")
+    answers = plan_program(Plans([other]))(observation, task_id)
+    ours, theirs = chosen(seen.truth, len(plan.steps)), chosen(answers, len(other.steps))
+    rows = torch.arange(len(ours))
+    done = scripts.program(observation, task_id)[rows, ours]
+    wanted = other_scripts.program(observation, task_id)[rows, theirs]
+    differ = (done - wanted).abs().amax(-1) > OTHER
+    same_text = torch.tensor([[a.skill == b.skill for b in other.steps] for a in plan.steps])[ours, theirs]
+    scripted = torch.tensor(scripts.known[plan.task])[ours] & torch.tensor(other_scripts.known[other.task])[theirs]
+    return torch.where(scripted, differ, ~same_text), ours, theirs
