@@ -126,7 +126,9 @@ class ObservationFeatures(Features):
         Raises:
             ValueError: the features mean something else in that layout.
         """
-        layout = plans.layout  # type: ignore[union-attr]
+        from lw_torchrl.language.task_index import as_plans
+
+        layout = as_plans(plans).layout
         if layout == self.layout:
             return self
         if self.kind not in TRANSFERS:

@@ -97,7 +97,8 @@ class ScriptedSkillActor(TensorDictModuleBase):
     def with_plans(self, plans: AnyPlans) -> ScriptedSkillActor:
         """Return the same skills under other plans."""
         keys = {"in_keys": self.in_keys, "out_keys": self.out_keys_source}
-        return ScriptedSkillActor(plans, self.select, skills=self._skills, seed=self.seed, **keys)
+        other = ScriptedSkillActor(plans, self.select, skills=self._skills, seed=self.seed, **keys)
+        return other.train(self.training)
 
     def skill_weights(self, tensordict: TensorDictBase) -> Tensor:
         """Return the weight of each step, (B, S) float32."""

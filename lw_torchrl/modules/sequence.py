@@ -53,7 +53,7 @@ def _parts_reading(module: nn.Module, renamed: Mapping[NestedKey, NestedKey], co
 
 
 class NamedParts(RenamedInputs, TensorDictSequential):
-    """A TensorDictSequential of named parts: ``actor.decoder`` is a part, and ``actor.decoder = network`` replaces it."""
+    """A sequence of named parts: ``actor.decoder`` is a part, and ``actor.decoder = network`` replaces it."""
 
     def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
         """Return a module as the part ``name``: a plain module reads and writes the keys of the part before it."""

@@ -62,6 +62,7 @@ class StochasticActor(RenamedInputs, ProbabilisticTensorDictSequential):
         action: Any = "action",
     ) -> None:
         check_choice("distribution", distribution, DISTRIBUTIONS)
+        action = tuple(action) if isinstance(action, list) else action  # JSON has no tuples
         loc, scale = decoder.out_keys
         if isinstance(decoder, Decode) and (width := encoding_width(trunk)) is not None:
             materialize(decoder.network, torch.zeros(1, width))

@@ -42,7 +42,9 @@ def make_role_actor(plans=CANONICAL, seed=0, **options):
 
 def make_action_mixer(plans=PLANS):
     parts = m.PlanAttention(plans), m.ObservationFeatures(), m.ActionMixer(plans, small_decoder())
-    return TensorDictSequential(*parts)
+    actor = TensorDictSequential(*parts)
+    actor(make_rows(1, plans=plans))  # the decoder is lazy
+    return actor
 
 
 ACTORS = {

@@ -179,9 +179,7 @@ def test_it_is_the_same_in_another_layout_only_if_it_means_the_same():
     assert (other.layout, other.noise) == (fetch.layout, 0.1)
     assert other.mean is features.mean
     assert features.with_plans(plans) is features
-    with pytest.raises(
-        ValueError, match="features 'raw' of layout 'metaworld' do not transfer to 'fetch'; .* RoleFeat"
-    ):
+    with pytest.raises(ValueError, match=r"features 'raw' of layout 'metaworld' do not transfer to 'fetch'"):
         ObservationFeatures("raw").with_plans(fetch)
 
 
