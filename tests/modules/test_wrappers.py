@@ -245,9 +245,7 @@ def test_both_policies_are_fitted_and_evaluated():
 def test_policies_that_do_not_belong_together_are_refused():
     plain, others = make_descriptor(SEEN), make_actor()
     for wrong in ((others, others), (plain, plain), (others, plain), (PLAIN, others)):
-        with pytest.raises(
-            ValueError, match="demonstrated must be an actor of tasks without plans, and others one with"
-        ):
+        with pytest.raises(ValueError, match="demonstrated must be an actor of tasks without plans"):
             DemonstratedActor(*wrong)
     with pytest.raises(ValueError, match="must have one layout, got 'metaworld' and 'fetch'"):
         DemonstratedActor(plain, make_actor(load_suite("fetch").plans))
