@@ -82,7 +82,7 @@ def dispatched(forward: Callable[[Any, TensorDictBase], TensorDictBase]) -> Call
             return tensordict
         return forward(self, tensordict)
 
-    called = dispatch(run)
+    called = dispatch(auto_batch_size=False)(run)  # of one tensor (B, F), all dimensions would be the batch
     # torch.export binds arguments to the signature, and dispatch leaves the names of in_keys out.
     called.__signature__ = Signature([Parameter("self", Parameter.POSITIONAL_OR_KEYWORD), *_ANY])
     return called

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
@@ -18,10 +18,10 @@ from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import MLP, materialize
 from lw_torchrl.modules.plan_conditioned_actor import plan_trunk
 from lw_torchrl.modules.policy import layout_of, plans_of
-from lw_torchrl.modules.sequence import encoding_width
+from lw_torchrl.modules.sequence import RenamedInputs, encoding_width
 
 
-class Value(TensorDictModuleBase):
+class Value(RenamedInputs):
     """The value of a state: a trunk with a head for values.
 
     Reads what the trunk reads; writes ``state_value`` (B, 1) float32, the minimum of the ensemble, and with an ensemble
@@ -47,6 +47,7 @@ class Value(TensorDictModuleBase):
 
     _written = ("state_value", "state_values")
     _numbers = 1  # of a value
+    _also_read: Sequence[NestedKey] = ()
 
     @checked
     def __init__(
@@ -61,7 +62,7 @@ class Value(TensorDictModuleBase):
         super().__init__()
         self.trunk = trunk
         self.plans, self.layout = plans_of(trunk), layout_of(trunk)
-        self.in_keys: list[NestedKey] = list(trunk.in_keys)
+        self.in_keys = [*trunk.in_keys, *self._also_read]
         self.out_keys = as_keys("out_keys", out_keys, self._written[: 1 if ensemble == 1 else 2])
         check_apart(self.in_keys, self.out_keys)
         self.heads = nn.ModuleList(
@@ -121,18 +122,16 @@ class QValue(Value):
         self._numbers = check_int("quantiles", quantiles, minimum=1)
         if quantiles > 1 and ensemble != 1:
             raise ValueError(f"ensemble must be 1 with quantiles, got {ensemble}: TQCLoss makes several critics itself")
-        super().__init__(trunk, ensemble=ensemble, **options)
         check_key("action_key", action_key)
-        self.action_key = action_key
-        self.in_keys = [*self.in_keys, action_key]
-        check_apart(self.in_keys, self.out_keys)
+        self._also_read = (action_key,)
+        super().__init__(trunk, ensemble=ensemble, **options)
 
     @property
     def _extra(self) -> int:
         return self.layout.action_size
 
     def _inputs(self, tensordict: TensorDictBase) -> Tensor:
-        (action,) = read(tensordict, [self.action_key])
+        (action,) = read(tensordict, self.in_keys[-1:])
         seen = super()._inputs(tensordict)
         return torch.cat((seen, action.to(seen.dtype)), -1)
 

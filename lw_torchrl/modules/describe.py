@@ -147,6 +147,8 @@ class _Decoder:
         if not isinstance(node.get("options"), Mapping):
             raise ValueError(f"options of a {name} must be a table, got {shown(node.get('options'))}")
         options = {key: self.value(value) for key, value in node["options"].items()}
+        for key in {*_KEYS} & {*options}:  # JSON has no tuples
+            options[key] = [tuple(each) if isinstance(each, list) else each for each in options[key]]
         rebuild: Callable[..., Any] = getattr(kind, "rebuild", kind)
         if "text_encoder" in signature(rebuild).parameters:
             options["text_encoder"] = self.text_encoder

@@ -296,7 +296,7 @@ class RoleFeatures(_RelativePositions):
         lifts = (pick(self.lifts, rows) & ~pick(self.demonstrated, rows).unsqueeze(-1))[..., None, None]
         beside, height = found[..., :2], found[..., 2:]
         far = beside.norm(dim=-1, keepdim=True)
-        height = height + lifts * _LIFTED * ((far - 0.03) / 0.04).clamp(0.0, 1.0)
+        height = height + _LIFTED * ((far - 0.03) / 0.04).clamp(0.0, 1.0) * lifts
         rising = torch.where(lifts, ((0.06 - height) / 0.04).clamp(0.0, 1.0), 1.0)
         return torch.cat((beside * rising, height), -1)
 

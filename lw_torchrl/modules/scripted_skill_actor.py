@@ -97,14 +97,19 @@ class ScriptedSkillActor(TensorDictModuleBase):
     def with_plans(self, plans: AnyPlans) -> ScriptedSkillActor:
         """Return the same skills under other plans."""
         keys = {"in_keys": self.in_keys, "out_keys": self.out_keys_source}
-        return ScriptedSkillActor(plans, self.select, skills=self._skills, seed=self.seed, **keys)
+        other = ScriptedSkillActor(plans, self.select, skills=self._skills, seed=self.seed, **keys)
+        return other.train(self.training)
 
     def skill_weights(self, tensordict: TensorDictBase) -> Tensor:
         """Return the weight of each step, (B, S) float32."""
         _, task_id, qaf = read(tensordict, self.in_keys)
         rows = self.tables.rows(task_id)
-        self.tables.refuse_others(tensordict.get(key_beside(self.in_keys[2], "_plan"), None), rows)
-        if qaf.shape != (shape := (*rows.shape, self.tables.mask.shape[-1])):
+        plan = tensordict.get(key_beside(self.in_keys[2], "_plan"), None)
+        self.tables.refuse_others(plan, rows)
+        steps = self.tables.mask.shape[-1]
+        if plan is not None and qaf.shape[-1] > steps:  # answers for more plans, of which some are longer
+            qaf = qaf[..., :steps]
+        if qaf.shape != (shape := (*rows.shape, steps)):
             raise ValueError(f"qaf must have shape {shape}, one column for each step, got {tuple(qaf.shape)}")
         if qaf.dtype != torch.bool:
             problem = "qaf must be bool, or numbers from 0 to 1 for soft truth; it holds other numbers, or NaN"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
@@ -12,11 +13,47 @@ from torch import nn
 from lw_torchrl._keys import as_keys
 
 
-class NamedParts(TensorDictSequential):
-    """A TensorDictSequential of named parts: ``actor.decoder`` is a part, and ``actor.decoder = network`` replaces it.
+class RenamedInputs(TensorDictModuleBase):
+    """Base of modules that hold TensorDict modules, which read the new names that are assigned to ``in_keys``.
 
-    New names that are assigned to ``in_keys``, in the same order, are read by all parts.
+    Another module that shares parts with this one keeps reading the names that it read.
     """
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What is read. New names can be assigned, in the same order."""
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, keys: Sequence[NestedKey]) -> None:
+        before = self.__dict__.get("_in_keys")
+        if before is not None:  # not the constructor
+            keys = as_keys("in_keys", keys, list(map(str, before)))
+            renamed = dict(zip(before, keys, strict=True))
+            self.__dict__.update(_parts_reading(self, renamed, {}))
+        self._in_keys = list(keys)
+
+
+def _reading(module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any]) -> Any:
+    """Return a module on the same weights that reads renamed keys; ``copies`` are those made so far."""
+    if not isinstance(module, (TensorDictModuleBase, nn.ModuleDict, nn.ModuleList)):
+        return module
+    if module not in copies:
+        other = copies[module] = copy.copy(module)
+        other.__dict__.update(_parts_reading(module, renamed, copies))
+        if isinstance(module, TensorDictModuleBase):
+            other.__dict__["_in_keys"] = [renamed.get(key, key) for key in module.in_keys]
+    return copies[module]
+
+
+def _parts_reading(module: nn.Module, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any]) -> dict[str, Any]:
+    parts = {name: _reading(part, renamed, copies) for name, part in module._modules.items()}
+    hidden = {n: part for n, part in vars(module).items() if isinstance(part, TensorDictModuleBase)}  # _det_part
+    return {"_modules": parts, **{name: _reading(part, renamed, copies) for name, part in hidden.items()}}
+
+
+class NamedParts(RenamedInputs, TensorDictSequential):
+    """A sequence of named parts: ``actor.decoder`` is a part, and ``actor.decoder = network`` replaces it."""
 
     def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
         """Return a module as the part ``name``: a plain module reads and writes the keys of the part before it."""
@@ -37,21 +74,6 @@ class NamedParts(TensorDictSequential):
         if not isinstance(value, nn.Module):
             raise TypeError(f"{name} must be a module, got {value!r:.80}")
         parts[name] = self.as_part(name, value)
-        self._update_keys()
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """What is read. New names can be assigned, in the same order."""
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, keys: Sequence[NestedKey]) -> None:
-        if "module" not in self._modules:  # TensorDictSequential's constructor
-            self._in_keys = list(keys)
-            return
-        renamed = dict(zip(self._in_keys, as_keys("in_keys", keys, list(map(str, self._in_keys))), strict=True))
-        for part in self.module.values():
-            part.in_keys = [renamed.get(key, key) for key in part.in_keys]
         self._update_keys()
 
     def _update_keys(self) -> None:

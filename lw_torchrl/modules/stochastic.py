@@ -22,13 +22,13 @@ from lw_torchrl._keys import key_beside
 from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
 from lw_torchrl.modules.features import Features
 from lw_torchrl.modules.networks import materialize
-from lw_torchrl.modules.sequence import encoding_width, trunk_attributes
+from lw_torchrl.modules.sequence import RenamedInputs, encoding_width, trunk_attributes
 
 DistributionName = Literal["tanh_normal", "normal"]
 DISTRIBUTIONS: dict[str, Any] = {"tanh_normal": TanhNormal, "normal": IndependentNormal}
 
 
-class StochasticActor(ProbabilisticTensorDictSequential):
+class StochasticActor(RenamedInputs, ProbabilisticTensorDictSequential):
     """A policy whose actions are drawn from a Normal, as TorchRL's ``ProbabilisticActor``.
 
     Reads what the trunk reads; writes what the trunk writes, ``loc`` and ``scale`` (B, A) float32, ``action`` (B, A)
@@ -62,6 +62,7 @@ class StochasticActor(ProbabilisticTensorDictSequential):
         action: Any = "action",
     ) -> None:
         check_choice("distribution", distribution, DISTRIBUTIONS)
+        action = tuple(action) if isinstance(action, list) else action  # JSON has no tuples
         loc, scale = decoder.out_keys
         if isinstance(decoder, Decode) and (width := encoding_width(trunk)) is not None:
             materialize(decoder.network, torch.zeros(1, width))

@@ -16,10 +16,12 @@ from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.tasks import task_id
+from lw_torchrl.modules.descriptor_conditioned_actor import TaskLatent
 from lw_torchrl.modules.policy import layout_of, plans_of, tasks_of, with_plans
+from lw_torchrl.modules.sequence import RenamedInputs
 
 
-class ActorEnsemble(TensorDictModuleBase):
+class ActorEnsemble(RenamedInputs):
     """The mean action of actors that were trained separately on the same demonstrations.
 
     Where the demonstrations do not say what to do, each member errs in its own way, and the mean errs less, most so
@@ -74,7 +76,7 @@ class ActorEnsemble(TensorDictModuleBase):
         return ActorEnsemble([with_plans(member, plans) for member in self.members]).train(self.training)
 
 
-class DecidedGripper(TensorDictModuleBase):
+class DecidedGripper(RenamedInputs):
     """Open or close the gripper fully while not training.
 
     Half open fingers push objects over, and half closed ones lose them.
@@ -130,7 +132,7 @@ def decided(action: Tensor, layout: Layout, closes_above: float | None = None) -
     return action
 
 
-class DemonstratedActor(TensorDictModuleBase):
+class DemonstratedActor(RenamedInputs):
     """Two policies: one without plans for the tasks that were demonstrated, one with plans for all others.
 
     Where ten demonstrations show all that there is to do, words have nothing to add.
@@ -179,7 +181,7 @@ class DemonstratedActor(TensorDictModuleBase):
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         outputs = self.others(tensordict.copy())
-        key = next(key for key in self.demonstrated.in_keys if _last(key) == "task_id")
+        key = _task_key(self.demonstrated)
         (task,) = read(tensordict, [key])
         ids = self._ids.to(task.device)
         known = torch.isin(task, ids)
@@ -196,7 +198,7 @@ class DemonstratedActor(TensorDictModuleBase):
         return DemonstratedActor(self.demonstrated, others).train(self.training)
 
 
-class TransferredActor(TensorDictModuleBase):
+class TransferredActor(RenamedInputs):
     """An actor with the same weights for another suite's plans, whose actions are converted to that suite's.
 
     A displacement keeps its metres a step, times ``speed``: it is multiplied by the ratio of the layouts' ``reach`` and
@@ -272,6 +274,11 @@ class TransferredActor(TensorDictModuleBase):
 
 def _action(actor: TensorDictModuleBase) -> NestedKey:
     return next(key for key in actor.out_keys if _last(key) == "action")
+
+
+def _task_key(actor: TensorDictModuleBase) -> NestedKey:
+    latents = (part for part in actor.modules() if isinstance(part, TaskLatent))
+    return next((part.in_keys[0] for part in latents), None) or next(k for k in actor.in_keys if _last(k) == "task_id")
 
 
 def _last(key: NestedKey) -> str:

@@ -6,27 +6,15 @@ import shutil
 
 import pytest
 import torch
+from small_actors import ACTORS, PLANS
 from tensordict import TensorDict
 from torch import nn
 
 import lw_torchrl as lw
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*Function.* should not be instantiated")  # by TorchRL's tanh
-PLANS = lw.load_plans("MT10")
-SMALL = dict(width=16, depth=1)
-
-
-ACTORS = {
-    "plan": lambda: lw.PlanConditionedActor(PLANS, **SMALL),
-    "focus": lambda: lw.PlanConditionedActor(PLANS, focus=True, **SMALL),
-    "stochastic": lambda: lw.PlanConditionedActor(PLANS, distribution="tanh_normal", **SMALL),
-    "description": lambda: lw.DescriptorConditionedActor("MT10", **SMALL),
-    "scripted": lambda: lw.ScriptedSkillActor(PLANS),
-    "ensemble": lambda: lw.modules.ActorEnsemble([lw.PlanConditionedActor(PLANS, **SMALL) for _ in range(2)]),
-}
-
-
-NAMES = [name if name in ("plan", "scripted") else pytest.param(name, marks=pytest.mark.slow) for name in ACTORS]
+SHARED = [name for name in ACTORS if name not in ("one-hot", "fallback")]
+NAMES = [name if name in ("plan", "scripted") else pytest.param(name, marks=pytest.mark.slow) for name in SHARED]
 
 
 class Deployed(nn.Module):
@@ -34,7 +22,7 @@ class Deployed(nn.Module):
 
     def __init__(self, actor):
         super().__init__()
-        self.actor, self.queries = actor, lw.QAFTransform(PLANS)
+        self.actor, self.queries = actor, lw.QAFTransform(lw.modules.plans_of(actor) or PLANS)
 
     def forward(self, observation, task_id):
         state = TensorDict({"observation": observation, "task_id": task_id}, [observation.shape[0]])
@@ -67,7 +55,8 @@ def test_exported_it_gives_the_same_bits_at_every_number_of_rows(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_the_bare_actor_is_exported(name):
     actor = ACTORS[name]().eval()
-    read = lw.QAFTransform(PLANS)(TensorDict(dict(zip(("observation", "task_id"), make_rows(7), strict=True)), [7]))
+    queries = lw.QAFTransform(lw.modules.plans_of(actor) or PLANS)
+    read = queries(TensorDict(dict(zip(("observation", "task_id"), make_rows(7), strict=True)), [7]))
     read = read.select(*actor.in_keys)
     written = actor(read.clone())
     by_name = torch.export.export(actor, args=(), kwargs=read.to_dict()).module()(**read.to_dict())

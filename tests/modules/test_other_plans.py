@@ -13,7 +13,7 @@ from torchrl.envs import ParallelEnv, TransformedEnv
 
 import lw_torchrl as lw
 from lw_torchrl.language.relations import RELATIONS, Comparison
-from lw_torchrl.modules import PlanAttention
+from lw_torchrl.modules import ActorEnsemble, FocusFeatures, PlanAttention
 
 STEPS = [
     ("the gripper is not above the puck", "place the gripper above the puck"),
@@ -33,10 +33,10 @@ OTHERS = {
     "another skill": plans_of([STEPS[0], (STEPS[1][0], "close the gripper around the puck")]),
 }
 ACTORS = {
-    "actor": lambda plans, **keys: lw.PlanConditionedActor(plans, width=8, **keys),
-    "focus": lambda plans, **keys: lw.PlanConditionedActor(plans, width=8, focus=True, swap_unmentioned=0.5, **keys),
+    "actor": lambda plans, **keys: lw.PlanConditionedActor(plans, **keys),
+    "focus": lambda plans, **keys: lw.PlanConditionedActor(plans, features=FocusFeatures(plans), **keys),
     "scripted": lw.ScriptedSkillActor,
-    "ensemble": lambda plans, **keys: lw.modules.ActorEnsemble([lw.PlanConditionedActor(plans, width=8, **keys)] * 2),
+    "ensemble": lambda plans, **keys: ActorEnsemble([lw.PlanConditionedActor(plans, **keys)] * 2),
     "attention": lambda plans: PlanAttention(plans),
 }
 
@@ -73,14 +73,14 @@ def test_each_row_has_its_plans_number():
     mixed = lw.QAFTransform(both)(mixed.auto_batch_size_())
     assert mixed["qaf_plan"].tolist() == [both.numbers["push"], both.numbers["reach"]] * 2
     assert mixed["qaf_plan"][0] == state(PLANS)["qaf_plan"][0], "whatever stands beside it"
-    lw.PlanConditionedActor(both, width=8)(mixed)
+    lw.PlanConditionedActor(both)(mixed)
     other = lw.ConditionalPlan.from_pairs("reach", [("the gripper is closed", "close the gripper")] * 2)
     with pytest.raises(ValueError, match="for reach: give"):
-        lw.PlanConditionedActor(plans_of(STEPS, other), width=8)(mixed)
+        lw.PlanConditionedActor(plans_of(STEPS, other))(mixed)
 
 
 def test_a_collector_and_a_replay_buffer_refuse():
-    actor, other = lw.PlanConditionedActor(PLANS, width=8), OTHERS["another skill"]
+    actor, other = lw.PlanConditionedActor(PLANS), OTHERS["another skill"]
 
     def env():
         return TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(other))
@@ -100,15 +100,16 @@ def test_through_processes():
         return TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(PLANS))
 
     env = ParallelEnv(2, make, mp_start_method="fork")
-    lw.PlanConditionedActor(PLANS, width=8)(env.reset())
+    lw.PlanConditionedActor(PLANS)(env.reset())
     with pytest.raises(ValueError, match=REFUSED):
-        lw.PlanConditionedActor(OTHERS["another skill"], width=8)(env.reset())
+        lw.PlanConditionedActor(OTHERS["another skill"])(env.reset())
     env.close()
 
 
 @pytest.mark.parametrize("make", ["actor", "scripted"])
 def test_beside_a_qaf_of_another_name(make):
-    keys = ["observation", "task_id", ("agent", "truth")]
+    truth, more = ("agent", "truth"), ("observation", "task_id")
+    keys = [truth, *more[::-1]] if make == "actor" else [*more, truth]
     data = TensorDict(observation=torch.zeros(3, 39), task_id=torch.full((3,), lw.task_id("push"))).auto_batch_size_()
     told = lw.QAFTransform(OTHERS["another skill"], out_keys=[("agent", "truth")])
     assert told.out_keys == [("agent", "truth"), ("agent", "truth_plan")]
@@ -117,15 +118,15 @@ def test_beside_a_qaf_of_another_name(make):
 
 
 def test_a_relation_that_means_something_else_since(monkeypatch):
-    before = lw.PlanConditionedActor(PLANS, width=8)
+    before = lw.PlanConditionedActor(PLANS)
     monkeypatch.setitem(RELATIONS, "above", (Comparison("z", ">", 0.3),))
     with pytest.raises(ValueError, match=REFUSED):
         before(state(PLANS))
-    lw.PlanConditionedActor(PLANS, width=8)(state(PLANS))
+    lw.PlanConditionedActor(PLANS)(state(PLANS))
 
 
 def test_under_vmap_over_the_rows_it_steps_aside():
-    actor, data = lw.PlanConditionedActor(PLANS, width=8).eval(), state(OTHERS["another skill"])
+    actor, data = lw.PlanConditionedActor(PLANS).eval(), state(OTHERS["another skill"])
     assert torch.vmap(lambda row: actor(row)["action"])(data.exclude("action")).shape == (3, 4)
     params = TensorDict.from_module(actor).expand(2).clone()
 
@@ -138,13 +139,13 @@ def test_under_vmap_over_the_rows_it_steps_aside():
 
 
 def test_the_number_travels_with_a_pickle():
-    actor = pickle.loads(pickle.dumps(lw.PlanConditionedActor(PLANS, width=8)))
+    actor = pickle.loads(pickle.dumps(lw.PlanConditionedActor(PLANS)))
     with pytest.raises(ValueError, match=REFUSED):
         actor(state(OTHERS["another skill"]))
 
 
 def test_compiled_it_refuses_when_it_is_run():
-    actor = lw.PlanConditionedActor(PLANS, width=8).eval()
+    actor = lw.PlanConditionedActor(PLANS).eval()
     act = torch.compile(lambda data: actor(data)["action"], backend="eager")
     assert act(state(PLANS)).shape == (3, 4)
     with pytest.raises(RuntimeError, match="qaf answers other plans"):
@@ -156,7 +157,7 @@ def test_compiled_it_refuses_when_it_is_run():
 
 
 def test_under_vmap_an_unknown_task_is_no_task_of_the_actor():
-    actor = lw.DescriptorConditionedActor(["reach", "push"], width=8).eval()
+    actor = lw.DescriptorConditionedActor(["reach", "push"]).eval()
     data = TensorDict(observation=torch.zeros(3, 39), task_id=torch.full((3,), lw.task_id("soccer")))
     with pytest.raises(IndexError):
         torch.vmap(lambda row: actor(row)["action"])(data.auto_batch_size_())

@@ -1,4 +1,4 @@
-"""PlanConditionedActor: keys, mixing by hand, shared weights, what is learned and what is refused."""
+"""PlanConditionedActor: what its parts write, mixing by hand, shared weights, learning, and refused input."""
 
 from __future__ import annotations
 
@@ -6,39 +6,16 @@ import warnings
 
 import pytest
 import torch
+from small_actors import PLANS, action_of, letters, make_actor, make_role_actor, make_rows, rows_for, small_decoder
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
 from torchrl.objectives import BCLoss
 
-from lw_torchrl.language.plan_files import load_plans
+import lw_torchrl as lw
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.language.tasks import task_id
 from lw_torchrl.language.text import encode_texts
-from lw_torchrl.modules import PlanConditionedActor
-
-SMALL = dict(latent_size=6, width=16, depth=1, encoder_width=12)
-PLANS = load_plans("MT10")
-
-
-def make_state(*shape, plans=PLANS, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    names = list(plans)
-    ids = torch.tensor([task_id(name) for name in names])
-    chosen = torch.randint(len(names), tuple(shape), generator=generator)
-    lengths = torch.tensor([len(plans[name].steps) for name in names])[chosen]
-    qaf = torch.rand(*shape, plans.num_steps, generator=generator) > 0.6
-    return TensorDict(
-        {
-            "observation": torch.rand(*shape, 39, generator=generator),
-            "task_id": ids[chosen],
-            "qaf": qaf & (torch.arange(plans.num_steps) < lengths.unsqueeze(-1)),
-        },
-        shape,
-    )
-
-
-def make_actor(seed=0, plans=PLANS, **options):
-    torch.manual_seed(seed)
-    return PlanConditionedActor(plans, **{**SMALL, **options}).eval()
+from lw_torchrl.modules import Decode, MLPDecoder, ObservationFeatures, PlanAttention, SkillMixer
 
 
 def make_loss(actor):
@@ -47,93 +24,140 @@ def make_loss(actor):
         return BCLoss(actor, loss_function="l2")
 
 
-@pytest.mark.parametrize("features", ["raw", "differences", "relative", "both"])
+@pytest.mark.parametrize("kind", ["raw", "differences", "relative", "both"])
 @pytest.mark.parametrize("shape", [(), (5,), (3, 4)])
-def test_it_writes_the_documented_keys_on_any_leading_shape(features, shape):
-    actor = make_actor(features=features)
-    state = make_state(*shape)
-    given = state.clone()
-    out = actor(state)
-    assert actor.in_keys == ["observation", "task_id", "qaf"]
-    assert actor.out_keys == ["action", "skill_weights", "skill_latent"]
+def test_it_writes_the_documented_keys_on_any_leading_shape(kind, shape):
+    actor = make_actor(features=ObservationFeatures(kind))
+    rows = make_rows(*shape)
+    out = actor(rows.copy())
+    assert actor.in_keys == ["qaf", "task_id", "observation"]
+    assert actor.out_keys == ["skill_weights", "skill_latent", "features", "action"]
     assert {key: out[key].shape for key in actor.out_keys} == {
-        "action": (*shape, 4),
         "skill_weights": (*shape, PLANS.num_steps),
         "skill_latent": (*shape, 6),
+        "features": (*shape, actor.features.width),
+        "action": (*shape, 4),
     }
     assert all(out[key].dtype == torch.float32 for key in actor.out_keys)
     assert out["action"].abs().max() < 1
     torch.testing.assert_close(out["skill_weights"].sum(-1), torch.ones(shape))
-    assert (out.select(*actor.in_keys) == given).all()
+    assert (out.select(*actor.in_keys) == rows).all()
 
 
-def test_it_can_be_called_with_tensors():
-    state = make_state(5)
-    actor = make_actor()
-    action, weights, latent = actor(**state)
-    assert torch.equal(action, actor(state)["action"])
-    assert (weights.shape, latent.shape) == ((5, PLANS.num_steps), (5, 6))
+def test_its_parts_are_modules_that_can_be_called_alone():
+    actor, rows = make_actor(), make_rows(5)
+    kinds = [type(part) for part in actor.module.values()]
+    assert kinds == [PlanAttention, SkillMixer, ObservationFeatures, Decode]
+    assert isinstance(actor, TensorDictSequential)
+    step_by_step = rows.copy()
+    for part in (actor.attention, actor.mixer, actor.features, actor.decoder):
+        part(step_by_step)
+    assert (step_by_step == actor(rows.copy())).all()
+    assert torch.equal(actor.trunk(rows.copy())["skill_latent"], step_by_step["skill_latent"])
 
 
 def test_mixing_step_by_step_by_hand():
-    actor = make_actor()
-    state = make_state(12)
-    out = actor(state.clone())
+    actor, rows = make_actor(), make_rows(12)
+    out = actor(rows.copy())
     for row in range(12):
-        task = next(name for name in PLANS if task_id(name) == state["task_id"][row])
-        steps = PLANS[task].steps
-        truth = state["qaf"][row, : len(steps)].float()
-        weights = torch.softmax(10 * truth - 5, 0)
+        steps = PLANS[lw.MT50[rows["task_id"][row]]].steps
+        weights = torch.softmax(10 * rows["qaf"][row, : len(steps)].float() - 5, 0)
         vectors = encode_texts([step.skill for step in steps])
-        latents = actor.encoder.texts(vectors / vectors.square().mean(-1, keepdim=True).sqrt())  # numbers of size 1
+        latents = actor.mixer.encoder(vectors / vectors.square().mean(-1, keepdim=True).sqrt())
         mixed = weights @ latents
-        features = actor.encoder.features(state["observation"][row])
-        action = actor.head(torch.cat((mixed, features), -1))
+        features = actor.features(rows["observation"][row])
         torch.testing.assert_close(out["skill_weights"][row, : len(steps)], weights)
         torch.testing.assert_close(out["skill_latent"][row], mixed)
-        torch.testing.assert_close(out["action"][row], action)
+        torch.testing.assert_close(out["action"][row], actor.decoder.network(torch.cat((mixed, features), -1)))
 
 
-def test_the_plan_decides_what_is_done():
-    """The same state, another condition true: another action."""
-    actor = make_actor()
-    state = make_state(1, seed=3)
-    state["task_id"][:] = task_id("reach")
-    actions = []
+def test_the_plan_decides_the_action():
+    actor, rows, actions = make_actor(), make_rows(1, seed=3), []
+    rows["task_id"][:] = lw.task_id("reach")
     for step in range(2):
-        state["qaf"] = torch.arange(PLANS.num_steps).unsqueeze(0) == step
-        actions.append(actor(state.clone())["action"])
-    assert not torch.allclose(*actions, atol=1e-3)
+        rows["qaf"] = torch.arange(PLANS.num_steps).unsqueeze(0) == step
+        actions.append(action_of(actor, rows))
+    assert not torch.allclose(*actions, atol=1e-5)
 
 
-def test_two_actors_of_one_seed_are_equal_and_a_call_repeats():
-    state = make_state(7)
-    one, other = make_actor(3), make_actor(3)
-    assert torch.equal(one(state.clone())["action"], other(state.clone())["action"])
-    assert torch.equal(one(state.clone())["action"], one(state.clone())["action"])
-    assert not torch.equal(make_actor(4)(state.clone())["action"], one(state.clone())["action"])
+def test_it_sees_the_plans_that_it_is_given():
+    assert make_actor().plans is PLANS
+    canonical = lw.canonical_plans({"coffee-pull": lw.load_plans("MT50")["coffee-pull"]}, fallback=True)
+    actor = make_role_actor(canonical)
+    assert (actor.plans, actor.tasks, actor.in_keys) == (
+        canonical,
+        ("coffee-pull",),
+        ["qaf", "task_id", "turn", "observation"],
+    )
+    rows = rows_for(actor, 6)
+    assert actor(rows.clone())["action"].shape == (6, 4)
+    written = lw.QAFTransform(lw.load_plans("MT50"))(make_rows(6, plans=canonical, answered=False))
+    with pytest.raises(ValueError, match="qaf answers other plans than the actor's, for coffee-pull"):
+        actor(written)
 
 
-def test_noise_is_on_the_features_while_training_and_only_then():
-    state = make_state(7)
-    actor, plain = make_actor(feature_noise=0.3), make_actor(feature_noise=0.0)
-    assert torch.equal(actor(state.clone())["action"], plain(state.clone())["action"])
-    assert torch.equal(plain.train()(state.clone())["action"], plain.eval()(state.clone())["action"])
-    actor.train()
-    one, other = actor(state.clone()), actor(state.clone())
-    assert not torch.equal(one["action"], other["action"])
-    assert torch.equal(one["skill_weights"], other["skill_weights"])
-    assert torch.equal(one["skill_latent"], other["skill_latent"])
+def test_two_actors_of_one_seed_are_equal():
+    rows = make_rows(7)
+    assert torch.equal(action_of(make_actor(seed=3), rows), action_of(make_actor(seed=3), rows))
+    assert not torch.equal(action_of(make_actor(seed=4), rows), action_of(make_actor(seed=3), rows))
 
 
-def test_depth_and_width_make_the_networks():
-    def linears(module):
-        return [(m.in_features, m.out_features) for m in module.modules() if isinstance(m, torch.nn.Linear)]
+def test_features_are_noisy_while_training_only():
+    rows = make_rows(7)
+    actor, plain = (make_actor(features=ObservationFeatures(noise=noise)) for noise in (0.3, 0.0))
+    assert torch.equal(action_of(actor, rows), action_of(plain, rows))
+    assert torch.equal(action_of(plain.train(), rows), action_of(plain.eval(), rows))
+    first, second = (actor.train()(rows.copy()) for _ in range(2))
+    assert not torch.equal(first["action"], second["action"])
+    assert torch.equal(first["skill_latent"], second["skill_latent"])
+    assert lw.PlanConditionedActor(PLANS).features.noise == 0.05
 
-    actor = make_actor(latent_size=5, width=7, depth=2, encoder_width=9, encoder_depth=3, features="raw")
-    assert linears(actor.encoder.texts) == [(384, 9), (9, 9), (9, 9), (9, 5)]
-    assert linears(actor.head) == [(44, 7), (7, 7), (7, 4)]
-    assert linears(make_actor(depth=0, encoder_depth=0, features="raw").head) == [(45, 4)]
+
+# ---- replaced parts
+
+
+def test_a_part_that_is_assigned_is_used():
+    actor, rows = make_actor(), make_rows(5)
+    actor.decoder = net = nn.Sequential(nn.LazyLinear(4), nn.Tanh())
+    assert (actor.decoder.network, type(actor.decoder)) == (net, Decode)
+    out = actor(rows.copy())
+    encoding = torch.cat((out["skill_latent"], out["features"]), -1)
+    assert torch.equal(out["action"], net(encoding))
+    assert {id(one) for one in net.parameters()} <= {id(one) for one in actor.parameters()}
+    actor.features = nn.Linear(39, actor.features.width)
+    assert (type(actor.features), actor.features.out_keys) == (TensorDictModule, ["features"])
+    assert not torch.equal(action_of(actor, rows), out["action"])
+    actor.features = TensorDictModule(nn.Linear(3, 56), in_keys=["hand"], out_keys=["features"])
+    assert actor.in_keys == ["qaf", "task_id", "hand"]
+    with pytest.raises(TypeError, match="decoder must be a module, got 3"):
+        actor.decoder = 3
+
+
+def test_a_decoder_may_have_other_out_keys():
+    class Two(nn.Module):
+        def forward(self, encoding):
+            return encoding[..., :4], encoding[..., 4:8].exp()
+
+    actor = make_actor(decoder=Two(), out_keys=["loc", ("d", "scale")])
+    assert actor.out_keys[-2:] == ["loc", ("d", "scale")]
+    assert (actor(make_rows(3))["d", "scale"] > 0).all()
+
+
+def test_assigned_in_keys_are_read():
+    actor, rows = make_actor(), make_rows(4)
+    expected = action_of(actor, rows)
+    trunk = actor.trunk
+    actor.in_keys = [("plan", "truth"), "task_id", ("robot", "state")]
+    moved = TensorDict({("plan", "truth"): rows["qaf"], ("robot", "state"): rows["observation"]}, [4])
+    moved["task_id"] = rows["task_id"]
+    assert torch.equal(action_of(actor, moved), expected)
+    with pytest.raises(ValueError, match=r"plan.*needed"):
+        actor(rows.copy())
+    assert trunk(rows.copy())["features"].shape == (4, 56), "a trunk that shares the parts reads its own names"
+    queries = lw.modules.transform_of(actor)
+    assert (queries.in_keys, queries.out_keys[0]) == ([("robot", "state"), "task_id"], ("plan", "truth"))
+    with pytest.raises(ValueError, match="in_keys must be a list of 3, in this order"):
+        actor.in_keys = ["observation"]
 
 
 # ---- other plans
@@ -147,87 +171,58 @@ def other_plans():
     return Plans([ConditionalPlan.from_pairs("reach", pairs), ConditionalPlan.from_pairs("sweep", pairs[:1])])
 
 
-def hashed(texts):
-    """A text encoder of one's own: letters counted."""
-    return torch.tensor([[float(text.count(letter)) for letter in "aeiou"] for text in texts])
-
-
 def test_with_plans_shares_the_weights_both_ways():
-    actor = make_actor(text_encoder=hashed)
+    actor = make_actor(text_encoder=letters)
     other = actor.with_plans(other_plans())
     ours, theirs = dict(actor.named_parameters()), dict(other.named_parameters())
     assert ours.keys() == theirs.keys()
     assert all(ours[name] is theirs[name] for name in ours)
-    state, seen = make_state(4, plans=other_plans()), make_state(4)
-    before, mine = other(state.clone())["action"], actor(seen.clone())["action"]
-    for one, trained in ((actor, seen), (other, state)):
-        optimizer = torch.optim.SGD(one.parameters(), 0.1)
-        one(trained.clone())["action"].sum().backward()
+    rows = {actor: make_rows(4), other: make_rows(4, plans=other_plans())}
+    for trained in (actor, other):
+        before = [action_of(each, rows[each]) for each in (actor, other)]
+        optimizer = torch.optim.SGD(trained.parameters(), 0.1)
+        action_of(trained, rows[trained]).sum().backward()
         optimizer.step()
         optimizer.zero_grad()
-        assert not torch.allclose(other(state.clone())["action"], before)
-        assert not torch.allclose(actor(seen.clone())["action"], mine)
-        before, mine = other(state.clone())["action"], actor(seen.clone())["action"]
+        assert not any(torch.allclose(action_of(each, rows[each]), old) for each, old in zip(rows, before, strict=True))
 
 
 def test_with_plans_follows_the_other_plans():
-    actor = make_actor(text_encoder=hashed)
-    other = actor.with_plans(other_plans())
-    assert list(other.plans) == ["reach", "sweep"]
-    out = other(make_state(6, plans=other_plans()))
-    assert out["skill_weights"].shape == (6, 2)
-    fresh = PlanConditionedActor(other_plans(), text_encoder=hashed, **SMALL).eval()
+    actor = make_actor(text_encoder=letters)
+    other, rows = actor.with_plans(other_plans()), make_rows(6, plans=other_plans())
+    assert (type(other), other.tasks) == (lw.PlanConditionedActor, ("reach", "sweep"))
+    assert other(rows.copy())["skill_weights"].shape == (6, 2)
+    fresh = make_actor(other_plans(), seed=1, text_encoder=letters)
     fresh.load_state_dict(actor.state_dict())
-    state = make_state(6, plans=other_plans())
-    assert torch.equal(fresh(state.clone())["action"], other(state.clone())["action"])
+    assert torch.equal(action_of(fresh, rows), action_of(other, rows))
 
 
 @pytest.mark.parametrize("training", [True, False])
-def test_with_plans_keeps_options_normalisation_and_mode(training):
-    actor = make_actor(features="differences", text_encoder=hashed).train(training)
-    actor.fit_normalization(make_state(50)["observation"])
+def test_with_plans_keeps_statistics_and_mode(training):
+    actor = make_actor(text_encoder=letters).train(training)
+    actor.features.fit(make_rows(50))
     other = actor.with_plans(other_plans())
-    assert other.config == actor.config
-    assert other.encoder.text_encoder is hashed
-    assert other.training is training
-    assert torch.equal(other.encoder.features.mean, actor.encoder.features.mean)
-    other.fit_normalization(make_state(50, seed=1)["observation"])
-    assert torch.equal(other.encoder.features.mean, actor.encoder.features.mean)
+    assert (other.mixer.text_encoder, other.training) == (letters, training)
+    other.features.fit(make_rows(50, seed=1))
+    assert torch.equal(other.features.mean, actor.features.mean)
 
 
 def test_the_saved_state_holds_no_tables_of_the_plans():
-    actor = make_actor(text_encoder=hashed)
+    actor = make_actor(text_encoder=letters)
     assert actor.state_dict().keys() == actor.with_plans(other_plans()).state_dict().keys()
-    assert not any("skill" in key or "attention" in key for key in actor.state_dict())
-    assert {key.split(".")[0] for key in actor.state_dict()} == {"encoder", "head"}
-
-
-def test_a_text_encoder_of_ones_own():
-    seen = []
-
-    def encoder(texts):
-        seen.append(tuple(texts))
-        return hashed(texts).double()
-
-    actor = make_actor(text_encoder=encoder)
-    assert seen == [PLANS.skills]
-    assert actor.skills == PLANS.skills
-    assert actor.encoder.text_vectors.dtype == torch.float32
-    assert next(actor.encoder.texts.parameters()).shape[1] == 5
-    actor(make_state(3))["action"].sum().backward()
-
-
-@pytest.mark.parametrize("shape", [(3, 5), (5,), ()])
-def test_a_text_encoder_that_gives_another_number_of_vectors_is_refused(shape):
-    with pytest.raises(ValueError, match=rf"text_encoder must give \({len(PLANS.skills)}, E\)"):
-        make_actor(text_encoder=lambda texts: torch.zeros(shape))
+    parts = {name.rsplit(".", 2)[0].removeprefix("module.") for name in actor.state_dict()}
+    assert parts == {"mixer.encoder", "module", "decoder.network"}
+    assert {name for name in actor.state_dict() if "features" in name} == {
+        "module.features.mean",
+        "module.features.std",
+    }
 
 
 # ---- learning
 
 
 def make_batch(rows=64, seed=0):
-    state = make_state(rows, seed=seed)
+    state = make_rows(rows, seed=seed)
     target = torch.stack((state["observation"][:, 0], state["qaf"][:, 0].float(), -state["observation"][:, 5]), -1)
     return state.set("action", torch.cat((target, target[:, :1] * 0), -1) * 0.8)
 
@@ -257,27 +252,20 @@ def test_the_gradient_reaches_every_weight():
         assert parameter.grad.abs().sum() > 0, name
 
 
-def test_only_networks_are_trained():
-    actor = make_actor()
-    names = {name.split(".")[0] for name, _ in actor.named_parameters()}
-    assert names == {"encoder", "head"}
-    assert not any("mean" in name or "std" in name for name, _ in actor.named_parameters())
-
-
-def test_the_normalisation_is_saved_with_the_actor():
-    actor, other = make_actor(0), make_actor(1)
-    actor.fit_normalization(make_state(50)["observation"] * 3 + 1)
+def test_statistics_are_saved_with_the_actor():
+    actor, other = make_actor(), make_actor(seed=1)
+    actor.features.fit(make_rows(50))
     other.load_state_dict(actor.state_dict())
-    state = make_state(6)
-    assert torch.equal(other(state.clone())["action"], actor(state.clone())["action"])
-    assert actor.encoder.features.mean.abs().sum() > 0
+    assert torch.equal(action_of(other, make_rows(6)), action_of(actor, make_rows(6)))
+    assert actor.features.mean.any()
+    assert not any("mean" in name or "std" in name for name, _ in actor.named_parameters())
 
 
 # ---- bad input
 
 
 def broken(key, change, rows=3):
-    state = make_state(rows)
+    state = make_rows(rows)
     return TensorDict({**state, key: change(state[key])}, [rows])
 
 
@@ -296,10 +284,10 @@ def poke(index, value):
         ("observation", poke((1, 5), torch.nan), "observation must hold finite numbers"),
         ("observation", poke((0, 0), torch.inf), "observation must hold finite numbers"),
         ("observation", lambda x: x[:, :38], r"observation must be float32 of shape \(..., 39\).*\(3, 38\)"),
-        ("observation", lambda x: x.double(), "observation must be float32.*float64"),
+        ("observation", lambda x: x.long(), "observation must be float32.*int64"),
         ("qaf", lambda x: x[:, 1:], "qaf must have shape.*QAFTransform the same plans"),
         ("qaf", lambda x: torch.cat((x, x), -1), "qaf must have shape"),
-        ("task_id", poke(0, task_id("sweep-into")), "without a plan.*: sweep-into"),
+        ("task_id", poke(0, lw.task_id("sweep-into")), "without a plan.*: sweep-into"),
         ("task_id", poke(0, 50), "task_id.*50"),
         ("task_id", poke(0, -1), "task_id.*-1"),
         ("task_id", lambda x: x.float(), "task_id.*float32"),
@@ -311,9 +299,8 @@ def test_wrong_input_is_named(key, change, message):
         make_actor()(broken(key, change))
 
 
-@pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
-def test_normalisation_cannot_be_fitted_to_what_are_no_numbers(wrong):
-    actor = make_actor()
-    with pytest.raises(ValueError, match="observation must hold finite numbers"):
-        actor.fit_normalization(poke((2, 2), wrong)(make_state(5)["observation"]))
-    actor(make_state(2))
+def test_a_misspelt_option_is_refused():
+    with pytest.raises(TypeError, match="decodr"):
+        lw.PlanConditionedActor(PLANS, decodr=small_decoder())
+    with pytest.raises(TypeError, match="widht"):
+        MLPDecoder(widht=3)

@@ -1,4 +1,4 @@
-"""PlanAttention: softmax over the real steps of 10·truth - 5."""
+"""PlanAttention: the softmax of 10·truth - 5 over the steps that exist."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+import lw_torchrl as lw
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.tasks import task_id
-from lw_torchrl.modules import PlanAttention
+from lw_torchrl.modules import PlanAttention, attend
 
 
 def make_plan(task, steps):
@@ -40,17 +41,17 @@ def test_the_softmax_by_hand():
     assert found.dtype == torch.float32
 
 
-def test_no_condition_true_is_uniform_over_the_real_steps():
+def test_without_a_true_condition_attention_is_uniform():
     found = weights(torch.zeros(3, 4, dtype=torch.bool), [PUSH, REACH, SWEEP])
     torch.testing.assert_close(found, torch.tensor([[0.25] * 4, [0.5, 0.5, 0, 0], [1.0, 0, 0, 0]]))
 
 
-def test_all_conditions_true_is_uniform_too():
+def test_if_all_conditions_are_true_attention_is_uniform():
     qaf = torch.tensor([[True] * 4, [True, True, False, False]])
     torch.testing.assert_close(weights(qaf, [PUSH, REACH]), torch.tensor([[0.25] * 4, [0.5, 0.5, 0, 0]]))
 
 
-def test_truth_on_padding_gets_nothing():
+def test_padding_has_no_weight():
     torch.testing.assert_close(weights([[False, False, True, True]], [REACH]), torch.tensor([[0.5, 0.5, 0, 0]]))
 
 
@@ -61,7 +62,7 @@ def test_soft_truth_moves_the_weight_smoothly():
     torch.testing.assert_close(weights([[1.0, 0, 1, 0]], [PUSH]), weights([[True, False, True, False]], [PUSH]))
 
 
-def test_the_gradient_reaches_soft_truth_and_no_padding():
+def test_the_gradient_reaches_soft_truth_but_not_padding():
     qaf = torch.full((1, 4), 0.5, requires_grad=True)
     weights(qaf, [REACH])[0, 0].backward()
     assert qaf.grad[0, 0] > 0
@@ -98,29 +99,79 @@ def test_a_task_without_a_plan_is_named():
 
 
 @pytest.mark.parametrize("wrong", [-1, 50, 1000])
-def test_a_number_that_is_no_task_is_named(wrong):
+def test_a_task_id_that_does_not_exist_is_named(wrong):
     with pytest.raises(ValueError, match=f"task_id.*{wrong}"):
         weights(torch.zeros(2, 4), [REACH, wrong])
 
 
 @pytest.mark.parametrize("shape", [(2, 3), (2, 5), (2, 1, 4)])
-def test_truth_of_another_shape_is_refused(shape):
+def test_qaf_of_another_shape_is_refused(shape):
     with pytest.raises(ValueError, match=r"qaf must have shape \(2, 4\).*QAFTransform the same plans"):
         weights(torch.zeros(shape), [REACH, PUSH])
 
 
-def test_a_plain_mapping_is_taken_for_plans():
+def test_a_plain_mapping_is_accepted_as_plans():
     plan = make_plan("reach", 2)
     found = PlanAttention({"reach": plan})(TensorDict(qaf=torch.zeros(2), task_id=torch.tensor(REACH)))
     assert found["skill_weights"].tolist() == [0.5, 0.5]
 
 
-def test_the_mask_is_no_part_of_the_saved_state():
+def test_the_mask_is_not_saved():
     assert PlanAttention(PLANS).state_dict() == {}
 
 
 @pytest.mark.parametrize("wrong", [math.nan, 100.0, -0.1, math.inf])
-def test_soft_truth_is_of_numbers_from_0_to_1(wrong):
+def test_soft_truth_outside_0_to_1_is_refused(wrong):
     with pytest.raises(ValueError, match="qaf must be bool, or numbers from 0 to 1"):
         weights(torch.tensor([[0.5, wrong, 0.0, 0.0]]), [REACH])
     assert weights(torch.tensor([[0.0, 1.0, 0.0, 0.0]]), [REACH]).sum() == 1
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.floats(-20, 20, width=32), min_size=5, max_size=5), st.lists(st.booleans(), min_size=4, max_size=4))
+def test_attend_is_a_softmax_over_the_mask(logits, mask):
+    logits, mask = torch.tensor(logits), torch.tensor([*mask, True])
+    found = attend(logits, mask)
+    torch.testing.assert_close(found[mask], logits[mask].softmax(-1))
+    assert not found[~mask].any()
+    torch.testing.assert_close(attend(logits + 3.0, mask), found)
+
+
+def test_a_wider_qaf_is_read_if_qaf_plan_shows_the_same_plan():
+    """A policy of two plans reads rows that were answered for ten, of which some are longer."""
+    plans = lw.load_plans("MT10")
+    two = lw.Plans([plans["reach"], plans["drawer-open"]])
+    rows = TensorDict(observation=torch.rand(5, 39), task_id=torch.full((5,), task_id("drawer-open")), batch_size=[5])
+    wide, narrow = lw.QAFTransform(plans)(rows.clone()), lw.QAFTransform(two)(rows.clone())
+    assert wide["qaf"].shape[-1] > narrow["qaf"].shape[-1]
+    attention = PlanAttention(two)
+    assert torch.equal(attention(wide.clone())["skill_weights"], attention(narrow)["skill_weights"])
+    scripted = lw.ScriptedSkillActor(two)
+    assert torch.equal(scripted(wide.clone())["action"], scripted(narrow)["action"])
+    for module in (attention, scripted):
+        with pytest.raises(ValueError, match="qaf must have shape"):
+            module(wide.exclude("qaf_plan"))
+    assert lw.PlanConditionedQValue(two)(wide.set("action", torch.zeros(5, 4)))["state_action_value"].shape == (5, 1)
+
+
+@pytest.mark.parametrize("turn", [None, 0, 1, 2, 3])
+def test_fallback_steps_have_their_own_turns(turn):
+    plans = lw.canonical_plans(lw.load_plans("MT10"), fallback=True)
+    attention = PlanAttention(plans)
+    assert attention.in_keys == ["qaf", "task_id", "turn"]
+    rows = TensorDict(qaf=torch.rand(8, plans.num_steps), task_id=torch.full((8,), PUSH), batch_size=[8])
+    if turn is not None:
+        rows["turn"] = torch.full((8,), turn)
+    found = attention(rows)["skill_weights"][:, : len(plans["push"].steps)]
+    fallback = torch.tensor([step.role.fallback for step in plans["push"].steps])
+    active = fallback if (turn or 0) % 2 else ~fallback
+    torch.testing.assert_close(found[:, active].sum(-1), torch.ones(8))
+    assert not found[:, ~active].any()
+
+
+def test_it_follows_other_plans_with_the_same_keys():
+    attention = PlanAttention(PLANS, in_keys=["truth", ("words", "task")], out_keys=["weights"])
+    other = attention.with_plans(Plans([make_plan("reach", 3)]))
+    assert (other.in_keys, other.out_keys) == (attention.in_keys, ["weights"])
+    rows = TensorDict({"truth": torch.zeros(2, 3), ("words", "task"): torch.full((2,), REACH)}, [2])
+    torch.testing.assert_close(other(rows)["weights"], torch.full((2, 3), 1 / 3))

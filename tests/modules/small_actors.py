@@ -1,0 +1,93 @@
+"""Small actors of every kind, and rows that they read."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+
+import lw_torchrl as lw
+from lw_torchrl import modules as m
+
+PLANS = lw.load_plans("MT10")
+CANONICAL = lw.canonical_plans(PLANS)
+FALLBACK = lw.canonical_plans(PLANS, fallback=True)
+
+
+def letters(texts):
+    """A text encoder that counts vowels."""
+    return torch.tensor([[float(text.count(letter)) for letter in "aeiou"] for text in texts])
+
+
+def small_decoder(**options):
+    return m.MLPDecoder(**{"width": 16, "depth": 1, **options})
+
+
+def make_actor(plans=PLANS, seed=0, **options):
+    torch.manual_seed(seed)
+    small = {"skill_encoder": m.SkillEncoder(6, width=12), "decoder": small_decoder()}
+    return lw.PlanConditionedActor(plans, **{**small, **options}).eval()
+
+
+def make_descriptor(tasks="MT10", seed=0, **options):
+    torch.manual_seed(seed)
+    small = {"task_encoder": m.SkillEncoder(6, width=12), "decoder": small_decoder()}
+    return lw.DescriptorConditionedActor(tasks, **{**small, **options}).eval()
+
+
+def make_role_actor(plans=CANONICAL, seed=0, **options):
+    torch.manual_seed(seed)
+    return make_actor(plans, seed, features=m.RoleFeatures(plans), **options)
+
+
+def make_action_mixer(plans=PLANS):
+    parts = m.PlanAttention(plans), m.ObservationFeatures(), m.ActionMixer(plans, small_decoder())
+    actor = TensorDictSequential(*parts)
+    actor(make_rows(1, plans=plans))  # the decoder is lazy
+    return actor
+
+
+ACTORS = {
+    "plan": make_actor,
+    "focus": lambda: make_actor(features=m.Concat(m.ObservationFeatures(), m.FocusFeatures(PLANS))),
+    "roles": make_role_actor,
+    "fallback": lambda: make_role_actor(FALLBACK),
+    "mixed actions": make_action_mixer,
+    "tanh_normal": lambda: make_actor().stochastic(),
+    "normal": lambda: make_descriptor().stochastic("normal"),
+    "description": make_descriptor,
+    "one-hot": lambda: make_descriptor(condition="one-hot"),
+    "scripted": lambda: lw.ScriptedSkillActor(PLANS),
+    "evaluator": lambda: TensorDictSequential(lw.StateQueryEvaluator(PLANS, width=8), make_actor()),
+    "ensemble": lambda: m.ActorEnsemble([make_actor(seed=seed) for seed in range(2)]),
+    "decided": lambda: m.DecidedGripper(make_actor()),
+    "demonstrated": lambda: m.DemonstratedActor(make_descriptor(["push", "reach"]), make_role_actor()),
+}
+
+
+def make_rows(*shape, plans=PLANS, seed=0, answered=True):
+    """Random states of the plans' tasks; ``qaf`` is random too, but none is true beyond a plan's last step."""
+    generator = torch.Generator().manual_seed(seed)
+    names = list(plans)
+    chosen = torch.randint(len(names), tuple(shape), generator=generator)
+    rows = TensorDict(
+        observation=torch.rand(*shape, 39, generator=generator),
+        task_id=torch.tensor([lw.task_id(name) for name in names])[chosen],
+        batch_size=shape,
+    )
+    if not answered:
+        return rows
+    lengths = torch.tensor([len(plans[name].steps) for name in names])[chosen]
+    truth = torch.rand(*shape, plans.num_steps, generator=generator) > 0.6
+    return rows.set("qaf", truth & (torch.arange(plans.num_steps) < lengths.unsqueeze(-1)))
+
+
+def rows_for(actor, *shape, seed=0):
+    """States with exact answers, as ``actor`` reads them."""
+    rows = make_rows(*shape, plans=m.plans_of(actor) or PLANS, seed=seed, answered=False)
+    transform = m.transform_of(actor)
+    return rows if transform is None else transform(rows)
+
+
+def action_of(actor, rows):
+    return actor(rows.copy())["action"]

@@ -1,0 +1,151 @@
+"""Custom parts: put in by two lines, trained, saved, and loaded in a new process."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from my_parts import Closest, Gated, Pictures, Projection
+from small_actors import action_of, letters, make_actor, make_rows
+from torch import nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+import lw_torchrl as lw
+from lw_torchrl.modules import Concat, MLPDecoder, ObservationFeatures, SkillEncoder
+
+KINDS = {
+    "decoder": lambda: {"decoder": Gated(6)},
+    "decoder that reads the observation": lambda: {"decoder": Closest()},
+    "decoder of PyTorch's layers": lambda: {"decoder": nn.Sequential(nn.Linear(62, 8), nn.GELU(), nn.Linear(8, 4))},
+    "skill encoder": lambda: {"skill_encoder": Projection(5)},
+    "features": lambda: {"features": Pictures(3)},
+    "more features": lambda: {"features": Concat(ObservationFeatures(), Pictures(3))},
+    "text encoder": lambda: {"text_encoder": letters, "skill_encoder": SkillEncoder(3)},
+}
+
+
+def make(kind):
+    return make_actor(**KINDS[kind]())
+
+
+def make_batch(rows=16):
+    generator = torch.Generator().manual_seed(1)
+    batch = make_rows(rows).set("action", torch.rand(rows, 4, generator=generator) - 0.5)
+    pixels = torch.randint(256, (rows, 9, 9, 3), generator=generator, dtype=torch.uint8)
+    return batch.set("pixels", pixels)
+
+
+PROGRAM = """
+import sys
+import torch
+import lw_torchrl as lw
+from my_parts import Closest, Gated, Pictures, Projection
+from small_actors import letters
+from tensordict import load_memmap
+
+actor = lw.load_actor(sys.argv[1], text_encoder=letters if "text" in sys.argv[2] else None)
+rows = load_memmap(sys.argv[3])
+print(actor(rows.clone())["action"].flatten().tolist())
+"""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_is_trained_saved_and_loaded_in_a_new_process(kind, tmp_path):
+    actor, batch = make(kind), make_batch()
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(len(batch)), batch_size=8)
+    replay.extend(batch)
+    before = {name: value.clone() for name, value in actor.named_parameters()}
+    config = lw.BehavioralCloningConfig(steps=3, batch_size=8, learning_rate=1e-2)
+    path = tmp_path / "policy.safetensors"
+    lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=path, progress=False).train()
+    assert all(not torch.equal(value, before[name]) for name, value in actor.named_parameters())
+    rows = batch.exclude("action").memmap(tmp_path / "rows")
+    command = [sys.executable, "-c", PROGRAM, str(path), kind, str(tmp_path / "rows")]
+    here = Path(__file__).parent
+    search = os.pathsep.join([str(here), str(here.parent.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=240, env={**os.environ, "PYTHONPATH": search}
+    )
+    assert done.returncode == 0, done.stderr
+    found = torch.tensor(json.loads(done.stdout)).reshape(len(batch), 4)
+    torch.testing.assert_close(found, action_of(actor.eval(), rows.clone()))
+
+
+def test_statistics_are_fitted_for_custom_parts_too():
+    actor, batch = make("more features"), make_batch()
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(len(batch)), batch_size=8)
+    replay.extend(batch)
+    lw.BehavioralCloningTrainer(
+        actor, replay, lw.BehavioralCloningConfig(steps=1, batch_size=8), progress=False
+    ).train()
+    assert actor.features.parts[0].mean.any()
+
+
+class Plain(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.net = nn.LazyLinear(4)
+
+    def forward(self, encoding):
+        return self.net(encoding)
+
+
+@pytest.mark.parametrize(
+    ("options", "name", "kind"),
+    [
+        ({"decoder": Plain()}, "decoder.network", "Plain"),
+        ({"skill_encoder": nn.Sequential(nn.LazyLinear(4), Plain())}, "trunk.mixer.encoder.1", "Plain"),
+        ({"features": Plain()}, "trunk.features", "Plain"),
+    ],
+)
+def test_a_part_that_cannot_be_saved_is_named_with_the_way_out(options, name, kind, tmp_path):
+    actor = make_actor(**options)
+    message = rf"{name} is a {kind}, which cannot be saved: give it an attribute config, a dict of its constructor's"
+    for refused in (
+        lambda: lw.save_actor(actor, tmp_path / "policy.safetensors"),
+        lambda: lw.modules.describe(actor),
+    ):
+        with pytest.raises(TypeError, match=message):
+            refused()
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_assigned_part_is_saved_or_refused(tmp_path):
+    path, actor, rows = tmp_path / "policy.safetensors", make_actor(), make_rows(4)
+    actor.decoder = Plain()
+    with pytest.raises(TypeError, match=r"decoder.network is a Plain, which cannot be saved"):
+        lw.save_actor(actor, path)
+    actor.decoder = Gated(5)
+    lw.save_actor(actor, path)
+    assert torch.equal(action_of(lw.load_actor(path), rows), action_of(actor, rows))
+    actor.decoder = MLPDecoder(width=4)
+    actor.decoder.network.config["width"] = 5  # a config that is not the network's
+    with pytest.raises(ValueError, match="its description does not rebuild it"):
+        lw.save_actor(actor, path)
+
+
+def test_no_module_is_imported_because_a_file_names_it(tmp_path, monkeypatch):
+    path = tmp_path / "policy.safetensors"
+    lw.save_actor(make("decoder"), path)
+    monkeypatch.delitem(sys.modules, "my_parts")
+    message = r"the class 'my_parts:Gated' is not known here: import my_parts first.*--import my_parts.*parts=\[Gated\]"
+    with pytest.raises(ValueError, match=message):
+        lw.load_actor(path)
+    assert "my_parts" not in sys.modules
+    rows = make_rows(4)
+    assert type(lw.load_actor(path, parts=[Gated]).decoder.network) is Gated
+    assert action_of(lw.load_actor(path, parts=[Gated]), rows).shape == (4, 4)
+
+
+def test_a_class_of_a_script_is_passed_by_hand(tmp_path, monkeypatch):
+    path = tmp_path / "policy.safetensors"
+    monkeypatch.setattr(Gated, "__module__", "__main__")
+    lw.save_actor(make("decoder"), path)
+    with pytest.raises(ValueError, match=r"'__main__:Gated' is not known here: pass the class, parts=\[Gated\]"):
+        lw.load_actor(path)
+    assert type(lw.load_actor(path, parts=[Gated]).decoder.network) is Gated

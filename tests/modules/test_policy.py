@@ -1,0 +1,110 @@
+"""plans_of, tasks_of, layout_of, transform_of and with_plans: what other code may ask of any actor."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from small_actors import ACTORS, CANONICAL, FALLBACK, PLANS, make_actor, make_descriptor, make_role_actor, make_rows
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torchrl.envs import Compose
+
+import lw_torchrl as lw
+from lw_torchrl.language.layout import METAWORLD
+from lw_torchrl.modules import layout_of, plans_of, tasks_of, transform_of, with_plans
+from lw_torchrl.suites import load_suite
+from lw_torchrl.transforms import FallbackTurns, QAFTransform
+
+PLAIN = TensorDictModule(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
+
+
+@pytest.mark.parametrize("name", ACTORS)
+def test_every_actor_states_its_plans_tasks_and_layout(name):
+    actor = ACTORS[name]()
+    expected = {"roles": CANONICAL, "demonstrated": CANONICAL, "fallback": FALLBACK}.get(name, PLANS)
+    expected = None if name in ("description", "one-hot", "normal") else expected
+    assert plans_of(actor) == expected
+    assert tasks_of(actor) == lw.MT10
+    assert layout_of(actor) == METAWORLD
+
+
+def test_a_module_that_is_not_ours_states_nothing():
+    assert (plans_of(PLAIN), tasks_of(PLAIN), layout_of(PLAIN), transform_of(PLAIN)) == (None, None, METAWORLD, None)
+    assert isinstance(transform_of(PLAIN, PLANS), QAFTransform)
+    fetch = load_suite("fetch").plans
+    assert layout_of(make_actor(fetch)) == fetch.layout
+
+
+def test_the_transform_writes_what_the_actor_reads():
+    assert transform_of(make_descriptor()) is None
+    assert transform_of(ACTORS["evaluator"]()) is None
+    fallback = transform_of(make_role_actor(FALLBACK))
+    assert isinstance(fallback, Compose)
+    assert [type(part) for part in fallback.transforms] == [QAFTransform, FallbackTurns]
+    actor = make_actor(in_keys=["truth", ("words", "task"), "state"])
+    queries = transform_of(actor)
+    rows = make_rows(3, answered=False)
+    moved = TensorDict({"state": rows["observation"], ("words", "task"): rows["task_id"]}, [3])
+    assert torch.equal(queries(moved)["truth"], transform_of(make_actor())(rows)["qaf"])
+    assert "truth_plan" in moved.keys()
+
+
+@pytest.mark.parametrize("name", [name for name in ACTORS if name not in ("description", "one-hot", "normal")])
+def test_with_plans_shares_every_weight(name):
+    actor = ACTORS[name]().eval()
+    own = {"push": PLANS["push"]}
+    if name in ("roles", "fallback", "demonstrated"):
+        own = lw.canonical_plans(own, fallback=name == "fallback")
+    other = with_plans(actor, own)
+    assert (plans_of(other), other.training) == (lw.Plans(own), False)
+    assert {id(one) for one in other.parameters()} == {id(one) for one in actor.parameters()}
+    rows = make_rows(4, plans=lw.Plans(own), answered=False)
+    found = []
+    for each in (actor, other):
+        transform = transform_of(each)
+        found.append(each(rows.copy() if transform is None else transform(rows.copy()))["action"])
+    torch.testing.assert_close(*found)
+
+
+def test_actors_that_cannot_follow_other_plans_are_refused():
+    with pytest.raises(TypeError, match="with_plans needs an actor that follows plans, and this Descriptor"):
+        with_plans(make_descriptor(), PLANS)
+
+    class Mine(TensorDictModule):
+        pass
+
+    mine = Mine(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
+    mine.plans = PLANS
+    with pytest.raises(TypeError, match=r"Mine cannot follow other plans: give it a method with_plans\(plans\)"):
+        with_plans(mine, PLANS)
+    sequence = with_plans(TensorDictSequential(PLAIN, make_actor()), {"push": PLANS["push"]})
+    assert sequence[0] is PLAIN
+
+
+def test_a_policy_that_makes_no_progress_comes_to_its_fallback_steps():
+    actor, turns = make_role_actor(FALLBACK), []
+    nn.init.zeros_([*actor.decoder.parameters()][-1])
+    lw.evaluate(
+        actor,
+        tasks="reach",
+        episodes_per_task=1,
+        seed=1_000,
+        also_record=["turn"],
+        on_episode=lambda episode: turns.append(episode.steps["turn"].max()),
+        progress=False,
+    )
+    assert max(turns) >= 1
+
+
+@pytest.mark.parametrize("turn", [0, 1])
+def test_in_each_turn_it_acts_as_under_that_plan_alone(turn):
+    """The plan's own steps in even turns, the fallback plan's in odd ones."""
+    from lw_torchrl.language.canonical import fallback_plan
+
+    actor = make_role_actor(FALLBACK)
+    alone = lw.Plans([fallback_plan(plan.definition) for plan in PLANS.values()]) if turn else CANONICAL
+    other = actor.with_plans(alone)
+    rows = make_rows(40, plans=PLANS, answered=False)
+    found = actor(transform_of(actor)(rows.copy()).set("turn", torch.full((40,), turn)))["action"]
+    torch.testing.assert_close(found, other(transform_of(other)(rows.copy()))["action"])

@@ -1,0 +1,387 @@
+"""FocusFeatures and RoleFeatures: relative positions by hand, contacts of demonstrations, turned scenes."""
+
+from __future__ import annotations
+
+import pickle
+from copy import deepcopy
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_actors import CANONICAL, PLANS, make_actor, make_role_actor, rows_for
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import TD3Loss
+
+import lw_torchrl as lw
+from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.modules import (
+    ActorEnsemble,
+    Concat,
+    FocusFeatures,
+    ObservationFeatures,
+    PlanAttention,
+    RoleFeatures,
+    transform_of,
+)
+from lw_torchrl.training.normalization import fit_normalization
+
+ZERO_SHOT = lw.canonical_plans(lw.load_plans("MT50", skills="MT10"))
+HAND, OBJECT, SECOND, GOAL = slice(0, 3), slice(4, 7), slice(11, 14), slice(36, 39)
+
+
+def row_of(plans, task):
+    return RoleFeatures(plans).tables.index.row(task)
+
+
+# ---- FocusFeatures
+
+
+def focus_of(task, *conditions):
+    return FocusFeatures(Plans([ConditionalPlan.from_pairs(task, [(condition, "wait") for condition in conditions])]))
+
+
+def compared(focus, observation, weights=None):
+    """The positions (B, 2, 3), metres, of the first and the last clause."""
+    weights = torch.ones(len(observation), 1) if weights is None else weights
+    found = focus(observation, weights, torch.full((len(observation),), lw.task_id(next(iter(focus.plans)))))
+    assert found.shape == (len(observation), 18)
+    return found[:, :6].reshape(-1, 2, 3) / 10
+
+
+@pytest.fixture
+def observation():
+    return torch.randn(5, 39, generator=torch.Generator().manual_seed(0))
+
+
+def test_the_first_and_the_last_clause_with_two_objects(observation):
+    condition = "the gripper is above the puck and the gripper is open and the puck is near the target location"
+    found = compared(focus_of("push", condition), observation)
+    torch.testing.assert_close(found[:, 0], observation[:, OBJECT] - observation[:, HAND])
+    torch.testing.assert_close(found[:, 1], observation[:, GOAL] - observation[:, OBJECT])
+    found = compared(focus_of("push", "the gripper is not above the puck"), observation)
+    assert torch.equal(found[:, 0], found[:, 1])
+    assert not compared(focus_of("push", "the gripper is open"), observation).any()
+
+
+def test_points_have_offsets_and_fixed_places(observation):
+    found = compared(focus_of("hammer", "the hammer head is near the nail"), observation)
+    head = observation[:, OBJECT] + torch.tensor([0.16, 0.06, 0.0])
+    torch.testing.assert_close(found[:, 0], observation[:, SECOND] - head)
+    found = compared(focus_of("bin-picking", "the gripper is near the other bin"), observation)
+    torch.testing.assert_close(found[:, 0], torch.tensor([0.12, 0.7, 0.02]) - observation[:, HAND])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**31))
+def test_steps_are_mixed_by_attention(seed):
+    generator = torch.Generator().manual_seed(seed)
+    observation = torch.randn(4, 39, generator=generator)
+    weights = torch.rand(4, 2, generator=generator).softmax(-1)
+    conditions = ("the gripper is above the puck", "the puck is near the target location")
+    each = [compared(focus_of("push", condition), observation) for condition in conditions]
+    mixed = compared(focus_of("push", *conditions), observation, weights)
+    torch.testing.assert_close(mixed, weights[:, 0, None, None] * each[0] + weights[:, 1, None, None] * each[1])
+
+
+def test_positions_are_squashed_at_two_scales(observation):
+    focus = focus_of("push", "the gripper is above the puck")
+    found = focus(observation, torch.ones(5, 1), torch.full((5,), lw.task_id("push")))
+    position = found[:, :6] / 10
+    torch.testing.assert_close(found[:, 6:12], torch.tanh(position / 0.02))
+    torch.testing.assert_close(found[:, 12:], torch.tanh(position / 0.1))
+
+
+@pytest.mark.parametrize("kind", [FocusFeatures, RoleFeatures])
+def test_any_leading_shape_and_noise_while_training(kind):
+    features = kind(CANONICAL, noise=0.1).eval()
+    rows = TensorDict(
+        observation=torch.randn(2, 3, 39),
+        skill_weights=torch.rand(2, 3, CANONICAL.num_steps),
+        task_id=torch.full((2, 3), lw.task_id("push")),
+        batch_size=[2, 3],
+    )
+    once = features(rows.copy())["features"]
+    assert once.shape == (2, 3, features.width)
+    torch.testing.assert_close(features(rows.reshape(6))["features"].reshape(2, 3, -1), once)
+    assert not torch.equal(features.train()(rows.copy())["features"], once)
+
+
+def test_an_actor_sees_the_positions_of_its_own_plans():
+    own = Plans([PLANS["push"], PLANS["reach"]])
+    actor = make_actor(own, features=Concat(ObservationFeatures(), FocusFeatures(own)))
+    other = actor.with_plans(PLANS)
+    for each in (actor, other):
+        found = each(rows_for(each, 4))
+        assert (found["features"].shape, found["action"].shape) == ((4, 56 + 18), (4, 4))
+    assert other.decoder is actor.decoder
+    assert other.features.parts[1].plans == PLANS
+
+
+# ---- RoleFeatures
+
+
+def roles_of(plans=CANONICAL, **options):
+    return RoleFeatures(plans, **options).eval()
+
+
+def in_step(plans, task, step, number=5, seed=0):
+    """Random observations with all attention on one step of a task's plan, as ``positions`` reads them."""
+    observation = torch.randn(number, 39, generator=torch.Generator().manual_seed(seed))
+    weights = torch.zeros(number, plans.num_steps)
+    weights[:, step] = 1.0
+    return observation, weights, torch.full((number,), row_of(plans, task))
+
+
+def written(roles, seen, **more):
+    """The features (B, 12) of what :func:`in_step` returned."""
+    observation, weights, rows = seen
+    ids = torch.tensor([lw.task_id(task) for task in roles.tables.index.tasks])[rows]
+    rows = TensorDict(observation=observation, skill_weights=weights, task_id=ids, batch_size=[len(ids)])
+    return roles(rows.update(more))["features"]
+
+
+def rows_of(plans, seen):
+    ids = torch.tensor([lw.task_id(task) for task in RoleFeatures(plans).tables.index.tasks])[seen[2]]
+    return TensorDict(observation=seen[0], task_id=ids, batch_size=[len(ids)])
+
+
+def test_plans_without_roles_are_refused():
+    with pytest.raises(ValueError, match=r"plans must have roles for RoleFeatures; use lw.canonical_plans\(plans\)"):
+        RoleFeatures(PLANS)
+
+
+@pytest.mark.parametrize(
+    ("task", "step", "way"),
+    [
+        ("push", 0, lambda o: o[:, 4:7] - o[:, :3]),
+        ("push", 3, lambda o: o[:, 36:39] - o[:, 4:7]),
+        ("assembly", 3, lambda o: o[:, 36:39] - o[:, 4:7] - torch.tensor([-0.13, 0.0, 0.0])),
+        ("peg-unplug-side", 3, lambda o: o[:, 36:39] - o[:, 4:7]),  # the goal, which that task has no name for
+    ],
+)
+def test_the_position_is_from_what_is_moved_to_the_target(task, step, way):
+    seen, roles = in_step(ZERO_SHOT, task, step), roles_of(ZERO_SHOT)
+    roles.demonstrated.fill_(True)
+    torch.testing.assert_close(roles.positions(*seen)[:, 0], way(seen[0]))
+
+
+@pytest.mark.parametrize(
+    ("task", "step", "direction"),
+    [("push", 0, (0.0, 0.0, 0.0)), ("drawer-open", 2, (0.0, -1.0, 0.0)), ("window-open", 2, (1.0, 0.0, 0.0)),
+     ("window-open", 0, (1.0, 0.0, 0.0)), ("button-press-topdown", 2, (0.0, 0.0, -1.0))],
+)  # fmt: skip
+def test_a_step_shows_its_direction(task, step, direction):
+    roles, seen = roles_of(), in_step(CANONICAL, task, step)
+    assert torch.equal(roles.directions(*seen), torch.tensor(direction).expand(5, 3))
+    assert torch.equal(written(roles, seen)[:, 9:], torch.tensor(direction).expand(5, 3))
+
+
+def test_toward_the_goal_is_from_the_object_and_turns_with_the_scene():
+    pairs = [
+        ("gripper is not near the puck", "lower the gripper beside the puck"),
+        ("gripper is near the puck", "push the puck to the target location"),
+    ]
+    plans = lw.canonical_plans(Plans([ConditionalPlan.from_pairs("push", pairs)]))
+    (number,) = (n for n, step in enumerate(plans["push"].steps) if step.role.verb == "push")
+    roles, (observation, weights, rows) = roles_of(plans), in_step(plans, "push", number)
+    ahead = torch.nn.functional.normalize(observation[:, 36:39] - observation[:, 4:7], dim=-1)
+    torch.testing.assert_close(roles.directions(observation, weights, rows), ahead)
+    turned = lw.RandomYaw(0.7)(TensorDict(observation=observation, action=torch.zeros(5, 4), batch_size=[5]))
+    yaw = turned["observation_yaw"]
+    after = roles.directions(turned["observation"], weights, rows, yaw)
+    now = torch.nn.functional.normalize(turned["observation"][:, 36:39] - turned["observation"][:, 4:7], dim=-1)
+    torch.testing.assert_close(after, now)
+    observation[:, 36:39] = observation[:, 4:7]
+    assert not roles.directions(observation, weights, rows).any(), "it is there already"
+
+
+def test_an_object_that_is_moved_up_has_a_target_there():
+    pairs = [
+        ("gripper is not near the puck", "lower the gripper around the puck"),
+        ("gripper is near the puck and gripper is open", "close the gripper around the puck"),
+        ("gripper is near the puck and gripper is closed", "lift the puck"),
+    ]
+    plans = lw.canonical_plans(Plans([ConditionalPlan.from_pairs("push", pairs)]))
+    (number,) = (n for n, step in enumerate(plans["push"].steps) if step.role.verb == "move")
+    seen = in_step(plans, "push", number)
+    torch.testing.assert_close(roles_of(plans).positions(*seen)[:, 0], torch.tensor([0.0, 0.0, 0.15]).expand(5, 3))
+    assert not roles_of(plans).directions(*seen).any()
+
+
+def test_beyond_25_cm_only_the_direction_is_visible():
+    roles = roles_of()
+    observation, *rest = in_step(CANONICAL, "push", 0)
+    observation[:, :3] = observation[:, 4:7] + torch.tensor([0.3, -0.4, 0.0])
+    far = written(roles, (observation, *rest))
+    torch.testing.assert_close(far[:, :3] * 0.1, torch.tensor([-0.15, 0.2, 0.0]).expand(5, 3))
+    observation[:, :3] = observation[:, 4:7] + torch.tensor([0.15, -0.2, 0.0])
+    torch.testing.assert_close(written(roles, (observation, *rest)), far)
+    observation[:, :3] = observation[:, 4:7] + torch.tensor([0.1, 0.0, 0.0])
+    torch.testing.assert_close(written(roles, (observation, *rest))[:, 0], torch.full((5,), -1.0))
+
+
+def carried(beside, below):
+    """One row in which the puck is carried, at a distance beside its target and below it, metres."""
+    observation, weights, rows = in_step(CANONICAL, "push", 3, number=1)
+    observation[:, 4:7] = observation[:, 36:39] - torch.tensor([beside, 0.0, below])
+    return observation, weights, rows
+
+
+@pytest.mark.parametrize(
+    ("beside", "below", "wanted"),
+    [
+        (0.2, 0.0, (0.0, 0.0, 0.15)),  # far away: first straight up
+        (0.2, -0.13, (0.2, 0.0, 0.02)),  # high: to the side
+        (0.2, -0.11, (0.1, 0.0, 0.04)),  # in between: both
+        (0.02, -0.15, (0.02, 0.0, -0.15)),  # over it: down
+        (0.0, 0.0, (0.0, 0.0, 0.0)),
+    ],
+)
+def test_without_demonstrations_a_carried_object_is_lifted_first(beside, below, wanted):
+    roles, seen = roles_of(), carried(beside, below)
+    torch.testing.assert_close(roles.positions(*seen)[0, 0], torch.tensor(wanted), atol=1e-5, rtol=0)
+    roles.fit(rows_of(CANONICAL, in_step(CANONICAL, "push", 0)))
+    assert roles.demonstrated.tolist() == [task == "push" for task in roles.tables.index.tasks]
+    torch.testing.assert_close(roles.positions(*seen)[0, 0], torch.tensor((beside, 0.0, below)), atol=1e-5, rtol=0)
+
+
+def test_a_sliding_object_is_not_lifted():
+    roles = roles_of()
+    observation, weights, rows = in_step(CANONICAL, "peg-insert-side", 4)
+    before = roles.positions(observation, weights, rows)
+    roles.demonstrated.fill_(True)
+    assert torch.equal(roles.positions(observation, weights, rows), before)
+
+
+def demonstrations(task):
+    env = lw.LanguageWorldEnv(task, num_envs=2)
+    rows = env.rollout(160, lw.ExpertActor(task), break_when_any_done=False).flatten()
+    env.close()
+    return rows.select("observation", "task_id", "action")
+
+
+def test_contacts_are_where_the_hand_is_when_it_acts():
+    roles, rows = roles_of(), demonstrations("drawer-open")
+    roles.fit(rows)
+    attended = PlanAttention(CANONICAL)(lw.QAFTransform(CANONICAL)(rows.copy()))["skill_weights"]
+    (pull,) = (n for n, step in enumerate(CANONICAL["drawer-open"].steps) if step.role.verb == "pull")
+    observation = rows["observation"][attended[:, pull] > 0.5]
+    assert 10 < len(observation) < len(rows)
+    row = row_of(CANONICAL, "drawer-open")
+    expected = (observation[:, HAND] - observation[:, OBJECT]).median(0).values
+    torch.testing.assert_close(roles.contact[row], expected)
+    assert roles.contact.count_nonzero() == 3
+    assert roles.demonstrated.tolist() == [task == "drawer-open" for task in roles.tables.index.tasks]
+    assert roles.fitted
+    observation, *rest = in_step(CANONICAL, "drawer-open", pull)
+    observation[:, HAND] = observation[:, OBJECT] + roles.contact[row]
+    at_contact = roles.positions(observation, *rest)
+    torch.testing.assert_close(at_contact, torch.zeros_like(at_contact), atol=1e-5, rtol=0)
+
+
+def test_a_button_that_is_pressed_from_above_has_no_contact():
+    roles = roles_of()
+    roles.fit(demonstrations("button-press-topdown"))
+    assert not roles.contact.any()
+    assert roles.demonstrated.sum() == 1
+
+
+def test_contacts_move_neither_carried_objects_nor_named_points():
+    roles = roles_of(ZERO_SHOT)
+    roles.contact.fill_(1.0)
+    roles.demonstrated.fill_(True)
+    carried, point = in_step(ZERO_SHOT, "push", 3), in_step(ZERO_SHOT, "coffee-pull", 0)
+    torch.testing.assert_close(roles.positions(*carried)[:, 0], carried[0][:, 36:39] - carried[0][:, 4:7])
+    rim = torch.tensor([-0.005, 0.0, 0.05])
+    torch.testing.assert_close(roles.positions(*point)[:, 0], point[0][:, 4:7] + rim - point[0][:, :3])
+
+
+@pytest.mark.parametrize(("task", "step"), [("push", 0), ("peg-insert-side", 4), ("drawer-open", 2)])
+def test_a_turned_scene_turns_the_way_fixed_places_and_contacts_too(task, step):
+    """The hole of peg-insert-side has a fixed x, which no turned observation holds."""
+    roles = roles_of()
+    roles.contact.copy_(torch.rand(roles.contact.shape))
+    observation, weights, rows = in_step(CANONICAL, task, step)
+    sample = TensorDict(observation=observation, action=torch.zeros(5, 4), batch_size=[5])
+    turned = lw.RandomYaw(0.7)(sample)
+    yaw = turned["observation_yaw"]
+    before = roles.positions(observation, weights, rows)[:, 0]
+    after = roles.positions(turned["observation"], weights, rows, yaw)[:, 0]
+    x, y = before[:, 0], before[:, 1]
+    torch.testing.assert_close(after[:, 0], yaw.cos() * x - yaw.sin() * y)
+    torch.testing.assert_close(after[:, 1], yaw.sin() * x + yaw.cos() * y)
+    torch.testing.assert_close(after[:, 2], before[:, 2])
+
+
+def test_the_buffer_s_jitter_and_tilt_move_the_position():
+    roles, seen = roles_of(), in_step(CANONICAL, "drawer-open", 2)
+    offset = torch.full((5, 3), 0.01)
+    plain, moved = written(roles, seen), written(roles, seen, target_offset=offset)
+    position = roles.positions(*seen)[:, 0] + offset
+    position = position * (0.25 / position.norm(dim=-1, keepdim=True).clamp(min=0.25))
+    torch.testing.assert_close(moved[:, :3] * 0.1, position)
+    assert torch.equal(moved[:, 9:], plain[:, 9:])
+
+
+def make_replay(task="drawer-open"):
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(400), batch_size=8)
+    replay.extend(demonstrations(task))
+    return replay
+
+
+def test_training_takes_contacts_and_they_are_saved_with_the_policy(tmp_path):
+    actor, replay = make_role_actor(), make_replay()
+    replay.append_transform(transform_of(actor))
+    config = lw.BehavioralCloningConfig(steps=2, batch_size=8)
+    lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()
+    contact, row = actor.features.contact, row_of(CANONICAL, "drawer-open")
+    assert contact[row].any()
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    loaded = lw.load_actor(tmp_path / "policy.safetensors").features
+    assert torch.equal(loaded.contact, contact)
+    assert loaded.demonstrated.tolist() == [task == "drawer-open" for task in loaded.tables.index.tasks]
+    wider = actor.with_plans(ZERO_SHOT).features
+    assert wider.demonstrated.tolist() == [task == "drawer-open" for task in wider.tables.index.tasks]
+    assert torch.equal(wider.contact[row_of(ZERO_SHOT, "drawer-open")], contact[row])
+    assert wider.contact.count_nonzero() == contact.count_nonzero()
+    ensemble = ActorEnsemble([make_role_actor(seed=seed) for seed in range(2)])
+    fit_normalization(ensemble, replay)
+    assert all(torch.equal(member.features.contact, contact) for member in ensemble.members)
+
+
+def test_actors_with_the_same_weights_share_contacts_whichever_is_fitted():
+    actor, replay, row = make_role_actor(), make_replay(), row_of(CANONICAL, "drawer-open")
+    copies = [pickle.loads(pickle.dumps(actor)), deepcopy(actor)]
+    wider = actor.with_plans(ZERO_SHOT)
+    back = wider.with_plans(CANONICAL)
+    fit_normalization(back, replay)
+    contact = back.features.contact
+    assert contact[row].any()
+    assert torch.equal(actor.features.contact, contact)
+    assert torch.equal(wider.features.contact[row_of(ZERO_SHOT, "drawer-open")], contact[row])
+    for each in (actor, wider, back):
+        assert each.features.fitted
+        assert each.features.demonstrated.sum() == 1
+    for other in copies:
+        assert not other.features.fitted
+        fit_normalization(other, replay)
+        assert torch.equal(other.features.contact, contact)
+
+
+def test_training_without_contacts_is_refused():
+    replay, actor = make_replay(), make_role_actor()
+    replay.append_transform(transform_of(actor))
+    config = lw.BehavioralCloningConfig(steps=1, batch_size=8, normalize=False)
+
+    def make_loss():
+        return TD3Loss(actor, lw.PlanConditionedQValue(CANONICAL), bounds=(-1.0, 1.0))
+
+    with pytest.raises(ValueError, match=r"call fit_normalization\(actor, replay\)"):
+        lw.BehavioralCloningTrainer(actor, replay, config, progress=False)
+    with pytest.raises(ValueError, match=r"before the loss is made of the actor"):
+        fit_normalization(make_loss(), replay)
+    fit_normalization(actor, replay)
+    fit_normalization(make_loss(), replay)
+    lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()

@@ -1,0 +1,316 @@
+"""Wrappers of any actor: ensembles, a decided gripper, demonstrated tasks, another robot."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from small_actors import (
+    CANONICAL,
+    PLANS,
+    action_of,
+    make_actor,
+    make_descriptor,
+    make_role_actor,
+    make_rows,
+    rows_for,
+)
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import TransformedEnv
+
+import lw_torchrl as lw
+from lw_torchrl.language.layout import METAWORLD, Layout, Slot
+from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.modules import (
+    ActorEnsemble,
+    Concat,
+    DecidedGripper,
+    DemonstratedActor,
+    ObservationFeatures,
+    RoleFeatures,
+    TransferredActor,
+)
+from lw_torchrl.modules.wrappers import decided
+from lw_torchrl.suites import load_suite
+from lw_torchrl.training import fit_normalization
+
+PLAIN = TensorDictModule(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
+
+
+def with_effort(actor, effort):
+    """The actor, whose last layer returns an effort whatever it sees."""
+    *_, last = (part for part in actor.decoder.modules() if isinstance(part, nn.Linear))
+    with torch.no_grad():
+        last.weight[3] = 0.0
+        last.bias[3] = torch.atanh(torch.tensor(effort))
+    return actor.eval()
+
+
+# ---- ActorEnsemble
+
+
+def make_members(kind="plan"):
+    if kind == "description":
+        return [make_descriptor(seed=seed) for seed in range(3)]
+    features = (ObservationFeatures(kind) for kind in ("differences", "relative", "both"))  # members may see otherwise
+    return [make_actor(seed=seed, features=each) for seed, each in enumerate(features)]
+
+
+@pytest.mark.parametrize("kind", ["plan", "description"])
+def test_the_action_is_the_members_mean(kind):
+    members, rows = make_members(kind), make_rows(7)
+    ensemble = ActorEnsemble(members).eval()
+    found = ensemble(rows.copy())
+    actions = [action_of(member, rows) for member in members]
+    assert not torch.allclose(actions[0], actions[1], atol=1e-3)
+    torch.testing.assert_close(found["action"], (actions[0] + actions[1] + actions[2]) / 3)
+    assert set(found.keys()) == {*rows.keys(), *ensemble.out_keys}
+    if kind == "plan":
+        assert ensemble.out_keys == ["action", "skill_weights"]
+        assert torch.equal(found["skill_weights"], members[0](rows.copy())["skill_weights"])
+
+
+def test_any_modules_are_members():
+    ensemble, rows = ActorEnsemble([PLAIN, PLAIN]), make_rows(3)
+    assert ensemble.in_keys == ["observation"]
+    torch.testing.assert_close(action_of(ensemble, rows), action_of(PLAIN, rows))
+
+
+def test_an_ensemble_acts_in_an_environment():
+    ensemble = ActorEnsemble(make_members()).eval()
+    env = TransformedEnv(lw.LanguageWorldEnv("reach", num_envs=2), lw.QAFTransform(ensemble.plans))
+    assert env.rollout(3, ensemble)["action"].shape == (2, 3, 4)
+    env.close()
+
+
+def test_members_that_do_not_belong_together_are_refused():
+    with pytest.raises(ValueError, match="members must be at least one actor, got none"):
+        ActorEnsemble([])
+    for other in (make_actor(Plans([PLANS["reach"]])), make_descriptor()):
+        with pytest.raises(ValueError, match="members must have the same plans"):
+            ActorEnsemble([make_actor(), other])
+    with pytest.raises(ValueError, match="members must have the same tasks"):
+        ActorEnsemble([make_descriptor(), make_descriptor("reach")])
+
+
+# ---- DecidedGripper
+
+
+@pytest.mark.parametrize("make", [make_actor, make_descriptor])
+def test_the_gripper_is_decided_only_when_the_policy_acts(make):
+    actor, rows = make(features=ObservationFeatures()), make_rows(200)
+    policy = DecidedGripper(actor)
+    assert (policy.in_keys, policy.out_keys) == (actor.in_keys, actor.out_keys)
+    before, after = action_of(policy.train(), rows), action_of(policy.eval(), rows)
+    assert before[:, 3].unique().numel() > 2
+    torch.testing.assert_close(after[:, :3], before[:, :3])
+    assert after[:, 3].abs().eq(1.0).all()
+
+
+@pytest.mark.parametrize(("effort", "done"), [(0.29, -1.0), (0.31, 1.0), (-0.9, -1.0), (1e-3, -1.0)])
+def test_it_closes_above_the_layouts_effort(effort, done):
+    policy = DecidedGripper(with_effort(make_actor(), effort)).eval()
+    assert (action_of(policy, make_rows(10))[:, 3] == done).all()
+    assert (action_of(DecidedGripper(policy.actor, -1.0).eval(), make_rows(10))[:, 3] == 1.0).all()
+
+
+@pytest.mark.parametrize(("efforts", "done"), [((0.9, 0.35, -0.9), 1.0), ((0.9, 0.2, 0.2), -1.0)])
+def test_most_members_of_an_ensemble_decide(efforts, done):
+    members = [DecidedGripper(with_effort(make_actor(), effort)) for effort in efforts]
+    policy = DecidedGripper(ActorEnsemble(members), 0.0).eval()
+    assert (action_of(policy, make_rows(10))[:, 3] == done).all()
+    assert action_of(policy.train(), make_rows(10))[:, 3].abs().max() < 1
+
+
+SEVEN = Layout(
+    "seven", 16, hand=1, opening=0, things=(Slot(4),), goal=13, action_size=7, displacement=1, gripper=6, closes=-1
+)
+PUCK = lw.Task("seven/push", "Push it.", (NamedObject(GRIPPER, (1, 2, 3)), NamedObject("puck", (4, 5, 6))), SEVEN)
+
+
+def seven_plans():
+    pairs = [
+        ("the gripper is not above the puck", "place the gripper above the puck"),
+        ("the gripper is above the puck", "lower the gripper around the puck"),
+        ("the gripper is near the puck", "close the gripper around the puck"),
+    ]
+    return lw.canonical_plans(Plans([ConditionalPlan.from_pairs(PUCK, pairs)]))
+
+
+@pytest.mark.parametrize(("effort", "done"), [(0.2, 1.0), (0.4, -1.0), (-0.2, 1.0)])
+@pytest.mark.parametrize("members", [1, 3])
+def test_another_robots_gripper_is_decided_by_the_first_robots_effort(effort, done, members):
+    """That robot's effort is at another place and has another sign, and 0.2 does not close with either."""
+    one = DecidedGripper(with_effort(make_role_actor(), effort))
+    actor = one if members == 1 else DecidedGripper(ActorEnsemble([one] * members), 0.0)
+    policy = TransferredActor(actor, seven_plans()).eval()
+    state = TensorDict(observation=torch.rand(4, 16), task_id=torch.full((4,), lw.task_id(PUCK.name)), batch_size=[4])
+    state = lw.QAFTransform(policy.plans)(state)
+    for each in (policy, policy.with_plans(seven_plans()).eval()):
+        assert (action_of(each, state)[:, SEVEN.effort] == done).all()
+    assert action_of(one.eval(), rows_for(one, 2))[0, 3] == (1.0 if effort > 0.3 else -1.0)
+
+
+def test_the_effort_is_where_the_layout_has_it():
+    actions = torch.zeros(2, 7)
+    actions[0, 6] = -0.5
+    assert decided(actions, SEVEN)[:, 6].tolist() == [-1.0, 1.0]
+    assert not decided(actions, SEVEN)[:, :6].any()
+    assert actions[0, 6] == -0.5
+
+
+# ---- DemonstratedActor
+
+MT50 = lw.canonical_plans(lw.load_plans("MT50"))
+SEEN = ("push", "reach")
+
+
+def make_demonstrated(seen=SEEN, **keys):
+    plain = {"in_keys": keys["in_keys"][1:]} if keys else {}
+    return DemonstratedActor(make_descriptor(seen, **plain), make_role_actor(MT50, **keys)).eval()
+
+
+def state_of(policy, tasks=("push", "hammer", "reach", "soccer", "push")):
+    ids = torch.tensor([lw.task_id(task) for task in tasks])
+    return lw.QAFTransform(policy.plans)(
+        TensorDict(observation=torch.rand(len(tasks), 39), task_id=ids, batch_size=[len(tasks)])
+    )
+
+
+def test_each_row_has_its_policy():
+    policy = make_demonstrated()
+    state = state_of(policy)
+    found, seen = policy(state.copy()), torch.tensor([True, False, True, False, True])
+    torch.testing.assert_close(found["action"][seen], action_of(policy.demonstrated, state[seen]))
+    others = policy.others(state.copy())
+    assert torch.equal(found["action"][~seen], others["action"][~seen])
+    assert torch.equal(found["skill_weights"], others["skill_weights"])
+    assert set(found.keys()) == {*state.keys(), *policy.out_keys}
+    assert torch.equal(found["task_id"], state["task_id"])
+    assert (policy.plans, policy.tasks) == (policy.others.plans, tuple(MT50))
+    for tasks, part in ((("push", "reach"), policy.demonstrated), (("hammer", "soccer"), policy.others)):
+        state = state_of(policy, tasks)
+        torch.testing.assert_close(action_of(policy, state), action_of(part, state))
+
+
+def test_demonstrated_actors_of_custom_keys():
+    policy = make_demonstrated(in_keys=["qaf", ("agent", "which"), "state"])
+    assert policy.in_keys == ["qaf", ("agent", "which"), "state"]
+    state = state_of(policy)
+    moved = TensorDict({"qaf": state["qaf"], "state": state["observation"], ("agent", "which"): state["task_id"]}, [5])
+    assert torch.equal(action_of(policy, moved), action_of(make_demonstrated(), state))
+
+
+def test_each_policy_acts_once_a_step():
+    policy, calls = make_demonstrated(), []
+    policy.others.register_forward_hook(lambda *_: calls.append("others"))
+    policy.demonstrated.register_forward_hook(lambda *_: calls.append("demonstrated"))
+    policy(state_of(policy))
+    assert sorted(calls) == ["demonstrated", "others"]
+
+
+def test_with_plans_are_for_the_one_with_plans():
+    policy = make_demonstrated()
+    steps = [("the gripper is open", "grab the puck"), ("the gripper is closed", "bring the puck to the goal")]
+    other = policy.with_plans(lw.canonical_plans(Plans([ConditionalPlan.from_pairs("push", steps), MT50["hammer"]])))
+    assert (other.training, other.tasks) == (False, ("hammer", "push"))
+    assert other.demonstrated is policy.demonstrated
+    assert other.others.decoder is policy.others.decoder
+    state = state_of(other, ("push", "hammer"))
+    assert torch.equal(action_of(other, state)[1], action_of(other.others, state)[1])
+    torch.testing.assert_close(action_of(other, state)[:1], action_of(policy.demonstrated, state[:1]))
+
+
+def test_in_another_suite_no_task_was_demonstrated():
+    fetch = lw.canonical_plans(load_suite("fetch").plans)
+    assert type(make_demonstrated().with_plans(fetch)) is lw.PlanConditionedActor
+    assert TransferredActor(make_demonstrated(), fetch).tasks == tuple(fetch)
+
+
+def test_both_policies_are_fitted_and_evaluated():
+    policy = make_demonstrated()
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(50), batch_size=8)
+    ids = torch.full((50,), lw.task_id("push"))
+    replay.extend(TensorDict(observation=torch.randn(50, 39), task_id=ids, batch_size=[50]))
+    fit_normalization(policy, replay)
+    assert policy.demonstrated.features.mean.any()
+    assert policy.others.features.demonstrated.sum() == 1
+    result = lw.evaluate(policy, tasks=["push", "hammer"], episodes_per_task=1, seed=1_000, max_steps=3, progress=False)
+    assert result.mean_success == 0.0
+
+
+def test_policies_that_do_not_belong_together_are_refused():
+    plain, others = make_descriptor(SEEN), make_actor()
+    for wrong in ((others, others), (plain, plain), (others, plain), (PLAIN, others)):
+        with pytest.raises(ValueError, match="demonstrated must be an actor of tasks without plans"):
+            DemonstratedActor(*wrong)
+    with pytest.raises(ValueError, match="must have one layout, got 'metaworld' and 'fetch'"):
+        DemonstratedActor(plain, make_actor(load_suite("fetch").plans))
+
+
+# ---- TransferredActor
+
+
+def test_a_displacement_keeps_its_metres():
+    fetch = lw.canonical_plans(load_suite("fetch").plans)
+    features = Concat(ObservationFeatures("opening"), RoleFeatures(CANONICAL))
+    actor = make_actor(CANONICAL, features=features)
+    rows = torch.rand(20, 4) - 0.5
+    for speed in (1.0, 2.0):
+        moved = TransferredActor(actor, fetch, speed=speed)
+        found = moved.converted(rows)
+        ratio = speed * METAWORLD.reach / fetch.layout.reach
+        expected = (rows[:, METAWORLD.displaced("test")] * ratio).clamp(-1, 1)
+        torch.testing.assert_close(found[:, fetch.layout.displaced("test")], expected)
+        assert {id(one) for one in moved.parameters()} == {id(one) for one in actor.parameters()}
+    state = TensorDict(
+        observation=torch.rand(3, fetch.layout.size),
+        task_id=torch.full((3,), lw.task_id("fetch/push")),
+        batch_size=[3],
+    )
+    assert action_of(moved, lw.QAFTransform(fetch)(state)).abs().max() <= 1
+
+
+def test_what_does_not_transfer_is_refused():
+    fetch = lw.canonical_plans(load_suite("fetch").plans)
+    with pytest.raises(ValueError, match="features 'differences' of layout 'metaworld' do not transfer to 'fetch'"):
+        TransferredActor(make_actor(CANONICAL), fetch)
+    with pytest.raises(TypeError, match="needs an actor that follows plans"):
+        TransferredActor(make_descriptor(), fetch)
+    with pytest.raises(ValueError, match="speed must be above 0, got 0"):
+        TransferredActor(make_role_actor(), fetch, speed=0.0)
+
+
+# ---- all
+
+
+WRAPPED = {
+    "ensemble": lambda: ActorEnsemble(make_members()).eval(),
+    "decided": lambda: DecidedGripper(ActorEnsemble([DecidedGripper(make_actor())] * 2), 0.0).eval(),
+    "demonstrated": make_demonstrated,
+    "transferred": lambda: TransferredActor(make_role_actor(), CANONICAL, speed=0.5).eval(),
+}
+
+
+@pytest.mark.parametrize("name", WRAPPED)
+def test_saved_and_loaded_it_acts_the_same(name, tmp_path):
+    policy = WRAPPED[name]()
+    lw.save_actor(policy, tmp_path / "policy.safetensors")
+    loaded, rows = lw.load_actor(tmp_path / "policy.safetensors"), rows_for(policy, 6)
+    assert (type(loaded), loaded.training) == (type(policy), False)
+    assert torch.equal(action_of(loaded, rows), action_of(policy, rows))
+
+
+@pytest.mark.parametrize("name", WRAPPED)
+def test_assigned_in_keys_are_read_by_the_wrapped(name):
+    policy = WRAPPED[name]()
+    rows = rows_for(policy, 6)
+    inner, expected = next(policy.children()), action_of(policy, rows)
+    policy.in_keys = ["state" if key == "observation" else key for key in policy.in_keys]
+    moved = rows.exclude("observation").set("state", rows["observation"])
+    assert torch.equal(action_of(policy, moved), expected)
+    if not isinstance(inner, nn.ModuleList):
+        assert "observation" in inner.in_keys, "the wrapped actor itself keeps its names"
