@@ -8,23 +8,22 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torchrl.envs import Compose
+from tensordict.nn import TensorDictModuleBase
 
+from benchmarks.paper.actors import Parts, ensemble, reads_plans
 from benchmarks.paper.recipes import DataSetting, Execution, Member, Preset
 from benchmarks.paper.runs import Dataset, Run, Work, load_result, own_tasks, plain
 from benchmarks.paper.stacked import StackedBehavioralCloning
+from lw_torchrl._checks import check_choice
 from lw_torchrl._progress import Progress
 from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import resolve_tasks
-from lw_torchrl.modules import ActorEnsemble, DemonstratedActor, ScriptedSkillActor
-from lw_torchrl.modules.policy import Policy
-from lw_torchrl.modules.registry import find_method, make_policy
+from lw_torchrl.modules import METHODS, DemonstratedActor, ScriptedSkillActor
 from lw_torchrl.training import BehavioralCloningTrainer
 from lw_torchrl.training.checkpoint import check_description, load_actor, save_actor
 from lw_torchrl.training.descriptions import describe_data
-from lw_torchrl.transforms import RandomYaw
 
 SCRIPTED = "scripted"
 """Plans with scripted skills: a method beside those of :data:`lw_torchrl.modules.METHODS`, without training."""
@@ -50,42 +49,6 @@ class ExpertDataset(Dataset):
 
 
 @dataclass(frozen=True)
-class _Trained:
-    """A member of a policy, of a method."""
-
-    member: Member
-    method: str
-
-    @property
-    def reads_plans(self) -> bool:
-        return find_method(self.method).reads_plans
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """Of its actor; a method of the user's may not have all."""
-        given = {**self.member.actor, **(self.member.plan_actor if self.reads_plans else {})}
-        return {name: value for name, value in given.items() if find_method(self.method).takes(name)}
-
-    @property
-    def yaw(self) -> float:
-        plan_yaw = self.member.plan_yaw
-        return plan_yaw if self.reads_plans and plan_yaw is not None else self.member.yaw
-
-    def turned(self, actor: Policy) -> list[RandomYaw]:
-        """How its rows are turned."""
-        if not self.yaw:
-            return []
-        if not self.reads_plans:
-            return [RandomYaw(self.yaw)]
-        free, tilt = self.member.any_yaw, self.member.tilt
-        return [RandomYaw(self.yaw, plans=actor.plans if free or tilt else None, tilt=tilt)]
-
-    def describe(self) -> dict[str, Any]:
-        more = {"any_yaw": self.member.any_yaw, "tilt": self.member.tilt} if self.reads_plans else {}
-        return {"actor": self.options, "yaw": self.yaw} | {name: value for name, value in more.items() if value}
-
-
-@dataclass(frozen=True)
 class ImitationRun(Run):
     """One policy, or one for each target, or plans with scripts."""
 
@@ -98,8 +61,7 @@ class ImitationRun(Run):
     any_device = True
 
     def __post_init__(self) -> None:
-        if self.method != SCRIPTED:
-            find_method(self.method)
+        check_choice("method", self.method, [*METHODS, SCRIPTED])
 
     @property
     def group(self) -> Path:
@@ -128,7 +90,7 @@ class ImitationRun(Run):
 
     @property
     def reads_plans(self) -> bool:
-        return self.method == SCRIPTED or _Trained(Member({}), self.method).reads_plans
+        return self.method == SCRIPTED or reads_plans(self.method)
 
     @property
     def skills(self) -> Literal["own", "MT10"]:
@@ -146,9 +108,9 @@ class ImitationRun(Run):
         if self.method != SCRIPTED:
             described |= {"setting": self.setting.name, "preset": self.preset.name}
             described["datasets"] = [asdict(dataset) for dataset in self.datasets]
-            described["members"] = [_Trained(one, self.method).describe() for one in self.preset.members]
+            described["members"] = [one.of(self.method).describe() for one in self.preset.members]
             if self.demonstrated:
-                described["demonstrated"] = [_Trained(one, "dc").describe() for one in self.demonstrated]
+                described["demonstrated"] = [one.of("dc").describe() for one in self.demonstrated]
             described["training"] = self.preset.training.describe()
             described |= {name: getattr(self.preset, name) for name in ("label", "after_success", "passes")}
             if self.preset.evaluations > 1:
@@ -173,10 +135,10 @@ class ImitationRun(Run):
         else:
             members, replays = self._train(work, targets or ())
             for file, replay, *actors in zip(files, replays, *members, strict=True):
-                others, seen = (
-                    _mean(part) for part in (actors[: len(self.preset.members)], actors[len(self.preset.members) :])
-                )
-                policies.append(others if seen is None else DemonstratedActor(seen, others))
+                number = len(self.preset.members)
+                others, demonstrated = ensemble(actors[:number]), ensemble(actors[number:])
+                assert others is not None
+                policies.append(others if demonstrated is None else DemonstratedActor(demonstrated, others))
                 save_actor(policies[-1], file, data=describe_data(replay), **described)
         for checkpoint in folder.glob("checkpoint-*.safetensors"):
             checkpoint.unlink()
@@ -205,7 +167,7 @@ class ImitationRun(Run):
 
     def _train(
         self, work: Work, targets: Sequence[str]
-    ) -> tuple[list[list[Policy]], list[LanguageWorldExperienceReplay]]:
+    ) -> tuple[list[list[TensorDictModuleBase]], list[LanguageWorldExperienceReplay]]:
         """The policies, one of all tasks or one of each target, member by member. Seeds count from the run's by
         thousands; with targets, from 1000 times the run's, target by target."""
         preset, roots = self.preset, [work.out / dataset.folder for dataset in self.datasets]
@@ -213,34 +175,28 @@ class ImitationRun(Run):
         if preset.passes is not None:  # over the base tasks, which have half of each minibatch of a target
             rows = len(LanguageWorldExperienceReplay(roots[0], after_success=preset.after_success))
             steps = max(1, preset.passes * (2 if targets else 1) * rows // preset.training.batch_size)
-        members: list[list[Policy]] = []
-        trained = [_Trained(one, self.method) for one in preset.members] + [
-            _Trained(one, "dc") for one in self.demonstrated
-        ]
-        for number, member in enumerate(trained):
+        members: list[list[TensorDictModuleBase]] = []
+        known = Plans({task: work.plans[task] for task in resolve_tasks(self.setting.base)})
+        trained = [(self.method, one.of(self.method), work.plans) for one in preset.members]
+        trained += [("dc", one.of("dc"), known) for one in self.demonstrated]
+        for number, (method, parts, plans) in enumerate(trained):
             first = 1_000 * self.seed + len(targets) * number if targets else self.seed + 1_000 * number
             config = replace(preset.training, steps=steps, seed=first)
-            actors = []
+            plans, actors = parts.seen(plans), []
             for i in range(len(targets) or 1):
                 torch.manual_seed(first + i)
-                known = (
-                    work.plans
-                    if number < len(preset.members)
-                    else Plans({t: work.plans[t] for t in resolve_tasks(self.setting.base)})
-                )
-                actors.append(make_policy(member.method, known, **member.options))
+                actors.append(parts.actor(method, plans))
             checkpoint = work.out / self.folder / f"checkpoint-{number}.safetensors"
             options: dict[str, Any] = {"checkpoint": checkpoint, "progress": work.progress, "device": work.device}
             trainer: BehavioralCloningTrainer | StackedBehavioralCloning
             if targets:
-                samplers = [CoLearningSampler(target, exact=True) for target in targets]
                 replays = [
-                    self._replay(member, work, actor, roots, sampler, episodes=[None, {target: 1}])
-                    for target, actor, sampler in zip(targets, actors, samplers, strict=True)
+                    self._replay(parts, work, actor, roots, CoLearningSampler(target, exact=True), episodes=[None, {target: 1}])
+                    for target, actor in zip(targets, actors, strict=True)
                 ]
                 trainer = StackedBehavioralCloning(actors, replays, config, **options)
             else:
-                replays = [self._replay(member, work, actors[0], roots[0], TaskBalancedSampler(exact=True))]
+                replays = [self._replay(parts, work, actors[0], roots[0], TaskBalancedSampler(exact=True))]
                 trainer = BehavioralCloningTrainer(actors[0], replays[0], config, **options)
             policy = dict(zip(targets, actors, strict=True)) if targets else actors[0]
             for step in preset.evaluated_before(steps):
@@ -256,20 +212,13 @@ class ImitationRun(Run):
         return members, replays
 
     def _replay(
-        self, member: _Trained, work: Work, actor: Policy, roots: Any, sampler: Any, **options: Any
+        self, parts: Parts, work: Work, actor: TensorDictModuleBase, roots: Any, sampler: Any, **options: Any
     ) -> LanguageWorldExperienceReplay:
-        queries = actor.transform()
-        transform = Compose(*([] if queries is None else [queries]), *member.turned(actor))
         options |= {"label": self.preset.label, "after_success": self.preset.after_success, "device": work.device}
-        return LanguageWorldExperienceReplay(roots, sampler=sampler, transform=transform, **options)
+        return LanguageWorldExperienceReplay(roots, sampler=sampler, transform=parts.transform(actor), **options)
 
 
 def joined(results: Sequence[EvaluationResult]) -> EvaluationResult:
     """One result of those of several tasks, evaluated alike."""
     tasks = [task for one in results for task in one.config["tasks"]]
     return EvaluationResult(results[0].config | {"tasks": tasks}, tuple(e for one in results for e in one.episodes))
-
-
-def _mean(actors: Sequence[Policy]) -> Any:
-    """The policy of some actors; None of none."""
-    return (actors[0] if len(actors) == 1 else ActorEnsemble(actors)) if actors else None

@@ -9,8 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
-from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig
-
+from benchmarks.paper.actors import Parts, reads_plans
 from lw_torchrl._checks import Count, Probability, Scale, check_fields
 from lw_torchrl._files import read_toml
 from lw_torchrl.data import BEHAVIOURS, EpisodeFilter
@@ -41,18 +40,18 @@ class Execution:
 
 @dataclass(frozen=True)
 class Member:
-    """One of the actors whose actions a policy averages."""
+    """One of the actors whose actions a policy averages, by the fields of :class:`Parts`."""
 
-    actor: Mapping[str, Any] = field(hash=False)  # its options
-    plan_actor: Mapping[str, Any] = field(default_factory=dict, hash=False)  # more, of those that read plans
-    yaw: float = 0.0  # scale of :class:`RandomYaw` on its demonstrations, in radians
-    any_yaw: bool = False  # with plans, turn rows by any angle if their steps in force say no direction
-    plan_yaw: float | None = None  # the scale with plans, if another
-    tilt: float = 0.0  # with plans, see :class:`RandomYaw`
+    parts: Mapping[str, Any] = field(default_factory=dict, hash=False)  # of every method
+    plan_parts: Mapping[str, Any] = field(default_factory=dict, hash=False)  # more, of methods that read plans
 
     def __post_init__(self) -> None:
-        for name in ("actor", "plan_actor"):  # a frozen recipe's options are read-only, too
+        for name in ("parts", "plan_parts"):  # a frozen recipe's options are read-only, too
             object.__setattr__(self, name, MappingProxyType(_tuples(getattr(self, name))))
+
+    def of(self, method: str) -> Parts:
+        """Return the parts of an actor of a method."""
+        return Parts(**{**self.parts, **(self.plan_parts if reads_plans(method) else {})})
 
 
 @dataclass(frozen=True)

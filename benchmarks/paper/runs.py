@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 
 from lw_torchrl._checks import differences
 from lw_torchrl._devices import CPU, check_device
@@ -17,7 +18,6 @@ from lw_torchrl.data import collect_demonstrations
 from lw_torchrl.evaluation import EvaluationResult, evaluate
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import TASKS
-from lw_torchrl.modules.policy import Policy
 from lw_torchrl.suites.suite import find_suite
 from lw_torchrl.training import load_actor, save_actor
 from lw_torchrl.training.checkpoint import check_description, training_file
@@ -181,7 +181,7 @@ def execute_run(
         return result
 
 
-def kept_policy(file: Path, described: dict[str, Any], train: Callable[[Path], Mapping[str, Any]]) -> Policy:
+def kept_policy(file: Path, described: dict[str, Any], train: Callable[[Path], Mapping[str, Any]]) -> TensorDictModuleBase:
     """The policy of a file, which must say what is ``described``; if there is none, it is trained and saved first.
 
     ``train`` is given the checkpoint to use meanwhile; it returns arguments of :func:`~lw_torchrl.save_actor`.

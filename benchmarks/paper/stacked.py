@@ -2,66 +2,56 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from hashlib import sha256
 from typing import Any, Unpack
 
 import torch
-from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig, make_optimizer
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives.utils import distance_loss
 
-from lw_torchrl._checks import checked, passes_on
+from lw_torchrl._checks import checked, differences, passes_on
 from lw_torchrl._devices import place
 from lw_torchrl.data.replay_checks import check_replay
-from lw_torchrl.modules.policy import Policy
+from lw_torchrl.modules.describe import describe
+from lw_torchrl.modules.features import Features
+from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig, make_optimizer
 from lw_torchrl.training.checkpoint import check_can_be_saved, text_vectors
 from lw_torchrl.training.descriptions import describe_data, describe_replay
 from lw_torchrl.training.loop import ReplayState, Training, TrainingOptions, make_schedule
 from lw_torchrl.training.normalization import check_contacts, fit_normalization
 
 
-class _Act(nn.Module):
-    """``functional_call`` calls a module's forward: this one's is the actor's ``act``."""
-
-    def __init__(self, actor: Any) -> None:
-        super().__init__()
-        self.actor = actor
-
-    def forward(self, *prepared: Tensor) -> Tensor:
-        return self.actor.act(*prepared)[0]
-
-
-def _check_actors(actors: Sequence[Policy]) -> None:
-    """Raise :class:`ValueError` unless the actors differ in their weights, plans and tasks alone."""
-    described = [actor.describe() for actor in actors]
-    first, *others = ({"kind": one["kind"], "evaluator": one.get("evaluator"), **one["options"]} for one in described)
+def _check_actors(actors: Sequence[TensorDictModuleBase]) -> None:
+    """Raise :class:`ValueError` unless the actors differ only in their weights."""
+    first, *others = map(describe, actors)
     for number, other in enumerate(others, 1):
-        if names := [name for name in {**first, **other} if first.get(name) != other.get(name)]:
-            raise ValueError(f"actors must be of one architecture, 0 and {number} differ in {', '.join(names)}")
+        if different := differences(first, other):
+            raise ValueError(
+                f"actors must have the same parts and plans, 0 and {number} differ in {', '.join(different)}"
+            )
     weights = [id(parameter) for actor in actors for parameter in actor.parameters()]
     if len({*weights}) < len(weights):
-        raise ValueError("actors must have weights of their own, some are the same or share theirs")
+        raise ValueError("actors must not share weights")
 
 
 class StackedBehavioralCloning(Training):
-    """Trains M actors, each on batches of its own, as :class:`BehavioralCloningTrainer` trains one.
+    """Train M actors, each on its own batches, as :class:`BehavioralCloningTrainer` trains one.
 
-    Every product is done for all M at once. Each actor draws its batches, turns and feature noise from the seed that
-    it would have alone, so its losses are those it would have alone, up to rounding.
+    One ``vmap`` computes all M actors. Each actor has the batches and augmentations that its seed gives it alone, so
+    that its losses are those it would have alone, up to rounding and the features' noise.
 
     Args:
-        actors: M policies, each with weights of its own, trained in place, that differ in plans and tasks alone.
-        replays: M buffers, each with its sampler; the i-th actor's batches come from the i-th.
+        actors: M policies with the same parts and plans and with their own weights, trained in place.
+        replays: M buffers, each with its own sampler; the i-th actor's batches come from the i-th.
         config: how to train each; the i-th has the seed ``config.seed + i``.
         checkpoint, logger, progress, title: as of :class:`~lw_torchrl.training.loop.Training`, with its errors.
         device: where to train, as for :class:`BehavioralCloningTrainer`; None for where the first actor is.
 
     Raises:
-        ValueError: not as many buffers as actors, one twice, or actors of different options.
+        ValueError: the numbers of buffers and actors differ, one of them stands twice, or the actors' parts differ.
 
     Source: paper section 'Conditional Plan Experiments', which trains 50 one-shot models; ``torch.func``.
     """
@@ -70,7 +60,7 @@ class StackedBehavioralCloning(Training):
     @checked
     def __init__(
         self,
-        actors: Sequence[Policy],
+        actors: Sequence[TensorDictModuleBase],
         replays: Sequence[TensorDictReplayBuffer],
         config: BehavioralCloningConfig | None = None,
         *,
@@ -91,10 +81,9 @@ class StackedBehavioralCloning(Training):
             raise ValueError("qaf_anchor is for BehavioralCloningTrainer, which trains one policy at a time")
         self.device = place(actors[0], device)
         if self.checkpoint is not None:
-            described = [json.dumps(actor.describe(), sort_keys=True).encode() for actor in actors]
+            check_can_be_saved(actors[0])
             self.described = {
-                "actor": check_can_be_saved(actors[0]).describe() | {"number": len(actors)},
-                "actors": {str(number): sha256(one).hexdigest()[:16] for number, one in enumerate(described)},
+                "actor": describe(actors[0]) | {"number": len(actors)},
                 "training": config.describe(),
                 "data": {str(number): describe_data(replay) for number, replay in enumerate(replays)},
                 "replay": {str(number): describe_replay(replay) for number, replay in enumerate(replays)},
@@ -103,18 +92,18 @@ class StackedBehavioralCloning(Training):
             actor.to(self.device)
             check_replay(actor, replay, config.batch_size)
             self.states.append(ReplayState(replay, config.seed + number))
-            if config.normalize:
+            if config.normalize and any(isinstance(part, Features) for part in actor.modules()):
                 fit_normalization(actor, replay)
             else:
                 check_contacts(actor)
             actor.train()
-        modules: list[nn.Module] = [_Act(actor) for actor in actors]
-        try:
-            parameters, self._buffers = stack_module_state(modules)
-        except RuntimeError as error:
-            raise ValueError(f"actors must be of one architecture ({error})") from error
+        parameters, buffers = stack_module_state([*actors])  # type: ignore[arg-type]
+        # All actors have the same tables of their plans, which are no part of the state.
+        self._buffers = {name: value for name, value in buffers.items() if name in actors[0].state_dict()}
         self._parameters = {name: nn.Parameter(value.detach()) for name, value in parameters.items()}
-        self._act = vmap(lambda p, b, prepared: functional_call(modules[0], (p, b), prepared))
+        self._act = vmap(
+            lambda p, b, batch: functional_call(actors[0], (p, b), (batch,)).get("action"), randomness="different"
+        )
         self.optimizer = make_optimizer(self._parameters.values(), config)
         self.schedule = make_schedule(config.schedule, self.optimizer, config.steps)
         self.resume()
@@ -127,15 +116,15 @@ class StackedBehavioralCloning(Training):
 
     def step(self) -> Tensor:
         """Train every actor on one minibatch and return their losses, (M,) float32, on the device."""
-        prepared, targets = [], []
-        for actor, state in zip(self.actors, self.states, strict=True):
+        batches = []
+        for state in self.states:
             with state.drawing(self.device):
-                batch = state.minibatch(self.config.batch_size, self.device)
-                prepared.append(actor.prepare(batch))
-            targets.append(batch.get("action"))
-        inputs = tuple(torch.stack(column) for column in zip(*prepared, strict=True))
-        actions = self._act(self._parameters, self._buffers, inputs)
-        losses = distance_loss(actions, torch.stack(targets), self.config.loss_function).flatten(1).mean(1)
+                batches.append(state.minibatch(self.config.batch_size, self.device).exclude("next"))
+        stacked = torch.stack(batches)
+        targets = stacked.pop("action")
+        with self.states[0].drawing(self.device):  # the features' noise
+            actions = self._act(self._parameters, self._buffers, stacked)
+        losses = distance_loss(actions, targets, self.config.loss_function).flatten(1).mean(1)
         return self.descend(losses)
 
     def clip_gradients(self) -> None:
@@ -161,5 +150,5 @@ class StackedBehavioralCloning(Training):
         for number, actor in enumerate(self.actors):
             own = dict(actor.named_parameters())
             for name, value in self._parameters.items():
-                own[name.removeprefix("actor.")].copy_(value[number])
+                own[name].copy_(value[number])
             actor.eval()
