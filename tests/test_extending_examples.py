@@ -14,13 +14,13 @@ import pytest
 import lw_torchrl as lw
 from lw_torchrl.cli.main import main
 from lw_torchrl.language.relations import RELATIONS
-from lw_torchrl.modules import ENCODERS, EVALUATORS
+from lw_torchrl.modules import METHODS
 from lw_torchrl.suites import SUITES
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "examples" / "extending"
 FILES = sorted(FOLDER.glob("my_*.py"))
-TABLES = (ENCODERS, EVALUATORS, RELATIONS, SUITES, lw.PLAN_FORMATS)
+TABLES = (METHODS, RELATIONS, SUITES, lw.PLAN_FORMATS)
 SAYS = {
     "my_method.py": ("trained to step 3", "reach"),
     "my_evaluator.py": ("trained to step 3", "window-open"),

@@ -1,7 +1,7 @@
-"""A query evaluator of your own: conditions are soft near their thresholds, and how soft is learned.
+"""A custom query evaluator: conditions are soft near their thresholds, and how soft is learned.
 
 lw-torchrl collect reach window-open --episodes 2 --out demos
-lw-torchrl train demos --out policy.safetensors --steps 300 --evaluator SoftTruth --import my_evaluator
+lw-torchrl train demos --out policy.safetensors --steps 300 --evaluator my_evaluator:SoftTruth
 lw-torchrl evaluate policy.safetensors --episodes 2 --import my_evaluator
 """
 
@@ -9,19 +9,15 @@ import torch
 from torch import nn
 
 import lw_torchrl as lw
-from lw_torchrl.modules import EVALUATORS
 
 
 class SoftTruth(lw.QueryEvaluator):
-    def __init__(self, plans, temperature=1.0):
-        super().__init__(plans)
-        self.config = {"temperature": temperature}  # makes it again, from a policy's file, beside the plans
+    def __init__(self, plans, temperature=1.0, **options):
+        super().__init__(plans, **options)
+        self.config = {**self.config, "temperature": temperature}  # what a file needs, besides the plans
         conditions = {plan.definition: [step.condition for step in plan.steps] for plan in plans.values()}
         self.program = lw.QueryProgram(conditions)
         self.scale = nn.Parameter(torch.tensor(temperature).log())
 
     def logits(self, observation, task_id):  # (B, 39) float32 and (B,) int64 -> (B, steps of the longest plan) float32
         return self.program.logits(observation, task_id) / self.scale.exp()
-
-
-EVALUATORS["SoftTruth"] = SoftTruth

@@ -1,38 +1,37 @@
-"""A way of conditioning of your own: each task has a vector that is learned, and no words are read.
+"""A custom method: each task has a vector that is learned, and no words are read.
 
 lw-torchrl collect reach window-open --episodes 2 --out demos
-lw-torchrl train demos --out policy.safetensors --steps 300 --method TaskVectors --import my_method
+lw-torchrl train demos --out policy.safetensors --steps 300 --method task-vectors --import my_method
 lw-torchrl evaluate policy.safetensors --episodes 2 --import my_method
 """
 
+from collections import OrderedDict
+
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import nn
 
 from lw_torchrl.language.task_index import TaskIndex
-from lw_torchrl.language.tasks import named_tasks, one_layout, task_ids
-from lw_torchrl.modules import ENCODERS, Encoder, Encoding, ObservationFeatures
+from lw_torchrl.modules import METHODS, ConditionedActor, ObservationFeatures
 
 
-class TaskVectors(Encoder):
-    def __init__(self, tasks, *, size=16, feature_noise=0.05):
+class TaskVectors(TensorDictModuleBase):
+    def __init__(self, task_ids, size=16):
         super().__init__()
-        self.definitions = named_tasks(tasks)  # name -> Task
-        self.tasks, self.layout = tuple(self.definitions), one_layout(self.definitions.values())
-        self.config = {"size": size, "feature_noise": feature_noise}  # makes it again, from a policy's file
-        self.in_keys, self.out_keys = ["observation", "task_id"], ["encoding"]
-        self.index = TaskIndex(task_ids(self.tasks))
-        self.features = ObservationFeatures("differences", feature_noise, self.layout)  # (B, 39) float32 -> (B, F)
-        self.vectors = nn.Embedding(len(self.tasks), size)
-        self.latent_size = size
+        self.config = {"task_ids": dict(task_ids), "size": size}  # what a file needs to build it again
+        self.in_keys, self.out_keys = ["task_id"], ["task_latent"]
+        self.tasks, self.latent_size = tuple(task_ids), size
+        self.index = TaskIndex(task_ids)
+        self.vectors = nn.Embedding(len(task_ids), size)
 
-    def definition(self, task):
-        return self.definitions.get(task)
-
-    def prepare(self, tensordict):  # what no trained parameter touches, and all checks
-        observation, task_id = self.read(tensordict)
-        return self.index.rows(task_id, "tasks that it was not made for"), self.features(observation)
-
-    def encode(self, rows, seen):  # what is trained
-        return Encoding(latent=self.vectors.weight[rows], features=seen)
+    def forward(self, tensordict):  # task_id (B,) int64 -> task_latent (B, size) float32
+        rows = self.index.rows(tensordict["task_id"], "tasks that this policy was not trained on")
+        return tensordict.set("task_latent", self.vectors(rows))
 
 
-ENCODERS["TaskVectors"] = TaskVectors
+def task_vectors(plans, *, features=None, decoder=None, text_encoder=None, size=16):
+    latent = TaskVectors(plans.task_ids, size)
+    features = features or ObservationFeatures(noise=0.05, layout=plans.layout)
+    return ConditionedActor(TensorDictSequential(OrderedDict(latent=latent, features=features)), decoder)
+
+
+METHODS["task-vectors"] = task_vectors
