@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import torch
 from gymnasium_robotics.envs.franka_kitchen.kitchen_env import OBS_ELEMENT_GOALS, OBS_ELEMENT_INDICES, KitchenEnv
+from tensordict.nn import TensorDictModuleBase
 
 import lw_torchrl as lw
 from lw_torchrl.language.layout import Layout, Slot
@@ -110,21 +111,17 @@ def goal_of(env: KitchenEnv) -> np.ndarray:
     return data.site(SITES[(*JOINTED, "kettle").index(thing)]).xpos - COUNTER
 
 
-class Pusher(lw.Policy):
-    """Slides the cabinet open: the hand goes beside the handle, then to the right, by the arm's Jacobian."""
+class Pusher(TensorDictModuleBase):
+    """Slide the cabinet open: the hand goes beside the handle, then to the right, by the arm's Jacobian."""
 
     row_by_row = True
+    in_keys, out_keys = ("observation",), ("action",)
+    layout, tasks = KITCHEN, (CABINET.name, MICROWAVE.name)
 
-    def __init__(self):
-        super().__init__()
-        self.layout, self.tasks, self.config = KITCHEN, (CABINET.name, MICROWAVE.name), {}
-        self.in_keys, self.out_keys = ["observation"], ["action"]
-
-    def prepare(self, tensordict):
-        return tuple(self.read(tensordict))
-
-    def act(self, observation):
-        return (torch.tensor(np.array([self.velocities(state) for state in observation.double().numpy()])).float(),)
+    def forward(self, tensordict):
+        states = tensordict["observation"].double().numpy()
+        action = np.array([self.velocities(state) for state in states], np.float32)
+        return tensordict.set("action", torch.from_numpy(action))
 
     def velocities(self, state: np.ndarray) -> np.ndarray:
         env, jacobian = built(), np.zeros((3, built().model.nv))

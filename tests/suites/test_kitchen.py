@@ -14,6 +14,7 @@ from torchrl.objectives import SoftUpdate, TD3Loss
 import lw_torchrl as lw
 from lw_torchrl.cli.main import main
 from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.modules import Concat, MLPDecoder, ObservationFeatures, RoleFeatures, SkillEncoder, transform_of
 from lw_torchrl.record.rollouts import run_recorded
 from lw_torchrl.suites import check_suite
 
@@ -30,7 +31,14 @@ def letters(texts):
     return torch.tensor([[float(text.count(letter)) for letter in "aeioust"] for text in texts])
 
 
-SMALL = {"width": 32, "depth": 1, "latent_size": 4, "text_encoder": letters}
+def small(kind="differences", encoder="skill_encoder", actions=9):
+    """The parts of a small actor, whose skill texts are counted letters."""
+    return {
+        "features": ObservationFeatures(kind, layout=KITCHEN, noise=0.05),
+        encoder: SkillEncoder(4),
+        "decoder": MLPDecoder(width=32, depth=1, actions=actions),
+        "text_encoder": letters,
+    }
 
 
 @pytest.fixture
@@ -105,16 +113,21 @@ def test_plans_about_openings_are_read_from_every_format():
 
 
 def actors(features):
-    yield lw.PlanConditionedActor(PLANS, features=features, roles=features == "opening", **SMALL)
-    if features != "opening":
-        yield lw.DescriptorConditionedActor([MICROWAVE, CABINET], features=features, **SMALL)
+    yield lw.PlanConditionedActor(PLANS, **small(features))
+    if features == "opening":
+        plans = lw.canonical_plans(PLANS)
+        yield lw.PlanConditionedActor(
+            plans, **small() | {"features": Concat(ObservationFeatures("opening", layout=KITCHEN), RoleFeatures(plans))}
+        )
+    else:
+        yield lw.DescriptorConditionedActor([MICROWAVE, CABINET], **small(features, "task_encoder"))
 
 
 @pytest.mark.parametrize("features", ["raw", "differences", "relative", "opening", "both"])
 def test_actors_give_nine_numbers(features, env, tmp_path):
     for actor in actors(features):
         state = env.reset()
-        state = state if actor.plans is None else actor.transform()(state)
+        state = state if actor.plans is None else transform_of(actor)(state)
         assert actor.eval()(state.clone())["action"].shape == (4, 9)
         lw.save_actor(actor, tmp_path / "actor.safetensors")
         again = lw.load_actor(tmp_path / "actor.safetensors", text_encoder=letters).eval()
@@ -139,9 +152,10 @@ def test_what_needs_a_displacement_says_so():
         lw.ScriptedSkillActor(lw.Plans([plan]), skills={go.text: go})
     with pytest.raises(ValueError, match=f"RandomYaw: {says}"):
         lw.RandomYaw(0.3, plans=PLANS)
-    trained = lw.PlanConditionedActor(lw.load_plans("MT10"), roles=True, features="opening", text_encoder=letters)
+    plans = lw.canonical_plans(lw.load_plans("MT10"))
+    trained = lw.PlanConditionedActor(plans, features=RoleFeatures(plans))
     with pytest.raises(ValueError, match=f"TransferredActor: {says}"):
-        lw.modules.TransferredActor(trained, PLANS)
+        lw.modules.TransferredActor(trained, lw.canonical_plans(PLANS))
 
 
 @pytest.fixture(scope="module")
@@ -176,8 +190,8 @@ def test_a_policy_learns_from_demonstrations_and_acts(demos, replay):
 
 @pytest.mark.slow
 def test_torchrl_s_losses_step(replay):
-    actor = lw.PlanConditionedActor(PLANS, **SMALL)
-    qvalue = lw.PlanConditionedQValue(PLANS, **SMALL)
+    actor = lw.PlanConditionedActor(PLANS, **small())
+    qvalue = lw.PlanConditionedQValue(PLANS, text_encoder=letters, width=32, depth=1)
     loss = TD3Loss(actor, qvalue, bounds=(-1.0, 1.0))
     loss.make_value_estimator(gamma=0.9)
     targets, optimizer = SoftUpdate(loss, eps=0.99), torch.optim.AdamW(loss.parameters(), lr=1e-3)
@@ -207,7 +221,7 @@ def places_of_bodies(chunks, scene):
 
 @pytest.mark.slow
 def test_a_recording_shows_the_kitchen_as_it_moved(tmp_path):
-    actor = lw.PlanConditionedActor(PLANS, **SMALL)
+    actor = lw.PlanConditionedActor(PLANS, **small())
     (one,) = run_recorded(actor, "kitchen/microwave", suite=SUITE, seed=7, max_steps=10)
     with lw.RerunLogger(tmp_path / "kitchen.rrd") as logger:
         assert lw.log_rollout(logger, one.steps, PLANS, seed=7, suite=SUITE) == "kitchen/microwave-0"
@@ -235,7 +249,7 @@ def test_chance_acts_in_it(tmp_path):
 
 @pytest.mark.slow
 def test_the_command_line_evaluates_and_records_it(tmp_path, capsys):
-    lw.save_actor(lw.PlanConditionedActor(PLANS, width=8), tmp_path / "kitchen.safetensors")
+    lw.save_actor(lw.PlanConditionedActor(PLANS), tmp_path / "kitchen.safetensors")
     where = ["--suite", f"{__name__}:SUITE", "--episodes", "1", "--max-steps", "3", "--out", str(tmp_path / "out")]
     main(["evaluate", str(tmp_path / "kitchen.safetensors"), *where])
     assert "kitchen/slide-cabinet" in capsys.readouterr().out

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from tensordict.nn import TensorDictSequential
 from torchrl.envs import Compose, TransformedEnv, check_env_specs
 from torchrl.objectives import TD3Loss
 from toy_suite import SKILLS, TASKS, TOY, ToyEngine, make_toy_suite
@@ -14,13 +15,37 @@ from toy_suite import SKILLS, TASKS, TOY, ToyEngine, make_toy_suite
 import lw_torchrl as lw
 from lw_torchrl.language.layout import METAWORLD, Slot
 from lw_torchrl.language.skills import ScriptedSkill
-from lw_torchrl.modules import ActorEnsemble, TransferredActor
+from lw_torchrl.modules import (
+    ActorEnsemble,
+    Concat,
+    FocusFeatures,
+    MLPDecoder,
+    ObservationFeatures,
+    RoleFeatures,
+    SkillEncoder,
+    TransferredActor,
+    transform_of,
+)
 from lw_torchrl.record.verdict import action_names
 from lw_torchrl.suites import SUITES, Suite, check_suite, find_suite, load_suite
 
 SUITE = make_toy_suite()
+CANONICAL = lw.canonical_plans(SUITE.plans)
 FEATURES = ["raw", "differences", "relative", "both"]
-SMALL = {"width": 16, "depth": 1, "latent_size": 4, "encoder_width": 8}
+
+
+def small(actions=7):
+    return {
+        "skill_encoder": SkillEncoder(4, width=8),
+        "decoder": MLPDecoder(width=16, depth=1, actions=actions),
+    }
+
+
+def role_actor(plans, actions=7):
+    """A policy that knows a step by its role, and sees the opening of the gripper."""
+    plans = lw.canonical_plans(plans)
+    seen = Concat(ObservationFeatures("opening", layout=plans.layout), RoleFeatures(plans))
+    return lw.PlanConditionedActor(plans, features=seen, **small(actions))
 
 
 def pressing(task):
@@ -76,24 +101,27 @@ def test_behaviours_by_name_follow_the_suite_s_plans(tmp_path):
 
 @pytest.mark.parametrize("features", FEATURES)
 def test_every_feature_has_the_layout_s_width(features, demos):
-    replay = lw.LanguageWorldExperienceReplay(demos.root, transform=lw.QAFTransform(SUITE.plans))
-    actor = lw.PlanConditionedActor(SUITE.plans, features=features, focus=True, swap_unmentioned=0.5, **SMALL)
+    plans = SUITE.plans
+    transform = Compose(lw.QAFTransform(plans), lw.transforms.SwapUnmentioned(plans, 0.5))
+    replay = lw.LanguageWorldExperienceReplay(demos.root, transform=transform)
+    seen = ObservationFeatures(features, layout=TOY)
+    actor = lw.PlanConditionedActor(plans, features=Concat(seen, FocusFeatures(plans)), **small())
     lw.BehavioralCloningTrainer(
         actor, replay, lw.BehavioralCloningConfig(steps=2, batch_size=8), progress=False
     ).train()  # fmt: skip
     things = 10  # pairs of hand, three blocks and goal
     widths = {"raw": 16, "relative": 9 * things, "differences": 9 * things + 2, "both": 16 + 9 * things + 2}
-    assert actor.encoder.features.width == widths[features]
+    assert seen.width == widths[features]
     assert actor.spec["action"].shape == (7,)
 
 
 def test_a_policy_is_trained_saved_evaluated_and_recorded(demos, tmp_path):
     plans = lw.Plans([pressing(task) for task in TASKS.values()])
-    actor = lw.PlanConditionedActor(plans, features="opening", roles=True, **SMALL)
+    actor = role_actor(plans)
     replay = lw.LanguageWorldExperienceReplay(
         demos.root,
         sampler=lw.TaskBalancedSampler(),
-        transform=Compose(actor.transform(), lw.RandomYaw(0.3, plans=actor.plans)),
+        transform=Compose(transform_of(actor), lw.RandomYaw(0.3, plans=actor.plans)),
     )
     config = lw.BehavioralCloningConfig(steps=300, batch_size=60, learning_rate=1e-2)
     lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()
@@ -141,7 +169,7 @@ def test_failures_are_attributed_by_the_suite_s_own_skills():
 
 def test_evaluators_and_critics_read_the_layout(demos):
     evaluator = lw.StateQueryEvaluator(SUITE.plans, width=8)
-    actor = lw.PlanConditionedActor(SUITE.plans, evaluator=evaluator, answers="tanh", **SMALL)
+    actor = TensorDictSequential(evaluator, lw.PlanConditionedActor(SUITE.plans, **small()))
     env = lw.LanguageWorldEnv("toy", suite=SUITE)
     state = actor(env.reset())
     assert state["action"].shape == (2, 7)
@@ -153,36 +181,34 @@ def test_evaluators_and_critics_read_the_layout(demos):
 
 def test_a_policy_of_meta_world_acts_in_it():
     """Without training it only shows that sizes, units and signs are turned."""
-    trained = lw.PlanConditionedActor(lw.load_plans("MT10"), features="opening", roles=True, **SMALL).eval()
-    moved = TransferredActor(ActorEnsemble([trained, trained]), SUITE.plans)
+    trained = role_actor(lw.load_plans("MT10"), 4).eval()
+    moved = TransferredActor(ActorEnsemble([trained, trained]), CANONICAL)
     given = torch.tensor([[0.5, -1.0, 0.2, 0.7], [0.0, 0.0, 0.0, 0.2]])
-    turned = moved.turned(given)
+    turned = moved.converted(given)
     torch.testing.assert_close(turned[0], torch.tensor([0.0, 0.1, -0.2, 0.04, 0.0, 0.0, -1.0]))
     assert turned[1, 6] == 1.0  # below 0.3 it opens, and -1 closes here
-    faster = TransferredActor(trained, SUITE.plans, speed=6.0).turned(given)[0]
+    faster = TransferredActor(trained, CANONICAL, speed=6.0).converted(given)[0]
     torch.testing.assert_close(faster, torch.tensor([0.0, 0.6, -1.0, 0.24, 0.0, 0.0, -1.0]))
     result = lw.evaluate(moved, tasks="toy", suite=SUITE, episodes_per_task=1, seed=3, progress=False)
     assert set(result.success_once) == set(TASKS)
 
 
 def test_what_does_not_carry_over_is_named():
-    trained = lw.PlanConditionedActor(lw.load_plans("MT10"), **SMALL)
-    with pytest.raises(ValueError, match="features='differences' of layout 'metaworld' do not carry over to 'toy'"):
+    trained = lw.PlanConditionedActor(lw.load_plans("MT10"))
+    with pytest.raises(ValueError, match="features 'differences' of layout 'metaworld' do not transfer to 'toy'"):
         TransferredActor(trained, SUITE.plans)
-    with pytest.raises(TypeError, match="with_plans is for policies with plans"):
-        TransferredActor(lw.DescriptorConditionedActor("MT10", **SMALL), SUITE.plans)
-    carries = lw.PlanConditionedActor(lw.load_plans("MT10"), features="opening", roles=True, **SMALL)
+    with pytest.raises(TypeError, match="needs an actor that follows plans"):
+        TransferredActor(lw.DescriptorConditionedActor("MT10"), SUITE.plans)
     with pytest.raises(ValueError, match=r"speed must be above 0, got 0\.0"):
-        TransferredActor(carries, SUITE.plans, speed=0.0)
+        TransferredActor(role_actor(lw.load_plans("MT10"), 4), CANONICAL, speed=0.0)
 
 
 def test_a_transferred_policy_is_saved(tmp_path):
-    trained = lw.PlanConditionedActor(lw.load_plans("MT10"), features="opening", roles=True, **SMALL).eval()
-    moved = TransferredActor(trained, SUITE.plans, speed=1.5).eval()
+    moved = TransferredActor(role_actor(lw.load_plans("MT10"), 4), CANONICAL, speed=1.5).eval()
     lw.save_actor(moved, tmp_path / "moved.safetensors")
     again = lw.load_actor(tmp_path / "moved.safetensors").eval()
     env = lw.LanguageWorldEnv("toy", suite=SUITE)
-    state = again.transform()(env.reset())
+    state = transform_of(again)(env.reset())
     assert torch.equal(again(state.clone())["action"], moved(state.clone())["action"])
     assert (again.layout, again.trained, again.speed) == (TOY, METAWORLD, 1.5)
     env.close()
@@ -320,7 +346,7 @@ def test_a_number_is_one_thing(change, says):
 
 
 def td3(plans):
-    actor, critic = lw.PlanConditionedActor(plans, **SMALL), lw.PlanConditionedQValue(plans, width=8)
+    actor, critic = lw.PlanConditionedActor(plans, **small()), lw.PlanConditionedQValue(plans, width=8)
     return TD3Loss(actor, critic, bounds=(-1.0, 1.0))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import lw_torchrl as lw
+from lw_torchrl.modules import Concat, MLPDecoder, ObservationFeatures, RoleFeatures
 from lw_torchrl.suites import check_suite
 
 pytestmark = pytest.mark.slow
@@ -65,7 +66,9 @@ def test_plans_with_scripted_skills_succeed(task, suite):
 
 
 def test_the_example_runs_a_policy_of_meta_world(example, tmp_path):
-    actor = lw.PlanConditionedActor(lw.load_plans("MT10"), roles=True, features="opening", width=8)
+    plans = lw.canonical_plans(lw.load_plans("MT10"))
+    features = Concat(ObservationFeatures("opening"), RoleFeatures(plans))
+    actor = lw.PlanConditionedActor(plans, features=features, decoder=MLPDecoder(width=8))
     lw.save_actor(actor, tmp_path / "policy.safetensors")
     options = ["--episodes", "1", "--steps", "5", "--arms", "Panda", "IIWA"]
     done = subprocess.run(
