@@ -191,7 +191,9 @@ class ImitationRun(Run):
             trainer: BehavioralCloningTrainer | StackedBehavioralCloning
             if targets:
                 replays = [
-                    self._replay(parts, work, actor, roots, CoLearningSampler(target, exact=True), episodes=[None, {target: 1}])
+                    self._replay(
+                        parts, work, actor, roots, CoLearningSampler(target, exact=True), episodes=[None, {target: 1}]
+                    )
                     for target, actor in zip(targets, actors, strict=True)
                 ]
                 trainer = StackedBehavioralCloning(actors, replays, config, **options)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lw_torchrl.training.behavioral_cloning import bc_loss
 from torch import Tensor
 from torchrl.objectives import CQLLoss, IQLLoss, LossModule, TD3BCLoss
 
@@ -28,6 +27,7 @@ from lw_torchrl.modules.registry import find_method, make_policy
 from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
 from lw_torchrl.training import OfflineConfig, OfflineTrainer
 from lw_torchrl.training.checkpoint import check_same_description
+from lw_torchrl.training.cloning import bc_loss
 from lw_torchrl.transforms import QAFTransform
 
 CONDITIONS: Mapping[str, str] = {"pcbc": "plan", "dc": "description", "one-hot": "one-hot"}

@@ -16,6 +16,7 @@ from lw_torchrl.data import BEHAVIOURS, EpisodeFilter
 from lw_torchrl.data.rewards import RewardName
 from lw_torchrl.data.selection import Label
 from lw_torchrl.language.tasks import MT10
+from lw_torchrl.training.cloning import BehavioralCloningConfig
 
 
 @dataclass(frozen=True)

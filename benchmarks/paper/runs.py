@@ -181,7 +181,9 @@ def execute_run(
         return result
 
 
-def kept_policy(file: Path, described: dict[str, Any], train: Callable[[Path], Mapping[str, Any]]) -> TensorDictModuleBase:
+def kept_policy(
+    file: Path, described: dict[str, Any], train: Callable[[Path], Mapping[str, Any]]
+) -> TensorDictModuleBase:
     """The policy of a file, which must say what is ``described``; if there is none, it is trained and saved first.
 
     ``train`` is given the checkpoint to use meanwhile; it returns arguments of :func:`~lw_torchrl.save_actor`.

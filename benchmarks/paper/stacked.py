@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Unpack
+from typing import Unpack
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -17,8 +17,8 @@ from lw_torchrl._devices import place
 from lw_torchrl.data.replay_checks import check_replay
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.modules.features import Features
-from lw_torchrl.training.behavioral_cloning import BehavioralCloningConfig, make_optimizer
 from lw_torchrl.training.checkpoint import check_can_be_saved, text_vectors
+from lw_torchrl.training.cloning import BehavioralCloningConfig, make_optimizer
 from lw_torchrl.training.descriptions import describe_data, describe_replay
 from lw_torchrl.training.loop import ReplayState, Training, TrainingOptions, make_schedule
 from lw_torchrl.training.normalization import check_contacts, fit_normalization

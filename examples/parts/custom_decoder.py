@@ -1,6 +1,7 @@
 """A custom decoder: any module from latent and features to an action. It is saved, and loaded in a new process."""
 
 import torch
+
 from lw_torchrl import PlanConditionedActor, load_actor, load_plans, save_actor
 
 

@@ -1,6 +1,5 @@
 """A learned evaluator in front of a policy: it answers the conditions, and one loss trains both."""
 
-import torch
 from tensordict.nn import TensorDictSequential
 
 import lw_torchrl as lw
