@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lw_torchrl._files import AnyPath, locked
 from lw_torchrl._tensor_files import pop_state
@@ -19,9 +19,15 @@ from lw_torchrl.training.checkpoint import (
     copy_tensors,
     read_file,
     short_message,
+    text_vectors,
     training_file,
     write_file,
 )
+
+
+def contents_of(module: nn.Module) -> dict[str, Tensor]:
+    """Return the tensors that a file holds of a module: weights by name, and the vectors of texts."""
+    return {**module.state_dict(keep_vars=True), **text_vectors(module)}
 
 
 class CheckpointFiles:
@@ -61,15 +67,15 @@ class CheckpointFiles:
         device: torch.device,
         tensors: Mapping[str, Tensor],
         state: Any,
-        part: Mapping[str, Tensor],
+        part: nn.Module | None,
     ) -> None:
-        """Write ``tensors`` and ``state``, then the tensors of ``part``. Earlier files are replaced whole."""
+        """Write ``tensors`` and ``state``, then the policy or evaluator ``part``. Earlier files are replaced whole."""
         if self.checkpoint is None or self.state is None:
             return
         write_file(self.state, "training", {**description, "device": device.type}, tensors, state)
         self._known = self._version()
-        if self.part is not None:
-            write_file(self.checkpoint, self.part, description, part)
+        if self.part is not None and part is not None:
+            write_file(self.checkpoint, self.part, description, contents_of(part))
 
     def exist(self) -> bool:
         """Return whether there is a state; raise :class:`ValueError` if there is only a policy, which would be lost."""

@@ -16,19 +16,14 @@ from lw_torchrl._checks import Count, check_int, checked
 from lw_torchrl._devices import CPU
 from lw_torchrl._files import AnyPath
 from lw_torchrl._progress import Progress
-from lw_torchrl.training.checkpoint import check_finite, text_vectors
-from lw_torchrl.training.checkpoint_files import CheckpointFiles
+from lw_torchrl.training.checkpoint import check_finite
+from lw_torchrl.training.checkpoint_files import CheckpointFiles, contents_of
 from lw_torchrl.training.interrupts import interrupts_between_steps
 from lw_torchrl.training.minibatches import Minibatches
-from lw_torchrl.training.optimizer import rate_factor, set_learning_rates
+from lw_torchrl.training.optimizer import check_loss, rate_factor, set_learning_rates
 
 READ_EVERY = 100
 """Steps between two readings of the losses; only a reading waits for the device."""
-
-
-def contents_of(module: nn.Module) -> dict[str, Tensor]:
-    """Return the tensors that a file holds of a module: weights by name, and the vectors of texts."""
-    return {**module.state_dict(keep_vars=True), **text_vectors(module)}
 
 
 class TrainingOptions(TypedDict, total=False):
@@ -50,26 +45,21 @@ class Training:
             "constant", and ``max_grad_norm`` where the training has them.
         checkpoint: the file to write the trained policy to, "mt10.safetensors". The training state is written next to
             it, "mt10.training.safetensors". If the state exists, training resumes from it.
-        evaluate: returns numbers to log as ``evaluation/NAME``, for example the success rate on held-out seeds. The
-            networks are in eval mode.
-        evaluate_every: call ``evaluate`` every N steps, and after the last.
+        evaluate: returns numbers to log as ``evaluation/NAME``, for example the success rate on held-out seeds.
+        evaluate_every: call ``evaluate`` every N steps, and after the last, with the networks in eval mode.
         logger: a TorchRL logger, which gets the mean losses of each 100 steps as ``train/NAME``.
         progress, title: whether to show a progress bar, and its title.
 
     Attributes:
-        module: holds everything that is trained.
-        networks: are in train mode while training runs and in eval mode afterwards.
-        device: the device of the networks.
+        module, optimizer: hold everything that is trained.
+        networks, device: are in train mode while training runs and in eval mode afterwards; and their device.
         minibatches: one for each buffer.
-        optimizer: see :func:`~lw_torchrl.training.optimizer.make_optimizer`.
         description: describes the training as JSON; it only resumes from a training state of the same description.
         part: what ``checkpoint`` is, "actor" or "evaluator"; None if it is the training state itself.
-        steps: the number of minibatches so far.
-        last: the means of the latest 100 steps, by name.
+        steps, last: the number of minibatches so far, and the means of the latest 100, by name.
 
     Warns:
-        UserWarning: the checkpoint was written on another kind of device, or under other versions of torch, say.
-            Training resumes with the same minibatches, but not bit for bit.
+        UserWarning: it resumes, but not bit for bit: on another kind of device, or with another version of torch, say.
 
     Raises:
         ValueError: the checkpoint is damaged, or of another architecture, config or dataset; a loss or weight is NaN.
@@ -122,16 +112,15 @@ class Training:
         return values["loss"]
 
     def update(self, batch: Any) -> dict[str, Tensor]:
-        """Update the parameters and return the values to log, detached. The loss of M models has shape (M,).
+        """Update the parameters and return the values to log, detached: everything that the device does in a step.
 
-        This is everything that the device does in a step. On a GPU it reads no value back, and no shape depends on
-        data, so a CUDA graph can capture it.
+        On a GPU no value is read back, and no shape depends on data, so a CUDA graph can capture it.
         """
         values = dict(self.losses(batch))
         terms = [value for name, value in values.items() if name.startswith("loss")]
         values["loss"] = loss = terms[0] if len(terms) == 1 else torch.stack(terms).sum(0)
         if self.device == CPU:
-            self._check_loss(loss.detach(), self.steps)
+            check_loss(loss.detach(), self.steps, self.config)
         self.optimizer.zero_grad()
         loss.sum().backward()
         self.clip_gradients()
@@ -148,30 +137,26 @@ class Training:
     def after_update(self) -> None:
         """Do what follows the optimizer's step, for example update target networks."""
 
-    def parameters(self) -> dict[str, Tensor]:
-        """Return the trained parameters by name."""
-        return dict(self.module.named_parameters())
-
-    def contents(self) -> dict[str, Tensor]:
-        """Return the tensors to resume from: weights by name, and the vectors of texts."""
-        return contents_of(self.module)
-
     @property
     def saved(self) -> nn.Module:
         """The policy or evaluator that is written to ``checkpoint``."""
         return self.module
 
-    def run(self, until: int | None = None) -> Tensor:
-        """Train to the last step, or to step ``until``. Ctrl-C saves a checkpoint after the current step and stops.
+    def parameters(self) -> dict[str, Tensor]:
+        """Return the trained parameters by name."""
+        return dict(self.module.named_parameters())
 
-        Returns:
-            The losses of the latest 100 steps of this call, (n,) or (n, M) float32 on the CPU.
-        """
+    def contents(self) -> dict[str, Tensor]:
+        """Return the tensors to resume from."""
+        return contents_of(self.module)
+
+    def run(self, until: int | None = None) -> Tensor:
+        """Train as :meth:`train` does, and return the latest 100 losses, (n,) or (n, M) float32 on the CPU."""
         total = self.config.steps
         if until is not None and check_int("until", until, minimum=1) > total:
             raise ValueError(f"until must be at most the configuration's steps, {total}, got {until}")
         self._values.clear()
-        self._train_mode(True)
+        self._set_training(True)
         last = total if until is None else until
         with self._files.locked(), interrupts_between_steps() as interrupt:
             with Progress(self.title, total, "step", initial=self.steps, show=self.progress) as bar:
@@ -184,46 +169,43 @@ class Training:
             if interrupt.requested:
                 self._read_losses()
                 self.save()
-        self._train_mode(False)
+        self._set_training(False)
         return self._read_losses()
 
     def train(self, until: int | None = None) -> float:
-        """Train to the last step, from wherever training stands; a second Ctrl-C stops at once, without a checkpoint.
+        """Train to the last step and return the mean of the latest 100 losses; NaN if no step was left.
+
+        Ctrl-C saves a checkpoint after the current step and stops; a second one stops at once.
 
         Args:
             until: stop after this many steps in all, with a checkpoint; a later call resumes. None for all steps.
-
-        Returns:
-            The mean loss over the latest 100 steps of this call; NaN if there were none left.
         """
         losses = self.run(until)
         return losses.double().mean().item() if len(losses) else math.nan
 
     def _report(self, bar: Progress, done: bool) -> None:
         """Log, save and evaluate after a step, where it is time."""
-        logs = done or self.steps % READ_EVERY == 0
-        saves = done or self.steps % self.config.checkpoint_every == 0
+        logs, saves = (done or self.steps % every == 0 for every in (READ_EVERY, self.config.checkpoint_every))
         if logs or saves:
             self._read_losses()
         if logs:
-            rate = self.optimizer.param_groups[0]["initial_lr"] * rate_factor(self.config, self.steps)
-            self._log("train", {**self.last, "learning_rate": rate})
+            self._log("train", {**self.last, "learning_rate": float(self.optimizer.param_groups[0]["lr"])})
             bar.note(**{name: f"{value:.4f}" for name, value in self.last.items() if "loss" in name})
         if saves:
             self.save()
         if self.evaluate is not None and self.evaluate_every and (done or self.steps % self.evaluate_every == 0):
-            self._train_mode(False)
+            self._set_training(False)
             self._log("evaluation", self.evaluate())
-            self._train_mode(True)
+            self._set_training(True)
 
     def _log(self, group: str, values: Mapping[str, float]) -> None:
         if self.logger is not None:
             for name, value in values.items():
                 self.logger.log_scalar(f"{group}/{name}", value, step=self.steps)
 
-    def _train_mode(self, mode: bool) -> None:
+    def _set_training(self, training: bool) -> None:
         for network in self.networks:
-            network.train(mode)
+            network.train(training)
 
     def _read_losses(self) -> Tensor:
         """Wait for the device, set ``last``, and return the latest losses; raise ValueError if one is not finite."""
@@ -233,18 +215,8 @@ class Training:
         read = {name: torch.stack([values[name] for values in self._values]).cpu() for name in names}
         self.last = {name: value.double().mean().item() for name, value in read.items()}
         for step, loss in enumerate(read["loss"], self.steps - len(self._values)):
-            self._check_loss(loss, step)
+            check_loss(loss, step, self.config)
         return read["loss"]
-
-    def _check_loss(self, losses: Tensor, step: int) -> None:
-        if losses.isfinite().all():
-            return
-        which = int((~losses.reshape(-1).isfinite()).nonzero()[0])
-        model = f" of actor {which}" if losses.ndim else ""
-        raise ValueError(
-            f"the loss{model} is {losses.reshape(-1)[which].item()} at step {step}: the demonstrations hold NaN, or "
-            f"the learning rate {self.config.learning_rate} is too high"
-        )
 
     def save(self) -> None:
         """Write the checkpoint, if there is one to write. Earlier files are replaced whole."""
@@ -252,7 +224,7 @@ class Training:
             check_finite(self.parameters())
         except ValueError as error:
             raise ValueError(f"{error} after step {self.steps}: the learning rate is too high") from error
-        part = contents_of(self.saved) if self.part else {}
+        part = self.saved if self.part else None
         self._files.write(self.description, self.device, self.contents(), self.state_dict(), part)
 
     def resume(self) -> bool:

@@ -45,3 +45,15 @@ def set_learning_rates(optimizer: torch.optim.Optimizer, factor: float) -> None:
             group["lr"].fill_(rate)
         else:
             group["lr"] = rate
+
+
+def check_loss(losses: Tensor, step: int, config: Any) -> None:
+    """Raise :class:`ValueError` if a loss, () or (M,) of M actors, is not finite."""
+    if losses.isfinite().all():
+        return
+    which = int((~losses.reshape(-1).isfinite()).nonzero()[0])
+    model = f" of actor {which}" if losses.ndim else ""
+    raise ValueError(
+        f"the loss{model} is {losses.reshape(-1)[which].item()} at step {step}: the demonstrations hold NaN, or the "
+        f"learning rate {config.learning_rate} is too high"
+    )
