@@ -60,13 +60,12 @@ def place(module: Any, device: str | torch.device | None) -> torch.device:
 
 
 @contextmanager
-def drawn_on(device: torch.device, state: torch.Tensor) -> Iterator[None]:
-    """Within the block the generators draw from ``state``, the CPU's, which also seeds a device's generator."""
+def seeded(device: torch.device, seed: int) -> Iterator[None]:
+    """Within the block the default generators of the CPU and of a device start at a seed; then they are as before."""
     others = [] if device.type == "cpu" else [device]
     with torch.random.fork_rng(devices=others, device_type=device.type):
-        torch.set_rng_state(state)
+        torch.default_generator.manual_seed(seed)
         if others:
-            seed = int(torch.randint(2**62, ()))
             module = torch.get_device_module(device.type)
             generators = getattr(module, "default_generators", None)  # one for each; manual_seed is of the current one
             (module if generators is None else generators[device.index]).manual_seed(seed)

@@ -9,8 +9,9 @@ import pytest
 import test_offline_trainer as offline
 import torch
 from pretend_device import COPIES, MODULE, PRETEND, WAITS
-from small_training import CONFIG, PLANS, SMALL, assert_same, collect_demos, flat, make_actor
+from small_training import CONFIG, PLANS, assert_same, collect_demos, flat, make_actor, make_descriptor_actor
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from test_losses import LOSSES, make_batch, make_loss, ready, total, trained
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, TransformedEnv
@@ -20,11 +21,14 @@ from benchmarks.paper.stacked import StackedBehavioralCloning
 from lw_torchrl.transforms import FallbackTurns
 
 ACTORS = {
-    "plan": lambda: make_actor(feature_noise=0.0),
-    "noisy plan": lambda: make_actor(feature_noise=0.1, focus=True, swap_unmentioned=0.5),
-    "description": lambda: seeded(lw.DescriptorConditionedActor, "MT10", feature_noise=0.0, **SMALL),
-    "one-hot": lambda: seeded(lw.DescriptorConditionedActor, "MT10", condition="one-hot", feature_noise=0.0, **SMALL),
-    "stochastic": lambda: make_actor(feature_noise=0.0, distribution="normal"),
+    "plan": lambda: make_actor(noise=0.0),
+    "noisy plan": lambda: make_actor(noise=0.1),
+    "description": lambda: make_descriptor_actor(noise=0.0),
+    "one-hot": lambda: make_descriptor_actor(condition="one-hot", noise=0.0),
+    "stochastic": lambda: make_actor(noise=0.0).stochastic("normal"),
+    "evaluator": lambda: TensorDictSequential(
+        seeded(lw.StateQueryEvaluator, PLANS, width=8, depth=1), make_actor(noise=0.0)
+    ),
 }
 SAMPLERS = {
     "balanced": lambda: (lw.TaskBalancedSampler(), None),
@@ -54,7 +58,7 @@ def make_trainer(demos, device, actor="plan", sampler="balanced", turned=False, 
     return lw.BehavioralCloningTrainer(
         ACTORS[actor](),
         make_replay(demos, device, sampler, turned),
-        replace(CONFIG, **config),
+        replace(CONFIG, **config, qaf_anchor=0.5 if actor == "evaluator" else 0.0),
         progress=False,
         checkpoint=checkpoint,
         device=device,
@@ -212,7 +216,7 @@ def test_it_carries_on_bit_for_bit_where_it_was_begun(demos, tmp_path, many):
 
     def everything(trainer):
         own = trainer._parameters if many else weights(trainer)
-        found = flat({"weights": own, "states": [state.state_dict(trainer.steps) for state in trainer.states]})
+        found = flat({"weights": own, "minibatches": [one.state_dict() for one in trainer.minibatches]})
         found |= flat({"optimizer": trainer.optimizer.state_dict()})
         return {key: value.cpu() if isinstance(value, torch.Tensor) else value for key, value in found.items()}
 
@@ -265,7 +269,7 @@ def test_an_evaluation_there_is_the_cpus(kind):
     made = {
         "scripted": lambda: lw.ScriptedSkillActor(PLANS),
         "ensemble": lambda: lw.modules.ActorEnsemble([ACTORS["plan"](), ACTORS["plan"]()]),
-        "evaluator": lambda: seeded(lw.PlanConditionedActor, PLANS, evaluator=Guess(PLANS), **SMALL),
+        "evaluator": lambda: TensorDictSequential(Guess(PLANS), make_actor()),
     }
     actor = made.get(kind, ACTORS.get(kind))()
     options = {"tasks": ["push", "reach"], "episodes_per_task": 2, "seed": 1000, "max_steps": 8, "progress": False}
@@ -390,11 +394,8 @@ def test_any_loss_over_a_buffer_waits_for_nothing_and_is_the_cpus(demos, name):
     WAITS.clear()
     given += [there.step() for _ in range(2)]
     assert WAITS == []
-    for one in given:
-        expected = cpu.step()
-        for key in expected.keys():
-            if expected[key].numel() == 1:
-                assert one[key].item() == pytest.approx(expected[key].item(), rel=1e-5), key
+    for loss in given:
+        assert loss.item() == pytest.approx(cpu.step().item(), rel=1e-5)
 
 
 def test_an_environment_is_where_it_is_put():

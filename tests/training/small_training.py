@@ -44,10 +44,10 @@ def make_actor(seed=0, plans=PLANS, **options):
     return PlanConditionedActor(plans, **make_parts(**options))
 
 
-def make_descriptor_actor(tasks="MT10"):
+def make_descriptor_actor(tasks="MT10", condition="description", **options):
     torch.manual_seed(0)
-    parts = make_parts()
-    return DescriptorConditionedActor(tasks, task_encoder=parts.pop("skill_encoder"), **parts)
+    parts = make_parts(**options)
+    return DescriptorConditionedActor(tasks, condition=condition, task_encoder=parts.pop("skill_encoder"), **parts)
 
 
 class Stopping(BehavioralCloningTrainer):

@@ -36,7 +36,7 @@ def test_the_first_loss_is_the_named_distance_to_the_experts_action(demos, loss_
     config = BehavioralCloningConfig(steps=1, batch_size=8, loss_function=loss_function)
     trainer = make_trainer(demos, config=config, actor=make_actor(noise=0.0))
     with torch.random.fork_rng():
-        torch.manual_seed(0)
+        torch.manual_seed(0)  # step 0 of seed 0
         batch = make_replay(demos).sample(8)
     with torch.no_grad():
         action = trainer.actor(batch.exclude("action"))["action"]

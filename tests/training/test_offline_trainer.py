@@ -157,8 +157,8 @@ def test_a_step_is_the_one_written_by_hand(demos):
     cosine = [0.5 * (1 + math.cos(math.pi * step / CONFIG.steps)) for step in range(CONFIG.steps + 1)]
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: cosine[step])
     with torch.random.fork_rng():
-        torch.manual_seed(CONFIG.seed)
-        for _ in range(CONFIG.steps):
+        for step in range(CONFIG.steps):
+            torch.manual_seed(CONFIG.seed * 1_000_003 + step)
             found = loss(replay.sample(CONFIG.batch_size))
             optimizer.zero_grad()
             (found["loss_actor"] + found["loss_qvalue"]).backward()
