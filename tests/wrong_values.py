@@ -78,6 +78,7 @@ WRONG: dict[str, list[Any]] = {
     ],
     "float | Iterable[float]": ["0.1", -1.0, math.nan, math.inf, [], ["0.1"], [math.nan], None],
     "Callable[[FinishedEpisode], object]": FUNCTION,
+    "Callable[[TensorDictBase], Mapping[str, Tensor]]": FUNCTION,
     "Callable[[int, tuple[bool, ...]], object]": FUNCTION,
     "Literal['vectorized', 'metaworld'] | Callable[..., Engine]": [3, "mujoco", None, []],
     "tuple[int, int]": [3, (0,), (2, 1), ("0", 1), (0, 0), "01", (0.5, 2)],

@@ -20,7 +20,7 @@ from lw_torchrl.modules.policy import layout_of, plans_of, with_plans
 
 @dataclass(kw_only=True)
 class Acting:
-    """How the policy acts."""
+    """Options of a policy that acts: its plans, its evaluator, noise and seed."""
 
     plans: Annotated[options.PlanSources, arg(help=f"plans to carry out instead of the policy's: {options.PLANS}")] = ()
     suite: options.SuiteName = None

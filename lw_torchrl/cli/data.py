@@ -230,6 +230,8 @@ class Import:
     json: options.Json = False
 
     def run(self) -> Output:
+        from lw_torchrl.data.exchange import MissingDataWarning
+
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             about: dict[str, Any] = {"format": self.format, "task": self.task, "behaviour": self.behaviour}
@@ -237,6 +239,6 @@ class Import:
             dataset = lw.import_dataset(self.source, self.out, suite=suite, episodes_per_task=self.episodes, **about)
         rows = [{"task": task, "success": rate} for task, rate in dataset.success_rate.items()]
         output = Output(self.json).table("tasks", rows, _SUCCESS)
-        lacking = [str(one.message) for one in caught if str(one.message).startswith("source: ")]
+        lacking = [str(one.message) for one in caught if issubclass(one.category, MissingDataWarning)]
         output.show("lacking", lacking, "\n".join(lacking) or None)
         return _show_dataset(output, dataset)

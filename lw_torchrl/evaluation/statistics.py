@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number, of the rates themselves, and the ends of its interval, None where a single seed gives none.
+    """An estimate and its interval; the ends are None for a single seed, which gives no interval.
 
     Example:
         >>> print(Estimate(0.5, 0.41, 0.6))
@@ -43,12 +43,12 @@ class Estimate:
         return f"{self.value:.3f}" + ("" if self.low is None else f" [{self.low:.3f}, {self.high:.3f}]")
 
     def to_json(self) -> dict[str, float | None]:
-        """As a mapping of plain numbers."""
+        """Return a mapping of plain numbers."""
         return asdict(self)
 
 
 def check_rates(argument: str, given: Any) -> Array:
-    """``given`` as a float64 array (seeds, tasks) of rates in [0, 1], NaN refused."""
+    """Return ``given`` as a float64 array (seeds, tasks) of rates in [0, 1]; refuse NaN."""
     try:
         rates = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -62,7 +62,7 @@ def check_rates(argument: str, given: Any) -> Array:
 
 @checked
 def mean_rate(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
-    """The mean success rate over seeds and tasks of ``rates`` (seeds, tasks), in [0, 1], with its interval.
+    """Return the mean success rate over seeds and tasks of ``rates`` (seeds, tasks), in [0, 1], with its interval.
 
     Example:
         >>> print(mean_rate([[1.0, 0.2], [0.9, 0.3], [1.0, 0.1]]))
@@ -73,7 +73,7 @@ def mean_rate(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
 
 @checked
 def interquartile_mean(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
-    """The mean of the middle half of all ``rates`` (seeds, tasks), in [0, 1]: a quarter is cut at each end.
+    """Return the mean of the middle half of all ``rates`` (seeds, tasks), in [0, 1]: a quarter is cut at each end.
 
     Example:
         >>> print(interquartile_mean([[1.0, 0.2, 0.6, 0.7], [0.9, 0.3, 0.5, 0.9], [1.0, 0.1, 0.4, 0.8]]))
@@ -91,8 +91,9 @@ def interquartile_mean(rates: ArrayLike, *, confidence: float = 0.95) -> Estimat
 
 @checked
 def mean_difference(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> Estimate:
-    """The mean over tasks of how much higher method X's rate is than Y's on the same task; ``x`` and ``y`` are
-    (seeds, tasks), in [0, 1].
+    """Return the mean over tasks of method X's rate minus Y's on the same task.
+
+    ``x`` and ``y`` are (seeds, tasks), in [0, 1].
 
     Example:
         >>> print(mean_difference([[1.0, 0.5], [0.9, 0.4]], [[0.6, 0.3], [0.7, 0.3]]))
@@ -103,8 +104,9 @@ def mean_difference(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> 
 
 @checked
 def probability_of_improvement(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> Estimate:
-    """How likely a seed of method X beats one of Y on a task drawn at random; a tie counts half. ``x`` and ``y`` are
-    (seeds, tasks), in [0, 1].
+    """Return the probability that a seed of method X beats one of Y on a random task; a tie counts half.
+
+    ``x`` and ``y`` are (seeds, tasks), in [0, 1].
 
     Example:
         >>> probability_of_improvement([[1.0, 0.5], [0.9, 0.3]], [[0.6, 0.3], [0.7, 0.3]]).value
@@ -118,8 +120,9 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, *, confidence: float 
 
 @checked
 def count_solved(rates: ArrayLike, threshold: float = 0.8) -> int:
-    """How many tasks' mean over seeds of ``rates`` (seeds, tasks), in [0, 1], is at least ``threshold``, in (0, 1];
-    rounding of the mean does not matter.
+    """Return the number of tasks whose mean over seeds is at least ``threshold``, in (0, 1], up to rounding.
+
+    ``rates`` are (seeds, tasks), in [0, 1].
 
     Example:
         >>> count_solved([[0.8, 0.2, 1.0], [0.8, 0.9, 0.6]])
@@ -131,7 +134,7 @@ def count_solved(rates: ArrayLike, threshold: float = 0.8) -> int:
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """The 95 % Wilson score interval of a success rate over the episodes of one policy."""
+    """Return the 95 % Wilson score interval of a success rate over the episodes of one policy."""
     rate, z = successes / trials, 1.96
     center = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
     half = z / (1 + z**2 / trials) * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2))
@@ -148,14 +151,14 @@ def _pair(x: ArrayLike, y: ArrayLike) -> list[Array]:
 def _seed_interval(
     statistic: Callable[..., Any], methods: list[Array], confidence: float, *, least: float, most: float = 1.0
 ) -> Estimate:
-    """The statistic of the methods' rates and its interval, cut to what the statistic can be."""
+    """Return the statistic of the methods' rates and its interval, within the range of the statistic."""
     from scipy.special import stdtrit
 
     if not 0 < confidence < 1:
         raise ValueError(f"confidence must be in (0, 1), got {confidence!r}")
     value = float(statistic(*methods))
     if min(len(rates) for rates in methods) == 1:
-        return Estimate(value)  # one seed says nothing of another
+        return Estimate(value)  # one seed says nothing about others
     variances = np.zeros(len(methods))  # over the seeds of each method: each is left out once
     for k, rates in enumerate(methods):
         without = [np.delete(rates, seed, axis=0) for seed in range(len(rates))]

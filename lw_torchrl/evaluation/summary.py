@@ -14,12 +14,12 @@ from lw_torchrl.evaluation import statistics
 from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.evaluation.statistics import Array, Estimate
 
-_SETTINGS = ("episodes_per_task", "noise_scale", "max_steps")  # what rates must share to be averaged
+_SETTINGS = ("episodes_per_task", "noise_scale", "max_steps")  # rates are averaged only if these are equal
 
 
 @dataclass(frozen=True)
 class TaskSummary:
-    """One task over the seeds: the mean, the least and the greatest success rate."""
+    """The mean, the smallest and the largest success rate of a task over the seeds."""
 
     mean: float
     min: float
@@ -34,7 +34,7 @@ class Summary:
         tasks, seeds: their names, T and n of them.
         rates: n rows of T success rates at any step.
         mean, iqm: the mean and the interquartile mean over seeds and tasks, with 95 % intervals over the seeds.
-        solved: how many tasks' mean over seeds is at least ``threshold``.
+        solved: the number of tasks whose mean over seeds is at least ``threshold``.
         threshold: 0.8.
     """
 
@@ -64,7 +64,7 @@ class Summary:
         return dict(zip(self.seeds, self.array.mean(1).tolist(), strict=True))
 
     def to_json(self) -> dict[str, Any]:
-        """As plain numbers, lists and mappings."""
+        """Return plain numbers, lists and mappings."""
         return {
             "seeds": list(self.seeds),
             "mean": self.mean.to_json(),
@@ -73,8 +73,8 @@ class Summary:
             "threshold": self.threshold,
             "by_seed": self.by_seed,
             "tasks": {
-                task: {**asdict(found), "rates": rates}
-                for (task, found), rates in zip(self.per_task.items(), self.array.T.tolist(), strict=True)
+                task: {**asdict(summary), "rates": rates}
+                for (task, summary), rates in zip(self.per_task.items(), self.array.T.tolist(), strict=True)
             },
         }
 
@@ -98,12 +98,12 @@ def summarize_rates(
     threshold: float = 0.8,
     confidence: float = 0.95,
 ) -> Summary:
-    """Summarize success rates, for those that come from elsewhere than one evaluation per seed.
+    """Summarize success rates that do not come from one evaluation per seed.
 
     Args:
         rates: task to its n success rates, one per training seed, in [0, 1].
         seeds: the seeds' names; by default 0 to n - 1.
-        threshold: a task counts as solved from here.
+        threshold: the smallest mean rate of a solved task.
         confidence: of the intervals, in (0, 1).
 
     Example:
@@ -113,7 +113,7 @@ def summarize_rates(
         >>> summary.per_task["push"].min
         0.5
     """
-    counts = {task: len(found) for task, found in rates.items()}
+    counts = {task: len(listed) for task, listed in rates.items()}
     if not counts or min(counts.values()) == 0:
         raise ValueError(f"rates must hold at least one task, each with at least one rate, got {dict(rates)!r}")
     if len(set(counts.values())) > 1:
@@ -144,7 +144,7 @@ def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResul
     Raises:
         ValueError: no results, one evaluation given twice, or evaluations that differ in tasks, plans,
             episodes_per_task, noise_scale or max_steps.
-        TypeError: one is no :class:`EvaluationResult`.
+        TypeError: a result is not an :class:`EvaluationResult`.
 
     Example:
         >>> from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, summarize

@@ -1,4 +1,4 @@
-"""What is drawn of a MuJoCo model: a mesh for each body, once a recording; each episode moves them in its own views."""
+"""Draw MuJoCo models: one mesh for each body and recording, which each episode moves in its own views."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that was given 
 
 FINEST, COARSEST = 0.0015, 0.010
 CUBES_ALONG = 18.0
-"""How many cubes the longest side of a mesh is cut into; the finest and the coarsest cube bound it, metres."""
+"""The number of cubes along the longest side of a mesh, and the smallest and largest cube, metres."""
 AROUND, ALONG = 24, 7
-"""How many corners a round thing has around its axis, and a quarter of a circle along it."""
+"""The number of corners of a round shape around its axis, and of a quarter of a circle along it."""
 
 GHOST = (150, 190, 255, 90)
 
@@ -31,9 +31,9 @@ _prepared: dict[str, ModelGeometry] = {}
 
 @dataclass(frozen=True)
 class Motion:
-    """Where the B bodies of a model were: ``position`` T×B×3 float32, metres; ``quaternion`` T×B×4 float32, w first.
+    """The poses of a model's B bodies: ``position`` T×B×3 float32, metres; ``quaternion`` T×B×4 float32, w first.
 
-    ``touched`` is what the fingers touched in each row, a body's name or "nothing"; None where that is not known.
+    ``touched`` names the body that the fingers touched in each row, or "nothing"; None if that is unknown.
     """
 
     model: RowModel
@@ -44,9 +44,9 @@ class Motion:
 
 @dataclass(frozen=True)
 class ModelGeometry:
-    """What is drawn of a model: its bodies' names by number; for each mesh its body, its name, and itself.
+    """The geometry of a model: the names of its bodies by number; for each mesh its body, its name, and the mesh.
 
-    What is fixed to a moving body is drawn with that. The same meshes have the same name, whatever the model: most
+    Bodies that are fixed to a moving body are drawn with it. Equal meshes have equal names in all models, since most
     models have the same robot.
     """
 
@@ -55,19 +55,18 @@ class ModelGeometry:
 
 
 def model_geometry(model: RowModel) -> ModelGeometry:
-    """What is drawn of a model; prepared once for each XML file, in about half a second."""
+    """Return the geometry of a model; it is prepared once for each XML file, in about half a second."""
     if model.path not in _prepared:
         _prepared[model.path] = _prepare(model.model)
     return _prepared[model.path]
 
 
 Known = dict[str, bytes | None]
-"""The meshes that are in a recording, and the pose that each has of itself: none yet, or b"" where it has one in each
-episode."""
+"""The meshes of a recording with their static poses: None for none yet, b"" for a pose that each episode sets."""
 
 
 def log_meshes(stream: Any, model: RowModel, known: Known) -> None:
-    """Add the meshes of a model that are not in the recording yet, ahead of its first episode."""
+    """Add the meshes of a model that the recording lacks, before its first episode."""
     for _, name, mesh in model_geometry(model).meshes:
         _log_mesh(stream, entity_path("meshes", name), mesh, known)
 
@@ -90,16 +89,16 @@ def log_motion(
     *,
     ghost: bool = False,
 ) -> dict[str, str]:
-    """The poses of the bodies below ``root``, row t at step t; and their meshes below /meshes, once a recording.
+    """Log the poses of the bodies below ``root``, row t at step t, and their meshes below /meshes, once a recording.
 
     Args:
         known: the recording's meshes; new ones are added.
         step_time: seconds per row.
         drawn: the rows to draw, the first one among them; None for all.
-        ghost: draw translucent meshes, below /ghosts, and only of what moves.
+        ghost: draw translucent meshes of moving bodies, below /ghosts.
 
     Returns:
-        A mesh's entity to the frame in which a view is to show it; "" where it stands where it is.
+        A mesh's entity to the frame in which a view shows it; "" for a mesh that does not move.
     """
     geometry = model_geometry(motion.model)
     last = len(motion.position) - 1
@@ -122,7 +121,7 @@ def log_motion(
             if pose:
                 still = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
                 stream.log(path, still, static=True)
-        # What stands where it stood in the first episode needs no frame, which costs a page two kilobytes.
+        # A mesh that stands as in the first episode needs no frame, which costs a page two kilobytes.
         if pose and known[path] == pose:
             frames[path] = ""
             continue
@@ -167,7 +166,7 @@ def _prepare(model: Any) -> ModelGeometry:
 
 
 def _joined(shapes: Iterable[tuple[Vertices, NDArray[np.uint8]]]) -> Vertices:
-    """Shapes of a colour each, as one."""
+    """Join shapes, each of one colour."""
     parts: dict[str, list[NDArray[Any]]] = {}
     start = 0
     for vertices, color in shapes:
@@ -180,7 +179,7 @@ def _joined(shapes: Iterable[tuple[Vertices, NDArray[np.uint8]]]) -> Vertices:
 
 
 def _placed(shape: Vertices, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> Vertices:
-    """A shape that stands at a pose, w first, in the frame that the pose is given in."""
+    """Return a shape moved to a pose, w first."""
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
     turn = matrix.reshape(3, 3).T
@@ -191,7 +190,7 @@ def _placed(shape: Vertices, position: NDArray[np.float64], quaternion: NDArray[
 
 
 def _shape(model: Any, geom: int) -> Vertices | None:
-    """The geom's surface in its own frame, None for a plane."""
+    """Return the geom's surface in its own frame, None for a plane."""
     kind, size = mujoco.mjtGeom(int(model.geom_type[geom])).name, model.geom_size[geom]
     angle = np.linspace(0, np.pi / 2, ALONG)
     quarter, up, out = np.stack([np.cos(angle), np.sin(angle)], axis=1), np.array([0, 1]), np.array([1, 0])
@@ -244,7 +243,7 @@ def _box(half: NDArray[np.float64]) -> Vertices:
 
 
 def _turned(profile: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> Vertices:
-    """Lines of corners (K×2: from the axis, along it), from bottom to top, and their normals, turned around z."""
+    """Turn lines of corners (K×2: from the axis, along it), from bottom to top, and their normals around z."""
     angle = np.arange(AROUND) * 2 * np.pi / AROUND
     corners: list[NDArray[np.float64]] = []
     normals: list[NDArray[np.float64]] = []
@@ -268,7 +267,7 @@ def _turned(profile: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]]) 
 
 
 def _corners(model: Any, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The corners of a mesh's triangles and their normals, each F×3×3: MuJoCo numbers the two apart."""
+    """Return the corners of a mesh's triangles and their normals, each F×3×3; MuJoCo numbers them separately."""
 
     def part(values: Any, start: Any, count: Any) -> NDArray[np.float64]:
         return np.asarray(values[start[mesh] : start[mesh] + count[mesh]])
@@ -281,7 +280,7 @@ def _corners(model: Any, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 
 def _color(model: Any, geom: int) -> NDArray[np.uint8]:
-    """(4,) uint8: the geom's colour or else its material's, times what the texture is on average."""
+    """Return (4,) uint8: the geom's colour, or its material's, times the mean of its texture."""
     material = model.geom_matid[geom]
     rgba = np.array(model.geom_rgba[geom], np.float64)
     if material >= 0:
@@ -296,9 +295,10 @@ def _color(model: Any, geom: int) -> NDArray[np.uint8]:
 
 
 def _clustered(corners: NDArray[np.float64], normals: NDArray[np.float64]) -> dict[str, Any]:
-    """A coarse mesh, as rerun takes it, of triangles' corners (F×3×3, metres) and their unit normals (F×3×3).
+    """Return a coarse mesh for rerun from triangles' corners (F×3×3, metres) and their unit normals (F×3×3).
 
-    The corners in a cube move to their mean, so no gap opens; those whose normals differ stay apart: edges stay sharp.
+    The corners in a cube move to their mean, so no gap opens; corners with different normals stay separate, so edges
+    stay sharp.
     """
     points, directions = corners.reshape(-1, 3), normals.reshape(-1, 3)
     low = points.min(axis=0)
@@ -322,11 +322,11 @@ def _clustered(corners: NDArray[np.float64], normals: NDArray[np.float64]) -> di
 
 
 def _packed(indices: NDArray[np.int64], base: int = 1 << 20) -> NDArray[np.int64]:
-    """N×3 indices below ``base`` as one number each."""
+    """Return N×3 indices below ``base`` as one number each."""
     return (indices[:, 0] * base + indices[:, 1]) * base + indices[:, 2]
 
 
 def _means(values: NDArray[np.float64], group: NDArray[np.int64], groups: int) -> NDArray[np.float64]:
-    """The mean of N×3 values in each group."""
+    """Return the mean of N×3 values in each group."""
     count = np.bincount(group, minlength=groups)
     return np.stack([np.bincount(group, column, minlength=groups) / count for column in values.T], axis=1)

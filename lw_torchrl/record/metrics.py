@@ -1,4 +1,4 @@
-"""What training logs: curves, histograms, images, videos and hyperparameters, checked and sent to a recording."""
+"""Training metrics: curves, histograms, images, videos and hyperparameters, checked and sent to a recording."""
 
 import io
 from collections.abc import Iterable, Mapping
@@ -24,22 +24,22 @@ def check_name(name: str) -> str:
 
 
 def numbers(name: str, value: Any) -> list[float]:
-    """A metric's value as a list of numbers; else :class:`ValueError`."""
+    """Return a metric's value as a list of numbers, or raise :class:`ValueError`."""
     if type(value) is float or type(value) is int:
         return [float(value)]
     try:
         value = value.detach().cpu() if isinstance(value, Tensor) else value
-        found = torch.as_tensor(value, dtype=torch.float64).ravel().tolist()
+        values = torch.as_tensor(value, dtype=torch.float64).ravel().tolist()
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"value of {name!r} must be a number or several, got {value!r}") from error
-    if not 1 <= len(found) <= MOST_CURVES:
-        hint = "; log_histogram shows more" if found else ""
-        raise ValueError(f"value of {name!r} must be 1 to {MOST_CURVES} numbers, got {len(found)}{hint}")
-    return found
+    if not 1 <= len(values) <= MOST_CURVES:
+        hint = "; log_histogram shows more" if values else ""
+        raise ValueError(f"value of {name!r} must be 1 to {MOST_CURVES} numbers, got {len(values)}{hint}")
+    return values
 
 
 def histogram(name: str, data: Any, bins: Any) -> Any:
-    """The counts of ``data`` as a bar chart in columns; ``bins`` is the number or the edges of the bins."""
+    """Return the counts of ``data`` as a bar chart in columns; ``bins`` is the number or the edges of the bins."""
     values = np.asarray(torch.as_tensor(data).detach().cpu().to(torch.float64)).ravel()
     if not values.size or not np.isfinite(values).all():
         raise ValueError(f"data of histogram {name!r} must be finite and not empty, got {values.tolist()[:8]}")
@@ -49,7 +49,7 @@ def histogram(name: str, data: Any, bins: Any) -> Any:
 
 
 def check_image(name: str, image: Any) -> NDArray[np.uint8]:
-    """An image as H×W×C uint8: from H×W, H×W×C or C×H×W with C = 1 or 3, of uint8 or of floats in [0, 1]."""
+    """Return an image as H×W×C uint8: from H×W, H×W×C or C×H×W with C = 1 or 3, of uint8 or of floats in [0, 1]."""
     pixels = torch.as_tensor(image).detach().cpu()
     shape = tuple(pixels.shape)
     if pixels.ndim == 2:
@@ -80,7 +80,7 @@ def send_images(stream: Any, path: str, times: Any, images: Iterable[NDArray[np.
 
 
 def flatten(cfg: Mapping[Any, Any], prefix: str = "") -> dict[str, str]:
-    """Nested mappings as one: "actor.width" to the text of its value."""
+    """Flatten nested mappings: "actor.width" to the text of its value."""
     flat: dict[str, str] = {}
     for key, value in cfg.items():
         if isinstance(value, Mapping) and value:

@@ -20,7 +20,6 @@ from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.rollouts import read_rollout
 from lw_torchrl.transforms.environment import base_env, refuse_changed
 
-Objects = Callable[[TensorDictBase], Mapping[str, Tensor]]
 _OURS = {"task_id", "episode", "qaf_plan", "observation", "qaf", "qaf_logits", "skill_weights", "action_corrected"}
 _BEFORE = {*_OURS, "pixels"}  # the keys of a LanguageWorldEnv before a step, and after it
 _AFTER = {"executed_action", "success", "reward"}
@@ -67,7 +66,7 @@ class RolloutRecorder(Transform):
         plans: AnyPlans | None = None,
         every: int = 1,
         policy: str | None = None,
-        objects: Objects | None = None,
+        objects: Callable[[TensorDictBase], Mapping[str, Tensor]] | None = None,
         task: str | None = None,
     ) -> None:
         super().__init__(in_keys=[], out_keys=[])

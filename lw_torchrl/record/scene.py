@@ -87,7 +87,7 @@ def log_scene(
             stream.send_columns(f"{scene}/{path}", episode.times(rows), rr.Points3D.columns(positions=position[rows]))
 
     def named(path: str, label: str, radius: float, color: Color) -> None:
-        """A point with its name, which is moved away if it would cover another name."""
+        """Draw a point with its name, which is moved away if it would cover another name."""
         away = offsets[label]
         point(path, things[label], None if away.any() else label, radius, color)
         if away.any():
@@ -182,7 +182,7 @@ def name_offsets(things: dict[str, NDArray[np.float32]], eye: tuple[Point, Point
     right = np.cross(ahead, [0, 0, 1]).astype(np.float32)
     right /= np.linalg.norm(right)
     up = np.cross(right, ahead)
-    found: dict[str, NDArray[np.float32]] = {}
+    offsets: dict[str, NDArray[np.float32]] = {}
     taken: list[tuple[NDArray[Any], float]] = []
     for name, position in things.items():
         depth = np.maximum((position - place) @ ahead, 0.05)
@@ -196,8 +196,8 @@ def name_offsets(things: dict[str, NDArray[np.float32]], eye: tuple[Point, Point
 
         lines = min((0, 1, -1, 2, -2, 3), key=lambda lines: covered(lines) + 0.1 * abs(lines))
         taken.append((at + np.array([0, lines * LABEL]), wide))
-        found[name] = (up * lines * LABEL * float(depth.mean()) / FOCAL).astype(np.float32)
-    return found
+        offsets[name] = (up * lines * LABEL * float(depth.mean()) / FOCAL).astype(np.float32)
+    return offsets
 
 
 def _log_simple_robot(stream: Any, scene: str, episode: RecordedEpisode, drawn: NDArray[np.int64]) -> None:

@@ -21,7 +21,7 @@ _PROPERTY = "layout"
 
 
 class Tab(NamedTuple):
-    """A tab; its name is that of its episode, or the title."""
+    """A tab, named after its episode, or by its title."""
 
     name: str
     title: str
@@ -95,7 +95,7 @@ class Tabs:
 
     @property
     def has_grown(self) -> bool:
-        """Whether a quarter of the tabs that a viewer shows, or more, have been added since :meth:`send`."""
+        """Whether the tabs have grown by a quarter or more since :meth:`send`."""
         return 4 * (len(self._entries) - self._sent) >= self._sent
 
     def send(self, stream: Any) -> None:
@@ -178,7 +178,7 @@ class Tabs:
         raise unknown_name("episode", str(name), [tab.name for tab in tabs])
 
     def _has_overview(self) -> bool:
-        """Whether there are several episodes, other than the two of one comparison."""
+        """Return whether there are several episodes, other than the two of one comparison."""
         return len(self.pages) > 1 and len(self._compared) != 1
 
     def _ordered(self) -> list[Page]:

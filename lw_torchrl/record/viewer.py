@@ -31,7 +31,7 @@ REASONS = {
     r"DISPLAY is set|EventLoopError|failed to open display": "there is no screen. Take a picture with --screenshot, "
     "serve a page with --web, or write one with --html",
 }
-"""What rerun's viewer prints when it fails, and what to do about it."""
+"""Patterns in the output of a failed viewer, and the reason and remedy to report."""
 
 
 @checked
@@ -136,7 +136,7 @@ def readable(recording: Path) -> Iterator[Path]:
 
 
 class Opening(NamedTuple):
-    """Where to open a recording: the index of a tab, a timeline and a step; None leaves what the viewer chose."""
+    """The place to open a recording at: the index of a tab, a timeline and a step; None leaves the viewer's choice."""
 
     tab: int | None
     timeline: str | None

@@ -1,4 +1,4 @@
-"""A recording as a web page with rerun's viewer: in one file that opens from disk, or served by this machine."""
+"""Show a recording as a web page with rerun's viewer: in one file that opens from disk, or served locally."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def write_html(path: AnyPath, page: AnyPath, *, episode: str | None = None, step
 
 
 class WebPage(AbstractContextManager["WebPage"]):
-    """A recording as a page at ``address``, as it is when the page is made, served until :meth:`close`.
+    """A page of a recording, as it is when the page is made, served at ``address`` until :meth:`close`.
 
     In a notebook, a page that is the last value of a cell shows itself, while the kernel runs.
 

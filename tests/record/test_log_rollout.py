@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 import torch
 from recordings import Recording, run
+from tensordict.nn import TensorDictSequential
 
 import lw_torchrl as lw
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
 from lw_torchrl.evaluation.diagnose.failure import ActiveStep, Failure, MendedEpisode
+from lw_torchrl.record.rollouts import run_recorded
 from lw_torchrl.record.tabs import Tabs
 from lw_torchrl.record.viewer import open_viewer
 from lw_torchrl.suites.metaworld.engines import MetaWorldEngine
@@ -209,6 +211,21 @@ def test_what_mends_a_failure_is_a_ghost_beside_it(tmp_path, pushed):
     page = Tabs.read(found.reader).pages["push-0"]
     assert page.shown[0] == 22
     assert page.states["ghost0"][0] == f"1 {PLANS['push'].steps[0].skill}"
+
+
+@pytest.mark.parametrize("in_front", [True, False])
+def test_exact_answers_are_recorded_with_those_of_an_evaluator(in_front):
+    class Never(lw.QueryEvaluator):
+        def logits(self, observation, task_id):
+            return observation.new_full((*task_id.shape, self.plans.num_steps), -3.0)
+
+    scripted, never = lw.ScriptedSkillActor(PLANS), Never(PLANS)
+    actor = TensorDictSequential(never, scripted) if in_front else scripted
+    (episode,) = run_recorded(actor, "push", seed=SEED, max_steps=5, evaluator=None if in_front else never)
+    assert bool((episode.steps["qaf_logits"] == -3.0).all())
+    exact = lw.QAFTransform(PLANS)(episode.steps.select("observation", "task_id"))["qaf"]
+    assert torch.equal(episode.steps["qaf"], exact)
+    assert bool(exact.any())
 
 
 def test_an_overview_lists_failures_first_and_counts_causes(tmp_path, pushed):

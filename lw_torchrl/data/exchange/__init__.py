@@ -18,12 +18,24 @@ from lw_torchrl.data.exchange.table import ExchangeError, Table, table_of
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.suites.suite import Suite, find_suite, load_suite
 
-__all__ = ["FORMATS", "ExchangeError", "ExportFormat", "ImportFormat", "export_dataset", "import_dataset"]
+__all__ = [
+    "FORMATS",
+    "ExchangeError",
+    "ExportFormat",
+    "ImportFormat",
+    "MissingDataWarning",
+    "export_dataset",
+    "import_dataset",
+]
 
 ExportFormat = Literal["lerobot", "minari"]
 ImportFormat = Literal["lerobot", "minari", "robomimic"]
 FORMATS: tuple[str, ...] = get_args(ExportFormat)
 _EXTRAS = {"av": "exchange", "h5py": "exchange", "minari": "minari"}  # package to the extra that installs it
+
+
+class MissingDataWarning(UserWarning):
+    """Warns that an imported source lacks data that our datasets hold."""
 
 
 @contextmanager
@@ -152,7 +164,7 @@ def import_dataset(
     with _reading(source):
         columns, lacking = incoming.complete_columns(table, there)
     if lacking:
-        warnings.warn(f"source: {str(source)!r} lacks {'; '.join(lacking)}", stacklevel=3)
+        warnings.warn(f"source: {str(source)!r} lacks {'; '.join(lacking)}", MissingDataWarning, stacklevel=3)
     return incoming.write_dataset(columns, spans, description, target)
 
 
