@@ -7,6 +7,7 @@ import torch
 from evaluator_rows import assert_a_logit_for_each_step
 from pictures import why_no_pictures
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.objectives import BCLoss
 
@@ -26,6 +27,10 @@ def letters(texts):
 def make(plans=PLANS, seed=0, **options):
     torch.manual_seed(seed)
     return lw.modules.ImageQueryEvaluator(plans, **SMALL, **options)
+
+
+def in_front_of_a_policy(evaluator):
+    return TensorDictSequential(evaluator, lw.PlanConditionedActor(PLANS, text_encoder=letters))
 
 
 def states(rows=10, shape=(16, 48)):
@@ -105,21 +110,21 @@ def test_not_is_the_opposite_with_structure():
 
 @pytest.mark.filterwarnings("ignore:.*target_actor_network_params")
 def test_imitation_reaches_it_through_the_softmax():
-    actor = lw.PlanConditionedActor(PLANS, evaluator=make(), answers="hard", width=8, text_encoder=letters).train()
+    actor = in_front_of_a_policy(make(answers="hard")).train()
     BCLoss(actor, loss_function="l2")(states())["loss_bc"].backward()
-    for name, weight in actor.evaluator.named_parameters():
+    for name, weight in actor[0].named_parameters():
         assert weight.grad is not None, name
         assert weight.grad.abs().sum() > 0 or name.endswith("bias"), name
 
 
 def test_a_policy_with_it_is_made_again_from_its_file(tmp_path):
-    actor = lw.PlanConditionedActor(PLANS, evaluator=make(), width=8, text_encoder=letters).eval()
+    actor = in_front_of_a_policy(make()).eval()
     lw.save_actor(actor, tmp_path / "policy.safetensors")
     again = lw.load_actor(tmp_path / "policy.safetensors", text_encoder=letters)
     assert torch.equal(again(states())["action"], actor(states())["action"])
-    lw.training.save_evaluator(actor.evaluator, tmp_path / "evaluator.safetensors")
+    lw.training.save_evaluator(actor[0], tmp_path / "evaluator.safetensors")
     other = lw.training.load_evaluator(tmp_path / "evaluator.safetensors", PLANS, text_encoder=letters)
-    assert torch.equal(other(states())["qaf_logits"], actor.evaluator(states())["qaf_logits"])
+    assert torch.equal(other(states())["qaf_logits"], actor[0](states())["qaf_logits"])
 
 
 def test_other_plans_share_its_weights():
@@ -159,14 +164,14 @@ class TestActing:
 
     @pytest.mark.slow
     def test_results_do_not_depend_on_num_envs(self):
-        actor = lw.PlanConditionedActor(PLANS, evaluator=make(), width=8)
+        actor = in_front_of_a_policy(make())
         found = [self.evaluated(actor, num_envs=n, num_threads=t) for n, t in ((2, 1), (4, 2))]
         for one, other in zip(*found, strict=True):
             assert torch.equal(one, other)
 
     def test_scripted_skills_on_it_and_any_policy_behind_it(self):
         evaluator = make(every=4)
-        own = self.evaluated(lw.ScriptedSkillActor(PLANS, evaluator=evaluator))
+        own = self.evaluated(TensorDictSequential(evaluator, lw.ScriptedSkillActor(PLANS)))
         behind = self.evaluated(lw.ScriptedSkillActor(PLANS), evaluator=evaluator)
         for one, other in zip(own, behind, strict=True):
             assert torch.equal(one, other)
@@ -174,7 +179,7 @@ class TestActing:
     @pytest.mark.slow
     def test_failures_are_told_with_true_answers_in_its_place(self):
         result = lw.evaluate(
-            lw.ScriptedSkillActor(PLANS, evaluator=make()),
+            TensorDictSequential(make(), lw.ScriptedSkillActor(PLANS)),
             tasks="drawer-open",
             episodes_per_task=1,
             seed=1000,

@@ -1,16 +1,18 @@
-"""A QueryEvaluator under other plans: the same weights, not a copy of them."""
+"""QueryEvaluator: checks of its logits, and the same weights under other plans."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torch import nn
 
 import lw_torchrl as lw
 
 PLANS = lw.load_plans("MT10")
 OTHER = lw.Plans([PLANS["push"]])
+S = PLANS.num_steps
 
 
 class Answers(lw.QueryEvaluator):
@@ -32,14 +34,14 @@ def state(plans):
 
 
 def test_with_plans_shares_its_weights_and_not_its_tables():
-    actor = lw.PlanConditionedActor(PLANS, evaluator=Answers(PLANS), width=8).eval()
-    other = actor.with_plans(OTHER)
+    actor = TensorDictSequential(Answers(PLANS), lw.PlanConditionedActor(PLANS)).eval()
+    other = lw.modules.with_plans(actor, OTHER)
     assert {id(one) for one in actor.parameters()} == {id(one) for one in other.parameters()}
-    assert other.evaluator.seen is actor.evaluator.seen
-    assert other.evaluator.table.shape == (1, OTHER.num_steps)
-    assert not other.evaluator.training
+    assert other[0].seen is actor[0].seen
+    assert other[0].table.shape == (1, OTHER.num_steps)
+    assert not other[0].training
     other(state(OTHER))["action"].sum().backward()
-    assert actor.evaluator.net[0].weight.grad is not None
+    assert actor[0].net[0].weight.grad is not None
 
 
 def test_weights_of_another_shape_are_refused():
@@ -49,6 +51,37 @@ def test_weights_of_another_shape_are_refused():
             self.config = {}
             self.net = nn.Linear(39, plans.num_steps)
 
-    actor = lw.PlanConditionedActor(PLANS, evaluator=Columns(PLANS), width=8)
     with pytest.raises(RuntimeError, match="size mismatch for net"):
-        actor.with_plans(OTHER)
+        Columns(PLANS).with_plans(OTHER)
+
+
+class Made(lw.QueryEvaluator):
+    def __init__(self, make):
+        super().__init__(PLANS)
+        self.make = make
+
+    def logits(self, observation, task_id):
+        return self.make(*task_id.shape)
+
+
+def act(make):
+    return TensorDictSequential(Made(make), lw.PlanConditionedActor(PLANS).eval())(state(PLANS))
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda b: torch.zeros(b, S - 1), ValueError, rf"of Made must be \(B, {S}\).*got shape \(2, {S - 1}\)"),
+        (lambda b: torch.zeros(()), ValueError, r"must be \(B, .*got shape \(\)"),
+        (lambda b: torch.zeros(b, S, dtype=torch.bool), TypeError, r"must be float32.*got torch.bool"),
+    ],
+)
+def test_wrong_logits_are_refused_by_name(make, error, message):
+    with pytest.raises(error, match=message):
+        act(make)
+
+
+def test_logits_of_double_precision_are_accepted():
+    double, single = (act(lambda b, d=d: torch.zeros(b, S, dtype=d)) for d in (torch.float64, torch.float32))
+    assert torch.equal(double["skill_weights"], single["skill_weights"])
+    assert double["qaf"].dtype == torch.float32

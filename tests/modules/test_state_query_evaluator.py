@@ -1,4 +1,4 @@
-"""StateQueryEvaluator: what it reads, how clauses become conditions, and that it is part of a policy like any other."""
+"""StateQueryEvaluator: what it reads, how clauses become conditions, and its use in front of a policy."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import pytest
 import torch
 from evaluator_rows import assert_a_logit_for_each_step
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
-from lw_torchrl.evaluation.counterfactuals import with_true_answers
 from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.language.relations import RELATIONS, Comparison
 from lw_torchrl.modules.clause_evaluator import conjunction
@@ -26,9 +26,9 @@ def make(plans=PLANS, seed=0, **options):
     return lw.StateQueryEvaluator(plans, width=8, depth=1, **options)
 
 
-def make_actor(**options):
-    evaluator = make()
-    return lw.PlanConditionedActor(PLANS, evaluator=evaluator, width=8, text_encoder=letters, **options).eval()
+def make_actor(answers="soft"):
+    evaluator = make(answers=answers)
+    return TensorDictSequential(evaluator, lw.PlanConditionedActor(PLANS, text_encoder=letters)).eval()
 
 
 def states(rows=20, plans=PLANS):
@@ -81,120 +81,88 @@ def test_a_conjunction_has_a_gradient_everywhere():
     assert (logits.grad[2] == 0).all()
 
 
-@pytest.mark.parametrize("answers", ["logit", "tanh", "hard"])
+@pytest.mark.parametrize("answers", ["soft", "hard"])
 @pytest.mark.filterwarnings("ignore:.*target_actor_network_params")
 def test_the_loss_of_imitation_reaches_the_evaluator(answers):
-    actor = make_actor(answers=answers).train()
-    loss = BCLoss(actor, loss_function="l2")
-    loss(states())["loss_bc"].backward()
-    found = dict(actor.evaluator.named_parameters())
-    assert len(found) >= 3
-    for name, parameter in found.items():
-        assert parameter.grad is not None, name
-        assert parameter.grad.abs().sum() > 0, name
+    actor = make_actor(answers).train()
+    BCLoss(actor, loss_function="l2")(states())["loss_bc"].backward()
+    weights = dict(actor[0].named_parameters())
+    assert len(weights) >= 3
+    assert all(weight.grad.abs().sum() > 0 for weight in weights.values())
+
+
+class Truth(lw.QueryEvaluator):
+    def __init__(self, plans, **options):
+        super().__init__(plans, **options)
+        self.exact = lw.QAFTransform(plans)
+
+    def logits(self, observation, task_id):
+        rows = TensorDict(observation=observation, task_id=task_id, batch_size=task_id.shape)
+        return torch.where(self.exact(rows)["qaf"], 0.3, -12.0)
 
 
 def test_hard_answers_act_as_exact_truth_does():
-    class Truth(lw.QueryEvaluator):
-        def __init__(self, plans):
-            super().__init__(plans)
-            self.qaf = lw.QAFTransform(plans)
-
-        def logits(self, observation, task_id):
-            told = self.qaf(TensorDict(observation=observation, task_id=task_id, batch_size=task_id.shape))
-            return torch.where(told["qaf"], 0.3, -12.0)
-
-    actor = lw.PlanConditionedActor(PLANS, width=8).eval()
-    found = states()
-    with_qaf = actor(lw.QAFTransform(PLANS)(found.clone()))
-    hard = actor.with_evaluator(Truth(PLANS))(found.clone())
-    assert torch.equal(hard["skill_weights"], with_qaf["skill_weights"])
-    assert torch.equal(hard["action"], with_qaf["action"])
-    soft = actor.with_evaluator(Truth(PLANS), answers="tanh")(found.clone())
-    assert not torch.equal(soft["skill_weights"], with_qaf["skill_weights"])
+    actor, rows = lw.PlanConditionedActor(PLANS, text_encoder=letters).eval(), states()
+    expected = actor(lw.QAFTransform(PLANS)(rows.clone()))
+    hard = TensorDictSequential(Truth(PLANS, answers="hard"), actor)(rows.clone())
+    assert torch.equal(hard["skill_weights"], expected["skill_weights"])
+    assert torch.equal(hard["action"], expected["action"])
+    soft = TensorDictSequential(Truth(PLANS), actor)(rows.clone())
+    assert not torch.equal(soft["skill_weights"], expected["skill_weights"])
 
 
-def test_tanh_is_the_papers_ten_times_the_probability_less_five():
-    from lw_torchrl.modules.plan_attention import attention_logits
-
-    logits = torch.linspace(-8, 8, 33)
-    assert torch.allclose(attention_logits(logits, "tanh"), 10 * logits.sigmoid() - 5, atol=1e-5)
-    assert torch.equal(attention_logits(logits, "logit"), logits)
-
-
-def test_with_evaluator_shares_the_weights():
-    actor = lw.PlanConditionedActor(PLANS, width=8)
-    other = actor.with_evaluator(make())
-    own = {id(one) for one in other.evaluator.parameters()}
-    assert {id(one) for one in actor.parameters()} == {id(one) for one in other.parameters()} - own
-    assert other.config["answers"] == "hard"
-    with pytest.raises(TypeError, match="DescriptorConditionedActor has none"):
-        lw.DescriptorConditionedActor("MT10").with_evaluator(make())
+def test_soft_answers_are_probabilities():
+    evaluator, rows = make(), states()
+    found = evaluator(rows.clone())
+    assert torch.equal(found["qaf"], found["qaf_logits"].sigmoid())
+    evaluator.answers = "hard"
+    found = evaluator(rows.clone())
+    assert torch.equal(found["qaf"], (found["qaf_logits"] > 0).float())
+    with pytest.raises(ValueError, match="answers must be one of 'soft', 'hard', got 'tanh'"):
+        evaluator.answers = "tanh"
 
 
-def test_with_plans_shares_the_network_alone():
+def test_with_plans_shares_the_network():
     actor, other = make_actor(), lw.Plans([PLANS["push"]])
-    found = actor.with_plans(other)
-    assert {id(one) for one in actor.evaluator.parameters()} == {id(one) for one in found.evaluator.parameters()}
+    found = lw.modules.with_plans(actor, other)
+    assert {id(one) for one in actor.parameters()} == {id(one) for one in found.parameters()}
     rows = states(4, other)
-    assert torch.allclose(found(rows.clone())["action"], actor(rows.clone())["action"], atol=1e-6)
+    torch.testing.assert_close(found(rows.clone())["action"], actor(rows.clone())["action"])
 
 
-def test_saved_and_loaded_with_the_policy_to_the_bit(tmp_path):
-    actor = make_actor(answers="tanh")
+@pytest.mark.parametrize("answers", ["soft", "hard"])
+def test_saved_and_loaded_with_the_policy_to_the_bit(answers, tmp_path):
+    actor = make_actor(answers)
     lw.save_actor(actor, tmp_path / "policy.safetensors")
     loaded = lw.load_actor(tmp_path / "policy.safetensors", text_encoder=letters)
-    assert loaded.config["answers"] == "tanh"
+    assert loaded[0].answers == answers
     for key in actor.out_keys:
         assert torch.equal(loaded(states())[key], actor(states())[key]), key
 
 
 def test_scripted_skills_act_on_its_answers(tmp_path):
-    plans = lw.load_plans("MT10")
-    evaluator = make(plans)
-    actor = lw.ScriptedSkillActor(plans, evaluator=evaluator)
+    evaluator, scripted = make(), lw.ScriptedSkillActor(PLANS)
+    actor = TensorDictSequential(evaluator, scripted)
     assert actor.in_keys == ["observation", "task_id"]
-    assert actor.transform() is None
+    assert lw.modules.transform_of(actor) is None
     found = actor(states())
-    told = evaluator(states())["qaf_logits"] > 0
-    by_truth = lw.ScriptedSkillActor(plans)(states().set("qaf", told))
+    expected = scripted(states().set("qaf", evaluator(states())["qaf_logits"] > 0))
     for key in ("action", "skill_weights"):
-        assert torch.equal(found[key], by_truth[key])
+        assert torch.equal(found[key], expected[key])
     assert found["skill_weights"][:, 1:].any()
     lw.save_actor(actor, tmp_path / "policy.safetensors")
     assert torch.equal(lw.load_actor(tmp_path / "policy.safetensors")(states())["action"], found["action"])
-    other = actor.with_plans(lw.Plans([PLANS["push"]]))
-    assert other.evaluator.network.predicates.weight is evaluator.network.predicates.weight
-    assert lw.ScriptedSkillActor(plans).with_evaluator(evaluator)(states())["action"].equal(found["action"])
 
 
-def test_true_answers_in_its_place_are_worth_what_exact_truth_is():
-    actor = make_actor(answers="tanh")
-    plain = lw.PlanConditionedActor(PLANS, width=8, text_encoder=letters).eval()
-    plain.encoder.texts, plain.encoder.features, plain.head = actor.encoder.texts, actor.encoder.features, actor.head
-    found = with_true_answers(actor)(states())
-    assert torch.equal(found["skill_weights"], plain(lw.QAFTransform(PLANS)(states()))["skill_weights"])
-    assert actor.encoder.config["answers"] == "tanh"
-
-
-def test_as_an_evaluator_of_an_evaluation_its_sign_counts():
+def test_an_evaluation_uses_the_sign_of_its_answers():
     class Never(lw.QueryEvaluator):
         def logits(self, observation, task_id):
             return torch.full((*task_id.shape, self.plans.num_steps), -1.0)
 
-    seen = []
-    plans = lw.Plans([PLANS["reach"]])
-    lw.evaluate(
-        lw.ScriptedSkillActor(plans),
-        tasks="reach",
-        episodes_per_task=1,
-        seed=1_000,
-        max_steps=5,
-        evaluator=Never(plans),
-        also_record=["qaf"],
-        on_episode=seen.append,
-    )
-    assert not seen[0].steps["qaf"].any()
+    episodes, plans = [], lw.Plans([PLANS["reach"]])
+    run = dict(tasks="reach", episodes_per_task=1, seed=1_000, max_steps=5, progress=False, also_record=["qaf"])
+    lw.evaluate(lw.ScriptedSkillActor(plans), **run, evaluator=Never(plans), on_episode=episodes.append)
+    assert not episodes[0].steps["qaf"].any()
 
 
 # ---- refusals
