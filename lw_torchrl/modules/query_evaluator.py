@@ -66,7 +66,7 @@ class QueryEvaluator(TensorDictModuleBase):
     @property
     def answers(self) -> Answers:
         """Whether ``qaf`` is "soft" or "hard"; it can be set."""
-        answers: Answers = self.config["answers"]
+        answers: Answers = self.config.get("answers", "soft")  # a subclass may replace config
         return answers
 
     @answers.setter

@@ -78,7 +78,7 @@ def test_an_action_of_another_name():
     rows = rows_of(4)
     rows["agent", "action"] = rows.pop("action")
     assert critic(rows)["state_action_value"].shape == (4, 1)
-    with pytest.raises(TypeError, match="action_key must be a key"):
+    with pytest.raises(TypeError, match="action_key must be a NestedKey"):
         lw.PlanConditionedQValue(PLANS, action_key=3)
 
 

@@ -6,11 +6,10 @@ import torch
 
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
 from lw_torchrl.language.plan_files import load_plans
-from lw_torchrl.modules import PlanConditionedActor
+from lw_torchrl.modules import MLPDecoder, PlanConditionedActor, SkillEncoder
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.transforms import QAFTransform
 
-SMALL = dict(latent_size=4, width=16, depth=1, encoder_width=8)
 CONFIG = BehavioralCloningConfig(steps=12, batch_size=8, checkpoint_every=5, learning_rate=1e-2)
 PLANS = load_plans("MT10")
 
@@ -26,9 +25,10 @@ def make_replay(root, sampler=None):
     return LanguageWorldExperienceReplay(root, sampler=sampler or TaskBalancedSampler(), transform=QAFTransform(PLANS))
 
 
-def make_actor(seed=0, **options):
+def make_actor(seed=0, plans=PLANS, **options):
     torch.manual_seed(seed)
-    return PlanConditionedActor(PLANS, **{**SMALL, **options})
+    small = {"skill_encoder": SkillEncoder(4, width=8), "decoder": MLPDecoder(width=16, depth=1)}
+    return PlanConditionedActor(plans, **{**small, **options})
 
 
 class Stopping(BehavioralCloningTrainer):
