@@ -82,10 +82,14 @@ def dispatched(forward: Callable[[Any, TensorDictBase], TensorDictBase]) -> Call
             return tensordict
         return forward(self, tensordict)
 
-    called = dispatch(auto_batch_size=False)(run)  # of one tensor (B, F), all dimensions would be the batch
-    # torch.export binds arguments to the signature, and dispatch leaves the names of in_keys out.
-    called.__signature__ = Signature([Parameter("self", Parameter.POSITIONAL_OR_KEYWORD), *_ANY])
-    return called
+    called: Any = dispatch(auto_batch_size=False)(run)  # of one tensor (B, F), all dimensions would be the batch
+    return any_arguments(called)
+
+
+def any_arguments(forward: Any) -> Any:
+    """Give a dispatched ``forward`` a signature to which ``torch.export`` can bind the tensors of ``in_keys``."""
+    forward.__signature__ = Signature([Parameter("self", Parameter.POSITIONAL_OR_KEYWORD), *_ANY])
+    return forward
 
 
 _ANY = Parameter("args", Parameter.VAR_POSITIONAL), Parameter("kwargs", Parameter.VAR_KEYWORD)

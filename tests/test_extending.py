@@ -8,7 +8,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential, dispatch
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import TransformedEnv
@@ -19,8 +19,7 @@ from lw_torchrl.language.relations import RELATIONS, Comparison
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import TaskIndex
 from lw_torchrl.language.tasks import task_ids
-from lw_torchrl.modules import EVALUATORS, METHODS, POLICIES, Method, ObservationFeatures, make_policy
-from lw_torchrl.modules.networks import ActionHead
+from lw_torchrl.modules import METHODS, MLPDecoder, ObservationFeatures, SkillEncoder, make_policy
 from lw_torchrl.record.rollouts import run_recorded, write_recording
 
 STEPS = 40
@@ -64,31 +63,24 @@ class PointEngine:
         pass
 
 
-class LearnedTaskActor(lw.Policy):
-    """Conditioned on a vector of each task that is learned."""
+class LearnedTaskActor(TensorDictModuleBase):
+    """Conditioned on a vector of each task that is learned: any TensorDict module that writes ``action`` is an actor."""
 
     def __init__(self, tasks, size=8, width=32):
         super().__init__()
-        self.tasks, self.config = tuple(tasks), {"size": size, "width": width}
+        self.tasks, self.config = tuple(tasks), {"tasks": list(tasks), "size": size, "width": width}
         self.in_keys, self.out_keys = ["observation", "task_id"], ["action"]
         self.index = TaskIndex(task_ids(self.tasks))
         self.vectors = nn.Embedding(len(self.tasks), size)
         self.features = ObservationFeatures()
-        self.head = ActionHead(size + self.features.width, width, 1)
+        self.net = MLPDecoder(width=width, depth=1)
+        self(**{"observation": torch.zeros(1, 39), "task_id": torch.tensor([self.index.ids[0]])})
 
-    def prepare(self, tensordict):
-        observation, task_id = self.read(tensordict)
-        return self.index.rows(task_id, "tasks unknown to this actor"), self.features(observation)
-
-    def act(self, rows, seen):
-        return (self.head(torch.cat((self.vectors.weight[rows], seen), -1)),)
-
-    def describe(self):
-        return super().describe() | {"tasks": list(self.tasks)}
-
-    @classmethod
-    def from_description(cls, found, text_encoder=None):
-        return cls(found["tasks"], **found["options"])
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict):
+        rows = self.index.rows(tensordict["task_id"], "tasks unknown to this actor")
+        seen = self.features(tensordict["observation"])
+        return tensordict.set("action", self.net(torch.cat((self.vectors.weight[rows], seen), -1)))
 
 
 class NearnessEvaluator(lw.QueryEvaluator):
@@ -142,19 +134,20 @@ def trained(actor, replay, path):
 
 def made(kind, plans):
     torch.manual_seed(0)
-    small = dict(latent_size=4, width=32, depth=1, encoder_width=8, text_encoder=letters)
-    if kind == "evaluator":
-        return lw.PlanConditionedActor(plans, evaluator=NearnessEvaluator(plans), **small)
     if kind == "learned":
         return make_policy("learned", plans, width=32)
-    return lw.PlanConditionedActor(plans, **small)
+    actor = small(plans)
+    return TensorDictSequential(NearnessEvaluator(plans), actor) if kind == "evaluator" else actor
+
+
+def small(plans):
+    parts = {"skill_encoder": SkillEncoder(4, width=8), "decoder": MLPDecoder(width=32, depth=1)}
+    return lw.PlanConditionedActor(plans, text_encoder=letters, **parts)
 
 
 @pytest.mark.parametrize("kind", ["plan", "learned", "evaluator"])
 def test_it_is_trained_saved_loaded_evaluated_and_recorded(kind, plans, replay, tmp_path, monkeypatch):
-    monkeypatch.setitem(POLICIES, "LearnedTaskActor", LearnedTaskActor)
-    monkeypatch.setitem(METHODS, "learned", Method("LearnedTaskActor"))
-    monkeypatch.setitem(EVALUATORS, "NearnessEvaluator", NearnessEvaluator)
+    monkeypatch.setitem(METHODS, "learned", lambda plans, **options: LearnedTaskActor([*plans], **options))
     path = tmp_path / "policy.safetensors"
     actor = trained(made(kind, plans), replay, path)
     loaded = lw.load_actor(path, text_encoder=letters)
@@ -162,52 +155,31 @@ def test_it_is_trained_saved_loaded_evaluated_and_recorded(kind, plans, replay, 
         assert name == other
         assert torch.equal(ours, found)
     definitions = [plan.definition for plan in plans.values()]
-    result = lw.evaluate(
-        loaded,
-        tasks=definitions,
-        episodes_per_task=10,
-        seed=1_000,
-        engine=PointEngine,
-        max_steps=STEPS,
-        noise_scale=0.0,
-    )
+    run = dict(seed=1_000, engine=PointEngine, max_steps=STEPS)
+    result = lw.evaluate(loaded, tasks=definitions, episodes_per_task=10, noise_scale=0.0, **run)
     assert result.success_once["touch-the-block"] >= 0.8
-    episodes = run_recorded(loaded, definitions, seed=1_000, engine=PointEngine, max_steps=STEPS)
-    write_recording(tmp_path / "rollout.rrd", episodes, loaded.plans, tasks=definitions)
+    episodes = run_recorded(loaded, definitions, **run)
+    write_recording(tmp_path / "rollout.rrd", episodes, lw.modules.plans_of(loaded), tasks=definitions)
     assert (tmp_path / "rollout.rrd").stat().st_size > 10_000
     if kind == "evaluator":
-        assert actor.evaluator.radius.item() != pytest.approx(0.1)
+        assert actor[0].radius.item() != pytest.approx(0.1)
         assert "qaf" not in actor.in_keys
 
 
-def test_a_kind_that_is_not_there_is_named(plans, replay, tmp_path, monkeypatch):
-    monkeypatch.setitem(POLICIES, "LearnedTaskActor", LearnedTaskActor)
-    lw.save_actor(LearnedTaskActor(plans), tmp_path / "policy.safetensors")
-    monkeypatch.delitem(POLICIES, "LearnedTaskActor")
-    with pytest.raises(ValueError, match=r"'LearnedTaskActor' is not known here.*--import test_extending"):
-        lw.load_actor(tmp_path / "policy.safetensors")
-    monkeypatch.setattr(LearnedTaskActor, "__module__", "__main__")
-    monkeypatch.setitem(POLICIES, "LearnedTaskActor", LearnedTaskActor)
-    lw.save_actor(LearnedTaskActor(plans), tmp_path / "policy.safetensors")
-    monkeypatch.delitem(POLICIES, "LearnedTaskActor")
-    with pytest.raises(ValueError, match="is of a script; register it in a module"):
-        lw.load_actor(tmp_path / "policy.safetensors")
-
-
 def test_a_relation_that_is_not_there_is_told_of(plans, tmp_path, monkeypatch):
-    lw.save_actor(lw.PlanConditionedActor(plans, text_encoder=letters, width=8), tmp_path / "policy.safetensors")
+    lw.save_actor(small(plans), tmp_path / "policy.safetensors")
     monkeypatch.delitem(RELATIONS, "beside")
     with pytest.raises(ValueError, match=r"'beside'.*; import the module that registers your relations first"):
         lw.load_actor(tmp_path / "policy.safetensors", text_encoder=letters)
 
 
 def test_an_own_task_travels_with_its_policy(plans, tmp_path):
-    lw.save_actor(lw.PlanConditionedActor(plans, text_encoder=letters, width=8), tmp_path / "policy.safetensors")
+    lw.save_actor(small(plans), tmp_path / "policy.safetensors")
     loaded = lw.load_actor(tmp_path / "policy.safetensors", text_encoder=letters)
     assert loaded.plans.fingerprint == plans.fingerprint
     assert loaded.plans["touch-the-block"].definition.object_names == ("robot's gripper", "block")
     lw.save_actor(
-        lw.DescriptorConditionedActor([plan.definition for plan in plans.values()], text_encoder=letters, width=8),
+        lw.DescriptorConditionedActor([plan.definition for plan in plans.values()], text_encoder=letters),
         tmp_path / "dc.safetensors",
     )
     assert lw.load_actor(tmp_path / "dc.safetensors", text_encoder=letters).tasks == ("touch-the-block",)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 
 import pytest
-import torch
 
 import lw_torchrl as lw
 from lw_torchrl import _registry
 from lw_torchrl._registry import Registry, is_function
 from lw_torchrl.language.relations import RELATIONS, STATES, Comparison
-from lw_torchrl.modules import ENCODERS, EVALUATORS, METHODS, POLICIES, make_policy
+from lw_torchrl.modules import METHODS, make_policy
 from lw_torchrl.suites import SUITES
 
 MODULE = """
@@ -19,30 +19,14 @@ import torch
 import lw_torchrl as lw
 from dataclasses import replace
 from lw_torchrl.language.relations import Comparison
-from lw_torchrl.modules import DescriptorEncoder
+from lw_torchrl.modules import MLPDecoder
 
-class Unseeing(lw.Policy):
-    def __init__(self, tasks, width=8):
-        super().__init__()
-        self.tasks, self.config = tuple(tasks), {"width": width}
-        self.in_keys, self.out_keys = ["observation"], ["action"]
-        self.net = torch.nn.Linear(39, 4)
-    def prepare(self, tensordict):
-        return tuple(self.read(tensordict))
-    def act(self, observation):
-        return (self.net(observation),)
-    def describe(self):
-        return super().describe() | {"tasks": list(self.tasks)}
-    @classmethod
-    def from_description(cls, found, text_encoder=None):
-        return cls(found["tasks"], **found["options"])
+def make(plans, width=8):
+    return lw.PlanConditionedActor(plans, decoder=MLPDecoder(width=width))
 
 class Guess(lw.QueryEvaluator):
     def logits(self, observation, task_id):
         return torch.zeros(*task_id.shape, self.plans.num_steps)
-
-class Shouted(DescriptorEncoder):
-    pass
 
 FAR = (Comparison("xyz", ">", 0.3),)
 LOUD = replace(lw.PLAN_FORMATS["basic_py"], extension="txt")
@@ -51,14 +35,10 @@ def make_suite():
     return replace(lw.suites.load_suite("metaworld"), name="metaworld")
 """
 POINTS = """
-[lw_torchrl.policies]
-Unseeing = my_plugin:Unseeing
-Broken = no_such_module:Broken
-NoClass = my_plugin:FAR
-[lw_torchrl.evaluators]
-Guess = my_plugin:Guess
-[lw_torchrl.encoders]
-Shouted = my_plugin:Shouted
+[lw_torchrl.methods]
+mine = my_plugin:make
+broken = no_such_module:broken
+uncallable = my_plugin:FAR
 [lw_torchrl.relations]
 far from = my_plugin:FAR
 [lw_torchrl.formats]
@@ -66,7 +46,7 @@ loud = my_plugin:LOUD
 [lw_torchrl.suites]
 again = my_plugin:make_suite
 """
-REGISTRIES = (POLICIES, EVALUATORS, ENCODERS, RELATIONS, STATES, lw.PLAN_FORMATS, SUITES, METHODS)
+REGISTRIES = (RELATIONS, STATES, lw.PLAN_FORMATS, SUITES, METHODS)
 
 
 @pytest.fixture
@@ -88,28 +68,27 @@ def plugin(tmp_path, monkeypatch):
 
 
 def test_plugins_are_listed_without_import_and_loaded_by_name(plugin):
-    assert [*POLICIES][-3:] == ["Unseeing", "Broken", "NoClass"]
-    assert len(POLICIES) == len([*POLICIES])
+    assert [*METHODS][-3:] == ["mine", "broken", "uncallable"]
+    assert len(METHODS) == len([*METHODS])
     assert "my_plugin" not in sys.modules
-    assert POLICIES["Unseeing"].__name__ == "Unseeing"
+    assert METHODS["mine"].__name__ == "make"
     assert lw.PLAN_FORMATS["loud"].extension == "txt"
     assert lw.suites.load_suite("again").tasks.keys() == lw.TASKS.keys()
-    assert issubclass(EVALUATORS["Guess"], lw.QueryEvaluator)
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("name", "message"),
     [
-        ("Broken", r"policy 'Broken' is no_such_module:Broken of the package my-plugin.*ModuleNotFoundError"),
-        ("NoClass", r"policy 'NoClass' is my_plugin:FAR of the package my-plugin.*must be a class derived from Policy"),
+        ("broken", r"method 'broken' is no_such_module:broken of the package my-plugin.*ModuleNotFoundError"),
+        ("uncallable", r"method 'uncallable' is my_plugin:FAR of the package my-plugin.*must be a function of plans"),
     ],
 )
-def test_a_plugin_that_cannot_be_loaded_is_named_and_others_work(plugin, name, says):
-    with pytest.raises(ImportError, match=says):
+def test_a_plugin_that_cannot_be_loaded_is_named_and_others_work(plugin, name, message):
+    with pytest.raises(ImportError, match=message):
         make_policy(name, lw.load_plans("MT10"))
-    assert make_policy("Unseeing", lw.load_plans("MT10")).tasks == lw.MT10
-    with pytest.raises(ValueError, match=r"method must be one of .*'Unseeing'.*got 'Unseeng'; did you mean 'Unseeing'"):
-        make_policy("Unseeng", lw.load_plans("MT10"))
+    assert make_policy("mine", lw.load_plans("MT10"), width=3).decoder.network.config["width"] == 3
+    with pytest.raises(ValueError, match=r"method must be one of .*'mine'.*got 'mien'; did you mean 'mine'"):
+        make_policy("mien", lw.load_plans("MT10"))
 
 
 def test_queries_know_the_relation_of_a_plugin(plugin):
@@ -118,15 +97,18 @@ def test_queries_know_the_relation_of_a_plugin(plugin):
     assert RELATIONS["far from"] == (Comparison("xyz", ">", 0.3),)
 
 
-def test_an_encoder_and_a_policy_of_plugins_are_kept_in_files(plugin, tmp_path):
+def test_a_plugins_evaluator_is_loaded_once_its_module_is_imported(plugin, tmp_path):
+    from tensordict.nn import TensorDictSequential
+
     plans = lw.load_plans("MT10")
-    for method in ("Unseeing", "Shouted"):
-        torch.manual_seed(0)
-        actor = make_policy(method, plans)
-        lw.save_actor(actor, tmp_path / "policy.safetensors")
-        again = lw.load_actor(tmp_path / "policy.safetensors")
-        assert again.state_dict().keys() == actor.state_dict().keys()
-        assert again.tasks == lw.MT10
+    guess = importlib.import_module("my_plugin").Guess
+    actor = TensorDictSequential(guess(plans), make_policy("mine", plans))
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    assert type(lw.load_actor(tmp_path / "policy.safetensors")[0]) is guess
+    del sys.modules["my_plugin"]
+    with pytest.raises(ValueError, match=r"'my_plugin:Guess' is not known here: import my_plugin first"):
+        lw.load_actor(tmp_path / "policy.safetensors")
+    assert "my_plugin" not in sys.modules
 
 
 def test_a_string_is_imported_at_its_first_look_up():
@@ -143,10 +125,6 @@ def test_a_string_is_imported_at_its_first_look_up():
     assert [*registry] == ["later"]
 
 
-def test_classes_are_registered_by_their_own_name():
-    with pytest.raises(ValueError, match="policy 'mine' must have the name of its class, 'Policy'"):
-        POLICIES["mine"] = lw.Policy
-    with pytest.raises(TypeError, match="policy 'Tensor' must be a class derived from Policy"):
-        POLICIES["Tensor"] = torch.Tensor
-    with pytest.raises(TypeError, match="method 'mine' must be a Method"):
+def test_a_method_is_a_function():
+    with pytest.raises(TypeError, match="method 'mine' must be a function of plans, got 'PlanConditionedActor'"):
         METHODS["mine"] = "PlanConditionedActor"

@@ -102,7 +102,7 @@ class _RelativePositions(Features):
         """Return the relative positions of each step, (..., S, P, 3) in metres."""
         known = torch.cat((observation, self.constants.expand(*observation.shape[:-1], -1)), -1)
         begin, end = pick(self.begin, rows), pick(self.end, rows)  # (..., S, P, 3)
-        flat = (*begin.shape[: rows.ndim], -1)
+        flat = (*begin.shape[: rows.ndim], begin.shape[rows.ndim :].numel())
         found = (known.gather(-1, end.reshape(flat)) - known.gather(-1, begin.reshape(flat))).reshape(begin.shape)
         return found + pick(self.offset, rows)
 

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from tensordict.utils import NestedKey
 from torch import nn
 
-from lw_torchrl._keys import as_keys
+from lw_torchrl._keys import any_arguments, as_keys
 
 
 class RenamedInputs(TensorDictModuleBase):
@@ -54,6 +54,10 @@ def _parts_reading(module: nn.Module, renamed: Mapping[NestedKey, NestedKey], co
 
 class NamedParts(RenamedInputs, TensorDictSequential):
     """A sequence of named parts: ``actor.decoder`` is a part, and ``actor.decoder = network`` replaces it."""
+
+    @any_arguments
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        return super().forward(*args, **kwargs)
 
     def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
         """Return a module as the part ``name``: a plain module reads and writes the keys of the part before it."""

@@ -18,7 +18,7 @@ from torchrl.data import Composite
 from torchrl.modules import IndependentNormal, TanhNormal
 
 from lw_torchrl._checks import check_choice, checked
-from lw_torchrl._keys import key_beside
+from lw_torchrl._keys import any_arguments, key_beside
 from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
 from lw_torchrl.modules.features import Features
 from lw_torchrl.modules.networks import materialize
@@ -78,6 +78,10 @@ class StochasticActor(RenamedInputs, ProbabilisticTensorDictSequential):
         self.plans, self.tasks, self.layout = trunk_attributes(trunk).values()
         self.spec = spec
         self.distribution, self.action = distribution, action
+
+    @any_arguments
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        return super().forward(*args, **kwargs)
 
     @classmethod
     def of(cls, actor: Any, distribution: DistributionName, init_std: float) -> StochasticActor:

@@ -58,7 +58,8 @@ class ActorEnsemble(RenamedInputs):
         self.plans, self.tasks, self.layout = plans_of(first), tasks_of(first), layout_of(first)
         self.in_keys = list(dict.fromkeys(key for member in members for key in member.in_keys))
         written = [key for key in first.out_keys if _last(key) in ("action", "skill_weights")]
-        self.out_keys = sorted(written, key=_last)
+        self._written: list[NestedKey] = sorted(written, key=_last)
+        self.out_keys = list(self._written)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -68,7 +69,7 @@ class ActorEnsemble(RenamedInputs):
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         outputs = [member(tensordict.copy()) for member in self.members]
-        means = [torch.stack([output.get(key) for output in outputs]).mean(0) for key in self.out_keys_source]
+        means = [torch.stack([output.get(key) for output in outputs]).mean(0) for key in self._written]
         return write(tensordict, self, means)
 
     def with_plans(self, plans: AnyPlans) -> ActorEnsemble:
@@ -114,9 +115,9 @@ class DecidedGripper(RenamedInputs):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         outputs = self.actor(tensordict.copy())
         if not self.training:
-            action = outputs.get(_action(self))
-            outputs.set(_action(self), decided(action, self.action_layout, self.closes_above))
-        return write(tensordict, self, [outputs.get(key) for key in self.out_keys_source])
+            action = outputs.get(_action(self.actor))
+            outputs.set(_action(self.actor), decided(action, self.action_layout, self.closes_above))
+        return write(tensordict, self, [outputs.get(key) for key in self.actor.out_keys])
 
     def with_plans(self, plans: AnyPlans) -> DecidedGripper:
         """Return the policy with the same networks that follows other plans."""
@@ -187,8 +188,9 @@ class DemonstratedActor(RenamedInputs):
         known = torch.isin(task, ids)
         shown_tasks = tensordict.copy().set(key, torch.where(known, task, ids[0]))
         learned = self.demonstrated(shown_tasks).get(_action(self.demonstrated))
-        outputs.set(_action(self), torch.where(known.unsqueeze(-1), learned, outputs.get(_action(self))))
-        return write(tensordict, self, [outputs.get(key) for key in self.out_keys_source])
+        key = _action(self.others)
+        outputs.set(key, torch.where(known.unsqueeze(-1), learned, outputs.get(key)))
+        return write(tensordict, self, [outputs.get(key) for key in self.others.out_keys])
 
     def with_plans(self, plans: AnyPlans) -> TensorDictModuleBase:
         """Return the policy for other plans; for those of another suite only ``others``."""
@@ -253,8 +255,8 @@ class TransferredActor(RenamedInputs):
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         outputs = self.actor(tensordict.copy())
-        outputs.set(_action(self), self.converted(outputs.get(_action(self))))
-        return write(tensordict, self, [outputs.get(key) for key in self.out_keys_source])
+        outputs.set(_action(self.actor), self.converted(outputs.get(_action(self.actor))))
+        return write(tensordict, self, [outputs.get(key) for key in self.actor.out_keys])
 
     def converted(self, action: Tensor) -> Tensor:
         """Return actions of the layout that was trained with, (..., A), as actions of this layout."""

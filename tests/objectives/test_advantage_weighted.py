@@ -16,6 +16,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
+from lw_torchrl.modules import MLPDecoder, ObservationFeatures, Value, descriptor_trunk
 from lw_torchrl.training import fit_normalization
 
 PLANS = lw.load_plans("MT10")
@@ -25,11 +26,11 @@ FLOATS = st.floats(-100, 100, width=32)
 
 
 def make_actor(kind="plan", distribution=None, **options):
-    options = {**SMALL, "distribution": distribution, "feature_noise": 0.0, **options}
     torch.manual_seed(0)
-    if kind == "plan":
-        return lw.PlanConditionedActor(PLANS, **options)
-    return lw.DescriptorConditionedActor("MT10", **options)
+    parts = {"decoder": MLPDecoder(**SMALL), "features": ObservationFeatures(), **options}
+    make = lw.PlanConditionedActor if kind == "plan" else lw.DescriptorConditionedActor
+    actor = make(PLANS if kind == "plan" else "MT10", **parts)
+    return actor if distribution is None else actor.stochastic(distribution)
 
 
 def make_batch(rows=12, seed=0, spread=2.0):
@@ -183,7 +184,7 @@ def test_compiled_it_is_one_graph_with_the_same_gradients(name, distribution):
 
 def test_its_state_goes_round_and_statistics_reach_it():
     batch = make_batch()
-    loss, other = (lw.objectives.AdvantageWeightedLoss(make_actor(encoder_width=w)) for w in (128, 128))
+    loss, other = (lw.objectives.AdvantageWeightedLoss(make_actor()) for _ in range(2))
     for p in other.parameters():
         p.data += 0.1
     assert loss(batch)["loss_actor"] != other(batch)["loss_actor"]
@@ -199,7 +200,7 @@ def test_its_state_goes_round_and_statistics_reach_it():
 
 def test_keys_by_other_names_nested_ones_too():
     batch = make_batch()
-    keys = [("agent", "observation"), ("agent", "task_id")]
+    keys = [("agent", "task_id"), ("agent", "observation")]
     out = [("agent", "action")]
     plain = lw.objectives.AdvantageWeightedLoss(make_actor("description"))
     other = lw.objectives.AdvantageWeightedLoss(make_actor("description", in_keys=keys, out_keys=out))
@@ -226,7 +227,7 @@ def test_its_keys_are_enough_and_what_it_is_given_stays():
 
 def test_answers_to_other_plans_are_refused():
     other = lw.ConditionalPlan.from_pairs("reach", [(lw.supported_queries("reach")[0], "go there")])
-    loss = lw.objectives.AdvantageWeightedLoss(lw.PlanConditionedActor({**PLANS, "reach": other}, **SMALL))
+    loss = lw.objectives.AdvantageWeightedLoss(lw.PlanConditionedActor({**PLANS, "reach": other}))
     with pytest.raises(ValueError, match="other plans"):
         loss(make_batch())
 
@@ -293,13 +294,11 @@ def test_of_huge_ones_too():
 
 def test_from_the_value_to_the_weights():
     """The three together, as they are meant: what is better than its state's value counts more."""
-    from lw_torchrl.modules import DescriptorEncoder, Value
-
     batch = make_batch(40)
     ended = torch.ones(40, 1, dtype=torch.bool)
     following = batch.select("observation", "task_id").set("done", ended).set("terminated", ended)
     batch["next"] = following.set("reward", torch.rand(40, 1))
-    value = lw.objectives.ExpectileValueLoss(Value(DescriptorEncoder("MT10"), ensemble=2, **SMALL), delay_value=False)
+    value = lw.objectives.ExpectileValueLoss(Value(descriptor_trunk("MT10"), ensemble=2, **SMALL), delay_value=False)
     batch["advantage"] = lw.objectives.standardize_by_task(value.advantage(batch), batch["task_id"])
     found = lw.objectives.AdvantageWeightedLoss(make_actor("description"), beta=3.0)(batch)
     assert found["loss_actor"].isfinite()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from test_losses import BOUNDS, PLANS, SMALL, make_actor, make_batch, make_encoder, total
+from test_losses import BOUNDS, PLANS, SMALL, make_actor, make_batch, make_trunk, total
 from torchrl.objectives import SACLoss, SoftUpdate, TD3Loss
 
 import lw_torchrl as lw
@@ -15,7 +15,7 @@ from lw_torchrl.objectives.demonstrated import imitation
 def make(kind, bc_weight=2.0, seed=0, **options):
     torch.manual_seed(seed)
     actor = make_actor("plan", "tanh_normal" if kind is lw.objectives.DemonstratedSACLoss else None).eval()
-    critic = QValue(make_encoder("plan"), **SMALL)
+    critic = QValue(make_trunk("plan"), **SMALL)
     more = BOUNDS if kind in (lw.objectives.DemonstratedTD3Loss, TD3Loss) else {}
     loss = kind(actor, critic, **({} if bc_weight is None else {"bc_weight": bc_weight}), **more, **options)
     loss.make_value_estimator(gamma=0.9)
@@ -49,10 +49,10 @@ def test_td3s_actor_is_torn_between_values_and_demonstrations(shape):
     torch.testing.assert_close(about["state_action_value_actor"], value.detach())
     torch.testing.assert_close(about["lmbd"], 1 / value.abs().mean().detach())
     found.backward()
-    mine = actor.head.network[0].weight.grad.clone()
+    mine = actor.decoder.network[0].weight.grad.clone()
     actor.zero_grad()
     expected.backward()
-    torch.testing.assert_close(actor.head.network[0].weight.grad, mine)
+    torch.testing.assert_close(actor.decoder.network[0].weight.grad, mine)
     assert all(p.grad is None for p in loss.qvalue_network_params.parameters()), "critics are trained by theirs alone"
 
 
@@ -71,7 +71,7 @@ def test_sacs_actor_is_drawn_to_demonstrations_by_its_mode():
     batch = make_batch()
     batch["action"] = batch["action"].sign()  # where a likelihood explodes
     ours, actor, _ = make(lw.objectives.DemonstratedSACLoss, bc_weight=0.7)
-    theirs = SACLoss(actor, QValue(make_encoder("plan"), **SMALL))
+    theirs = SACLoss(actor, QValue(make_trunk("plan"), **SMALL))
     theirs.make_value_estimator(gamma=0.9)
     SoftUpdate(theirs, eps=0.9)
     theirs.load_state_dict(ours.state_dict())
@@ -183,7 +183,7 @@ def test_a_sum_is_the_mean_times_the_rows(kind):
 def test_an_action_spec_of_several_rows_is_refused():
     env = lw.LanguageWorldEnv("reach", num_envs=4)
     for kind in (lw.objectives.DemonstratedTD3Loss, lw.objectives.DemonstratedSACLoss):
-        actor, critic = make_actor("plan"), QValue(make_encoder("plan"), **SMALL)
+        actor, critic = make_actor("plan"), QValue(make_trunk("plan"), **SMALL)
         with pytest.raises(
             ValueError, match=r"action_spec must have no batch dimension, got shape \(4, 4\); use env.action"
         ):

@@ -18,22 +18,22 @@ from torchrl.objectives import IQLLoss, SoftUpdate, ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
 import lw_torchrl as lw
-from lw_torchrl.modules import DescriptorEncoder, ObservationFeatures, Value
+from lw_torchrl.modules import ObservationFeatures, Value, descriptor_trunk
 from lw_torchrl.training import fit_normalization
 
 PLANS = lw.load_plans("MT10")
 SMALL = dict(width=16, depth=1)
 CRITICS = {
     "plan": lambda ensemble, **more: lw.PlanConditionedValue(PLANS, ensemble=ensemble, **SMALL, **more),
-    "description": lambda ensemble, **more: Value(DescriptorEncoder("MT10", **more), ensemble=ensemble, **SMALL),
+    "description": lambda ensemble, **more: Value(descriptor_trunk("MT10", **more), ensemble=ensemble, **SMALL),
 }
 
 
 def make_loss(kind="plan", ensemble=2, seed=0, gamma=0.9, **options):
     """A loss whose targets differ from what it trains, as in the midst of a training."""
     torch.manual_seed(seed)
-    noise = {"feature_noise": options.pop("feature_noise", 0.0)}
-    loss = lw.objectives.ExpectileValueLoss(CRITICS[kind](ensemble, **noise), **options)
+    features = ObservationFeatures(noise=options.pop("noise", 0.0))
+    loss = lw.objectives.ExpectileValueLoss(CRITICS[kind](ensemble, features=features), **options)
     loss.make_value_estimator(gamma=gamma)
     if options.get("delay_value", True):
         SoftUpdate(loss, eps=0.9)
@@ -203,25 +203,23 @@ def test_statistics_reach_value_and_target(kind):
     before = loss.advantage(batch)
     fit_normalization(loss, replay)
     expected = ObservationFeatures("differences")
-    expected.fit(batch["observation"])
+    expected.fit(batch)
     for params in (loss.value_network_params, loss.target_value_network_params):
-        assert torch.equal(params["encoder", "features", "mean"], expected.mean)
+        assert torch.equal(params["trunk", "module", "features", "mean"], expected.mean)
     assert not torch.equal(loss.advantage(batch), before)
     np.testing.assert_allclose(loss(batch)["loss_value"].item(), by_hand(loss, batch)[0], rtol=1e-5)
 
 
 def test_keys_by_other_names_nested_ones_too():
-    keys = [("agent", "observation"), ("agent", "task_id")]
+    keys = [("agent", "task_id"), ("agent", "observation")]
     names = {"value": ("agent", "v"), "values": ("agent", "vs"), "reward": ("agent", "gain"), "priority": "urgency"}
     names |= {"done": ("agent", "over"), "terminated": ("agent", "dead"), "steps_to_next_obs": ("agent", "n")}
 
     def make(in_keys=None, out_keys=None):
         torch.manual_seed(3)
-        encoder = DescriptorEncoder("MT10", in_keys=in_keys)
-        loss = lw.objectives.ExpectileValueLoss(
-            Value(encoder, ensemble=2, out_keys=out_keys, **SMALL), delay_value=False
-        )
-        return loss
+        value = Value(descriptor_trunk("MT10"), ensemble=2, out_keys=out_keys, **SMALL)
+        value.in_keys = in_keys or value.in_keys
+        return lw.objectives.ExpectileValueLoss(value, delay_value=False)
 
     plain, other = make().make_value_estimator(gamma=0.9), make(keys, [names["value"], names["values"]])
     other.make_value_estimator(gamma=0.9)
@@ -265,13 +263,13 @@ def test_weights_of_a_prioritized_sampler_count():
 
 
 def test_noise_on_features_is_in_the_loss_alone():
-    loss, batch = make_loss(feature_noise=0.3), make_batch()
+    loss, batch = make_loss(noise=0.3), make_batch()
     assert loss.value_network.training
     assert loss(batch)["loss_value"] != loss(batch)["loss_value"]
     assert torch.equal(loss.advantage(batch), loss.advantage(batch))
     quiet = make_loss()
     assert torch.equal(loss.advantage(batch), quiet.advantage(batch))
-    assert loss.value_network.encoder.features.training  # as it was
+    assert loss.value_network.trunk.module["features"].training  # as it was
     loss.eval()
     assert torch.equal(loss(batch)["loss_value"], quiet(batch)["loss_value"])
     loss.train()

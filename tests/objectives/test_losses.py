@@ -33,7 +33,7 @@ from torchrl.objectives.value import GAE
 
 import lw_torchrl as lw
 from lw_torchrl._devices import device_of
-from lw_torchrl.modules import DescriptorEncoder, PlanEncoder, QValue, Value
+from lw_torchrl.modules import MLPDecoder, ObservationFeatures, QValue, Value, descriptor_trunk, plan_trunk
 from lw_torchrl.objectives import with_n_steps
 
 PLANS = lw.load_plans("MT10")
@@ -57,7 +57,7 @@ STOCHASTIC = {
     "IQL": lambda actor, q, v: IQLLoss(actor, q, v),
     "CQL": lambda actor, q, v: CQLLoss(actor, q, action_spec=actor.spec["action"]),
     "TQC": lambda actor, q, v: TQCLoss(
-        actor, QValue(q.encoder, quantiles=5, **SMALL).to(device_of(q)), num_qvalue_nets=2
+        actor, QValue(q.trunk, quantiles=5, **SMALL).to(device_of(q)), num_qvalue_nets=2
     ),
 }
 ON_POLICY = {
@@ -70,24 +70,27 @@ LOSSES = DETERMINISTIC | STOCHASTIC | ON_POLICY
 CONDITIONS = ("plan", "description", "one-hot")
 
 
-def make_actor(condition, distribution=None, **options):
-    options = {**SMALL, "distribution": distribution, **options}
+def make_actor(condition, distribution=None, noise=0.05, **options):
+    parts = {"decoder": MLPDecoder(**SMALL), "features": ObservationFeatures(noise=noise), **options}
     if condition == "plan":
-        return lw.PlanConditionedActor(PLANS, **options)
-    return lw.DescriptorConditionedActor("MT10", condition=condition, **options)
+        actor = lw.PlanConditionedActor(PLANS, **parts)
+    else:
+        actor = lw.DescriptorConditionedActor("MT10", condition=condition, **parts)
+    return actor if distribution is None else actor.stochastic(distribution)
 
 
-def make_encoder(condition, **options):
+def make_trunk(condition, noise=0.0):
+    features = ObservationFeatures(noise=noise)
     if condition == "plan":
-        return PlanEncoder(PLANS, **options)
-    return DescriptorEncoder("MT10", condition=condition, **options)
+        return plan_trunk(PLANS, features=features)
+    return descriptor_trunk("MT10", condition=condition, features=features)
 
 
 def make_loss(name, condition, distribution="tanh_normal", seed=0, device="cpu", **noise):
     torch.manual_seed(seed)
     actor = make_actor(condition, None if name in DETERMINISTIC else distribution, **noise)
-    q = QValue(make_encoder(condition, **noise), **SMALL)
-    v = Value(make_encoder(condition, **noise), **SMALL)
+    q = QValue(make_trunk(condition, **noise), **SMALL)
+    v = Value(make_trunk(condition, **noise), **SMALL)
     for network in (actor, q, v):
         network.to(device)
     with warnings.catch_warnings():
@@ -213,7 +216,7 @@ def test_compiled_it_is_one_graph_with_the_same_gradients(name, condition):
 @pytest.mark.parametrize("condition", CONDITIONS)
 def test_compiled_to_kernels_it_is_the_same_but_for_rounding(condition):
     torch._dynamo.reset()
-    loss, _, _ = make_loss("BC", condition, feature_noise=0.0)
+    loss, _, _ = make_loss("BC", condition, noise=0.0)
     expected = total(loss, make_batch())
     torch.testing.assert_close(total(torch.compile(loss, fullgraph=True), make_batch()), expected)
 
@@ -239,7 +242,7 @@ def test_it_goes_to_a_gpu_and_comes_back(name, condition):
 
 @pytest.mark.parametrize("name", ["SAC", "IQL", "TD3", "CQL", "REDQ"])
 def test_noise_on_the_features_is_drawn_for_each_critic(name):
-    loss, _, _ = make_loss(name, "plan", feature_noise=0.1)
+    loss, _, _ = make_loss(name, "plan", noise=0.1)
     assert total(loss, make_batch()).isfinite()
     assert loss.vmap_randomness == "different"
 
@@ -282,8 +285,10 @@ def test_the_ratio_is_one_before_an_update():
     from torchrl.envs import TransformedEnv
 
     for distribution in ("tanh_normal", "normal"):
-        actor, value = lw.modules.plan_actor_value(PLANS, distribution=distribution, init_std=1.5, **SMALL)
-        env = TransformedEnv(lw.LanguageWorldEnv(["push", "reach"], num_envs=4, seed=0), actor.transform())
+        actor = make_actor("plan").stochastic(distribution, init_std=1.5)
+        value = Value(actor.trunk, **SMALL)
+        queries = lw.modules.transform_of(actor)
+        env = TransformedEnv(lw.LanguageWorldEnv(["push", "reach"], num_envs=4, seed=0), queries)
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             data = env.rollout(20, actor)
         env.close()
@@ -296,13 +301,14 @@ def test_the_ratio_is_one_before_an_update():
         torch.testing.assert_close(found["kl_approx"], torch.tensor(0.0), atol=1e-6, rtol=0)
 
 
-def test_a_shared_encoder_is_trained_by_both():
-    actor, value = lw.modules.plan_actor_value(PLANS, **SMALL)
-    assert value.encoder is actor.encoder
+def test_a_shared_trunk_is_trained_by_both():
+    actor = make_actor("plan", "tanh_normal")
+    value = Value(actor.trunk, **SMALL)
+    assert value.trunk.module["mixer"] is actor.module["mixer"]
     batch = ready("PPO", make_batch(), actor, value)
     loss = ClipPPOLoss(actor, value, separate_losses=False)
     found = loss(batch)
-    shared = actor.encoder.texts[0].weight
+    shared = actor.module["mixer"].encoder[0].weight
     names = [name for name, p in loss.named_parameters() if p.shape == shared.shape and p.requires_grad]
     assert len(names) == 1
     found["loss_critic"].backward()

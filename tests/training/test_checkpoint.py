@@ -19,12 +19,18 @@ from lw_torchrl._tensor_files import read_tensors, write_tensors
 from lw_torchrl._versions import package_versions
 from lw_torchrl.language import embeddings
 from lw_torchrl.language.skills import load_skills
-from lw_torchrl.modules import ActorEnsemble
+from lw_torchrl.modules import ActorEnsemble, MLPDecoder, ObservationFeatures, SkillEncoder
+from lw_torchrl.modules.describe import describe
 from lw_torchrl.training import save_evaluator
 from lw_torchrl.training.checkpoint import read_description
 
-SMALL = dict(latent_size=4, width=16, depth=1, encoder_width=8)
 PLANS = lw.load_plans("MT10")
+
+
+def small(plans=PLANS, **options):
+    """A small actor; the same for :class:`lw.DescriptorConditionedActor`'s tasks."""
+    parts = {"skill_encoder": SkillEncoder(4, width=8), "decoder": MLPDecoder(width=16, depth=1)}
+    return lw.PlanConditionedActor(plans, **{**parts, **options})
 
 
 def count_vowels(texts):
@@ -65,7 +71,7 @@ def act(actor, plans=PLANS):
 def saved(tmp_path_factory):
     path = tmp_path_factory.mktemp("checkpoint") / "policy.safetensors"
     torch.manual_seed(0)
-    return path, train(lw.PlanConditionedActor(PLANS, **SMALL), path)
+    return path, train(small(), path)
 
 
 @pytest.fixture
@@ -79,17 +85,17 @@ def path(tmp_path):
 @pytest.mark.parametrize(
     "options",
     [
-        dict(features="raw"),
-        dict(features="both", feature_noise=0.5),
-        dict(latent_size=7, width=9, depth=2, encoder_width=5, encoder_depth=2),
+        lambda: dict(features=ObservationFeatures("raw")),
+        lambda: dict(features=ObservationFeatures("both", 0.5)),
+        lambda: dict(skill_encoder=SkillEncoder(7, width=5, depth=2), decoder=MLPDecoder(width=9, depth=2)),
     ],
 )
 def test_load_actor_makes_the_same_policy(path, options):
     torch.manual_seed(1)
-    actor = train(lw.PlanConditionedActor(PLANS, **{**SMALL, **options}), path)
+    actor = train(small(**options()), path)
     loaded = lw.load_actor(path)
     assert isinstance(loaded, lw.PlanConditionedActor)
-    assert (loaded.config, loaded.plans, loaded.training) == (actor.config, actor.plans, False)
+    assert (loaded.plans, loaded.training, describe(loaded)) == (actor.plans, False, describe(actor))
     state = make_rows(seed=1).exclude("action")
     expected, found = actor.eval()(state.clone()), loaded(state.clone())
     for key in actor.out_keys:
@@ -97,7 +103,7 @@ def test_load_actor_makes_the_same_policy(path, options):
 
 
 def test_own_plans_are_stored_and_the_text_encoder_is_passed_again(path):
-    actor = train(lw.PlanConditionedActor(own_plans(), text_encoder=count_vowels, **SMALL), path, own_plans())
+    actor = train(small(own_plans(), text_encoder=count_vowels), path, own_plans())
     loaded = lw.load_actor(path, text_encoder=count_vowels)
     assert loaded.plans == own_plans()
     assert torch.equal(act(loaded, own_plans()), act(actor, own_plans()))
@@ -108,13 +114,13 @@ def test_own_plans_are_stored_and_the_text_encoder_is_passed_again(path):
 
 
 def own_words():
-    return lw.PlanConditionedActor(own_plans(), **SMALL)
+    return small(own_plans())
 
 
 NOT_SHIPPED = {
     "a plan": own_words,
     "a description": lambda: lw.DescriptorConditionedActor(
-        [replace(lw.TASKS["reach"], description="Bring the hand over to the red spot.")], **SMALL
+        [replace(lw.TASKS["reach"], description="Bring the hand over to the red spot.")]
     ),
     "an ensemble": lambda: ActorEnsemble([own_words(), own_words()]),
 }
@@ -130,7 +136,7 @@ def test_texts_that_are_not_shipped_load_in_a_new_process(make, path):
 
 @pytest.mark.parametrize("other", [lambda actor: actor, lambda actor: actor.with_plans(PLANS)])
 def test_members_that_share_weights(path, other):
-    actor = lw.PlanConditionedActor(PLANS, **SMALL)
+    actor = small()
     ensemble = ActorEnsemble([actor, other(actor)])
     lw.save_actor(ensemble, path)
     loaded = lw.load_actor(path).state_dict()
@@ -141,7 +147,7 @@ def test_scripted_skills(path, tmp_path):
     actor = lw.ScriptedSkillActor(PLANS, "mix")
     lw.save_actor(actor, path)
     assert torch.equal(act(lw.load_actor(path)), act(actor))
-    with pytest.raises(TypeError, match="with skills of your own cannot be saved"):
+    with pytest.raises(TypeError, match="with custom skills cannot be saved"):
         lw.save_actor(lw.ScriptedSkillActor(PLANS, skills=load_skills()), tmp_path / "own.safetensors")
 
 
@@ -162,9 +168,8 @@ def test_any_safetensors_reader_reads_the_weights(saved):
 
 def test_the_description_says_how_it_was_made(saved, path):
     description = read_description(saved[0])
-    assert description["actor"]["kind"] == "PlanConditionedActor"
-    assert description["actor"]["options"] == saved[1].config
-    assert set(description["actor"]["plans"]) == set(lw.MT10)
+    assert description["actor"] == describe(saved[1])
+    assert description["actor"]["class"] == "PlanConditionedActor"
     assert (description["training"]["steps"], description["data"]) == (5, None)
     lw.save_actor(saved[1], path, note={"mine": [1, 2]})
     assert read_description(path)["note"] == {"mine": [1, 2]}
@@ -174,26 +179,26 @@ def test_the_description_says_how_it_was_made(saved, path):
 # ---- refused before it is written
 
 
-def test_an_actor_that_is_not_a_policy_is_refused_before_training(tmp_path, path):
-    module = TensorDictModule(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
+def test_an_actor_that_cannot_be_saved_is_refused_before_training(tmp_path, path):
+    module = TensorDictModule(nn.Conv1d(39, 4, 1), in_keys=["observation"], out_keys=["action"])
     for write in (train, lw.save_actor):
-        with pytest.raises(TypeError, match=r"actor must be a Policy.*, got TensorDictModule"):
+        with pytest.raises(TypeError, match=r"the policy is a Conv1d, which cannot be saved: give it an attr"):
             write(module, path)
     assert not list(tmp_path.iterdir())
 
 
 def pruned(actor):
-    prune.random_unstructured(actor.head.network[0], "weight", 0.5)
+    prune.random_unstructured(actor.decoder.network[0], "weight", 0.5)
     return actor
 
 
 def reconfigured(actor):
-    actor.config["width"] = 32
+    actor.decoder.network.config["width"] = 32
     return actor
 
 
 def not_finite(actor):
-    nn.init.constant_(actor.head.network[0].bias, float("inf"))
+    nn.init.constant_(actor.decoder.network[0].bias, float("inf"))
     return actor
 
 
@@ -201,13 +206,13 @@ def not_finite(actor):
     ("change", "message"),
     [
         (lw.PlanConditionedActor.double, r"must be torch.float32 of shape .*, got torch.float64"),
-        (pruned, "must hold the same tensors as the module, they differ in head.network.0.weight"),
+        (pruned, "must hold the same tensors as the module, they differ in module.decoder.network.0.weight"),
         (reconfigured, r"must be torch.float32 of shape \(32, .*, got torch.float32 of shape \(16, "),
-        (not_finite, "head.network.0.bias must be finite"),
+        (not_finite, "decoder.network.0.bias must be finite"),
     ],
 )
 def test_what_could_not_be_loaded_is_not_saved(tmp_path, path, change, message):
-    actor = change(lw.PlanConditionedActor(PLANS, **SMALL))
+    actor = change(small())
     for write in (lw.save_actor, train):
         with pytest.raises(ValueError, match=f"actor cannot be kept in a file, .*{message}"):
             write(actor, path)
@@ -215,7 +220,7 @@ def test_what_could_not_be_loaded_is_not_saved(tmp_path, path, change, message):
 
 
 def test_saving_draws_no_random_numbers(path):
-    actor = lw.PlanConditionedActor(PLANS, **SMALL)
+    actor = small()
     before = torch.get_rng_state()
     lw.save_actor(actor, path)
     assert torch.equal(torch.get_rng_state(), before)
@@ -232,7 +237,7 @@ def test_saving_draws_no_random_numbers(path):
 )
 def test_metadata_that_could_not_be_read_again(tmp_path, path, about, message):
     with pytest.raises(ValueError, match=message):
-        lw.save_actor(lw.PlanConditionedActor(PLANS, **SMALL), path, **about)
+        lw.save_actor(small(), path, **about)
     assert not list(tmp_path.iterdir())
 
 
@@ -244,7 +249,7 @@ def test_a_full_disk_leaves_the_old_file(saved, tmp_path, path, monkeypatch):
 
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OSError, match=r"No space left on device: '.*c\.safetensors'"):
-        lw.save_actor(lw.PlanConditionedActor(PLANS, width=64), path)
+        lw.save_actor(small(), path)
     assert path.read_bytes() == saved[0].read_bytes()
     assert list(tmp_path.iterdir()) == [path]
 
@@ -272,9 +277,9 @@ def test_files_of_another_kind(saved, tmp_path, path):
     save_file({"weight": torch.ones(2)}, path)
     refused(path, "it is a .safetensors file, but was not written by lw_torchrl")
     training = saved[0].with_name("policy.training.safetensors")
-    refused(training, "must be a policy of version 1, got format 'lw_torchrl.training', version 1")
+    refused(training, "must be a policy of version 2, got format 'lw_torchrl.training', version 2")
     save_evaluator(lw.StateQueryEvaluator(PLANS, width=8), path)
-    refused(path, "must be a policy of version 1, got format 'lw_torchrl.evaluator'")
+    refused(path, "must be a policy of version 2, got format 'lw_torchrl.evaluator'")
 
 
 def test_a_pickle_is_not_loaded(tmp_path, path):
@@ -296,12 +301,12 @@ def test_a_truncated_file(saved, path, share):
 
 NAN = torch.tensor([float("nan"), 0.0, 0.0, 0.0])
 CHANGES = {
-    "other options": ("options", "width", 32, r"must be torch.float32 of shape \(32, .* got .* \(16, "),
-    "an unknown option": ("options", "depht", 1, "depht"),
-    "an unknown kind": (None, "kind", "ElephantActor", "'ElephantActor'"),
+    "other options": ("decoder", "width", 32, r"must be torch.float32 of shape \(32, .* got .* \(16, "),
+    "an unknown option": ("decoder", "depht", 1, "depht"),
+    "an unknown class": (None, "class", "ElephantActor", "'ElephantActor'"),
     "a plan that cannot be parsed": ("plans", "reach", "def raech(", "plan of 'reach' must be like"),
-    "NaN": ("tensors", "head.network.2.bias", NAN, "must be finite, it holds NaN"),
-    "another dtype": ("tensors", "head.network.2.bias", NAN.double(), "got torch.float64"),
+    "NaN": ("tensors", "module.decoder.network.2.bias", NAN, "must be finite, it holds NaN"),
+    "another dtype": ("tensors", "module.decoder.network.2.bias", NAN.double(), "got torch.float64"),
     "another tensor": ("tensors", "more", NAN, "they differ in more"),
 }
 
@@ -309,7 +314,9 @@ CHANGES = {
 @pytest.mark.parametrize(("inside", "name", "value", "message"), CHANGES.values(), ids=CHANGES)
 def test_weights_that_do_not_fit_the_description(saved, path, inside, name, value, message):
     description, tensors = read_tensors(saved[0])
-    described = description["actor"] if inside is None else {**description["actor"], "tensors": tensors}[inside]
+    actor = description["actor"]
+    decoder = actor["options"]["decoder"]["module"]["options"]["network"]["module"]["options"]
+    described = {None: actor, "decoder": decoder, "plans": actor["plans"][0], "tensors": tensors}[inside]
     described[name] = value
     write_tensors(path, description, tensors)
     refused(path, f"the actor of .* cannot be made .*{message}")
@@ -317,7 +324,7 @@ def test_weights_that_do_not_fit_the_description(saved, path, inside, name, valu
 
 def test_a_flipped_bit_is_found(tmp_path):
     path = tmp_path / "policy.safetensors"
-    lw.save_actor(lw.PlanConditionedActor(PLANS, **SMALL), path)
+    lw.save_actor(small(), path)
     content = path.read_bytes()
     for place in range(len(content) // 3, len(content), len(content) // 7):
         damaged = bytearray(content)
