@@ -65,7 +65,7 @@ def test_what_is_no_device_is_refused(given, error, said):
 @needs_no_gpu
 def test_without_a_gpu_there_is_the_cpu(demos, tmp_path):
     assert check_device("device", "auto") == CPU
-    actor, replay = lw.PlanConditionedActor(PLANS, width=8), make_replay(demos)
+    actor, replay = lw.PlanConditionedActor(PLANS), make_replay(demos)
     for refused in (
         lambda: make_replay(demos, "cuda"),
         lambda: lw.BehavioralCloningTrainer(actor, replay, device="cuda"),
@@ -127,7 +127,7 @@ def test_on_a_gpu_nobody_waits(demos, tmp_path):
     losses = {}
     for device in ("cpu", "cuda"):
         torch.manual_seed(0)
-        actor = lw.PlanConditionedActor(PLANS, width=16, feature_noise=0.0)
+        actor = lw.PlanConditionedActor(PLANS, features=lw.modules.ObservationFeatures())
         options = {"checkpoint": tmp_path / f"{device}.safetensors", "progress": False, "device": device}
         trainer = lw.BehavioralCloningTrainer(actor, make_replay(demos, device), config, **options)
         losses[device] = [trainer.step().item() for _ in range(4)]

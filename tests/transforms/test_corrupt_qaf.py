@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -152,8 +154,8 @@ def walk(env: EnvBase, steps: int) -> TensorDictBase:
 def test_the_number_of_environments_and_workers_changes_nothing():
     tasks, options = ["push", "reach"], {"flip": 0.2, "delay": 1}
 
-    def make(rows: int, names=tasks) -> EnvBase:
-        return lw.LanguageWorldEnv(names, num_envs=rows, seed=1, max_steps=6, num_threads=1)
+    def make(rows: int, names=tasks, worker=None) -> EnvBase:
+        return lw.LanguageWorldEnv(names, num_envs=rows, seed=1, max_steps=6, num_threads=1, worker=worker)
 
     def spoilt(env: EnvBase) -> TransformedEnv:
         return TransformedEnv(env, Compose(lw.QAFTransform(PLANS), lw.CorruptQAF(PLANS, **options)))
@@ -161,8 +163,8 @@ def test_the_number_of_environments_and_workers_changes_nothing():
     envs = [
         spoilt(make(2)),
         spoilt(make(4)),
-        spoilt(SerialEnv(2, lambda: make(2))),
-        SerialEnv(2, lambda: spoilt(make(2))),
+        spoilt(SerialEnv(2, [partial(make, 2, worker=(w, 2)) for w in range(2)])),
+        SerialEnv(2, [lambda w=w: spoilt(make(2, worker=(w, 2))) for w in range(2)]),
         spoilt(make(1, ["reach"])),
     ]
     first, *others = (episodes_of(walk(env, 24)) for env in envs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 import torch
@@ -114,10 +115,9 @@ def test_masked_rows_keep_their_answers(env):
 
 
 def test_some_rows_of_a_worker_are_reset(few_plans):
-    def make() -> lw.LanguageWorldEnv:
-        return lw.LanguageWorldEnv(["push", "reach"], seed=0, max_steps=9)
-
-    env = TransformedEnv(SerialEnv(2, make), lw.QAFTransform(few_plans))
+    make = partial(lw.LanguageWorldEnv, ["push", "reach"], seed=0, max_steps=9)
+    workers = SerialEnv(2, [partial(make, worker=(w, 2)) for w in range(2)])
+    env = TransformedEnv(workers, lw.QAFTransform(few_plans))
     state = env.step(env.reset().set("action", torch.zeros(2, 2, 4)))["next"]
     fresh = env.reset(state.clone().set("_reset", torch.tensor([[False, True], [False, False]])))
     assert fresh["episode"].tolist() == [[0, 2], [1, 1]]
