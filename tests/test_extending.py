@@ -64,7 +64,7 @@ class PointEngine:
 
 
 class LearnedTaskActor(TensorDictModuleBase):
-    """Conditioned on a vector of each task that is learned: any TensorDict module that writes ``action`` is an actor."""
+    """Conditioned on a learned vector of each task; any TensorDict module that writes ``action`` is an actor."""
 
     def __init__(self, tasks, size=8, width=32):
         super().__init__()
@@ -74,7 +74,7 @@ class LearnedTaskActor(TensorDictModuleBase):
         self.vectors = nn.Embedding(len(self.tasks), size)
         self.features = ObservationFeatures()
         self.net = MLPDecoder(width=width, depth=1)
-        self(**{"observation": torch.zeros(1, 39), "task_id": torch.tensor([self.index.ids[0]])})
+        self(observation=torch.zeros(1, 39), task_id=torch.tensor([lw.task_id(self.tasks[0])]))  # the decoder is lazy
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict):
