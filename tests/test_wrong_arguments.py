@@ -25,7 +25,7 @@ MORE = {
     "language.plans": ("PlanStep",),
     "language.nearest": ("nearest_query", "nearest_skill"),
     "language.tasks": ("resolve_tasks",),
-    "modules": ("ActorEnsemble", "ImageQueryEvaluator", "plan_actor_value"),
+    "modules": ("ActorEnsemble", "ImageQueryEvaluator"),
     "objectives": (
         "AdvantageWeightedLoss", "DemonstratedSACLoss", "DemonstratedTD3Loss", "ExpectileValueLoss",
         "standardize_by_task",
@@ -38,8 +38,8 @@ MORE = {
     "transforms": ("CameraTransform", "EnvState", "HideOpening", "JitterTarget", "SwapUnmentioned"),
 }  # fmt: skip
 PUBLIC |= {name: import_module(f"lw_torchrl.{room}") for room, names in MORE.items() for name in names}
-PUBLIC |= {name: lw.modules for name in ("Value", "QValue", "PlanEncoder")}
-NOT_MADE_BY_USERS = {"DecodedPlan", "DecodedStep", "PlannerError", "PlanError", "QueryError", "Planner", "Policy"}
+PUBLIC |= {name: lw.modules for name in ("Value", "QValue")}
+NOT_MADE_BY_USERS = {"DecodedPlan", "DecodedStep", "PlannerError", "PlanError", "QueryError", "Planner"}
 WRONG: dict[str, list[Any]] = {
     "bool": ["no", "yes", "", 1, 0, 1.0, None, [], object],
     "int": ["3", 1.5, math.nan, True, None, [], "many"],
@@ -205,20 +205,3 @@ def test_a_gradient_norm_of_zero_would_train_nothing():
     for config in (lw.BehavioralCloningConfig, lw.OfflineConfig):
         with pytest.raises(ValueError, match="max_grad_norm"):
             config(max_grad_norm=0)
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (
-            lambda: lw.PlanConditionedActor(lw.load_plans("MT10"), widht=3),
-            r"PlanConditionedActor: .*'widht'; .*'width'",
-        ),
-        (lambda: lw.DescriptorConditionedActor("MT10", condtion="one-hot"), "did you mean 'condition'"),
-        (lambda: lw.PlanConditionedQValue(lw.load_plans("MT10"), quantile=3), "did you mean 'quantiles'"),
-        (lambda: lw.modules.plan_actor_value(lw.load_plans("MT10"), rolls=True), "did you mean 'roles'"),
-    ],
-)
-def test_a_misspelt_option_is_named_with_the_nearest(call, message):
-    with pytest.raises(TypeError, match=message):
-        call()

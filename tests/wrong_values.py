@@ -36,6 +36,13 @@ WRONG: dict[str, list[Any]] = {
     ],
     "ConditionalPlan": A_CLASS,
     "Sequence[ConditionalPlan]": [3, "reach", [], [3], object()],
+    "str | int | Task": [3.5, b"reach", []],
+    "Condition": ["no such", 3, None, []],
+    "Callable[[], Mapping[str, float]]": FUNCTION,
+    "Sampler | Callable[[], Sampler]": [3, "balanced", []],
+    "Transform | Callable[[TensorDictBase], TensorDictBase]": [3, "qaf", []],
+    "Literal['rollout'] | Iterable[NestedKey]": ["all"],
+    "StepRole": A_CLASS,
     "str | Suite": [3, "mujoco", [], b"fetch"],
     "Callable[[Tensor], Tensor]": [3, "act", []],
     "str | Task": [3, "reech", b"reach", [], 1.5],
@@ -104,7 +111,8 @@ WRONG: dict[str, list[Any]] = {
         None,
     ],
     "float | Fraction": ["half", -0.1, 1.5, math.nan, None, True],
-    "Sequence[Policy]": [3, "a", [], [3], ["a"]],
+    "Sequence[TensorDictModuleBase]": [3, "a", [], [3], ["a"]],
+    "Sequence[type[nn.Module]]": [3],
     "Sequence[TensorDictReplayBuffer]": [3, "a", [], [3], ["a"]],
     "TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase]": [None, 3, "expert", []],
     "TensorDictModuleBase | list[TensorDictModuleBase]": [3, "a", [], [3], None],
@@ -126,10 +134,10 @@ for name in [
     "Transform",
     "QueryEvaluator",
     "ClauseEvaluator",
-    "Encoder",
     "LabelledQueries",
     "LossModule",
-    "Policy",
+    "nn.Module",
+    "TensorDictSequential",
     "QValue",
     "RerunLogger",
     "TensorDictBase",
@@ -142,6 +150,8 @@ for name in [
 ]:
     WRONG[name] = A_CLASS
 OF_ONE_NAME: dict[str, list[Any]] = {
+    "ImageQueryEvaluatorTrainer.evaluator": A_CLASS,
+    "ImageQueryEvaluatorTrainer.config": A_CLASS,
     "ImageQueryEvaluator.names": ["gripper", 3, [3]],  # those that a plan speaks of must be there
     "resolve_tasks.tasks": [3, "MT10", ["reach"]],
     "evaluate.engine": [3, "mujoco", []],
@@ -167,7 +177,7 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         terminate_on_success=True,
         transform=lw.QAFTransform(plans),
     )
-    actor = lw.PlanConditionedActor(plans, width=8)
+    actor = lw.PlanConditionedActor(plans)
     expert = lw.ExpertActor("reach")
     evaluator = lw.StateQueryEvaluator(plans, width=8)
     images = lw.modules.ImageQueryEvaluator(plans, width=8)
@@ -175,7 +185,7 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
     data = lw.training.LabelledQueries(replay, config)
     value = lw.PlanConditionedValue(plans, width=8)
     qvalue = lw.PlanConditionedQValue(plans, width=8)
-    gaussian = lw.PlanConditionedActor(plans, width=8, distribution="tanh_normal")
+    gaussian = actor.stochastic()
     logger = lw.RerunLogger(folder / "pages.rrd")
     env = lw.LanguageWorldEnv("reach", max_steps=3)
     rollout = env.rollout(3, expert)[0]
@@ -195,26 +205,29 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "CorruptQAF": {"plans": plans},
         "DemonstratedSACLoss": {"actor_network": gaussian, "qvalue_network": qvalue},
         "DemonstratedTD3Loss": {"actor_network": actor, "qvalue_network": qvalue},
-        "DescriptorConditionedActor": {"tasks": "reach", "width": 8},
+        "DescriptorConditionedActor": {"tasks": "reach"},
         "EpisodeFilter": {},
         "ExpectileValueLoss": {"value_network": value},
         "ExpertActor": {"tasks": "reach"},
         "HideOpening": {"probability": 0.5},
         "ImageQueryEvaluator": {"plans": plans, "width": 8},
         "ImageQueryEvaluatorConfig": {},
-        "ImageQueryEvaluatorTrainer": {"evaluator": images, "data": data},
+        "ImageQueryEvaluatorTrainer": {
+            "evaluator": images,
+            "data": data,
+            "config": lw.training.ImageQueryEvaluatorConfig(),
+        },
         "JitterTarget": {"plans": lw.canonical_plans(plans), "std": 0.03},
         "LabelledQueries": {"replay": replay, "config": config},
         "LanguageWorldEnv": {"tasks": "reach"},
         "LanguageWorldExperienceReplay": {"root": root, "label": "executed"},
         "OfflineTrainer": {"loss": lw.objectives.ExpectileValueLoss(value), "replay": executed, "progress": False},
         "OpenAIPlanner": {"model": "none", "base_url": "http://localhost:1"},
-        "PlanConditionedActor": {"plans": plans, "width": 8},
+        "PlanConditionedActor": {"plans": plans},
         "PlanConditionedQValue": {"plans": plans, "width": 8},
         "PlanConditionedValue": {"plans": plans, "width": 8},
-        "PlanEncoder": {"plans": plans},
-        "QValue": {"encoder": actor.encoder, "width": 8},
-        "Value": {"encoder": actor.encoder, "width": 8},
+        "QValue": {"trunk": actor.trunk, "width": 8},
+        "Value": {"trunk": actor.trunk, "width": 8},
         "PlanStep": {"condition": PLAN.steps[0].condition, "skill": PLAN.steps[0].skill},
         "Plans": {"plans": plans},
         "QAFTransform": {"plans": plans},
@@ -258,6 +271,7 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
             "path": lw_saved(lw.training.save_evaluator, evaluator, folder / "asked.safetensors"),
             "plans": plans,
         },
+        "load_demonstrations": {"root": root},
         "load_pictures": {"replay": replay},
         "load_plans": {"source": "MT10"},
         "load_skills": {},
@@ -265,7 +279,6 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "nearest_query": {"text": "the gripper is open", "task": "reach"},
         "nearest_skill": {"text": "reach"},
         "parse_query": {"text": "the robot's gripper is open", "task": "reach"},
-        "plan_actor_value": {"plans": plans, "width": 8},
         "plan_prompt": {"task": "reach", "format": "basic_py"},
         "plot_success": {"result": result},
         "resolve_tasks": {"names": "reach"},

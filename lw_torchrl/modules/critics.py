@@ -152,6 +152,7 @@ class PlanConditionedValue(Value):
     """
 
     @passes_on(Value.__init__)
+    @checked
     def __init__(
         self,
         plans: AnyPlans,
@@ -182,6 +183,7 @@ class PlanConditionedQValue(QValue):
     """
 
     @passes_on(QValue.__init__)
+    @checked
     def __init__(
         self,
         plans: AnyPlans,

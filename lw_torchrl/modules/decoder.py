@@ -140,5 +140,5 @@ def as_decoder(decoder: nn.Module, trunk: TensorDictSequential, out_keys: Sequen
         materialize(getattr(decoder, "network", decoder), torch.zeros(1, width))
     if isinstance(decoder, TensorDictModuleBase):
         return decoder
-    keys = as_keys("out_keys", out_keys, list(map(str, out_keys)))
+    keys = as_keys("out_keys", out_keys, list(map(str, out_keys)) or ["action"])
     return Decode(decoder, in_keys=trunk.out_keys_source[-2:], out_keys=keys)
