@@ -13,14 +13,16 @@ from typing import Any, Literal
 
 import torch
 import tyro
+from tensordict.nn import TensorDictModuleBase
 
 import lw_torchrl as lw
 from benchmarks.figures import markdown_table
 from benchmarks.finding_points import find_points
 from lw_torchrl._files import read_json, write_json, write_text
 from lw_torchrl.evaluation.statistics import mean_difference, mean_rate, wilson_interval
-from lw_torchrl.language.canonical import canonical_plan, fallback_plan, most_confident
+from lw_torchrl.language.canonical import canonical_like, explain_canonical, fallback_plan, most_confident
 from lw_torchrl.language.plans import ConditionalPlan, Plans
+from lw_torchrl.modules import plans_of, with_plans
 from lw_torchrl.training import load_evaluator
 
 DEVELOPMENT = (
@@ -77,7 +79,7 @@ def main(arguments: Arguments) -> None:
             if key in found:
                 continue
             policy = lw.load_actor(folder_of(arguments, method) / f"seed{seed}" / "policy.safetensors").eval()
-            actor = policy if plans is None else policy.with_plans(plans)
+            actor = policy if plans is None else following(policy, plans)
             tasks = [task for task in arguments.tasks if plans is None or task in plans]
             row, _, number = name.partition(", number ")
             # Of each of ten paraphrases fewer episodes, each with its own initial states.
@@ -85,16 +87,22 @@ def main(arguments: Arguments) -> None:
             how: dict[str, Any] = {"episodes_per_task": episodes, "noise_scale": 0.1, "progress": False}
             fixes = 10_000 + seed + 100 * int(number or 0)
             if row == "evaluator" and plans is not None:
-                actor = policy.with_plans(Plans([plans[task] for task in tasks]))
-                how["evaluator"] = load_evaluator(required(arguments.evaluator, "evaluator"), actor.plans).eval()
+                actor = following(policy, Plans([plans[task] for task in tasks]))
+                how["evaluator"] = load_evaluator(required(arguments.evaluator, "evaluator"), plans_of(actor)).eval()
             result = lw.evaluate(actor, tasks=tasks, seed=fixes, stop_at_success=True, **how)
-            trust = {} if plans is None else {task: canonical_plan(plans[task]).confidence for task in tasks}
+            trust = {} if plans is None else {task: explain_canonical(plans[task]).plan.confidence for task in tasks}
             found[key] = {"row": row, "seed": seed, "success": result.success_once, "trust": trust}
             write_json(file, found)
             print(f"{key}: {result.mean_success:.3f}", flush=True)
     table = report(list(found.values()), arguments.episodes)
     write_text(arguments.out / "table.md", table)
     print(table)
+
+
+def following(policy: TensorDictModuleBase, plans: Plans) -> TensorDictModuleBase:
+    """Return the policy with other plans, in the form of those that it was trained with."""
+    actor: TensorDictModuleBase = with_plans(policy, canonical_like(plans, plans_of(policy)))
+    return actor
 
 
 def folder_of(arguments: Arguments, method: str) -> Path:

@@ -6,11 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.objectives import CQLLoss, IQLLoss, LossModule, TD3BCLoss
 
 from benchmarks.figures import markdown_table
 from benchmarks.paper import recipes
+from benchmarks.paper.actors import Parts
 from benchmarks.paper.comparison import compare, plot_methods, write_summary
 from benchmarks.paper.offline_losses import L1CQLLoss, L1IQLLoss, L1TD3BCLoss
 from benchmarks.paper.recipes import OfflineMethod, OfflineRecipe, OfflineTable, Portion
@@ -21,9 +23,7 @@ from lw_torchrl._tensor_files import read_tensors, write_tensors
 from lw_torchrl.data import BEHAVIOURS, LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.modules import DescriptorEncoder, PlanEncoder, QValue, Value
-from lw_torchrl.modules.policy import Encoder, Policy
-from lw_torchrl.modules.registry import find_method, make_policy
+from lw_torchrl.modules import ObservationFeatures, QValue, Value, descriptor_trunk, plan_trunk
 from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
 from lw_torchrl.training import OfflineConfig, OfflineTrainer
 from lw_torchrl.training.checkpoint import check_same_description
@@ -138,8 +138,7 @@ class Advantages(_Learned):
     def _learn(self, file: Path, described: dict[str, Any], plans: Plans, out: Path, progress: bool) -> None:
         recipe = self.recipe
         torch.manual_seed(self.seed)
-        encoder = _encoder(self.critic, plans, noise=0.02)
-        value = Value(encoder, ensemble=2, width=recipe.width, depth=recipe.critic_depth)
+        value = Value(_trunk(self.critic, plans, noise=0.02), ensemble=2, width=recipe.width, depth=recipe.critic_depth)
         loss = ExpectileValueLoss(value, expectile=recipe.expectile).make_value_estimator(gamma=recipe.gamma)
         replay = self._replay(plans, out, n_steps=True)
         checkpoint, config = file.with_name("checkpoint.safetensors"), self._config(recipe.value_steps)
@@ -198,7 +197,7 @@ class OfflineRun(_Learned, Run):
         described = {key: value for key, value in super().describe(plans).items() if key not in without}
         return described | {"how": plain(asdict(self.how))}
 
-    def learn(self, work: Work) -> tuple[Policy, dict[str, Any]]:
+    def learn(self, work: Work) -> tuple[TensorDictModuleBase, dict[str, Any]]:
         def train(checkpoint: Path) -> dict[str, Any]:
             recipe, own = self.recipe, self.own_plans(work.plans)
             learns_values = self.how.critic and self.advantages is None
@@ -206,37 +205,46 @@ class OfflineRun(_Learned, Run):
             if (advantages := self.advantages) is not None:
                 replay.add_column("advantage", advantages.make(work.plans, work.out, work.progress)["advantage"])
             torch.manual_seed(self.seed)
-            options: dict[str, Any] = {"width": recipe.width, "depth": recipe.depth}
-            options |= {"feature_noise": recipe.feature_noise, "distribution": DISTRIBUTIONS[self.how.loss]}
-            actor = make_policy(self.actor, own, **options)
+            actor = _actor(self.actor, own, recipe, DISTRIBUTIONS[self.how.loss])
             loss = _make_loss(self, actor, own)
             if learns_values:
                 loss.make_value_estimator(gamma=recipe.gamma)
-            options = {"checkpoint": checkpoint, "progress": work.progress, "title": self.label}
+            options: dict[str, Any] = {"checkpoint": checkpoint, "progress": work.progress, "title": self.label}
             OfflineTrainer(loss, replay, self._config(recipe.steps), **options).train()
             return {"actor": actor, "replay": replay}
 
         return kept_policy(work.out / self.folder / "policy.safetensors", {"run": self.describe(work.plans)}, train), {}
 
-    def evaluate(self, policy: Policy, work: Work) -> tuple[EvaluationResult, dict[str, Any]]:
+    def evaluate(self, policy: TensorDictModuleBase, work: Work) -> tuple[EvaluationResult, dict[str, Any]]:
         return self.rollouts(policy, work, max_steps=self.max_steps), {}
 
 
-def _encoder(condition: str, plans: Plans, noise: float = 0.0) -> Encoder:
-    """What a critic sees, as actors of the same condition see it."""
-    if find_method(condition).policy == "PlanConditionedActor":
-        return PlanEncoder(plans, feature_noise=noise)
-    return DescriptorEncoder(tuple(plans), feature_noise=noise, **find_method(condition).options)
+def _actor(condition: str, plans: Plans, recipe: OfflineRecipe, distribution: Any) -> TensorDictModuleBase:
+    """Return an actor; one with a distribution keeps the noise of its features."""
+    parts = Parts(feature_noise=recipe.feature_noise, width=recipe.width, depth=recipe.depth)
+    actor: Any = parts.actor(condition, plans)
+    if distribution is not None:
+        actor = actor.stochastic(distribution)
+        actor.trunk.features.noise = recipe.feature_noise
+    return actor  # type: ignore[no-any-return]
+
+
+def _trunk(condition: str, plans: Plans, noise: float = 0.0) -> TensorDictSequential:
+    """Return what a critic sees, the same as actors with the same condition."""
+    features = ObservationFeatures(noise=noise)
+    if condition == "pcbc":
+        return plan_trunk(plans, features=features)
+    return descriptor_trunk([plan.definition for plan in plans.values()], condition=CONDITIONS[condition], features=features)  # type: ignore[arg-type]
 
 
 DISTRIBUTIONS = {
     "advantage": None, "bc": None, "td3-bc": None, "td3-bc-l1": None, "iql": "normal", "iql-l1": "normal",
     "cql": "tanh_normal", "cql-l1": "tanh_normal",
 }  # fmt: skip
-"""By name: the distribution that the loss wants of its actor."""
+"""By name: the distribution that the loss requires of its actor."""
 
 
-def _make_loss(run: OfflineRun, actor: Policy, plans: Plans) -> LossModule:
+def _make_loss(run: OfflineRun, actor: TensorDictModuleBase, plans: Plans) -> LossModule:
     recipe, name = run.recipe, run.how.loss
     if name == "bc":
         return bc_loss(actor, recipe.distance)
@@ -245,8 +253,8 @@ def _make_loss(run: OfflineRun, actor: Policy, plans: Plans) -> LossModule:
         return AdvantageWeightedLoss(actor, loss_function=recipe.distance, **weighted)
     critic: dict[str, Any] = {"width": recipe.width, "depth": recipe.critic_depth}
     # The order in which networks are made decides their initial weights.
-    value = Value(_encoder(run.critic, plans), **critic) if name in ("iql", "iql-l1") else None
-    q = QValue(_encoder(run.critic, plans), **critic)
+    value = Value(_trunk(run.critic, plans), **critic) if name in ("iql", "iql-l1") else None
+    q = QValue(_trunk(run.critic, plans), **critic)
     pair: dict[str, Any] = {"num_qvalue_nets": 2, "loss_function": "l2"}
     if name == "iql":
         return IQLLoss(actor, q, value, expectile=recipe.expectile, temperature=recipe.temperature, **pair)

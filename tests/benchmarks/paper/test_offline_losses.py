@@ -18,7 +18,10 @@ DISTRIBUTIONS = {"iql": "normal", "td3-bc": None, "cql": "tanh_normal"}
 
 def make(name, alpha):
     torch.manual_seed(0)
-    actor = lw.PlanConditionedActor(PLANS, **SMALL, feature_noise=0.0, distribution=DISTRIBUTIONS[name])
+    features, decoder = lw.modules.ObservationFeatures(), lw.modules.MLPDecoder(**SMALL)
+    actor = lw.PlanConditionedActor(PLANS, features=features, decoder=decoder)
+    if DISTRIBUTIONS[name] is not None:
+        actor = actor.stochastic(DISTRIBUTIONS[name])
     q, value = lw.PlanConditionedQValue(PLANS, **SMALL), lw.PlanConditionedValue(PLANS, **SMALL)
     pair = {"num_qvalue_nets": 2, "loss_function": "l2"}
     if name == "iql":

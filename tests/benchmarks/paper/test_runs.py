@@ -8,6 +8,7 @@ from tiny_runs import (
     ENSEMBLE,
     MEMBER,
     OTHER,
+    ROLES,
     PLANS,
     PRESET,
     TINY,
@@ -24,7 +25,7 @@ from benchmarks.paper import imitation, runs
 from benchmarks.paper.imitation import SCRIPTED, ImitationRun
 from benchmarks.paper.recipes import PRESETS, SETTINGS, Member
 from benchmarks.paper.runs import load_result
-from lw_torchrl.modules.registry import make_policy
+from lw_torchrl.modules import plans_of
 from lw_torchrl.training.checkpoint import demonstration_seeds
 
 RUNS = [
@@ -121,17 +122,17 @@ def test_several_evaluations_leave_the_policy_unchanged_and_are_counted(undistur
 def test_trained_policies_are_kept_and_not_trained_again(copied, setting, file, monkeypatch):
     run = a_run(setting=setting, preset=ENSEMBLE)
     policy = lw.load_actor(copied / run.folder / file)
-    assert [actor.config["width"] for actor in policy.members] == [32, 16]
+    assert [actor.decoder.network.config["width"] for actor in policy.members] == [32, 16]
     assert demonstration_seeds(copied / run.folder / file) == {3}
     before = result_of(copied / run.folder)
     (copied / run.folder / "results.json").unlink()
-    monkeypatch.setattr(imitation, "make_policy", lambda *_, **__: pytest.fail("trained again"))
+    monkeypatch.setattr(imitation.Parts, "actor", lambda *_, **__: pytest.fail("trained again"))
     execute(run, copied)
     assert result_of(copied / run.folder) == before
 
 
 def test_actors_of_descriptions_act_in_demonstrated_tasks(tmp_path):
-    turned = replace(OTHER, any_yaw=False, plan_yaw=10.0, tilt=0.5)
+    turned = replace(OTHER, plan_parts={**ROLES, "any_yaw": False, "yaw": 10.0, "tilt": 0.5})
     run = a_run(preset=replace(PRESET, name="seen", members=(turned, turned), demonstrated=(MEMBER,)))
     execute(run, tmp_path)
     policy = lw.load_actor(tmp_path / run.folder / "policy.safetensors")
@@ -141,13 +142,12 @@ def test_actors_of_descriptions_act_in_demonstrated_tasks(tmp_path):
 
 
 def test_a_preset_can_put_an_evaluator_into_the_policy(tmp_path):
-    network = {"kind": "StateQueryEvaluator", "options": {"width": 16, "depth": 1}}
-    member = Member({"width": 32, "depth": 1}, {"evaluator": network, "answers": "tanh"})
+    member = Member({"width": 32, "depth": 1}, {"evaluator": {"width": 16, "depth": 1}})
     training = replace(PRESET.training, steps=2, qaf_anchor=1.0)
     run = a_run(preset=replace(PRESET, name="evaluator", members=(member,), training=training))
     execute(run, tmp_path)
     policy = lw.load_actor(tmp_path / run.folder / "policy.safetensors")
-    assert policy.evaluator.config["width"] == 16
+    assert policy[0].config["width"] == 16
     assert "qaf" not in policy.in_keys
 
 
@@ -156,10 +156,12 @@ def test_every_recipe_loads_and_makes_its_policies(name):
     for setting, preset in PRESETS[name].items():
         assert SETTINGS[setting].targets is None or preset.target is not None
         for member in (*preset.members, *preset.demonstrated):
-            options = {**member.actor, **member.plan_actor}
-            assert imitation._Trained(member, "pcbc").options == options, "an option that no longer exists is ignored"
             for method in ("pcbc", "dc"):
-                make_policy(method, lw.load_plans("MT10"), **imitation._Trained(member, method).options)
+                parts = member.of(method)
+                plans = parts.seen(lw.load_plans("MT10"))
+                actor = parts.actor(method, plans)
+                assert (plans_of(actor) is None) == (method == "dc")
+                assert parts.transform(actor) is not None
         assert ImitationRun(SETTINGS[setting], "pcbc", 0, preset).describe(PLANS)["training"]
 
 
@@ -169,7 +171,7 @@ def test_settings_are_those_of_the_paper():
     assert (SETTINGS["one-shot"].base, SETTINGS["one-shot"].targets) == ("MT10", "MT50")
     paper = PRESETS["paper"]["few-shot"]
     assert (paper.training.optimizer, paper.training.learning_rate, paper.training.momentum) == ("sgd", 1e-5, 0.995)
-    assert paper.members[0].actor["width"] == (128, 128, 128, 64, 32)
+    assert paper.members[0].of("dc").width == (128, 128, 128, 64, 32)
     assert (paper.passes, paper.base.noise_scale) == (500, (0.0,))
     assert {preset["one-shot"].training.batch_size % 180 for preset in PRESETS.values() if "one-shot" in preset} == {0}
 

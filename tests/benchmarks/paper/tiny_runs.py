@@ -22,8 +22,8 @@ PRESET = replace(
     members=(MEMBER,),
     training=lw.BehavioralCloningConfig(steps=60, batch_size=20, checkpoint_every=20),
 )
-ROLES = {"features": "opening", "roles": True, "jitter": 0.03}
-OTHER = Member({"features": "relative", "width": 16, "depth": 1}, ROLES, yaw=0.3, any_yaw=True)
+ROLES = {"features": "opening", "roles": True, "jitter": 0.03, "any_yaw": True}
+OTHER = Member({"features": "relative", "width": 16, "depth": 1, "yaw": 0.3}, ROLES)
 ENSEMBLE = replace(PRESET, name="ensemble", members=(MEMBER, OTHER))
 WATCHED = replace(PRESET, name="watched", evaluations=4)
 
