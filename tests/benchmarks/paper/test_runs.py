@@ -8,6 +8,7 @@ from tiny_runs import (
     ENSEMBLE,
     MEMBER,
     OTHER,
+    ROLES,
     PLANS,
     PRESET,
     ROLES,
