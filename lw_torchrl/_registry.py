@@ -50,8 +50,8 @@ class Registry(UserDict[str, Entry]):
     name is first looked up. Installed packages' names are listed too; a package is imported at its first look-up.
 
     Args:
-        kind: what errors call an entry, "policy".
-        group: the group of entry points, "lw_torchrl.policies".
+        kind: what errors call an entry, for example "method".
+        group: the group of entry points, for example "lw_torchrl.methods".
         entries: what we ship.
         check: from a name and an object to the entry; raises if the object is of the wrong kind.
 
@@ -60,8 +60,8 @@ class Registry(UserDict[str, Entry]):
         ImportError: an entry cannot be imported or is of the wrong kind; the message names its package.
 
     Example:
-        >>> from lw_torchrl.modules import POLICIES
-        >>> POLICIES["PlanConditionedActor"].__name__
+        >>> from lw_torchrl.modules import METHODS
+        >>> METHODS["pcbc"].__name__
         'PlanConditionedActor'
 
     Source: the entry points of the Python packaging user guide; gymnasium's registry.
