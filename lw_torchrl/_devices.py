@@ -66,7 +66,8 @@ def drawn_on(device: torch.device, state: torch.Tensor) -> Iterator[None]:
     with torch.random.fork_rng(devices=others, device_type=device.type):
         torch.set_rng_state(state)
         if others:
-            seed = int(torch.randint(2**62, ()))
+            copied = torch.default_generator.clone_state()  # the CPU's draws are the same whatever the device
+            seed = int(torch.randint(2**62, (), generator=copied))
             module = torch.get_device_module(device.type)
             generators = getattr(module, "default_generators", None)  # one for each; manual_seed is of the current one
             (module if generators is None else generators[device.index]).manual_seed(seed)
