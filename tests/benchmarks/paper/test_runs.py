@@ -8,7 +8,6 @@ from tiny_runs import (
     ENSEMBLE,
     MEMBER,
     OTHER,
-    ROLES,
     PLANS,
     PRESET,
     ROLES,
