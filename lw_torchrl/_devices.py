@@ -66,11 +66,6 @@ def seeded(device: torch.device, seed: int) -> Iterator[None]:
     with torch.random.fork_rng(devices=others, device_type=device.type):
         torch.default_generator.manual_seed(seed)
         if others:
-<<<<<<< HEAD
-=======
-            copied = torch.default_generator.clone_state()  # the CPU's draws are the same whatever the device
-            seed = int(torch.randint(2**62, (), generator=copied))
->>>>>>> cutb
             module = torch.get_device_module(device.type)
             generators = getattr(module, "default_generators", None)  # one for each; manual_seed is of the current one
             (module if generators is None else generators[device.index]).manual_seed(seed)
