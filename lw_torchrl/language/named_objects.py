@@ -89,13 +89,6 @@ def read_position(name: str, at: Any) -> tuple[Coordinate, Coordinate, Coordinat
     raise ValueError(f"position of {name!r} must be like 'obs[4:7]' or [0.1, 'obs[37]', 0.0], got {shown(at)}")
 
 
-def write_position(position: tuple[Coordinate, Coordinate, Coordinate]) -> str | list[str | float]:
-    first = position[0]
-    if isinstance(first, int) and position == (first, first + 1, first + 2):
-        return f"obs[{first}:{first + 3}]"
-    return [f"obs[{c}]" if isinstance(c, int) else c for c in position]
-
-
 def read_object(name: str, at: Any) -> NamedObject:
     """An object of tasks.toml: a position, or {position = ..., opening = "obs[92]"}."""
     if not isinstance(at, Mapping):
@@ -154,7 +147,10 @@ def write_objects(objects: Sequence[NamedObject]) -> dict[str, dict[str, Any]]:
     row: dict[str, dict[str, Any]] = {"objects": {}, "points": {}}
     published = {typed(named.position): named.name for named in reversed(objects) if not named.ours}
     for named in objects[1:]:
-        at: Any = write_position(named.position)
+        x, *_ = named.position
+        at: Any = [f"obs[{c}]" if isinstance(c, int) else c for c in named.position]
+        if isinstance(x, int) and named.position == (x, x + 1, x + 2):
+            at = f"obs[{x}:{x + 3}]"
         if any(named.offset):
             at = {"object": published.get(typed(named.position), ""), "offset": list(named.offset)}
         elif named.opening is not None:

@@ -67,7 +67,6 @@ class ConditionalPlan:
     """The steps that carry out one task, as in the paper's section 'Conditional Plan Generation'.
 
     Attributes:
-        task: the task's name.
         steps: 1 to 1,000 of :class:`PlanStep`, in canonical spelling, so that the plan's text reads back as the same
             plan: conditions as ``str(query)``, "the" before nouns. Equal conditions, skills and goals make equal plans.
         definition: the :class:`Task` whose objects the conditions name; None for ours of that name.
@@ -193,8 +192,8 @@ def parse_plan(text: str, task: str | None = None, source: str = "plan", tasks: 
 
     Args:
         text: the plan; its first fault is a :class:`PlanError` with the line.
-        task: the task it must be for; None takes the one its ``def`` line names.
-        source: what to call the text in errors, a file's name.
+        task: the task it must be for; None for the one that its ``def`` line names.
+        source: the text's name in errors.
         tasks: whose objects the conditions name, by task name, as from :func:`~lw_torchrl.load_tasks`.
 
     Source: paper section 'Conditional Plan Generation' and its figure of a chain_py plan.
@@ -290,19 +289,15 @@ class Plans(Mapping[str, ConditionalPlan]):
         Plans with the same fingerprint give the same ``qaf``. Reasons and descriptions do not count.
         """
         used = {clause.predicate for plan in self.values() for step in plan.steps for clause in step.condition.clauses}
+
+        def facts(plan: ConditionalPlan) -> dict[str, Any]:
+            objects = [(one.name, one.position, list(map(float, one.offset))) for one in plan.definition.objects]
+            return {"steps": [(str(step.condition), step.skill) for step in plan.steps], "objects": objects}
+
         told = {
             "steps": self.num_steps,
             "predicates": {name: [asdict(part) for part in comparisons(name, self.layout)] for name in sorted(used)},
-            "plans": {
-                task: {
-                    "steps": [(str(step.condition), step.skill) for step in plan.steps],
-                    "objects": [
-                        (named.name, named.position, [float(metres) for metres in named.offset])
-                        for named in plan.definition.objects
-                    ],
-                }
-                for task, plan in self.items()
-            },
+            "plans": {task: facts(plan) for task, plan in self.items()},
         }
         if self.layout != METAWORLD:
             told["layout"] = self.layout.to_json()

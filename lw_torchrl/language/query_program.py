@@ -95,12 +95,12 @@ class QueryProgram(nn.Module):
         """Answer the queries.
 
         Args:
-            observation: (..., D) float, as the tasks' layout says; Meta-World's 39 numbers, metres.
-            task_id: (...) int64.
+            observation: (..., D) float, as the tasks' layout says; Meta-World's 39 numbers, metres. NaN or infinity is
+                a :class:`ValueError`.
+            task_id: (...) int64, of tasks with queries.
 
         Returns:
-            (..., S) bool on the observation's device, in the order of the task's list; padding is false. NaN or
-            infinity in the observation, or a task without queries, is a :class:`ValueError`.
+            (..., S) bool on the observation's device, in the order of the task's list; padding is false.
         """
         _check_batch(observation, task_id, self.layout.size)
         if (kernel := self._kernel(observation, task_id)) is not None:

@@ -11,7 +11,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from lw_torchrl._checks import check_choice, checked, nearest, shown
+from lw_torchrl._checks import check_choice, checked, did_you_mean, shown
 from lw_torchrl._files import AnyPath, read_toml
 from lw_torchrl._registry import ReadOnlyDict
 from lw_torchrl.language.named_objects import GRIPPER, is_number, is_triple
@@ -76,8 +76,7 @@ class ScriptedSkill:
         for name in (skill.target, skill.moved):
             if name not in found.object_names:
                 lacks = f"needs {name!r}, which task {found.name!r} lacks; it has {', '.join(found.object_names)}"
-                near = "".join(f"; did you mean {other!r}?" for other in nearest(name, found.object_names, n=1))
-                raise SkillError(f"skill {self.text!r} {lacks}{near}")
+                raise SkillError(f"skill {self.text!r} {lacks}{did_you_mean(name, found.object_names)}")
         return skill
 
     def suits(self, task: str | Task) -> bool:
@@ -131,11 +130,11 @@ def _read(file: Path | Traversable, tasks: Tasks) -> dict[str, ScriptedSkill]:
 
 @checked
 def load_skills(path: AnyPath | None = None, *, tasks: Tasks = TASKS) -> Skills:
-    """The scripted skills by their text.
+    """Return the scripted skills by their text.
 
     Args:
         path: a file like data/skills.toml, whose skills join ours or replace those with the same text; None for
-            ours alone. One that is no TOML in UTF-8, or has a malformed skill, is a :class:`SkillError`.
+            only ours. A malformed file is a :class:`SkillError`.
         tasks: whose names its ``for`` tables may have, as from :func:`~lw_torchrl.load_tasks`.
 
     Example:

@@ -27,23 +27,14 @@ _TOOL = re.compile(r"(?<!line )(?<!level )(?<!aligned )\bwith <([^>]*)>")
 
 @dataclass(frozen=True)
 class ParsedStep:
-    """The meaning of one step.
-
-    Attributes:
-        verb: what is done.
-        moved: what is to arrive at the target: the robot's gripper, or an object that it holds; None if unknown.
-        target: the object or point to go to; None if unknown.
-        direction: where an object is pushed, pulled or moved to; "goal" leads from it to ``toward``.
-        confidence: 1 where the words say it, less where it follows from the condition, or from what is usual.
-        toward: an object; None for the task's goal.
-    """
+    """The meaning of one step."""
 
     verb: Verb
-    moved: str | None
-    target: str | None
-    direction: Direction | None = None
-    confidence: float = 1.0
-    toward: str | None = None
+    moved: str | None  # what is to arrive at the target: the robot's gripper, or an object that it holds
+    target: str | None  # the object or point to go to; like ``moved``, None if unknown
+    direction: Direction | None = None  # where an object is pushed, pulled or moved to; "goal" leads to ``toward``
+    confidence: float = 1.0  # less where it follows from the condition, or from what is usual
+    toward: str | None = None  # an object; None for the task's goal
 
 
 def compared_with_gripper(step: PlanStep) -> tuple[str, ...]:
@@ -216,12 +207,9 @@ class _StepParser:
             return ParsedStep("carry", self.first, target if elsewhere else GOAL)
         if above or self.verb == "raise":
             return ParsedStep("approach", GRIPPER, target)
-        if "front" in self.words:
-            return ParsedStep("beside", GRIPPER, target, "away")
-        if "behind" in self.words:
-            return ParsedStep("beside", GRIPPER, target, "toward")
-        if self.words & _PLACES["beside"]:
-            return ParsedStep("beside", GRIPPER, target)
+        if self.words & (_PLACES["beside"] | {"front", "behind"}):
+            side: Direction | None = "away" if "front" in self.words else "toward" if "behind" in self.words else None
+            return ParsedStep("beside", GRIPPER, target, side)
         if self.verb == "align":
             return ParsedStep("descend" if self.facts.aligned else "approach", GRIPPER, target)
         down = self.verb in ("lower", "drop") or self.words & _PLACES["around"]
@@ -258,8 +246,7 @@ class _StepParser:
 
     def _target(self, noun: str) -> str | None:
         """Return where an object is moved to, by the words, or by what the condition compares it with."""
-        goals = [name for name in self.named if is_goal(self.task, name)]
-        if goals:
+        if goals := [name for name in self.named if is_goal(self.task, name)]:
             return goals[-1]
         for name in reversed(self.named[1:] if self.tool is None else self.named):
             if not same_object(self.task, name, noun) or self.tool is not None:

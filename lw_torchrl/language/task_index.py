@@ -53,11 +53,9 @@ class TaskIndex:
         if task_id.dtype not in (torch.int64, torch.int32):
             raise ValueError(f"task_id must be int64, got {task_id.dtype}")
         kept = plain(task_id)
-        ids = self._ids
-        if ids.device != task_id.device:
-            ids = ids.to(task_id.device)
-            if kept:
-                self._ids = ids
+        ids = self._ids.to(task_id.device)
+        if kept:
+            self._ids = ids
         given = task_id.long().contiguous()
         if kept or asserted(task_id):
             rows = torch.searchsorted(ids[:-1], given)
@@ -126,11 +124,9 @@ class PlanTables:
         ``number``, (...) int64, is that plan's; 0 where unknown, None for all."""
         if number is None:
             return
-        numbers = self.number
-        if number.device != numbers.device:
-            numbers = numbers.to(number.device)
-            if plain(number, rows):
-                self.number = numbers
+        numbers = self.number.to(number.device)
+        if plain(number, rows):
+            self.number = numbers
         if asserted(number, rows):
             own = numbers[rows]
             torch._assert_async(((own == number) | (number == 0)).all(), "qaf answers other plans than the actor's")

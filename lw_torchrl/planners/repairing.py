@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -97,9 +96,7 @@ def check_plan(
     return _check_decoded(decoded, task, episodes, seed, skills)
 
 
-def _check_decoded(
-    decoded: DecodedPlan, task: Task, episodes: int, seed: int, skills: Skills | None = None
-) -> PlanCheck:
+def _check_decoded(decoded: DecodedPlan, task: Task, episodes: int, seed: int, skills: Skills | None) -> PlanCheck:
     if decoded.plan is None:
         return PlanCheck(task.name, decoded)
     expert = expert_use({task.name: decoded.plan}, task.name, episodes_per_task=episodes, seed=seed)[task.name]
@@ -210,12 +207,7 @@ def repair_plans(
         rounds: maximum number of rounds.
         enough: a plan with at least this success rate is not revised.
         episodes, seed: the episodes in which scripted skills carry out each plan. Compare plans with another seed.
-        tasks: where tasks' names are looked up.
-        out: see :meth:`OpenAIPlanner.revise`; each round is written like the answers of a model of its own.
-        progress: show progress bars.
-
-    Raises:
-        PlannerError: an answer is missing; the others are cached.
+        tasks, out, progress: see :meth:`OpenAIPlanner.revise`.
     """
     check_int("rounds", rounds, minimum=1)
 
@@ -235,13 +227,12 @@ def repair_plans(
         if not failing:
             break
         before = [repairs[k].answers[-1] for k in failing]
-        checks = [repairs[k].checks[-1] for k in failing]
         facts = [
-            plan_facts(check, get_task(answer.task, tasks), answer.notes)
-            for check, answer in zip(checks, before, strict=True)
+            plan_facts(repairs[k].checks[-1], get_task(answer.task, tasks), answer.notes)
+            for k, answer in zip(failing, before, strict=True)
         ]
-        options: dict[str, Any] = {"round": number, "tasks": tasks, "out": out, "progress": progress}
-        revised = {(answer.task, answer.attempt): answer for answer in planner.revise(before, facts, **options)}
+        answered = planner.revise(before, facts, round=number, tasks=tasks, out=out, progress=progress)
+        revised = {(answer.task, answer.attempt): answer for answer in answered}
         after = [revised[answer.task, answer.attempt] for answer in before]
         for k, answer, checked in zip(failing, after, run(after), strict=True):
             repairs[k] = Repair((*repairs[k].answers, answer), (*repairs[k].checks, checked))
