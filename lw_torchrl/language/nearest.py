@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import Literal, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from rapidfuzz import fuzz, process
 
 from lw_torchrl._checks import check_choice, checked, shown
@@ -125,7 +127,9 @@ def _choices(task: Task, relations: tuple[str, ...]) -> tuple[tuple[Clause, ...]
     return affirmed, tuple(_content(str(clause).split()) for clause in affirmed)
 
 
-_vectors = lru_cache(maxsize=256)(sentence_vectors)
+@lru_cache(maxsize=256)
+def _vectors(texts: tuple[str, ...]) -> NDArray[np.float32]:
+    return sentence_vectors(texts)
 
 
 @checked

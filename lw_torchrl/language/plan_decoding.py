@@ -38,21 +38,18 @@ class DecodedStep:
 
 @dataclass(frozen=True)
 class DecodedPlan:
-    """What :func:`decode_plan` made of a text.
+    """The plan that :func:`decode_plan` read from a text.
 
     Attributes:
-        plan: the plan, its conditions as queries and its skills in the text's words; None if there is none.
+        plan: its conditions as queries and its skills in the text's words; None if there is none.
         scripted: the same with the nearest scripted skills, without the steps that are near none; None if none is left.
-        reason: why there is no plan; "" if there is one.
-        notes: what was left out or changed, in the order of the lines.
-        steps: the clauses for the task, also those that were dropped.
     """
 
     plan: ConditionalPlan | None
     scripted: ConditionalPlan | None
-    reason: str
-    notes: tuple[Note, ...]
-    steps: tuple[DecodedStep, ...]
+    reason: str  # why there is no plan; "" if there is one
+    notes: tuple[Note, ...]  # what was left out or changed, in the order of the lines
+    steps: tuple[DecodedStep, ...]  # the clauses for the task, also those that were dropped
 
     @property
     def all_scripted(self) -> bool:
@@ -158,7 +155,6 @@ def _in_words(goal: str) -> str:
 
 
 def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedStep:
-
     def note(text: str) -> None:
         notes.append(Note(clause.line, text))
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from hashlib import sha256
+from types import NoneType
 from typing import Any, NoReturn
 
 from lw_torchrl._checks import Probability, check_fields, checked, shown
@@ -54,12 +55,8 @@ class PlanStep:
         names = {name for clause in clauses for name in (clause.subject, clause.object) if name is not None}
         if self.role is not None:
             return names.union(self.role.objects)
-        text = self.skill
-        for name in sorted(task.object_names, key=len, reverse=True):  # "drawer handle" is not "drawer"
-            text, found = re.subn(rf"(?<![\w-]){re.escape(name)}(?![\w-])", " ", text)
-            if found:
-                names.add(name)
-        return names
+        longest = sorted(task.object_names, key=len, reverse=True)  # "drawer handle" is not "drawer"
+        return names.union(re.findall(rf"(?<![\w-])(?:{'|'.join(map(re.escape, longest))})(?![\w-])", self.skill))
 
 
 @dataclass(frozen=True)
@@ -88,19 +85,18 @@ class ConditionalPlan:
         check_fields(self)
         if isinstance(self.steps, str) or not isinstance(self.steps, Iterable):
             raise TypeError(f"steps must be a tuple of PlanStep, got {shown(self.steps)}")
-        if self.definition is not None and not isinstance(self.definition, Task):
+        if not isinstance(self.definition, (Task, NoneType)):
             raise TypeError(f"definition must be a Task, got {shown(self.definition)}")
-        listed = tuple(self.steps)
+        listed, definition = tuple(self.steps), self.definition or TASKS[check_task(self.task)]
         if len(listed) > MOST_STEPS:
             raise PlanError(too_many_steps(f"plan of task {self.task!r}", len(listed)))
-        definition = TASKS[check_task(self.task)] if self.definition is None else self.definition
         if definition.name != self.task:
             raise PlanError(f"definition of plan {self.task!r} is of another task, {definition.name!r}")
         object.__setattr__(self, "definition", definition)
         steps = []
         for number, step in enumerate(listed, 1):
             where = f"step {number} of plan {self.task!r}"
-            if not isinstance(step, PlanStep) or not isinstance(step.skill, str):
+            if not isinstance(step, PlanStep):
                 raise TypeError(f"{where} must be a PlanStep with a skill in words, got {step!r}")
             try:
                 condition, skill = check_query(step.condition, definition), canonical_skill(step.skill, definition)
@@ -346,6 +342,4 @@ def as_plans(plans: AnyPlans, argument: str = "plans") -> Plans:
     try:
         return Plans(plans)
     except (TypeError, PlanError) as error:
-        if argument == "plans":
-            raise
-        raise type(error)(f"{argument}: {error}") from None
+        raise (error if argument == "plans" else type(error)(f"{argument}: {error}")) from None

@@ -86,7 +86,7 @@ def supported_queries(task: str | Task, published_only: bool = False) -> tuple[s
     the negations of open, closed and other states, and conjunctions of all these.
 
     Args:
-        published_only: the paper's queries alone, without the points that we named and relations that were added.
+        published_only: only the paper's queries, without the points that we named and relations that were added.
 
     Example:
         >>> len(supported_queries("reach")), supported_queries("reach")[0]

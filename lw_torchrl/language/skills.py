@@ -30,7 +30,6 @@ class ScriptedSkill:
     """A linear controller: action xyz = clip(gain · (target + offset - moved), -1, 1), with a constant gripper effort.
 
     Attributes:
-        text: what it does, in plain English: "place the gripper above the puck".
         target: the object or point to go to; the robot's gripper makes the offset relative to the hand.
         moved: what is to arrive there: the robot's gripper, or an object that it holds or pushes.
         offset: added to the target, metres. x points to the robot's right, y away from it, z up.
@@ -141,9 +140,7 @@ def load_skills(path: AnyPath | None = None, *, tasks: Tasks = TASKS) -> Skills:
         >>> load_skills()["place the gripper above the puck"].target
         'puck'
     """
-    if path is None:
-        return _shipped()
-    return ReadOnlyDict({**_shipped(), **_read(Path(path), tasks)})
+    return _shipped() if path is None else ReadOnlyDict({**_shipped(), **_read(Path(path), tasks)})
 
 
 @lru_cache(maxsize=256)
@@ -154,16 +151,16 @@ def _foreign_words(task: Task) -> frozenset[str]:
 
 
 def skills_for(task: Task, skills: Skills | None = None) -> Skills:
-    """The skills that a task may use, of the shipped ones if none are given: it has the objects that they name, and
-    their texts name nothing that only other tasks have, or they have a variant for it."""
+    """Return the skills that a task may use, of the shipped ones if none are given: it has the objects that they name,
+    and their texts name nothing that only other tasks have, or they have a variant for it."""
     if skills is None:
         return _shipped_for(task)
     foreign = _foreign_words(task)
-    return {
-        text: skill
-        for text, skill in skills.items()
-        if skill.suits(task) and (task.name in skill.variants or not foreign & set(text.split()))
-    }
+
+    def allows(skill: ScriptedSkill, text: str) -> bool:
+        return skill.suits(task) and (task.name in skill.variants or not foreign & set(text.split()))
+
+    return {text: skill for text, skill in skills.items() if allows(skill, text)}
 
 
 @lru_cache(maxsize=256)

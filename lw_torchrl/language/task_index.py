@@ -63,19 +63,16 @@ class TaskIndex:
             rows = (given.unsqueeze(-1) > ids[:-1]).sum(-1)
         found = ids.index_select(0, rows.reshape(-1)).reshape(rows.shape)
         if kept and not waits(task_id):
-            if not torch.equal(found, given):
-                raise _unknown_ids(given[found != given].unique().tolist()[:5], problem)
-            return rows
+            if torch.equal(found, given):
+                return rows
+            from lw_torchrl.language.tasks import MT50  # here: only the message needs the names of other tasks
+
+            wrong = given[found != given].unique().tolist()[:5]
+            names = (MT50[i] if 0 <= i < len(MT50) else f"{i} (none of the 50)" for i in wrong)
+            raise ValueError(f"task_id names {problem}: {', '.join(names)}")
         if asserted(task_id):
             torch._assert_async((found == given).all(), f"task_id names {problem}")
         return torch.where(found == given, rows, len(self.tasks))
-
-
-def _unknown_ids(ids: list[int], problem: str) -> ValueError:
-    from lw_torchrl.language.tasks import MT50  # here: only the message needs the names of other tasks
-
-    names = (MT50[i] if 0 <= i < len(MT50) else f"{i} (none of the 50)" for i in ids)
-    return ValueError(f"task_id names {problem}: {', '.join(names)}")
 
 
 def as_plans(plans: AnyPlans) -> Plans:

@@ -97,7 +97,13 @@ class OpenAIPlanner:
         self.examples = None if plans is None else as_plans(plans)
         self.temperature = None if temperature is None else float(temperature)  # 1 and 1.0 are one request
         self.max_tokens, self.seed = max_tokens, seed
-        self.options = _request_options(options)
+        try:
+            self.options = json.loads(json.dumps(dict(options or {}), allow_nan=False)) or None
+        except (TypeError, ValueError, RecursionError) as error:
+            raise TypeError(f"options must be fields of a request in JSON, got {shown(options)}") from error
+        if own := sorted(_OWN_FIELDS & set(self.options or ())):
+            others = ", ".join(sorted(_OWN_FIELDS))
+            raise ValueError(f"options must be other fields than {others}, got {', '.join(own)}")
         self.name = folder_name(name or (f"{model}-constrained" if constrain else model))
         self.cache = AnswerCache(cache)
         self.concurrency, self.retries, self.timeout = concurrency, retries, timeout
@@ -205,7 +211,7 @@ class OpenAIPlanner:
         written = 0
         for question in questions:
             reply = self.cache.read(question.request)
-            answer = None if reply is None else replace(self._read(reply, question, format), cached=True)
+            answer = None if reply is None else self._read(reply, question, format)
             path = answer_path(out or "", name, format, question.task.name, question.attempt)
             if out is not None and existing != "replace" and path.is_file():
                 written += 1
@@ -215,11 +221,10 @@ class OpenAIPlanner:
                         what = f"{str(path)!r} holds an answer to another question; it is not replaced"
                         raise ValueError(f"out: {what}: give the new answers another name (--name) or out")
                     answer = read_reply(Reply(text), question.task, format, question.attempt, self.skills)
-                    answer = replace(answer, cached=True)
             if answer is None:
                 missing.append(question)
             else:
-                answers.append(answer)
+                answers.append(replace(answer, cached=True))
         if out is not None:
             write_settings(Path(out) / folder_name(name), self.settings(), reading=written == len(questions))
             for answer in answers:
@@ -271,14 +276,3 @@ class OpenAIPlanner:
                 yield from ((asked, result) for asked, result in pool.imap_unordered(ask, questions) if result)
             finally:
                 stopped.set()
-
-
-def _request_options(options: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return further fields of a request as JSON has them, or raise an error for a field that the planner sends."""
-    try:
-        fields = json.loads(json.dumps(dict(options or {}), allow_nan=False))
-    except (TypeError, ValueError, RecursionError) as error:
-        raise TypeError(f"options must be fields of a request in JSON, got {shown(options)}") from error
-    if own := sorted(_OWN_FIELDS & set(fields)):
-        raise ValueError(f"options must be other fields than {', '.join(sorted(_OWN_FIELDS))}, got {', '.join(own)}")
-    return fields or None

@@ -92,8 +92,7 @@ def check_plan(
         ((), 1.0, 1.0)
     """
     task = get_task(task, tasks)
-    decoded = decode_plan(text, task, format, skills=skills, tasks=tasks)
-    return _check_decoded(decoded, task, episodes, seed, skills)
+    return _check_decoded(decode_plan(text, task, format, skills=skills, tasks=tasks), task, episodes, seed, skills)
 
 
 def _check_decoded(decoded: DecodedPlan, task: Task, episodes: int, seed: int, skills: Skills | None) -> PlanCheck:
@@ -134,8 +133,7 @@ class Repair:
     @property
     def best(self) -> int:
         """The round with the most successful plan, the earliest if several are equal; 0 is the first answer."""
-        rates = [check.success for check in self.checks]
-        return rates.index(max(rates))
+        return max(range(len(self.checks)), key=lambda round: self.checks[round].success)
 
 
 def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:

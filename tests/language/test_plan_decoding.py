@@ -29,7 +29,7 @@ def decoded(name):
 def test_what_models_write(name):
     answer, found = ANSWERS[name], decoded(name)
     steps = found.plan.steps if found.plan else ()
-    assert [(str(step.condition), step.skill) for step in steps] == answer.steps
+    assert [[str(step.condition), step.skill] for step in steps] == answer.steps
     assert answer.reason in found.reason
     assert bool(found.reason) == (found.plan is None) == (not answer.steps)
     for note in answer.notes:
