@@ -34,20 +34,15 @@ _SOURCES = {"plan": "its own steps", "completed": "completed", "fallback": "repl
 class CanonicalReport:
     """How :func:`canonical_plan` read a plan.
 
-    Attributes:
-        written: the plan as it was given.
-        plan: its canonical form.
-        source: "plan", the plan's own steps; "completed", its motion, objects and direction with standard conditions,
-            where its own do not cover the typical states; "fallback", the fallback plan, where it has no motion.
-        read: the plan's own steps as they were read, also where ``plan`` has others.
-        left_out: the skills that could not be read.
+    Its source is "plan", the plan's own steps; "completed", its motion, objects and direction with standard
+    conditions, if its own do not cover the typical states; or "fallback", the fallback plan, if it has no motion.
     """
 
     written: ConditionalPlan
-    plan: ConditionalPlan
+    plan: ConditionalPlan  # the canonical form
     source: Source
-    read: tuple[PlanStep, ...]
-    left_out: tuple[str, ...]
+    read: tuple[PlanStep, ...]  # the plan's own steps as they were read, also where ``plan`` has others
+    left_out: tuple[str, ...]  # the skills that could not be read
 
     def notes(self) -> list[dict[str, Any]]:
         """The result of each step as written, then the steps that replace them, if any, as JSON.
@@ -259,15 +254,12 @@ def _is_complete(steps: Sequence[PlanStep]) -> bool:
     """Return whether a plan moves something and, if it grasps, comes to the object and closes the gripper before."""
     roles = [_role(step) for step in steps]
     verbs = [role.verb for role in roles]
-    moving = [number for number, verb in enumerate(verbs) if verb in ("carry", "move")]
+    moving = next((number for number, verb in enumerate(verbs) if verb in ("carry", "move")), None)
     if any(role.verb == "pull" and "handle" not in role.target.split() for role in roles):
         return False  # a handle can be hooked; anything else is held better in closed fingers
-    if motion_of(roles) is None:
-        return False
-    if not moving:
-        return True
-    closing = verbs.index("close") if "close" in verbs else len(verbs)
-    return closing < min(moving) and any(verb in ("approach", "descend") for verb in verbs[:closing])
+    if moving is None:
+        return motion_of(roles) is not None
+    return "close" in verbs[:moving] and not {"approach", "descend"}.isdisjoint(verbs[: verbs.index("close")])
 
 
 def _completed(task: Task, steps: Sequence[PlanStep], last: StepRole) -> tuple[PlanStep, ...]:
@@ -344,15 +336,7 @@ def worth(plan: ConditionalPlan) -> tuple[bool, float, float]:
 
 
 def most_confident(plans: Iterable[ConditionalPlan]) -> ConditionalPlan:
-    """Return the plan with the largest :func:`worth`, the first of equals.
-
-    Example:
-        >>> import lw_torchrl as lw
-        >>> bad = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "ponder")])
-        >>> good = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "put the puck at the goal")])
-        >>> most_confident([bad, good]) is good
-        True
-    """
+    """Return the plan with the largest :func:`worth`, the first of equals."""
     if not (listed := list(plans)):
         raise ValueError("plans must be at least one, got none")
     return max(listed, key=worth)

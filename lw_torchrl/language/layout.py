@@ -13,15 +13,10 @@ from lw_torchrl._registry import ReadOnlyDict
 
 @dataclass(frozen=True)
 class Slot:
-    """Where an observation tells of one thing.
+    """The numbers of an observation that describe one object."""
 
-    Attributes:
-        position: index of its x; y and z follow.
-        quaternion: index of the first of its four numbers; None where they are not told.
-    """
-
-    position: int
-    quaternion: int | None = None
+    position: int  # index of its x; y and z follow
+    quaternion: int | None = None  # index of the first of its four numbers; None without an orientation
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -39,30 +34,11 @@ class Slot:
 
 @dataclass(frozen=True)
 class Layout:
-    """What the numbers of an observation and of an action are, for all tasks of a suite.
+    """The meaning of the numbers of observations and actions, for all tasks of a suite.
 
-    The frame that suites turn their numbers into: metres, x to the right, y away from the robot, z above the table.
-
-    Attributes:
-        size: D, how many numbers an observation has.
-        hand: index of the gripper's x; y and z follow.
-        opening: index of the gripper's opening, from 0, closed, to 1, open.
-        things: the things, in the order in which tasks have them. All but the first may be absent: zeros.
-        goal: index of the x of the task's target.
-        past: the numbers of the step before stand at their index + past; after a reset they are the present ones. None
-            without them. The goal has no past.
-        action_size: A, how many numbers an action has, each in [-1, 1].
-        displacement: index of the x of the hand's displacement; y and z follow. None where actions are something else,
-            velocities of joints for one: scripted skills, ``RandomYaw`` and ``TransferredActor`` then refuse it.
-        reach: metres that the hand moves in a step at a displacement of 1, once it moves.
-        gripper: index of the gripper's effort; None where no number is one.
-        closes: the effort's sign that closes, 1 or -1. Skills say 1 to close everywhere; actions and data have this
-            sign.
-        binary_gripper: whether the gripper opens or closes fully within a few steps, so that an effort in between has
-            to be decided.
-        closes_above: the effort above which such a gripper closes. Meta-World's fingers, which close as fast as the
-            effort is large, have closed within a quarter of a second at 0.3.
-        thresholds: relation, of one comparison, to a threshold, metres, where the hand is measured elsewhere.
+    Positions are in metres: x to the right, y away from the robot, z above the table. Where an index is of an x, y and
+    z follow. Without a ``displacement`` of the hand, scripted skills, ``RandomYaw`` and ``TransferredActor`` refuse an
+    action. Scripted skills say 1 to close everywhere; actions and data have the sign of ``closes``.
 
     Example:
         >>> METAWORLD.positions
@@ -72,20 +48,20 @@ class Layout:
     """
 
     name: str
-    size: int
-    hand: int
-    opening: int
-    things: tuple[Slot, ...]
-    goal: int
-    past: int | None = None
-    action_size: int = 4
-    displacement: int | None = 0
-    reach: float = 0.01
-    gripper: int | None = 3
-    closes: int = 1
-    binary_gripper: bool = False
-    closes_above: float = 0.3
-    thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)
+    size: int  # D, how many numbers an observation has
+    hand: int  # index of the gripper's x
+    opening: int  # index of the gripper's opening, from 0, closed, to 1, open
+    things: tuple[Slot, ...]  # in the order in which tasks have them; all but the first may be absent: zeros
+    goal: int  # index of the x of the task's target, which has no past
+    past: int | None = None  # numbers of the step before stand at their index + past; after a reset, the present ones
+    action_size: int = 4  # A, how many numbers an action has, each in [-1, 1]
+    displacement: int | None = 0  # index of the x of the hand's displacement; None if actions are something else
+    reach: float = 0.01  # metres that the hand moves in a step at a displacement of 1, once it moves
+    gripper: int | None = 3  # index of the gripper's effort
+    closes: int = 1  # the effort's sign that closes, 1 or -1
+    binary_gripper: bool = False  # whether it opens or closes fully within a few steps: an effort has to be decided
+    closes_above: float = 0.3  # the effort above which such a gripper closes
+    thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)  # metres, by relation, of this suite
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -95,9 +71,7 @@ class Layout:
         used = [*self.present, *self.positions]
         if min(part.start for part in used) < 0 or max(part.stop for part in used) > self.size:
             raise ValueError(f"{layout} names numbers outside the {self.size} of an observation")
-        told = [
-            number for place in (*self.present, *self._past(self.present)) for number in range(place.start, place.stop)
-        ]
+        told = [number for part in (*self.present, *self._past(self.present)) for number in places(part)]
         if twice := sorted({number for number in told if told.count(number) > 1}):
             raise ValueError(f"{layout} says of number {twice[0]} that it is two things")
         for name, index, width in (("displacement", self.displacement, 3), ("gripper", self.gripper, 1)):

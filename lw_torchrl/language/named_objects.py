@@ -46,19 +46,14 @@ def coordinate_indices(position: Sequence[Coordinate], constants: list[float], s
 class NamedObject:
     """An object that queries can name.
 
-    Attributes:
-        name: "drawer handle", in lower case and without an article.
-        position: x, y and z: an int is an index into the numbers of the observation, a float is in metres.
-        offset: added to it, metres; for a point beside an object.
-        ours: a point that we named, which the published object list lacks.
-        opening: index of a number of the observation, from 0, closed, to 1, open, that queries call "open" and
-            "closed"; None for what does not open, turn or slide. The gripper's is the layout's.
+    ``opening`` is the index of a number of the observation, from 0, closed, to 1, open; None for what does not open,
+    turn or slide. The gripper's is the layout's.
     """
 
-    name: str
-    position: tuple[Coordinate, Coordinate, Coordinate]
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    ours: bool = False
+    name: str  # "drawer handle", in lower case and without an article
+    position: tuple[Coordinate, Coordinate, Coordinate]  # x, y and z
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # metres, added to the position; for a point on an object
+    ours: bool = False  # a point that we named, which the published object list lacks
     opening: int | None = None
 
     def __post_init__(self) -> None:

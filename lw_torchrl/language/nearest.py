@@ -64,9 +64,6 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
         by: "edit", closest in spelling; "embedding", closest in meaning (an ImportError without the extra ``[text]``).
 
     Example:
-        >>> match = nearest_query("the gripper isn't touching the puck", "push")
-        >>> str(match.query), match.score > 0.5
-        ("the robot's gripper is not around the puck", True)
         >>> str(nearest_query("gripper open and over the target locaton", "push").query)
         "the robot's gripper is open and the robot's gripper is above the target location"
 

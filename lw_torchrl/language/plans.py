@@ -63,12 +63,10 @@ class PlanStep:
 class ConditionalPlan:
     """The steps that carry out one task, as in the paper's section 'Conditional Plan Generation'.
 
-    Attributes:
-        steps: 1 to 1,000 of :class:`PlanStep`, in canonical spelling, so that the plan's text reads back as the same
-            plan: conditions as ``str(query)``, "the" before nouns. Equal conditions, skills and goals make equal plans.
-        definition: the :class:`Task` whose objects the conditions name; None for ours of that name.
-        confidence: of a plan of :func:`~lw_torchrl.canonical_plan`, the fraction of typical states in which the plan,
-            as written, does what its motion needs.
+    It has 1 to 1,000 steps, in canonical spelling, so that its text reads back as the same plan: conditions as
+    ``str(query)``, "the" before nouns. Equal conditions, skills and goals make equal plans. A plan of
+    :func:`~lw_torchrl.canonical_plan` has as its confidence the fraction of typical states in which the plan, as
+    written, does what its motion needs.
 
     Example:
         >>> plan = ConditionalPlan.from_pairs("reach", [("gripper is open", "move the gripper to the target")])
@@ -78,6 +76,7 @@ class ConditionalPlan:
 
     task: str
     steps: tuple[PlanStep, ...]
+    # The task whose objects the conditions name; None for ours of that name.
     definition: Task = field(default=None, compare=False, repr=False)  # type: ignore[assignment]
     confidence: Probability | None = None
 
@@ -214,13 +213,7 @@ def _read(text: str, task: str | None, source: str, tasks: Tasks, report: Callab
 
 
 class Plans(Mapping[str, ConditionalPlan]):
-    """An immutable mapping from task names, sorted, to their plans.
-
-    Attributes:
-        layout: of the tasks' observations and actions.
-        num_steps: S, the steps of the longest plan.
-        skills: every skill text once, sorted.
-    """
+    """An immutable mapping from task names, sorted, to their plans. ``layout`` is that of the tasks."""
 
     @checked
     def __init__(self, plans: Mapping[str, ConditionalPlan] | Iterable[ConditionalPlan]) -> None:
@@ -256,10 +249,12 @@ class Plans(Mapping[str, ConditionalPlan]):
 
     @cached_property
     def num_steps(self) -> int:
+        """S, the steps of the longest plan."""
         return max(len(plan.steps) for plan in self.values())
 
     @cached_property
     def skills(self) -> tuple[str, ...]:
+        """Every skill text once, sorted."""
         return tuple(sorted({step.skill for plan in self.values() for step in plan.steps}))
 
     @property
@@ -300,14 +295,7 @@ class Plans(Mapping[str, ConditionalPlan]):
         return sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:32]
 
     def to_json(self) -> dict[str, Any]:
-        """Each task's plan as :meth:`ConditionalPlan.to_json` has it.
-
-        Example:
-            >>> from lw_torchrl.language.plan_files import load_plans
-            >>> plans = load_plans("MT10")
-            >>> Plans.from_json(plans.to_json()).fingerprint == plans.fingerprint
-            True
-        """
+        """Return each task's plan as :meth:`ConditionalPlan.to_json` has it."""
         return {task: plan.to_json() for task, plan in self.items()}
 
     @classmethod

@@ -17,23 +17,14 @@ from lw_torchrl.language.named_objects import is_number
 
 @dataclass(frozen=True)
 class Comparison:
-    """One comparison: a length or a coordinate of d against a threshold.
+    """One comparison: a length or a coordinate of d against a threshold."""
 
-    Attributes:
-        axes: the axes of d that count, "x", "xy", "xyz", ...
-        sense: how the value is compared with the threshold.
-        threshold: in metres.
-        length: the Euclidean length over the axes; otherwise the signed coordinate of the one axis.
-        raise_z: added to dz first, in metres.
-        temperature: of the soft truth, metres (or shares of an opening) to one logit, above 0.
-    """
-
-    axes: str
+    axes: str  # the axes of d that count, "x", "xy", "xyz", ...
     sense: Literal["<", ">", "<="]
-    threshold: float
-    length: bool = True
-    raise_z: float = 0.0
-    temperature: float = 0.01
+    threshold: float  # metres
+    length: bool = True  # compare the Euclidean length over the axes, not the signed coordinate of the one axis
+    raise_z: float = 0.0  # metres, added to dz first
+    temperature: float = 0.01  # of the soft truth: metres (or shares of an opening) to one logit, above 0
 
     def __post_init__(self) -> None:
         if not self.axes or self.axes != "".join(axis for axis in "xyz" if axis in self.axes):

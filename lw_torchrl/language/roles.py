@@ -29,24 +29,18 @@ _SKILLS, _WAYS = WORDS["roles"]["skills"], WORDS["roles"]["ways"]
 class StepRole:
     """What one step of a plan does, as :func:`~lw_torchrl.canonical_plan` reads it.
 
-    Attributes:
-        moved, target: what is to arrive where: names of the task's objects, or "target location", the goal.
-        direction: where an object is pushed, pulled or moved to; also given for a hand that comes to do so.
-        toward: the object that the direction "goal" leads to; None for the task's goal.
-        written: the skill in the plan's own words; "" for a step that the plan lacked.
-        confidence: from 0, a guess, to 1, stated in the plan's words.
-        fallback: whether the step belongs to the fallback plan, which is tried when the plan makes no progress.
+    What is moved, and its target, are names of the task's objects, or "target location", the goal.
     """
 
     verb: Verb
     moved: str
     target: str
     manner: Manner
-    direction: Direction | None = None
-    toward: str | None = None
-    written: str = ""
-    confidence: Probability = 1.0
-    fallback: bool = False
+    direction: Direction | None = None  # where an object is moved to, also of a hand that comes to do so
+    toward: str | None = None  # the object that the direction "goal" leads to; None for the task's goal
+    written: str = ""  # the skill in the plan's own words; "" for a step that the plan lacked
+    confidence: Probability = 1.0  # from 0, a guess, to 1, stated in the plan's words
+    fallback: bool = False  # whether the step is of the fallback plan, which is tried when the plan makes no progress
 
     def __post_init__(self) -> None:
         check_fields(self)

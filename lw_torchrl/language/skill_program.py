@@ -31,12 +31,7 @@ class SkillProgram(nn.Module):
         skills: task name (or :class:`Task`) to its skills, each a :class:`ScriptedSkill` or the text of one.
         table: where texts are looked up; None for the shipped skills.
 
-    Attributes:
-        num_skills: S, the length of the longest list.
-        layout: of the tasks.
-
     Example:
-        >>> import torch
         >>> from lw_torchrl.language.tasks import task_id
         >>> program = SkillProgram({"push": ["place the gripper above the puck"]})
         >>> program(torch.zeros(1, 39), torch.tensor([task_id("push")])).shape
@@ -61,7 +56,7 @@ class SkillProgram(nn.Module):
         super().__init__()
         self.layout = layout = one_layout(found)
         self._displaced = layout.displaced("scripted skills")
-        self.num_skills = max(map(len, found.values()))
+        self.num_skills = max(map(len, found.values()))  # S, the length of the longest list
         index = TaskIndex(task_ids(task.name for task in found))
         constants = [0.0]
         place = torch.full((len(found), 2, self.num_skills, 3), layout.size)

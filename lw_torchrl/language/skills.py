@@ -29,14 +29,7 @@ class SkillError(ValueError):
 class ScriptedSkill:
     """A linear controller: action xyz = clip(gain · (target + offset - moved), -1, 1), with a constant gripper effort.
 
-    Attributes:
-        target: the object or point to go to; the robot's gripper makes the offset relative to the hand.
-        moved: what is to arrive there: the robot's gripper, or an object that it holds or pushes.
-        offset: added to the target, metres. x points to the robot's right, y away from it, z up.
-        gain: per axis, at least 0, action per metre; 0 leaves an axis alone.
-        gripper: effort in [-1, 1]; -1 opens, 1 closes.
-        goal: the state it steers to, as a query of the tasks that it suits; "" where the language has no words for it.
-        variants: task name to what differs there, any of the above but the text.
+    The target is an object or point; the robot's gripper makes the offset relative to the hand.
 
     Example:
         >>> skill = ScriptedSkill("place the gripper above the puck", "puck", offset=(0.0, 0.0, 0.1), gripper=-1.0)
@@ -48,12 +41,12 @@ class ScriptedSkill:
 
     text: str
     target: str
-    moved: str = GRIPPER
-    offset: Triple = (0.0, 0.0, 0.0)
-    gain: Triple = (10.0, 10.0, 10.0)
-    gripper: float = 0.0
-    goal: str = ""
-    variants: Mapping[str, ScriptedSkill] = field(default_factory=dict, hash=False, repr=False)
+    moved: str = GRIPPER  # what is to arrive at the target: the robot's gripper, or an object that it holds or pushes
+    offset: Triple = (0.0, 0.0, 0.0)  # metres, added to the target: x to the robot's right, y away from it, z up
+    gain: Triple = (10.0, 10.0, 10.0)  # per axis, at least 0, action per metre; 0 leaves an axis alone
+    gripper: float = 0.0  # effort in [-1, 1]; -1 opens, 1 closes
+    goal: str = ""  # the state it steers to, as a query of the tasks that it suits; "" if no query says it
+    variants: Mapping[str, ScriptedSkill] = field(default_factory=dict, hash=False, repr=False)  # by task name
 
     def __post_init__(self) -> None:
         def check(name: str, allowed: str, holds: Callable[[Any], bool]) -> None:

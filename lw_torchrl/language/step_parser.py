@@ -114,8 +114,8 @@ def _resolve_it(texts: Iterable[str], facts: Iterable[_Facts], task: Task) -> li
 
 def _only_sent(step: ParsedStep | None, text: str) -> ParsedStep | None:
     """In a plan that does nothing else, "move the gripper to the block" is the whole motion."""
-    to_it = step is not None and step.verb == "descend" and re.match(rf"\w+ <{GRIPPER}> (?:to|at|toward|onto) <", text)
-    return replace(step, verb="reach") if step is not None and to_it else step
+    to_it = step and step.verb == "descend" and re.match(rf"\w+ <{GRIPPER}> (?:to|at|toward|onto) <", text)
+    return replace(step, verb="reach") if step and to_it else step
 
 
 def _grasps(text: str, facts: _Facts) -> bool:
@@ -221,20 +221,17 @@ class _StepParser:
         moved = self.tool if self.tool is not None and (target is None or not is_goal(self.task, target)) else noun
         if target is not None:
             moved = self._compared_point(moved, target)
+        lifts, carries = self.verb in _VERBS["lift"], self.verb in _VERBS["carry"]
+        direction: Direction | None = self.direction
+        if direction == "down" and (self.grasping or self.verb not in ("push", "press")):
+            direction = None
         if self.grasping:
             if target is not None:
-                lifted = self.verb in _VERBS["carry"] or self.words & _PLACES["above"]
-                return ParsedStep("carry" if lifted else "move", moved, target)
-            direction: Direction | None = self.direction if self.direction != "down" else None
-            if self.verb in _VERBS["lift"]:
-                direction = "up"
-            if direction is not None:
-                return ParsedStep("move", moved, moved, direction)
-            return ParsedStep("carry" if self.verb in _VERBS["carry"] else "move", moved, GOAL, confidence=0.7)
-        direction = self.direction
-        if direction == "down" and self.verb not in ("push", "press"):
-            direction = None
-        if self.verb in _VERBS["lift"] and direction is None:
+                return ParsedStep("carry" if carries or self.words & _PLACES["above"] else "move", moved, target)
+            if lifts or direction is not None:
+                return ParsedStep("move", moved, moved, "up" if lifts else direction)
+            return ParsedStep("carry" if carries else "move", moved, GOAL, confidence=0.7)
+        if lifts and direction is None:
             return ParsedStep("pull", GRIPPER, moved, "up")
         if self.verb == "press" or direction == "down":
             return ParsedStep("push", GRIPPER, moved, direction or "goal")

@@ -28,11 +28,6 @@ class TaskIndex:
 
     Args:
         task_ids: task name to id, as :attr:`Plans.task_ids`; two tasks of one id are a ValueError.
-
-    Example:
-        >>> index = TaskIndex({"reach": 35, "stack-blocks": 650718257, "push": 32})
-        >>> index.tasks, index.rows(torch.tensor([35, 32]), "tasks without a plan").tolist()
-        (('push', 'reach', 'stack-blocks'), [1, 0])
     """
 
     def __init__(self, task_ids: Mapping[str, int]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
@@ -34,17 +35,13 @@ class TaskError(ValueError):
 class Task:
     """One manipulation task in words.
 
-    Attributes:
-        name: "drawer-open", Meta-World's name without its version; or your own, lower-case words joined by hyphens,
-            after a suite's name and a slash if it is one of a suite: "fetch/push".
-        description: one sentence that says what is to be done.
-        objects: at most 64 with different names: the robot's gripper first, the points that we named last.
-        layout: what the numbers of its observations and actions are.
+    Its name is "drawer-open", Meta-World's without its version; or your own, lower-case words joined by hyphens, after
+    a suite's name and a slash if it is one of a suite: "fetch/push".
     """
 
     name: str
-    description: str
-    objects: tuple[NamedObject, ...]
+    description: str  # one sentence
+    objects: tuple[NamedObject, ...]  # at most 64: the robot's gripper first, the points that we named last
     layout: Layout = METAWORLD
 
     def __post_init__(self) -> None:
@@ -101,22 +98,14 @@ class Task:
         return {named.name: position(named) for named in self.objects}
 
     def to_json(self) -> dict[str, Any]:
-        """The task as a row of tasks.toml; a :class:`TaskError` where a row cannot hold it, another gripper's say.
-
-        Example:
-            >>> TASKS["reach"].to_json()["objects"]
-            {'reach target': 'obs[36:39]'}
-        """
+        """Return the task as a row of tasks.toml; a :class:`TaskError` if a row cannot hold it."""
         row = {"description": self.description, **write_objects(self.objects)}
         if self.layout != METAWORLD:
             row["layout"] = self.layout.to_json()
-        try:
-            same = Task.from_json(self.name, row) == self
-        except TaskError:
-            same = False
-        if not same:
-            raise TaskError(f"task {self.name!r} cannot be written as a row of tasks.toml, it holds {self.objects!r}")
-        return {key: found for key, found in row.items() if found}
+        with suppress(TaskError):
+            if Task.from_json(self.name, row) == self:
+                return {key: value for key, value in row.items() if value}
+        raise TaskError(f"task {self.name!r} cannot be written as a row of tasks.toml, it holds {self.objects!r}")
 
     @classmethod
     def from_json(cls, name: str, row: Any, layout: Layout = METAWORLD) -> Task:

@@ -237,9 +237,7 @@ class FilePlanner:
             object of "llm", "format", "task", "attempt" and "completion" on each line.
         model: the model whose answers to read; None if there is only one.
 
-    Attributes:
-        name: the model's name, as a folder's name.
-        recorded: (format, task, attempt) of each answer, sorted.
+    ``name`` is the model's name, as a folder's name; ``recorded`` has (format, task, attempt) of each answer, sorted.
 
     Example:
         >>> import json, pathlib, lw_torchrl as lw

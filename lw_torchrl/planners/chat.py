@@ -29,8 +29,7 @@ _FALLBACKS = {
 class PlannerError(RuntimeError):
     """A planner could not answer a question; the message names the model, the question, the cause and a remedy.
 
-    Attributes:
-        fatal: every other question to the same planner would fail in the same way.
+    After a ``fatal`` error, every other question to the same planner would fail in the same way.
     """
 
     def __init__(self, message: str, *, fatal: bool = False) -> None:
@@ -77,12 +76,7 @@ def server_address(base_url: str | None) -> str:
 
 
 class ChatClient:
-    """A client of one model, for any number of threads; the arguments are those of :class:`OpenAIPlanner`.
-
-    Raises:
-        ImportError: the extra ``[llm]`` is not installed.
-        PlannerError: the key is missing or cannot be sent, or the HTTP client refuses an environment variable.
-    """
+    """A client of one model, for any number of threads; the arguments are those of :class:`OpenAIPlanner`."""
 
     def __init__(self, model: str, base_url: str | None, timeout: float, retries: int) -> None:
         try:
