@@ -166,8 +166,8 @@ _LONGEST_BEFORE = max(map(len, _BEFORE_NOUN))
 
 
 def canonical_skill(skill: str, task: Task) -> str:
-    """The skill in plain English: articles go before the nouns that lack one, as in the paper, at the beginning and
-    after a word like "above"; else ("the coffee mug") a noun is left alone."""
+    """Return the skill in plain English: nouns at the beginning and after a word like "above" get an article, as in
+    the paper; other nouns ("the coffee mug") are left alone."""
     first, _, details = " ".join(skill.split()).partition(" ")
     verb, *rest = first.replace("_", " ").split() or [""]
     if not re.fullmatch(r"[A-Za-z]\w*", verb):
@@ -189,5 +189,5 @@ def _with_articles(details: str, task: Task) -> str:
 
 
 def has_direction(skill: str) -> bool:
-    """Whether a skill says a direction in the plane, "to the left", "into the hole"; "above the puck" says none."""
+    """Return whether a skill says a direction in the plane, "to the left", "into the hole"."""
     return not _DIRECTIONS.isdisjoint(skill.split())

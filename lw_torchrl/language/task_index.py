@@ -117,7 +117,7 @@ class PlanTables:
         if number is None:
             return
         numbers = self.number.to(number.device)
-        if plain(number, rows):
+        if numbers is not self.number and plain(number, rows):
             self.number = numbers
         if asserted(number, rows):
             own = numbers[rows]

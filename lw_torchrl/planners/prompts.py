@@ -65,10 +65,9 @@ def example_plans(plans: AnyPlans | None) -> Plans:
 def plan_prompt(
     task: str | Task, format: str, *, plans: AnyPlans | None = None, vocabulary: bool = False, tasks: Tasks = TASKS
 ) -> str:
-    """Return the text that asks a language model for a plan.
+    """Return the text that asks a language model for a plan, whose answer :func:`~lw_torchrl.decode_plan` reads.
 
-    It shows the plans of :func:`prompt_examples`, and ends with the task's name and description, in the format. A
-    model that completes texts continues from there; :func:`~lw_torchrl.decode_plan` reads its answer.
+    It shows the plans of :func:`prompt_examples`, and ends with the task's name and description, in the format.
 
     Args:
         plans: see :func:`prompt_examples`.
@@ -103,10 +102,8 @@ class Question(NamedTuple):
 def chat_messages(
     task: Task, format: str, plans: AnyPlans | None, vocabulary: bool, constrain: bool
 ) -> list[dict[str, str]]:
-    """Return a system message that asks a chat model for the plan alone, and the prompt.
-
-    If the model is constrained to a schema, the system message shows the last example as JSON.
-    """
+    """Return a system message that asks a chat model only for the plan, with the last example as JSON if the model is
+    constrained to a schema, and the prompt."""
     how = (
         "the whole of it, in the form of the plans that you are shown: no other tasks, and nothing before or after it."
     )

@@ -152,10 +152,9 @@ def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
     if check.decoded.plan is None:
         reason = check.decoded.reason
         return "\n".join([f"The answer was read, and no plan was found in it: {reason}.", *unread, again])
-    lines = [f"The plan was carried out, and succeeded in {check.success:.0%} of episodes."]
-    if check.own is None:
-        lines = ["The plan was not carried out: the robot has no skill that is near one of its steps."]
-    lines += unread
+    carried_out = f"The plan was carried out, and succeeded in {check.success:.0%} of episodes."
+    no_skill = "The plan was not carried out: the robot has no skill that is near one of its steps."
+    lines = [no_skill if check.own is None else carried_out, *unread]
     for step in check.never:
         condition = check.decoded.plan.steps[step].condition
         lines.append(f"The condition of step {step + 1}, '{condition}', held at no time.")

@@ -83,10 +83,3 @@ def test_touching_the_table_counts_the_offset():
     state[6] = 0.06
     answer = QueryProgram({task: ["puck touching the table", "low place touching the table"]})
     assert answer(state, torch.tensor(task_id("push"))).tolist() == [False, True]
-
-
-def test_shipped_points_are_marked_and_named_apart():
-    for task in TASKS.values():
-        assert all(point.ours for point in task.objects[len(task.published.objects) :])
-        assert all(not thing.ours for thing in task.published.objects)
-        assert task.published.published == task.published

@@ -77,11 +77,6 @@ def test_a_faulty_file_is_refused(tmp_path, text, message):
         load_skills(written(tmp_path, text))
 
 
-def test_a_missing_file_says_so(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        load_skills(tmp_path / "none.toml")
-
-
 def test_a_skill_for_objects_that_a_task_lacks():
     with pytest.raises(SkillError, match=r"needs 'puck', which task 'drawer-open' lacks; it has .*drawer handle"):
         load_skills()["place the gripper above the puck"].for_task("drawer-open")
