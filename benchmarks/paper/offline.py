@@ -234,7 +234,9 @@ def _trunk(condition: str, plans: Plans, noise: float = 0.0) -> TensorDictSequen
     features = ObservationFeatures(noise=noise)
     if condition == "pcbc":
         return plan_trunk(plans, features=features)
-    return descriptor_trunk([plan.definition for plan in plans.values()], condition=CONDITIONS[condition], features=features)  # type: ignore[arg-type]
+    return descriptor_trunk(
+        [plan.definition for plan in plans.values()], condition=CONDITIONS[condition], features=features
+    )  # type: ignore[arg-type]
 
 
 DISTRIBUTIONS = {
