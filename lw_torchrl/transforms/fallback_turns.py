@@ -52,7 +52,6 @@ class FallbackTurns(Transform):
         >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.transforms.FallbackTurns(patience=5))
         >>> env.rollout(12, lambda td: td.set("action", td["observation"].new_zeros(1, 4)))["turn"].max()
         tensor(2)
-        >>> env.close()
 
     Source: ours; time-outs of a behaviour tree's fallback node.
     """

@@ -38,7 +38,6 @@ class LanguageInstruction(Transform):
         >>> env = TransformedEnv(lw.LanguageWorldEnv(["reach", "push"]), lw.transforms.LanguageInstruction())
         >>> env.reset()["language_instruction"][0] == lw.TASKS["push"].description
         True
-        >>> env.close()
 
     Source: ``torchrl.envs.LiberoEnv``.
     """
