@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import lw_torchrl as lw
+from lw_torchrl.language.canonical import canonical_like
 from lw_torchrl.language.layout import Layout, Slot
 from lw_torchrl.suites import Suite, check_suite
 from lw_torchrl.suites.engine import EngineStep, checked_step, seeds_of_rows
@@ -138,7 +139,8 @@ def main() -> None:
             continue
         actor = lw.ScriptedSkillActor(suite.plans, skills=suite.skills)
         if args.policy != "expert":
-            actor = lw.modules.TransferredActor(lw.load_actor(args.policy), suite.plans)
+            trained = lw.load_actor(args.policy)
+            actor = lw.modules.TransferredActor(trained, canonical_like(suite.plans, lw.modules.plans_of(trained)))
         result = lw.evaluate(
             actor, tasks=f"robosuite/{args.task}", suite=suite, episodes_per_task=args.episodes, seed=args.seed,
             max_steps=args.steps, num_envs=args.rows, noise_scale=0.0, stop_at_success=True,
