@@ -31,27 +31,25 @@ OPEN = 0.1
 
 
 def our_positions(positions: Array, origin: Array) -> Array:
-    """Positions in Fetch's axes, (..., 3) float64, seen from ``origin`` (..., 3), which is in Fetch's axes too."""
+    """Convert positions (..., 3) float64 from Fetch's axes to ours, relative to ``origin`` (..., 3) in Fetch's axes."""
     way = positions - origin
     return np.stack((-way[..., 1], way[..., 0], way[..., 2]), -1)
 
 
 def our_quaternions(quaternions: Array) -> Array:
-    """Fetch's quaternions (..., 4) float64, w first, with the axis of rotation in our axes. So that of a thing which
-    was not turned stays (1, 0, 0, 0)."""
+    """Convert the axis of quaternions (..., 4) float64, w first, to our axes: (1, 0, 0, 0) stays."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     return np.stack((w, -y, x, z), -1)
 
 
 def turned_quaternions(quaternions: Array) -> Array:
-    """Orientations of bodies (..., 4) float64, w first, in Fetch's axes, as they are in ours: turned by a quarter."""
+    """Convert orientations of bodies (..., 4) float64, w first, from Fetch's axes to ours: a quarter turn."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     return np.sqrt(0.5) * np.stack((w - z, x - y, x + y, w + z), -1)
 
 
 def fetch_actions(action: NDArray[Any]) -> NDArray[Any]:
-    """The actions of gymnasium-robotics that equal ours, (..., 4) of the same dtype: displacement x, y, z, where 1 asks
-    for 5 cm, and the gripper's effort, where +1 opens. Ours go to the right, away and up, and +1 closes."""
+    """Return gymnasium-robotics' actions, (..., 4) of the same dtype, where +1 opens, for ours, where +1 closes."""
     return np.stack((action[..., 1], -action[..., 0], action[..., 2], -action[..., 3]), -1)
 
 
@@ -67,8 +65,8 @@ _SUCCESS = 0.05  # metres
 
 
 class _Scene(NamedTuple):
-    """A task's class in gymnasium-robotics, and where our origin is: metres, in Fetch's axes. A thing that rests on the
-    table is at our z = 0.018, two millimetres below what counts as touching; hands start near x = 0, y = 0.6."""
+    """A task's class in gymnasium-robotics, and our origin: metres, in Fetch's axes. An object on the table is at our
+    z = 0.018, two millimetres below what counts as touching; hands start near x = 0, y = 0.6."""
 
     module: str
     env: str
@@ -85,8 +83,7 @@ _SCENES = {
 
 @cache
 def _builder(task: str) -> Any:
-    """Gymnasium-robotics' environment of a task, built once in a process. Its compiled model never changes, so all rows
-    of all engines read it at the same time."""
+    """Build gymnasium-robotics' environment of a task; its model never changes, so all rows of all engines share it."""
     scene = _SCENES[task]
     with naming_absent_renderer(), redirect_stderr(StringIO()):  # importing it prints news of other environments
         try:
@@ -131,8 +128,7 @@ class _Row:
         self._read(read)
 
     def simulate(self, displacement: Array, effort: np.float64, read: Array, warnings: NDArray[np.int32]) -> None:
-        """One step of 20 of physics; ``displacement`` (3,) is in metres, ``effort`` is Fetch's. ``read`` (12,) and
-        ``warnings`` (3,) are filled."""
+        """Simulate 20 steps of physics and fill ``read`` (12,) and ``warnings`` (3,); ``displacement`` is in metres."""
         data = self.data
         np.add(self._hand[0], displacement, out=self._mocap[0])
         np.add(self._hand[1], _TURN, out=self._mocap[1])

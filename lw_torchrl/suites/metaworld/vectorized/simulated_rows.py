@@ -27,9 +27,8 @@ _VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 
 class SimulatedRow:
-    """A state, the positions that its last reset gave to bodies and sites, and Meta-World's program for its task, a
-    copy of ``builder`` for each episode. No other thread may use the ``shared`` model while this row simulates or
-    resets."""
+    """A state, the positions that its last reset gave to bodies and sites, and a copy of Meta-World's program for each
+    episode. No other thread may use the ``shared`` model while this row simulates or resets."""
 
     def __init__(self, sources: TaskSources, shared: SharedModel, builder: Any, reward: TaskReward | None) -> None:
         self.sources = sources
@@ -60,9 +59,8 @@ class SimulatedRow:
         return observation
 
     def simulate(self, mocap: Array, control: Array, sensors: Array, warnings: NDArray[np.int32]) -> None:
-        """One step of the environment: five of physics, and a look without moving, ``mj_forward``, which also leaves
-        the accelerations from which the next step's solver starts. ``sensors`` (as wide as its index) and ``warnings``
-        (3,) are filled while the state is still in the processor's cache."""
+        """Simulate five steps of physics, then ``mj_forward``, which leaves the accelerations from which the next
+        solver starts; fill ``sensors`` and ``warnings`` (3,) while the state is still in the processor's cache."""
         self._take_model()
         self.mocap[...] = mocap
         self._control[...] = control
