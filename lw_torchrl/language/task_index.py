@@ -49,7 +49,7 @@ class TaskIndex:
             raise ValueError(f"task_id must be int64, got {task_id.dtype}")
         kept = plain(task_id)
         ids = self._ids.to(task_id.device)
-        if kept:
+        if plain(ids):  # also inside of vmap, where task_id is not
             self._ids = ids
         given = task_id.long().contiguous()
         if kept or asserted(task_id):
@@ -117,7 +117,7 @@ class PlanTables:
         if number is None:
             return
         numbers = self.number.to(number.device)
-        if numbers is not self.number and plain(number, rows):
+        if numbers is not self.number and plain(numbers):
             self.number = numbers
         if asserted(number, rows):
             own = numbers[rows]
