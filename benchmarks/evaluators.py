@@ -18,6 +18,8 @@ from benchmarks.figures import markdown_table
 from lw_torchrl._files import write_text
 from lw_torchrl.cli.demo import DemoConfig
 from lw_torchrl.evaluation import EvaluationResult
+from lw_torchrl.modules import transform_of
+from lw_torchrl.modules.query_evaluator import evaluators_of
 
 RECIPE = DemoConfig()
 WHO = ("expert", "scripted", "spoilt-30", "random")
