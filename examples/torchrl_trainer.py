@@ -29,9 +29,8 @@ class Stepper(DefaultOptimizationStepper):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--updates", type=int, default=60)
-    parser.add_argument("--rows", type=int, default=16)
-    parser.add_argument("--horizon", type=int, default=100)
+    for name, default in (("updates", 60), ("rows", 16), ("horizon", 100)):
+        parser.add_argument(f"--{name}", type=int, default=default)
     args = parser.parse_args()
     torch.manual_seed(0)
     frames = args.rows * args.horizon
