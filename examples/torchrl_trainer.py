@@ -29,23 +29,21 @@ class Stepper(DefaultOptimizationStepper):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--updates", type=int, default=60)
-    parser.add_argument("--rows", type=int, default=16)
-    parser.add_argument("--horizon", type=int, default=100)
+    for name, default in (("updates", 60), ("rows", 16), ("horizon", 100)):
+        parser.add_argument(f"--{name}", type=int, default=default)
     args = parser.parse_args()
     torch.manual_seed(0)
     frames = args.rows * args.horizon
 
-    plans = lw.load_plans("MT10")
-    actor = lw.PlanConditionedActor(plans).stochastic("normal", init_std=0.5)
+    actor = lw.PlanConditionedActor(lw.load_plans("MT10")).stochastic("normal", init_std=0.5)
     value = lw.modules.Value(actor.trunk)
     env = lw.LanguageWorldEnv(TASK, num_envs=args.rows, reward="dense", max_steps=args.horizon)
     collector = Collector(
-        TransformedEnv(env, lw.QAFTransform(plans)),
+        TransformedEnv(env, lw.QAFTransform(actor.plans)),
         actor,
         frames_per_batch=frames,
         total_frames=args.updates * frames,
-        auto_register_policy_transforms=False,  # the environment has the transform already
+        auto_register_policy_transforms=False,
     )
     loss = ClipPPOLoss(actor, value, entropy_coeff=1e-3)
     trainer = Trainer(
