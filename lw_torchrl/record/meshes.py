@@ -54,22 +54,8 @@ def model_geometry(model: RowModel) -> ModelGeometry:
     return _prepared[model.path]
 
 
-Known = dict[str, bytes | None]
-"""The meshes of a recording with their static poses: None for none yet, b"" for a pose that each episode sets."""
-
-
-def log_meshes(stream: Any, model: RowModel, known: Known) -> None:
-    """Add the meshes of a model that the recording lacks, before its first episode."""
-    for _, name, mesh in model_geometry(model).meshes:
-        _log_mesh(stream, entity_path("meshes", name), mesh, known)
-
-
-def _log_mesh(stream: Any, path: str, mesh: Vertices, known: Known, *, ghost: bool = False) -> None:
-    if path in known:
-        return
-    known[path] = None
-    look: dict[str, Any] = {"albedo_factor": GHOST, "vertex_colors": None} if ghost else {}
-    stream.log(path, rr.Mesh3D(**(mesh | look)), static=True)
+Known = dict[str, bytes]
+"""The meshes of a recording with their static poses, b"" for a pose that each episode sets."""
 
 
 def log_motion(
@@ -102,9 +88,10 @@ def log_motion(
         pose = b"" if len(moved) > 1 else place[0].tobytes() + turn[0].tobytes()
         if ghost and pose:
             continue
-        _log_mesh(stream, path, mesh, known, ghost=ghost)
-        if known[path] is None:
+        if path not in known:
             known[path] = pose
+            look: dict[str, Any] = {"albedo_factor": GHOST, "vertex_colors": None} if ghost else {}
+            stream.log(path, rr.Mesh3D(**(mesh | look)), static=True)
             if pose:
                 still = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
                 stream.log(path, still, static=True)

@@ -30,13 +30,12 @@ from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.record import metrics
 from lw_torchrl.record.entities import METRIC_TIMELINE, STEP_TIME, entity_path, rr, time_columns
-from lw_torchrl.record.meshes import Known, Motion, log_meshes
+from lw_torchrl.record.meshes import Known, Motion
 from lw_torchrl.record.metrics import check_name
 from lw_torchrl.record.page import send_page
 from lw_torchrl.record.recorded_episode import MendedRecording, PlanLike, RecordedEpisode
 from lw_torchrl.record.tabs import OVERVIEW, TITLES, Tabs
 from lw_torchrl.record.verdict import Heading
-from lw_torchrl.suites.engine import RowModel
 from lw_torchrl.suites.suite import known_suite
 
 BUFFERED_SCALARS = 1024
@@ -337,11 +336,6 @@ class RerunLogger(Logger):
             self._tabs.add("page", vars(page))
             self._send()
         return name
-
-    def prepare(self, model: RowModel) -> None:
-        """Add the meshes of a model now, which takes half a second, so that its first page is fast."""
-        with self._lock:
-            log_meshes(self._open(), model, self._meshes)
 
     def show_causes(self, result: EvaluationResult) -> None:
         """Put :func:`lw_torchrl.evaluation.plot_failures` of a result into the overview of several episodes."""

@@ -84,7 +84,6 @@ class RolloutRecorder(Transform):
         return copied
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Join an environment; the meshes of its models are prepared now, in half a second for each."""
         super().set_container(container)
         env = base_env(self)
         if env is None:
@@ -191,8 +190,6 @@ class _OwnRow(_Row):
         self._seed = self.env.seed
         engine: Any = self.env.engine
         self._model: Any = engine.model(row) if hasattr(engine, "poses") else None  # a custom engine may lack bodies
-        if self._model is not None:
-            recorder.logger.prepare(self._model)
 
     def keeps(self, key: str, values: Any, later: bool) -> bool:
         return key in (_AFTER if later else _BEFORE)

@@ -101,11 +101,9 @@ def log_scene(
     goal = episode.goal
     # Objects that stand for the goal, like "target location", have its colour, and their own label.
     goals = [] if goal is None else [name for name, at in episode.objects.items() if np.allclose(goal, at, atol=1e-3)]
-    others = [name for name in episode.objects if name != GRIPPER]
-    colors = dict(zip(others, cycle(OBJECT_COLORS), strict=False))
-    if GRIPPER in episode.objects:
-        colors = {GRIPPER: GOLD} | colors
     things = {name: position for name, position in episode.objects.items() if name != GRIPPER}
+    colors = {GRIPPER: GOLD} if GRIPPER in episode.objects else {}
+    colors |= dict(zip(things, cycle(OBJECT_COLORS), strict=False))
     if goal is not None and goal.any() and not goals:
         things.setdefault("goal", goal)
     offsets = name_offsets({name: position[drawn] for name, position in things.items()}, eye)

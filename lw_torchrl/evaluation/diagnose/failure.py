@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from reprlib import repr as short
@@ -261,12 +262,9 @@ def read_failures(stated: Any, config: Mapping[str, Any], failed: Sequence[tuple
     return found
 
 
-def count_causes(tasks: Sequence[str], failures: Sequence[Failure]) -> dict[str, dict[str, int]]:
+def count_causes(tasks: Sequence[str], failures: Sequence[Failure]) -> dict[str, Counter[str]]:
     """Return the number of failures of each cause, by task."""
-    counts = {task: dict.fromkeys(CAUSES, 0) for task in tasks}
-    for failure in failures:
-        counts[failure.task][failure.cause] += 1
-    return counts
+    return {task: Counter(failure.cause for failure in failures if failure.task == task) for task in tasks}
 
 
 def failure_table(tasks: Sequence[str], episodes_per_task: int, failures: Sequence[Failure]) -> str:
@@ -276,9 +274,9 @@ def failure_table(tasks: Sequence[str], episodes_per_task: int, failures: Sequen
     lines = [f"{'task':{width}}  {'failed':>10}  " + "  ".join(f"{cause:>5}" for cause in causes)]
     counts = count_causes(tasks, failures)
     if len(tasks) > 1:
-        counts["all"] = {cause: sum(row[cause] for row in counts.values()) for cause in causes}
+        counts["all"] = Counter(failure.cause for failure in failures)
     for task, row in counts.items():
         trials = episodes_per_task * (len(tasks) if task == "all" and len(tasks) > 1 else 1)
-        cells = "  ".join(f"{number:>{max(5, len(cause))}}" for cause, number in row.items() if cause in causes)
+        cells = "  ".join(f"{row[cause]:>{max(5, len(cause))}}" for cause in causes)
         lines.append(f"{task:{width}}  {f'{sum(row.values())} of {trials}':>10}  {cells}")
     return "\n".join(lines)
