@@ -24,15 +24,10 @@ _ROWS = 256
 
 @dataclass(frozen=True)
 class PartScore:
-    """Answers to one held-out part of :class:`LabelledQueries`.
+    """Answers to one held-out part of :class:`LabelledQueries`, counted by predicate, negated or not."""
 
-    Attributes:
-        right: predicate to the number of correct answers where it, or its negation, is false and where it is true.
-        asked: predicate to the number of all answers, likewise.
-    """
-
-    right: dict[str, tuple[int, int]]
-    asked: dict[str, tuple[int, int]]
+    right: dict[str, tuple[int, int]]  # the number of correct answers where the clause is false and where it is true
+    asked: dict[str, tuple[int, int]]  # the number of all answers, likewise
 
     @property
     def answers(self) -> int:
@@ -70,15 +65,10 @@ class PartScore:
 
 @dataclass(frozen=True)
 class EvaluatorScore:
-    """The score of an evaluator on held-out data.
+    """The score of an evaluator on held-out data."""
 
-    Attributes:
-        parts: "states", "queries" and "tasks", where the data hold out any, to their scores.
-        about: the data and the split, as JSON.
-    """
-
-    parts: dict[str, PartScore]
-    about: dict[str, Any]
+    parts: dict[str, PartScore]  # of "states", "queries" and "tasks", where the data hold out any
+    about: dict[str, Any]  # the data and the split, as JSON
 
     def table(self, most: int = 4) -> str:
         """Return the rates as text, with this many of the worst predicates of each part."""

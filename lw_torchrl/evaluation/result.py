@@ -25,41 +25,25 @@ FORMAT_VERSION = 1
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """One evaluated episode.
-
-    Attributes:
-        task, episode: the task's name and the episode's index; ``episode_seed(task, seed, episode)`` is its seed.
-        success: at some step.
-        first_success: the first successful step, from 1; None without success.
-        success_at_end: at the last step; None where the episode was stopped at its success.
-        episode_return: the sum of the rewards; None where the episode was stopped.
-        actions: (T, 4) float32, as executed, if they were recorded; they are not saved.
-    """
+    """One evaluated episode; ``episode_seed(task, seed, episode)`` is its seed."""
 
     task: str
     episode: Natural
-    success: bool
-    first_success: Count | None
-    success_at_end: bool | None
-    episode_return: float | None
-    actions: Tensor | None = field(default=None, compare=False, repr=False)
+    success: bool  # at some step
+    first_success: Count | None  # the first successful step, from 1
+    success_at_end: bool | None  # at the last step; None if the episode was stopped at its success
+    episode_return: float | None  # the sum of the rewards; None if the episode was stopped
+    actions: Tensor | None = field(default=None, compare=False, repr=False)  # (T, 4) as executed; they are not saved
 
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """The result of :func:`evaluate`.
+    """The result of :func:`evaluate`, with episodes and failures by task and episode."""
 
-    Attributes:
-        config: tasks, episodes_per_task, seed, noise_scale, stop_at_success, max_steps.
-        episodes: one record each, by task and episode.
-        origin: provenance, as :meth:`save` noted it; it does not count in a comparison.
-        failures: why each failed episode failed, by task and episode; None unless :func:`evaluate` attributed them.
-    """
-
-    config: dict[str, Any]
+    config: dict[str, Any]  # tasks, episodes_per_task, seed, noise_scale, stop_at_success, max_steps
     episodes: tuple[EpisodeResult, ...]
-    origin: dict[str, Any] = field(default_factory=dict, compare=False)
-    failures: tuple[Failure, ...] | None = None
+    origin: dict[str, Any] = field(default_factory=dict, compare=False)  # provenance, as save noted it
+    failures: tuple[Failure, ...] | None = None  # why each failed episode failed; None unless they were attributed
 
     def _by_task(self, value: Callable[[list[EpisodeResult]], float | None]) -> dict[str, float | None]:
         found: dict[str, list[EpisodeResult]] = {}

@@ -102,7 +102,7 @@ def log_scene(
     # Objects that stand for the goal, like "target location", have its colour, and their own label.
     goals = [] if goal is None else [name for name, at in episode.objects.items() if np.allclose(goal, at, atol=1e-3)]
     things = {name: position for name, position in episode.objects.items() if name != GRIPPER}
-    colors = {GRIPPER: GOLD} if GRIPPER in episode.objects else {}
+    colors: dict[str, Color] = {GRIPPER: GOLD} if GRIPPER in episode.objects else {}
     colors |= dict(zip(things, cycle(OBJECT_COLORS), strict=False))
     if goal is not None and goal.any() and not goals:
         things.setdefault("goal", goal)

@@ -118,12 +118,6 @@ def test_results_that_cannot_be_averaged_are_refused(other, message):
         summarize({3: RESULTS[3], 7: other})
 
 
-@pytest.mark.parametrize("nothing", [{}, []])
-def test_no_results_are_refused(nothing):
-    with pytest.raises(ValueError, match="results must hold at least one result, got none"):
-        summarize(nothing)
-
-
 @pytest.mark.parametrize(
     ("rates", "seeds", "message"),
     [

@@ -59,13 +59,11 @@ def attribute_failures(
     noise and nothing replaced. If it succeeds, the failure is *not reproducible*, and the finding says what differs.
     Otherwise it is re-run with one part replaced by a sound one: the observations, if the policy was shown wrong ones
     (*perception*); the answers, where they were wrong (*query*); the *plan*, by the reference; the policy's action, by
-    that of scripted skills (where a text is no scripted skill, by the expert's), in one step of the plan (*skill*), for
-    the *gripper* or the hand's motion (*actuation*) only, or in all steps (*policy*); or twice the time (*out of
-    time*). If nothing helps, pairs are tried, which give ``cause`` and ``also``. If several replacements help, the one
-    that fixes most of the task's failed episodes counts, and of those about as good the smallest; but a skill does not
-    count if other steps have the same fault. One success may be luck, so ``shares`` holds the share of the task's
-    failed episodes that each replacement fixes, and "nothing" that of the null control. A policy without plans gets no
-    step.
+    that of scripted skills or, where a step has none, the expert's, in one step of the plan (*skill*), for the
+    *gripper* or the hand's motion (*actuation*) only, or in all steps (*policy*); or twice the time (*out of time*). If
+    nothing helps, pairs are tried, which give ``cause`` and ``also``. If several replacements help, the one that fixes
+    most of the task's failed episodes counts, and of those about as good the smallest; but a skill does not count if
+    other steps have the same fault. A policy without plans gets no step.
 
     Args:
         rollouts: episodes as :func:`evaluate` passes them to ``on_episode``, or TensorDicts of batch (T,), each one
