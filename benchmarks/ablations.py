@@ -20,8 +20,8 @@ from benchmarks.figures import markdown_table
 from benchmarks.paper.imitation import ImitationRun
 from benchmarks.paper.recipes import EXECUTIONS, PRESETS, SETTINGS, Member, Preset
 from benchmarks.paper.runs import execute_run
+from benchmarks.statistics import count_solved
 from lw_torchrl._files import write_text
-from lw_torchrl.evaluation import count_solved
 from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.task_objects import role_object
 from lw_torchrl.language.tasks import Task

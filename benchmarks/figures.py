@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from benchmarks.statistics import Array, Summary, check_rates
 from lw_torchrl._files import AnyPath
 from lw_torchrl.evaluation.figures import COLORS, check_image, new_figure, saved, trim
-from lw_torchrl.evaluation.statistics import Array, check_rates
-from lw_torchrl.evaluation.summary import Summary
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

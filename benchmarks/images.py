@@ -15,9 +15,10 @@ import lw_torchrl as lw
 from benchmarks.evaluator_report import plot_wrong_answers, write_report, wrong_answers
 from benchmarks.evaluators import WHO, demonstrations, evaluated, in_front
 from benchmarks.figures import markdown_table
+from benchmarks.statistics import Estimate
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import EvaluationResult
-from lw_torchrl.evaluation.statistics import Estimate, wilson_interval
+from lw_torchrl.evaluation.result import wilson_interval
 
 
 @dataclass(frozen=True)

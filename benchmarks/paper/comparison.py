@@ -11,10 +11,10 @@ import numpy as np
 
 from benchmarks.figures import markdown_table
 from benchmarks.paper.runs import Run
+from benchmarks.statistics import Estimate, Summary, mean_difference, probability_of_improvement, summarize
 from lw_torchrl._files import write_json, write_text
-from lw_torchrl.evaluation import EvaluationResult, Summary, statistics, summarize
+from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.evaluation.figures import new_figure, saved, trim
-from lw_torchrl.evaluation.statistics import Estimate
 from lw_torchrl.language.tasks import MT10
 
 
@@ -46,7 +46,7 @@ class MethodComparison:
         for other in others:
             order = [self.summaries[other].tasks.index(task) for task in self.tasks]
             rates = self.summaries[first].array, self.summaries[other].array[:, order]
-            difference, improvement = statistics.mean_difference(*rates), statistics.probability_of_improvement(*rates)
+            difference, improvement = mean_difference(*rates), probability_of_improvement(*rates)
             self.pairs.append(Pair((first, other), difference, improvement))
 
     def to_json(self) -> dict[str, Any]:

@@ -24,16 +24,10 @@ _ROWS = 256
 
 @dataclass(frozen=True)
 class PartScore:
-    """Answers to one held-out part of :class:`LabelledQueries`, counted by predicate.
+    """Answers to one held-out part of :class:`LabelledQueries`, counted by predicate, negated or not."""
 
-    Attributes:
-        right: predicate to the number of correct answers where it is false and where it is true. A negated clause
-            counts with its predicate.
-        asked: predicate to the number of all answers, likewise.
-    """
-
-    right: dict[str, tuple[int, int]]
-    asked: dict[str, tuple[int, int]]
+    right: dict[str, tuple[int, int]]  # the number of correct answers where the clause is false and where it is true
+    asked: dict[str, tuple[int, int]]  # the number of all answers, likewise
 
     @property
     def answers(self) -> int:
@@ -59,42 +53,32 @@ class PartScore:
 
     def to_json(self) -> dict[str, Any]:
         """Return the rates and counts as JSON."""
-        return {
-            "answers": self.answers,
-            "accuracy": self.accuracy(),
-            "balanced_accuracy": self.balanced_accuracy(),
-            "predicates": {
-                name: {
-                    "accuracy": self.accuracy(name),
-                    "balanced_accuracy": self.balanced_accuracy(name),
-                    "false_and_true": list(self.asked[name]),
-                    "right": list(self.right[name]),
-                }
-                for name in self.worst
-            },
+        predicates = {
+            name: self._rates(name) | {"false_and_true": list(self.asked[name]), "right": list(self.right[name])}
+            for name in self.worst
         }
+        return {"answers": self.answers, **self._rates(), "predicates": predicates}
+
+    def _rates(self, predicate: str | None = None) -> dict[str, Any]:
+        return {"accuracy": self.accuracy(predicate), "balanced_accuracy": self.balanced_accuracy(predicate)}
 
 
 @dataclass(frozen=True)
 class EvaluatorScore:
-    """The score of an evaluator on held-out data.
+    """The score of an evaluator on held-out data."""
 
-    Attributes:
-        parts: "states", "queries" and "tasks", where the data hold out any, to their scores.
-        about: the data and the split, as JSON.
-    """
-
-    parts: dict[str, PartScore]
-    about: dict[str, Any]
+    parts: dict[str, PartScore]  # of "states", "queries" and "tasks", where the data hold out any
+    about: dict[str, Any]  # the data and the split, as JSON
 
     def table(self, most: int = 4) -> str:
         """Return the rates as text, with this many of the worst predicates of each part."""
         lines = [f"{'':36}{'answers':>10}{'accuracy':>10}{'balanced':>10}"]
         for part, score in self.parts.items():
-            lines.append(f"{PARTS[part]:36}{score.answers:10}{score.accuracy():10.4f}{score.balanced_accuracy():10.4f}")
-            for name in score.worst[:most]:
+            rows: list[tuple[str, int, str | None]] = [(PARTS[part], score.answers, None)]
+            rows += [(f"  {name}", sum(score.asked[name]), name) for name in score.worst[:most]]
+            for title, answers, name in rows:
                 rates = f"{score.accuracy(name):10.4f}{score.balanced_accuracy(name):10.4f}"
-                lines.append(f"  {name:34}{sum(score.asked[name]):10}{rates}")
+                lines.append(f"{title:36}{answers:10}{rates}")
         return "\n".join(lines)
 
     def save(self, path: AnyPath) -> None:
@@ -104,10 +88,7 @@ class EvaluatorScore:
 
 @checked
 def score_evaluator(evaluator: ClauseEvaluator, data: LabelledQueries) -> EvaluatorScore:
-    """Score an evaluator, whatever its plans, on the held-out parts of the data.
-
-    Raises:
-        ValueError: the data hold out nothing.
+    """Score an evaluator, whatever its plans, on the held-out parts of the data, which must have some.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
@@ -132,7 +113,7 @@ def _score(evaluator: ClauseEvaluator, part: list[TaskQueries]) -> PartScore:
         for queries in part:
             logits, truth = clause_logits(evaluator, queries)
             for table, counted in ((asked, torch.ones_like(truth)), (right, (logits > 0) == truth)):
-                numbers = zip((counted & ~truth).sum(0).tolist(), (counted & truth).sum(0).tolist(), strict=True)
+                numbers = torch.stack([counted & ~truth, counted & truth], dim=-1).sum(0).tolist()
                 for clause, (false, true) in zip(queries.clauses, numbers, strict=True):
                     before = table.get(clause.predicate, (0, 0))
                     table[clause.predicate] = before[0] + false, before[1] + true

@@ -10,8 +10,7 @@ import numpy as np
 from lw_torchrl._checks import checked, counted
 from lw_torchrl._files import AnyPath, replacing
 from lw_torchrl.evaluation.diagnose.failure import CAUSES, count_causes
-from lw_torchrl.evaluation.result import EvaluationResult, attributed
-from lw_torchrl.evaluation.statistics import wilson_interval
+from lw_torchrl.evaluation.result import EvaluationResult, attributed, wilson_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,7 +33,7 @@ def check_image(path: AnyPath | None) -> None:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of so many inches."""
+    """Return an empty figure, in inches."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
@@ -48,7 +47,7 @@ def saved(figure: Figure, path: AnyPath | None) -> Figure:
 
 
 def trim(axes: Axes, grid: Literal["x", "y"] | None = None) -> None:
-    """Take the upper and right spines away; lines across ``grid`` stand behind what is drawn."""
+    """Remove the upper and right spines, and draw lines across ``grid`` behind everything else."""
     axes.spines[["top", "right"]].set_visible(False)
     if grid is not None:
         axes.grid(axis=grid, color="#dddddd", linewidth=0.6)
@@ -59,10 +58,7 @@ def trim(axes: Axes, grid: Literal["x", "y"] | None = None) -> None:
 def plot_success(result: EvaluationResult, path: AnyPath | None = None, *, title: str = "") -> Figure:
     """Draw the any-step success rate of each task, best first, with 95 % intervals over the episodes.
 
-    Args:
-        result: of :func:`evaluate`.
-        path: an image file, .png, .svg, .pdf or .jpg, replaced whole; another format raises :class:`ValueError`.
-        title: above the figure.
+    It is written to ``path``, a .png, .svg, .pdf or .jpg file, if one is given.
 
     Example:
         >>> import lw_torchrl as lw
@@ -78,8 +74,8 @@ def plot_success(result: EvaluationResult, path: AnyPath | None = None, *, title
     axes = figure.subplots()
     values = np.array([rates[task] for task in tasks])
     low, high = np.array([wilson_interval(round(rate * trials), trials) for rate in values.tolist()]).T
-    ends, bars = (values - low, high - values), {"ecolor": "#333333", "elinewidth": 1, "capsize": 2}
-    axes.barh(tasks, values, xerr=np.maximum(ends, 0.0), color="#4c78a8", error_kw=bars)
+    ends, bars = np.maximum((values - low, high - values), 0.0), {"ecolor": "#333333", "elinewidth": 1, "capsize": 2}
+    axes.barh(tasks, values, xerr=ends, color="#4c78a8", error_kw=bars)
     axes.axvline(result.mean_success, color="#e45756", linestyle="--")
     axes.set_xlim(0, 1.02)
     axes.margins(y=0.5 / len(tasks))
@@ -92,11 +88,9 @@ def plot_success(result: EvaluationResult, path: AnyPath | None = None, *, title
 
 @checked
 def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, title: str = "") -> Figure:
-    """Draw how many episodes of each task failed, and of what; the task with most failures at the top.
+    """Draw the failed episodes of each task by cause, of a result of ``evaluate(..., attribute=True)``, most on top.
 
-    Args:
-        result: of ``evaluate(..., attribute=True)``; one without failures raises :class:`ValueError`.
-        path, title: as for :func:`plot_success`.
+    It is written to ``path`` as by :func:`plot_success`.
 
     Example:
         >>> from lw_torchrl.evaluation import EpisodeResult, Failure

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from lw_torchrl._checks import checked, counted
 from lw_torchrl._files import AnyPath, replacing, shipped_policy, write_text
-from lw_torchrl.evaluation.result import EvaluationResult
-from lw_torchrl.evaluation.statistics import wilson_interval
+from lw_torchrl.evaluation.result import EvaluationResult, wilson_interval
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.training.checkpoint import demonstrated_tasks, load_actor, policy_file, read_description
 
@@ -51,7 +50,6 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
         ``huggingface_hub.ModelCard``; ``str()`` of it is Markdown, and ``card.save("README.md")`` writes it.
 
     Raises:
-        FileNotFoundError, ValueError: as for :func:`~lw_torchrl.load_actor`.
         ValueError: the result is of tasks that the policy does not know.
         ImportError: the extra ``[hub]`` is not installed.
 
@@ -61,22 +59,13 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
 
     Source: ``huggingface_hub.ModelCard``; Mitchell et al., 'Model Cards for Model Reporting'.
     """
-    measured = _measured(policy, result)
-    text = describe_policy(policy, measured, repo=repo)
-    metadata = hub().ModelCardData(
-        library_name="lw_torchrl", pipeline_tag="robotics", tags=_TAGS, model_name=Path(policy).stem
-    )
+    measured, about = _measured(policy, result), {"library_name": "lw_torchrl", "pipeline_tag": "robotics"}
+    metadata = hub().ModelCardData(**about, tags=_TAGS, model_name=Path(policy).stem)
     if measured is not None:
-        metadata.eval_results = [
-            hub().EvalResult(
-                task_type="robotics",
-                dataset_type="meta-world",
-                dataset_name=counted(len(measured.success_once), "task"),
-                metric_type="success_rate",
-                metric_name="mean success",
-                metric_value=round(measured.mean_success, 3),
-            )
-        ]
+        row = {"task_type": "robotics", "dataset_type": "meta-world", "metric_type": "success_rate"}
+        row |= {"dataset_name": counted(len(measured.success_once), "task"), "metric_name": "mean success"}
+        metadata.eval_results = [hub().EvalResult(**row, metric_value=round(measured.mean_success, 3))]
+    text = describe_policy(policy, measured, repo=repo)
     card: ModelCard = hub().ModelCard(f"---\n{metadata.to_yaml()}\n---\n\n{text}")
     return card
 
@@ -91,8 +80,7 @@ def _measured(policy: AnyPath, result: EvaluationResult | None) -> EvaluationRes
 def describe_policy(policy: AnyPath, result: EvaluationResult | None = None, *, repo: str = "") -> str:
     """Describe a policy in Markdown: training data, success rates, limits, how to load and cite it.
 
-    Args:
-        policy, result, repo: as for :func:`policy_card`, with its errors; no extra is needed.
+    The arguments and errors are those of :func:`policy_card`, but no extra is needed.
 
     Example:
         >>> describe_policy("few-shot-mt50").splitlines()[0]
@@ -144,15 +132,15 @@ def _kind(actor: Mapping[str, Any]) -> str:
 
 def _training(description: Mapping[str, Any], demonstrated: set[str]) -> str:
     run, data = description.get("run") or {}, description.get("data") or {}
-    rows: list[tuple[str, Mapping[str, Any]]] = [("dataset", part) for part in data.get("parts", [data])]
     training = description.get("training") or run.get("training") or {}
-    rows.append(("training", {**training, **({"seed": run["seed"]} if "seed" in run else {})}))
+    rows: list[tuple[str, Mapping[str, Any]]] = [("dataset", part) for part in data.get("parts", [data])]
+    rows.append(("training", training | ({"seed": run["seed"]} if "seed" in run else {})))
     rows.append(("versions", description["versions"]))
-    lines = []
+    lines = [f"- tasks: {', '.join(sorted(demonstrated)) or 'not recorded'}"]
     for name, row in rows:
-        shown = [f"{key} {value}" for key, value in row.items() if value is not None and key in _SHOWN]
-        lines += [f"- {name}: {', '.join(shown)}"] * bool(shown)
-    return "\n".join([f"- tasks: {', '.join(sorted(demonstrated)) or 'not recorded'}", *lines])
+        if shown := [f"{key} {value}" for key, value in row.items() if value is not None and key in _SHOWN]:
+            lines.append(f"- {name}: {', '.join(shown)}")
+    return "\n".join(lines)
 
 
 def _success(result: EvaluationResult) -> str:
@@ -172,11 +160,9 @@ def _success(result: EvaluationResult) -> str:
 def save_pretrained(
     policy: AnyPath, folder: AnyPath, result: EvaluationResult | None = None, *, repo: str = ""
 ) -> None:
-    """Write a policy and its card to a folder, as ``policy.safetensors`` and ``README.md``.
+    """Write a policy and its card to a folder, as ``policy.safetensors`` and ``README.md``, which are replaced.
 
-    Args:
-        policy, result, repo: as for :func:`policy_card`, with its errors.
-        folder: the folder; files of these names are replaced.
+    The other arguments and the errors are those of :func:`policy_card`.
 
     Example:
         >>> import os, tempfile
@@ -200,18 +186,12 @@ def push_to_hub(
     private: bool = False,
     token: str | None = None,
 ) -> str:
-    """Upload a policy and its card to the Hugging Face Hub.
+    """Upload a policy and its card, see :func:`policy_card`, to the Hugging Face Hub; return the URL of the commit.
 
     Args:
-        policy, result: as for :func:`policy_card`, with its errors.
         repo: the repository, such as "me/my-policy"; it is created if necessary.
         private: create it as a private repository.
         token: an access token; None for the one that ``hf auth login`` stored.
-
-    Returns:
-        The URL of the commit.
-
-    Source: ``huggingface_hub.HfApi.upload_folder``.
     """
     api = hub().HfApi(token=token)
     with TemporaryDirectory() as folder:
@@ -227,14 +207,11 @@ def from_pretrained(source: AnyPath, *, revision: str | None = None, text_encode
     Args:
         source: a folder that :func:`save_pretrained` wrote, or a repository such as "me/my-policy".
         revision: the repository's branch, tag or commit.
-        text_encoder: as for :func:`~lw_torchrl.load_actor`.
+        text_encoder: as for :func:`~lw_torchrl.load_actor`, like other errors.
 
     Raises:
         FileNotFoundError: the folder holds no policy; or there is no such folder, nor such a repository.
         ImportError: the extra ``[hub]`` is not installed.
-        ValueError: as for :func:`~lw_torchrl.load_actor`.
-
-    Source: ``transformers.PreTrainedModel.from_pretrained``.
     """
     if Path(source).is_dir():
         return load_actor(Path(source) / POLICY_FILE, text_encoder=text_encoder)
@@ -243,7 +220,6 @@ def from_pretrained(source: AnyPath, *, revision: str | None = None, text_encode
     try:
         path = hub().hf_hub_download(str(source), POLICY_FILE, revision=revision)
     except (OSError, ValueError) as error:
-        raise FileNotFoundError(
-            f"source: there is no folder {str(source)!r}, and no such policy on the Hub: {error}"
-        ) from error
+        missing = f"source: there is no folder {str(source)!r}, and no such policy on the Hub: {error}"
+        raise FileNotFoundError(missing) from error
     return load_actor(path, text_encoder=text_encoder)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from itertools import groupby
+from operator import itemgetter
 from statistics import median
 from typing import Any, NamedTuple
 
@@ -37,7 +39,6 @@ class TaskUse:
     failed: int  # number of failed episodes
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain numbers and lists."""
         return asdict(self)
 
 
@@ -48,12 +49,10 @@ class _Episode(NamedTuple):
     before: int  # states before the first success
     success: bool
 
-    def gaps(self) -> Iterator[tuple[int, int, int]]:
-        zero = torch.zeros(1, dtype=torch.int32)
-        none_holds = ~self.qaf[: self.before].any(-1)
-        edges = torch.diff(none_holds.int(), prepend=zero, append=zero)
-        for first, after in zip(*((edges == sign).nonzero().flatten().tolist() for sign in (1, -1)), strict=True):
-            yield self.number, first, after - 1
+    def gaps(self) -> list[tuple[int, int, int]]:
+        stretches = groupby(enumerate(self.qaf[: self.before].any(-1).tolist()), itemgetter(1))
+        gaps = [[state for state, _ in stretch] for holds, stretch in stretches if not holds]
+        return [(self.number, gap[0], gap[-1]) for gap in gaps]
 
 
 class PlanUse:
@@ -111,19 +110,11 @@ def _summed(seen: list[_Episode]) -> TaskUse:
 
 
 def expert_use(
-    plans: AnyPlans,
-    tasks: str | Iterable[str] | None = None,
-    *,
-    episodes_per_task: int = 10,
-    seed: int = 0,
+    plans: AnyPlans, tasks: str | Iterable[str] | None = None, *, episodes_per_task: int = 10, seed: int = 0
 ) -> dict[str, TaskUse]:
     """Return which conditions of the plans hold in the states that Meta-World's experts visit, without action noise.
 
-    Args:
-        plans: the plans.
-        tasks: some of the plans' tasks; None for all.
-        episodes_per_task: episodes of each task, which end 20 steps after their first success.
-        seed: the environment's seed.
+    Episodes end 20 steps after their first success.
 
     Example:
         >>> import lw_torchrl as lw
@@ -133,15 +124,8 @@ def expert_use(
     use = PlanUse(plans)
     names = resolve_tasks(list(use.plans) if tasks is None else tasks)
     suite, chosen = suite_tasks(names, None)
-    rollout(
-        "running experts",
-        ExpertActor(names),
-        chosen,
-        dict.fromkeys(names, range(episodes_per_task)),
-        use,
-        plans=use.plans,
-        env_options={"seed": seed, "suite": suite},
-        keys=["qaf", ("next", "success")],
-        after_success=_AFTER,
-    )
+    episodes = dict.fromkeys(names, range(episodes_per_task))
+    options: dict[str, Any] = {"env_options": {"seed": seed, "suite": suite}, "keys": ["qaf", ("next", "success")]}
+    expert = ExpertActor(names)
+    rollout("running experts", expert, chosen, episodes, use, plans=use.plans, after_success=_AFTER, **options)
     return use.tasks()

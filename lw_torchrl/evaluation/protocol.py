@@ -69,16 +69,15 @@ def evaluate(
         also_record: more keys to pass to ``on_episode``: "qaf", "skill_weights".
         on_episode: called with each finished episode, a named tuple of ``task``, ``episode`` (its index) and ``steps``,
             a TensorDict of batch (T,): ``action``, ``("next", "success")``, ``("next", "reward")``, ``also_record``.
-        device: where the actor works: "cpu", "cuda", "cuda:1", "mps", or "auto"; it is moved there, and stays. None
-            leaves it where it is. The environment and its queries are always on the CPU.
-        evaluator: a module, function or transform that answers the conditions, as if it stood in front of the actor,
-            such as :class:`~lw_torchrl.CorruptQAF`; None for exact answers at every step.
+        device: where the actor works, and stays: "cpu", "cuda", "cuda:1", "mps" or "auto"; None leaves it where it is.
+            The environment and its queries are always on the CPU.
+        evaluator: a module, function or transform in front of the actor that answers the conditions, such as
+            :class:`~lw_torchrl.CorruptQAF`; None for exact answers at every step.
         attribute: find out why episodes failed, see :func:`attribute_failures`: ``.failures`` of the result.
         reference: trusted plans for the same tasks, with which failed episodes are re-run.
 
     Warns:
-        UserWarning: a simulation became unstable; its episode ends there, a failure unless it had succeeded. The actor
-            cannot carry out the reference.
+        UserWarning: a simulation became unstable, which ends its episode; the actor cannot carry out the reference.
 
     Raises:
         ValueError: a wrong argument, plans that differ from the actor's, a task without a plan or not among the
@@ -110,9 +109,8 @@ def evaluate(
         check_key("also_record", key)
     if num_envs is not None:
         check_int("num_envs", num_envs)
-    max_steps = own_suite.max_steps if max_steps is None else max_steps
-    shared: dict[str, Any] = {"seed": seed, "suite": own_suite, "engine": engine, "num_threads": num_threads}
-    shared["max_steps"] = max_steps
+    shared: dict[str, Any] = {"seed": seed, "max_steps": max_steps or own_suite.max_steps}
+    env_options = shared | {"suite": own_suite, "engine": engine, "num_threads": num_threads}
     how: dict[str, Any] = {"noise_scale": noise_scale, "num_envs": num_envs, "device": device, "progress": progress}
     results: list[EpisodeResult] = []
     failed: list[FinishedEpisode] = []
@@ -122,8 +120,7 @@ def evaluate(
         at_end = None if stop_at_success else bool(steps.get(("next", "success"))[-1])
         total = None if stop_at_success else float(steps.get(("next", "reward")).double().sum())
         actions = steps.get("action").clone() if record_actions else None
-        about = finished.task, finished.episode, first is not None, first, at_end, total, actions
-        results.append(EpisodeResult(*about))
+        results.append(EpisodeResult(*finished[:2], first is not None, first, at_end, total, actions))
         if attribute and first is None:
             failed.append(finished)
         if on_episode is not None:
@@ -137,17 +134,17 @@ def evaluate(
         keep,
         plans=answered,
         evaluator=evaluator,
-        env_options={**shared, "reward": reward},
+        env_options=env_options | {"reward": reward},
         keys=["action", ("next", "success"), ("next", "reward"), *also_record],
         optional=(lambda env: keys_to_attribute(actor, env)) if attribute else (),
         after_success=0 if stop_at_success else None,
         **how,
     )
-    config = {"tasks": list(names), "episodes_per_task": episodes_per_task, "seed": seed, "noise_scale": noise_scale}
-    config |= {"stop_at_success": stop_at_success, "reward": reward, "max_steps": max_steps}
+    config = {"tasks": list(names), "episodes_per_task": episodes_per_task, "noise_scale": noise_scale, **shared}
+    config |= {"stop_at_success": stop_at_success, "reward": reward}
     failures = None
     if attribute and answered is not None:
-        failed.sort(key=lambda episode: (episode.task, episode.episode))
+        failed.sort(key=lambda episode: episode[:2])
         given: dict[str, Any] = {"actor": actor, "reference": reference, "evaluator": evaluator}
-        failures = tuple(attribute_failures(failed, answered, **given, **shared, **how))
+        failures = tuple(attribute_failures(failed, answered, **given, **env_options, **how))
     return EvaluationResult(config, tuple(sorted(results, key=lambda e: (e.task, e.episode))), failures=failures)

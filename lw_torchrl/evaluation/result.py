@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
@@ -16,8 +17,7 @@ from torch import Tensor
 from lw_torchrl._checks import Count, Natural, check_flag, check_int, check_scale
 from lw_torchrl._files import AnyPath, read_json, write_json
 from lw_torchrl._versions import package_versions
-from lw_torchrl.evaluation.diagnose.failure import Failure, failure_table, read_failures
-from lw_torchrl.evaluation.records import is_number, read_records
+from lw_torchrl.evaluation.diagnose.failure import Failure, failure_table, is_number, read_failures, read_records
 
 FORMAT = "lw_torchrl.evaluation"
 FORMAT_VERSION = 1
@@ -25,42 +25,25 @@ FORMAT_VERSION = 1
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """One evaluated episode.
-
-    Attributes:
-        task, episode: the task's name and the episode's index; ``episode_seed(task, seed, episode)`` is its seed.
-        success: at some step.
-        first_success: the first successful step, from 1; None without success.
-        success_at_end: at the last step; None where the episode was stopped at its success.
-        episode_return: the sum of the rewards; None where the episode was stopped.
-        actions: (T, 4) float32, as executed, if they were recorded; they are not saved.
-    """
+    """One evaluated episode; ``episode_seed(task, seed, episode)`` is its seed."""
 
     task: str
     episode: Natural
-    success: bool
-    first_success: Count | None
-    success_at_end: bool | None
-    episode_return: float | None
-    actions: Tensor | None = field(default=None, compare=False, repr=False)
+    success: bool  # at some step
+    first_success: Count | None  # the first successful step, from 1
+    success_at_end: bool | None  # at the last step; None if the episode was stopped at its success
+    episode_return: float | None  # the sum of the rewards; None if the episode was stopped
+    actions: Tensor | None = field(default=None, compare=False, repr=False)  # (T, 4) as executed; they are not saved
 
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """The result of :func:`evaluate`.
+    """The result of :func:`evaluate`, with episodes and failures by task and episode."""
 
-    Attributes:
-        config: tasks, episodes_per_task, seed, noise_scale, stop_at_success, max_steps.
-        episodes: one record each, by task and episode.
-        origin: provenance, once it was saved: ``date`` (UTC, ISO 8601), ``versions`` of the packages and, if given to
-            :meth:`save`, ``checkpoint`` (``path`` and ``sha256``) and ``plans``. It does not count in a comparison.
-        failures: why each failed episode failed, by task and episode; None unless :func:`evaluate` attributed them.
-    """
-
-    config: dict[str, Any]
+    config: dict[str, Any]  # tasks, episodes_per_task, seed, noise_scale, stop_at_success, max_steps
     episodes: tuple[EpisodeResult, ...]
-    origin: dict[str, Any] = field(default_factory=dict, compare=False)
-    failures: tuple[Failure, ...] | None = None
+    origin: dict[str, Any] = field(default_factory=dict, compare=False)  # provenance, as save noted it
+    failures: tuple[Failure, ...] | None = None  # why each failed episode failed; None unless they were attributed
 
     def _by_task(self, value: Callable[[list[EpisodeResult]], float | None]) -> dict[str, float | None]:
         found: dict[str, list[EpisodeResult]] = {}
@@ -102,17 +85,12 @@ class EvaluationResult:
         plans: str | None = None,
         evaluator: AnyPath | None = None,
     ) -> None:
-        """Write the result as JSON; a file is replaced whole or not at all.
+        """Write the result as JSON, with date and versions; a file is replaced whole or not at all.
 
         Args:
             path: the file.
-            checkpoint, evaluator: the files that the actor and what answered the conditions were made of; their paths
-                and SHA-256 are noted.
+            checkpoint, evaluator: the files of the actor and its evaluator; their paths and SHA-256 are noted.
             plans: the fingerprint of the plans.
-
-        Raises:
-            FileNotFoundError: there is no such checkpoint or evaluator.
-            ValueError: a number is NaN or infinite.
         """
         made = {"date": datetime.now(UTC).isoformat(timespec="seconds"), "versions": package_versions()}
         origin: dict[str, Any] = dict(self.origin) or made
@@ -131,12 +109,7 @@ class EvaluationResult:
 
     @classmethod
     def load(cls, path: AnyPath) -> EvaluationResult:
-        """Read what :meth:`save` wrote.
-
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: it is damaged, holds what cannot be, or is no result of this format and version.
-        """
+        """Read a result; raise :class:`ValueError` if the file is damaged or not a result of this version."""
         try:
             found = read_json(path, "the result")
             if (found["format"], found["version"]) != (FORMAT, FORMAT_VERSION) or type(found["version"]) is not int:
@@ -154,10 +127,8 @@ class EvaluationResult:
         except FileNotFoundError:
             raise FileNotFoundError(f"path: no result file {str(path)!r}; evaluate(...).save(path) writes it") from None
         except (ValueError, KeyError, TypeError) as error:
-            raise ValueError(
-                f"path: {str(path)!r} is no result of {FORMAT} version {FORMAT_VERSION} "
-                f"({type(error).__name__}: {str(error)[:500]})"
-            ) from error
+            what, why = f"result of {FORMAT} version {FORMAT_VERSION}", f"{type(error).__name__}: {str(error)[:500]}"
+            raise ValueError(f"path: {str(path)!r} is no {what} ({why})") from error
 
     def table(self) -> str:
         """Return the rates per task as text in columns."""
@@ -170,10 +141,7 @@ class EvaluationResult:
         return "\n".join(lines)
 
     def failure_table(self) -> str:
-        """Return the numbers of failed episodes as text: a row for each task, a column for each cause.
-
-        Raise :class:`ValueError` if the failures were not attributed.
-        """
+        """Return the numbers of failed episodes as text: a row for each task, a column for each cause."""
         return failure_table(self.config["tasks"], self.config["episodes_per_task"], attributed(self))
 
 
@@ -184,14 +152,22 @@ def attributed(result: EvaluationResult) -> tuple[Failure, ...]:
     return result.failures
 
 
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Return the 95 % Wilson score interval of a success rate over the episodes of one policy."""
+    rate, z = successes / trials, 1.96
+    center = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
+    half = z / (1 + z**2 / trials) * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2))
+    return max(0.0, center - half), min(1.0, center + half)
+
+
 def _mean(values: Collection[Any]) -> float | None:
     return None if not values or None in values else sum(values) / len(values)
 
 
 def _check_config(config: dict[str, Any]) -> None:
     tasks = config["tasks"]
-    named = isinstance(tasks, list) and bool(tasks) and all(isinstance(task, str) for task in tasks)
-    if not named or len(set(tasks)) != len(tasks):
+    named = isinstance(tasks, list) and all(isinstance(task, str) for task in tasks)
+    if not named or not tasks or len(set(tasks)) != len(tasks):
         raise ValueError(f"config: tasks must be different names, got {short(tasks)}")
     for name in ("episodes_per_task", "max_steps"):
         check_int(f"config: {name}", config[name], minimum=1)
@@ -201,7 +177,7 @@ def _check_config(config: dict[str, Any]) -> None:
 
 
 def _read_episodes(stated: Any, config: dict[str, Any]) -> tuple[EpisodeResult, ...]:
-    """The episodes of a file, as many of each task as its configuration says, all different."""
+    """Return the episodes of a file, as many of each task as its configuration says, all different."""
     count, wanted, max_steps = dict.fromkeys(config["tasks"], 0), config["episodes_per_task"], config["max_steps"]
 
     def faults(one: EpisodeResult) -> Iterator[str]:

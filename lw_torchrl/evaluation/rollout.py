@@ -49,28 +49,19 @@ def rollout(
 ) -> None:
     """Run each listed episode once, in eval mode and without exploration, and pass it to ``on_episode`` as it finishes.
 
-    The result depends neither on ``num_envs`` nor on the other tasks: networks run on blocks of a fixed number of rows,
-    and all randomness comes from (task, seed, episode).
+    Arguments without a description are those of :func:`evaluate`, which also says on what an episode depends.
 
     Args:
         label: the work, for the progress bar.
-        actor: writes ``action``.
         tasks: name to task.
         episodes: name of a task to indices of its episodes.
-        on_episode: called with each finished episode.
-        plans: the plans whose conditions are answered.
-        evaluator: answers the conditions instead of the exact function: a transform, module or function.
-        num_envs: environments stepped together; None for about 256. Environments that would have no work are left out.
         env_options: further arguments of :class:`LanguageWorldEnv`: ``seed``, ``suite``, ``max_steps``.
         keys: what to record of each step; :class:`ValueError` if the environment and the policy do not write it.
         optional: more keys, or a function from the environment to them, recorded if they are written.
-        noise_scale: standard deviation of the noise on each number of the action.
-        after_success: end an episode so many steps after its first success; None for never.
+        after_success: end an episode N steps after its first success; None for never.
         place: a key for the place of each row's episode in its task's list.
         first: a transform that runs before all others.
-        wrap: called with the actor, and returns what acts in its place.
-        device: where the actor works, as for :func:`evaluate`.
-        progress: show a progress bar.
+        wrap: called with the actor, and returns what acts instead of it.
     """
     most = len(tasks) * max(map(len, episodes.values()))  # more rows would have no work
     rows = min(most, len(tasks) * max(1, ROWS // len(tasks))) if num_envs is None else min(num_envs, most)

@@ -40,7 +40,7 @@ def step_color(step: int) -> Color:
 
 
 def entity_path(*parts: str) -> str:
-    """Join parts, which may hold any character, to an absolute entity path."""
+    """Return an absolute entity path; its parts may hold any character."""
     return "".join("/" + rr.escape_entity_path_part(part) for part in parts)
 
 

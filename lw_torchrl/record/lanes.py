@@ -72,25 +72,24 @@ def log_lanes(
     widths = [a.shape[1] for a in (episode.qaf, episode.believed, episode.skill_weights) if a is not None]
     columns = max([len(episode.steps), *widths])
     width = len(str(columns))
-    if episode.success is not None and episode.first_success is None:
-        lanes.send(stream, f"{0:0{width}} verdict", 1, np.repeat(ended, len(episode)), {ended: FAILED})
-    elif episode.success is not None:
-        states = np.where(episode.success, "success", "not yet")
-        lanes.send(stream, f"{0:0{width}} verdict", 1, states, {"success": TRUE, "not yet": FALSE})
+    if episode.success is not None:
+        won = episode.first_success is not None
+        looks = {"success": TRUE, "not yet": FALSE} if won else {ended: FAILED}
+        states = np.where(episode.success, "success", "not yet" if won else ended)
+        lanes.send(stream, f"{0:0{width}} verdict", 1, states, looks)
     if episode.active is not None:
         _send_steps(stream, lanes, f"{0:0{width}}b plan step", episode)
     if ghost is not None and ghost.episode.active is not None:
         _send_steps(stream, lanes, f"{0:0{width}}c ghost with {ghost.by}", ghost.episode, "ghost")
-    for column in range(columns):
-        number, believed = f"{column + 1:0{width}}", episode.believed
-        if episode.qaf is not None:
-            condition = episode.short_conditions[column] if episode.steps else "condition"
-            truth = np.where(episode.qaf[:, column], "true", "false")
-            if believed is not None:
-                wrong = believed[:, column] != episode.qaf[:, column]
-                truth = np.where(wrong, np.where(believed[:, column], *_WRONG), truth)
-            looks = {"true": TRUE, "false": FALSE, **dict.fromkeys(_WRONG, WRONG)}
-            lanes.conditions.append(lanes.send(stream, f"{number} {condition}", 0, truth, looks))
+    for column in range(0 if episode.qaf is None else columns):
+        assert episode.qaf is not None
+        condition = episode.short_conditions[column] if episode.steps else "condition"
+        truth = np.where(episode.qaf[:, column], "true", "false")
+        if episode.believed is not None:
+            believed = episode.believed[:, column]
+            truth = np.where(believed != episode.qaf[:, column], np.where(believed, *_WRONG), truth)
+        looks = {"true": TRUE, "false": FALSE, **dict.fromkeys(_WRONG, WRONG)}
+        lanes.conditions.append(lanes.send(stream, f"{column + 1:0{width}} {condition}", 0, truth, looks))
     if episode.opening is None:
         return lanes
     threshold = STATES[OPEN][0].threshold

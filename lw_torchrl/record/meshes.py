@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from hashlib import blake2s
 from typing import Any
@@ -31,27 +31,20 @@ _prepared: dict[str, ModelGeometry] = {}
 
 @dataclass(frozen=True)
 class Motion:
-    """The poses of a model's B bodies: ``position`` T×B×3 float32, metres; ``quaternion`` T×B×4 float32, w first.
-
-    ``touched`` names the body that the fingers touched in each row, or "nothing"; None if that is unknown.
-    """
+    """The poses of a model's B bodies, and what the fingers touched."""
 
     model: RowModel
-    position: NDArray[np.float32]
-    quaternion: NDArray[np.float32]
-    touched: tuple[str, ...] | None = None
+    position: NDArray[np.float32]  # T×B×3, metres
+    quaternion: NDArray[np.float32]  # T×B×4, w first
+    touched: tuple[str, ...] | None = None  # T names of bodies, or "nothing"; None if that is unknown
 
 
 @dataclass(frozen=True)
 class ModelGeometry:
-    """The geometry of a model: the names of its bodies by number; for each mesh its body, its name, and the mesh.
+    """The geometry of a model. Bodies that are fixed to a moving body are drawn with it."""
 
-    Bodies that are fixed to a moving body are drawn with it. Equal meshes have equal names in all models, since most
-    models have the same robot.
-    """
-
-    bodies: dict[int, str]
-    meshes: tuple[tuple[int, str, Vertices], ...]
+    bodies: dict[int, str]  # their names by number
+    meshes: tuple[tuple[int, str, Vertices], ...]  # body, name and mesh; equal meshes have equal names in all models
 
 
 def model_geometry(model: RowModel) -> ModelGeometry:
@@ -61,22 +54,8 @@ def model_geometry(model: RowModel) -> ModelGeometry:
     return _prepared[model.path]
 
 
-Known = dict[str, bytes | None]
-"""The meshes of a recording with their static poses: None for none yet, b"" for a pose that each episode sets."""
-
-
-def log_meshes(stream: Any, model: RowModel, known: Known) -> None:
-    """Add the meshes of a model that the recording lacks, before its first episode."""
-    for _, name, mesh in model_geometry(model).meshes:
-        _log_mesh(stream, entity_path("meshes", name), mesh, known)
-
-
-def _log_mesh(stream: Any, path: str, mesh: Vertices, known: Known, *, ghost: bool = False) -> None:
-    if path in known:
-        return
-    known[path] = None
-    look: dict[str, Any] = {"albedo_factor": GHOST, "vertex_colors": None} if ghost else {}
-    stream.log(path, rr.Mesh3D(**(mesh | look)), static=True)
+Known = dict[str, bytes]
+"""The meshes of a recording with their static poses, b"" for a pose that each episode sets."""
 
 
 def log_motion(
@@ -91,14 +70,8 @@ def log_motion(
 ) -> dict[str, str]:
     """Log the poses of the bodies below ``root``, row t at step t, and their meshes below /meshes, once a recording.
 
-    Args:
-        known: the recording's meshes; new ones are added.
-        step_time: seconds per row.
-        drawn: the rows to draw, the first one among them; None for all.
-        ghost: draw translucent meshes of moving bodies, below /ghosts.
-
-    Returns:
-        A mesh's entity to the frame in which a view shows it; "" for a mesh that does not move.
+    ``drawn`` are the rows to draw, the first one among them; None for all. A ``ghost`` has translucent meshes of moving
+    bodies, below /ghosts. Return each mesh's entity and the frame in which a view shows it; "" if it does not move.
     """
     geometry = model_geometry(motion.model)
     last = len(motion.position) - 1
@@ -115,9 +88,10 @@ def log_motion(
         pose = b"" if len(moved) > 1 else place[0].tobytes() + turn[0].tobytes()
         if ghost and pose:
             continue
-        _log_mesh(stream, path, mesh, known, ghost=ghost)
-        if known[path] is None:
+        if path not in known:
             known[path] = pose
+            look: dict[str, Any] = {"albedo_factor": GHOST, "vertex_colors": None} if ghost else {}
+            stream.log(path, rr.Mesh3D(**(mesh | look)), static=True)
             if pose:
                 still = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
                 stream.log(path, still, static=True)
@@ -220,50 +194,33 @@ def _shape(model: Any, geom: int) -> Vertices | None:
 
 
 def _box(half: NDArray[np.float64]) -> Vertices:
-    triangles: list[list[int]] = []
-    corners: list[NDArray[np.float64]] = []
-    normals: list[NDArray[np.float64]] = []
-    for axis in range(3):
-        for sign in (-1.0, 1.0):
-            across = (
-                np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-                if sign > 0
-                else np.array([(-1, -1), (-1, 1), (1, 1), (1, -1)])
-            )
-            face = np.empty((4, 3))
-            face[:, axis], face[:, (axis + 1) % 3], face[:, (axis + 2) % 3] = sign, across[:, 0], across[:, 1]
-            triangles += [[4 * len(corners) + i for i in one] for one in ((0, 1, 2), (0, 2, 3))]
-            corners.append(face * half)
-            normals.append(np.eye(3)[[axis] * 4] * sign)
+    front = np.array([(1.0, -1.0, -1.0), (1.0, 1.0, -1.0), (1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
+    faces = np.stack([np.roll(side, axis, axis=1) for axis in range(3) for side in (-front[::-1], front)])
+    triangles = 4 * np.arange(6)[:, None, None] + [(0, 1, 2), (0, 2, 3)]
     return {
-        "vertex_positions": np.concatenate(corners),
-        "vertex_normals": np.concatenate(normals),
-        "triangle_indices": np.array(triangles, np.uint32),
+        "vertex_positions": (faces * half).reshape(-1, 3),
+        "vertex_normals": np.repeat(faces.mean(axis=1), 4, axis=0),
+        "triangle_indices": triangles.reshape(-1, 3).astype(np.uint32),
     }
 
 
-def _turned(profile: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> Vertices:
+def _turned(profile: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> Vertices:
     """Turn lines of corners (K×2: from the axis, along it), from bottom to top, and their normals around z."""
     angle = np.arange(AROUND) * 2 * np.pi / AROUND
-    corners: list[NDArray[np.float64]] = []
-    normals: list[NDArray[np.float64]] = []
+    circle = np.stack([np.cos(angle), np.sin(angle), np.ones(AROUND)], axis=1)
+    corners, normals = (
+        np.concatenate([line[:, None, [0, 0, 1]] * circle for line in lines]).reshape(-1, 3)
+        for lines in zip(*profile, strict=True)
+    )
     triangles: list[NDArray[np.int64]] = []
     start = 0
-    for line, facing in profile:
-        for values, found in ((line, corners), (facing, normals)):
-            around = np.empty((len(line), AROUND, 3))
-            around[..., 0], around[..., 1] = values[:, :1] * np.cos(angle), values[:, :1] * np.sin(angle)
-            around[..., 2] = values[:, 1:]
-            found.append(around.reshape(-1, 3))
+    for line, _ in profile:
         here = start + np.arange(len(line) * AROUND).reshape(-1, AROUND)
         a, b, c, d = here[:-1], np.roll(here[:-1], -1, axis=1), np.roll(here[1:], -1, axis=1), here[1:]
         triangles += [np.stack(three, axis=-1).reshape(-1, 3) for three in ((a, b, c), (a, c, d))]
         start += here.size
-    return {
-        "vertex_positions": np.concatenate(corners),
-        "vertex_normals": np.concatenate(normals),
-        "triangle_indices": np.concatenate(triangles).astype(np.uint32),
-    }
+    indices = np.concatenate(triangles).astype(np.uint32)
+    return {"vertex_positions": corners, "vertex_normals": normals, "triangle_indices": indices}
 
 
 def _corners(model: Any, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -295,10 +252,9 @@ def _color(model: Any, geom: int) -> NDArray[np.uint8]:
 
 
 def _clustered(corners: NDArray[np.float64], normals: NDArray[np.float64]) -> dict[str, Any]:
-    """Return a coarse mesh for rerun from triangles' corners (F×3×3, metres) and their unit normals (F×3×3).
+    """Return a coarse mesh from triangles' corners (F×3×3, metres) and their unit normals (F×3×3).
 
-    The corners in a cube move to their mean, so no gap opens; corners with different normals stay separate, so edges
-    stay sharp.
+    The corners in a cube move to their mean, so no gap opens; corners with different normals stay separate.
     """
     points, directions = corners.reshape(-1, 3), normals.reshape(-1, 3)
     low = points.min(axis=0)

@@ -59,10 +59,9 @@ def check_image(name: str, image: Any) -> NDArray[np.uint8]:
     if pixels.is_floating_point() and bool(((pixels >= 0) & (pixels <= 1)).all()):
         pixels = (pixels * 255).round().to(torch.uint8)
     if pixels.ndim != 3 or pixels.shape[-1] not in (1, 3) or not pixels.numel() or pixels.dtype != torch.uint8:
-        raise ValueError(
-            f"image {name!r} must be uint8, or floats in [0, 1], of shape H×W, H×W×C or C×H×W with C = 1 or 3, "
-            f"got {str(pixels.dtype).removeprefix('torch.')} of shape {'×'.join(map(str, shape))}"
-        )
+        wanted = "uint8, or floats in [0, 1], of shape H×W, H×W×C or C×H×W with C = 1 or 3"
+        given = f"{str(pixels.dtype).removeprefix('torch.')} of shape {'×'.join(map(str, shape))}"
+        raise ValueError(f"image {name!r} must be {wanted}, got {given}")
     return pixels.contiguous().numpy()
 
 

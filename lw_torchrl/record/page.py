@@ -36,7 +36,7 @@ CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
 
 @dataclass(frozen=True)
 class Page:
-    """The part of an episode's data on which its views depend."""
+    """The part of an episode's data on which its views depend, which can be written as JSON."""
 
     root: str
     trails: Collection[str]  # entities that are shown up to the cursor
@@ -81,10 +81,7 @@ class Page:
         return rrb.Horizontal(_stacked(left), _stacked(right), column_shares=[9, 10], name=title)
 
     def column(self, title: str, shown: tuple[int, int], farthest: float) -> rrb.Vertical:
-        """Return a column of verdict, scene, distance and main lanes, which shows the same steps as other columns.
-
-        The lanes of conditions are behind the scene.
-        """
+        """Return a column of verdict, scene, distance and main lanes; those of conditions are behind the scene."""
         page = replace(self, shown=shown, farthest=farthest)
         behind: list[Any] = [view for _, view in page._lanes(self.conditions, "What held")]
         below: list[tuple[float, Any]] = [(100, page._curve("distance"))] if "distance" in page.curves else []
@@ -121,10 +118,8 @@ class Page:
         labels, colors = zip(*self.states.values(), strict=True)
         styles = rr.StateConfiguration(values=list(self.states), labels=labels, colors=colors)
         origin = lanes[0].rpartition("/")[0]
-        view = rrb.StateTimelineView(
-            origin=origin, contents=lanes, name=name, time_view=_window(self.shown), defaults=[styles]
-        )
-        return [(50 + 40 * len(lanes), view)]
+        look = {"time_view": _window(self.shown), "defaults": [styles]}
+        return [(50 + 40 * len(lanes), rrb.StateTimelineView(origin=origin, contents=lanes, name=name, **look))]
 
     def _curve(self, name: str) -> rrb.TimeSeriesView:
         title, limits = CURVES[name]
@@ -153,10 +148,7 @@ def send_page(
     ghost: MendedRecording | None,
     meshes: Known,
 ) -> Page:
-    """Log the recording's ``number``-th episode, under ``name``, and return its page.
-
-    ``meshes`` are the recording's, as for :func:`log_motion`.
-    """
+    """Log the recording's ``number``-th episode, under ``name``, and return its page."""
     root = entity_path(name)
     touched = None if motion is None else touched_objects(motion, episode)
     lanes = log_lanes(stream, entity_path(f"e{number}"), episode, heading.ended(episode), touched, ghost)

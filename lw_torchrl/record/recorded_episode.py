@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import groupby
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -28,26 +29,22 @@ NOBODY = -1  # instead of a step's number: no single step is active
 
 
 class PlanLike(Protocol):
-    """Anything with ``steps`` that have a ``condition``, whose ``str`` is English, and a ``skill``, a string."""
+    """Anything with ``steps`` that have a ``condition``, shown as ``str`` gives it, and a ``skill``, a string."""
 
     @property
     def steps(self) -> Sequence[Any]: ...
 
 
 class TargetPose(NamedTuple):
-    """The object that a scripted skill moves (``moved``) and its target (``position``), each T×3 float32, metres.
-
-    They are equal on an axis that the skill does not control. A ``relative`` target moves with the hand, which never
-    reaches it.
-    """
+    """What a scripted skill moves, and its target, T×3, metres; equal on an axis that the skill does not control."""
 
     position: NDArray[np.float32]
     moved: NDArray[np.float32]
-    relative: bool
+    relative: bool  # the target moves with the hand, which never reaches it
 
     @property
     def distance(self) -> NDArray[np.float32]:
-        """The distance between both, T float32, metres; NaN for a relative target."""
+        """The distance between both, T, metres; NaN for a relative target."""
         gap = np.linalg.norm(self.position - self.moved, axis=1)
         return np.full_like(gap, np.nan) if self.relative else gap
 
@@ -75,7 +72,6 @@ class RecordedEpisode:
     step_time: float = STEP_TIME  # seconds between two actions
 
     def times(self, steps: NDArray[np.int64]) -> list[Any]:
-        """Return the timelines of these steps."""
         return time_columns(steps, self.step_time)
 
     def at(self, step: int) -> str:
@@ -89,14 +85,14 @@ class RecordedEpisode:
 
     @property
     def goal(self) -> NDArray[np.float32] | None:
-        """The position of the task's target, T×3; None without a layout."""
+        """The position of the task's target, T×3, if there is a layout."""
         if self.observation is None or self.layout is None:
             return None
         return np.ascontiguousarray(self.observation[:, self.layout.positions[-1]])
 
     @property
     def opening(self) -> NDArray[np.float32] | None:
-        """The gripper's opening, T, from 0 to 1; None without a layout."""
+        """The gripper's opening, T, from 0 to 1, if there is a layout."""
         return None if self.observation is None or self.layout is None else self.observation[:, self.layout.opening]
 
     @cached_property
@@ -158,7 +154,7 @@ class RecordedEpisode:
         layout: Layout | None = METAWORLD,
         step_time: float = STEP_TIME,
     ) -> RecordedEpisode:
-        """Check a rollout; see :meth:`lw_torchrl.RerunLogger.log_episode` for the keys and the errors."""
+        """Check a rollout, as :meth:`lw_torchrl.RerunLogger.log_episode` describes it."""
         if len(rollout.batch_size) != 1 or not rollout.batch_size[0]:
             hint = "; take one episode, rollout[i]" if len(rollout.batch_size) > 1 else ""
             raise ValueError(f"rollout must have batch size (T,) with T >= 1, got {tuple(rollout.batch_size)}{hint}")
@@ -189,9 +185,8 @@ class RecordedEpisode:
             observation, action = column("observation", layout.size), column(acted, layout.action_size)
             places.setdefault(GRIPPER, observation[:, layout.positions[0]])
         else:
-            value, observation = rollout.get(acted, None), None
-            value = torch.zeros(length, 0) if value is None else value.reshape(length, -1).float()
-            action = _array(value, "rollout['action']", (length, None))
+            observation, value = None, rollout.get(acted, torch.zeros(length, 0))
+            action = _array(value[:, None].flatten(1).float(), "rollout['action']", (length, None))
         logits, pixels = optional("qaf_logits"), rollout.get("pixels", None)
         return cls(
             action=action,
@@ -237,16 +232,11 @@ def short_condition(condition: Any) -> str:
     """Shorten a condition: "gripper above and not left or right of puck"; a text that is not a query stays as it is."""
     if not isinstance(condition, Query):
         return str(condition)
-    groups: list[list[Clause]] = []  # consecutive clauses about the same two objects
-    for clause in condition.clauses:
-        same = groups and groups[-1][0].object == clause.object and groups[-1][0].subject == clause.subject
-        if not same or clause.object is None:
-            groups.append([])
-        groups[-1].append(clause)
     parts, before = [], ""
-    for group in groups:
-        words = ["" if group[0].subject == before else group[0].subject.removeprefix("robot's ")]
-        before, negated = group[0].subject, False
+    for (subject, target, _), clauses in groupby(enumerate(condition.clauses), _same_objects):
+        group = [clause for _, clause in clauses]
+        words = ["" if subject == before else subject.removeprefix("robot's ")]
+        before, negated = subject, False
         for i, clause in enumerate(group):
             joint = ("or" if negated else "and not") if clause.negated else "but" if negated else "and"
             first, *rest = clause.predicate.split()
@@ -256,8 +246,14 @@ def short_condition(condition: Any) -> str:
             else:
                 words += [joint if i else "not" if clause.negated else "", first, *(rest if is_last else rest[:-1])]
             negated = clause.negated
-        parts.append(" ".join(filter(None, [*words, group[0].object])))
+        parts.append(" ".join(filter(None, [*words, target])))
     return " and ".join(parts)
+
+
+def _same_objects(numbered: tuple[int, Clause]) -> tuple[str, str | None, int]:
+    """Return a key that consecutive clauses about the same two objects share; one without an object is on its own."""
+    number, clause = numbered
+    return clause.subject, clause.object, number if clause.object is None else -1
 
 
 def _reason(step: Any) -> str:
@@ -275,9 +271,7 @@ def _array(value: Any, label: str, shape: tuple[int | None, ...]) -> NDArray[Any
     allowed = "×".join("S" if size is None else str(size) for size in shape)
     if tensor.ndim != len(shape) or any(s not in (None, n) for s, n in zip(shape, tensor.shape, strict=True)):
         raise ValueError(f"{label} must have shape {allowed}, got {'×'.join(map(str, tensor.shape)) or 'a scalar'}")
-    if tensor.dtype == torch.bool:
-        return tensor.numpy()
-    array = tensor.to(torch.float32).numpy()
+    array = tensor.numpy() if tensor.dtype == torch.bool else tensor.to(torch.float32).numpy()
     if not np.isfinite(array).all():
         row = int(np.argwhere(~np.isfinite(array))[0][0])
         raise ValueError(f"{label} must be finite, got {array[row].tolist()} in row {row}")

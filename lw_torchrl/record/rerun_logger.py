@@ -30,13 +30,12 @@ from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.record import metrics
 from lw_torchrl.record.entities import METRIC_TIMELINE, STEP_TIME, entity_path, rr, time_columns
-from lw_torchrl.record.meshes import Known, Motion, log_meshes
+from lw_torchrl.record.meshes import Known, Motion
 from lw_torchrl.record.metrics import check_name
 from lw_torchrl.record.page import send_page
 from lw_torchrl.record.recorded_episode import MendedRecording, PlanLike, RecordedEpisode
 from lw_torchrl.record.tabs import OVERVIEW, TITLES, Tabs
 from lw_torchrl.record.verdict import Heading
-from lw_torchrl.suites.engine import RowModel
 from lw_torchrl.suites.suite import known_suite
 
 BUFFERED_SCALARS = 1024
@@ -62,9 +61,6 @@ class RerunLogger(Logger):
     Attributes:
         path: the file that is written, or None.
         experiment: the rerun RecordingStream, for logging more by hand. It is not rerun's global recording.
-
-    Raises:
-        OSError: the file cannot be created.
 
     Example:
         >>> import tempfile, os
@@ -131,7 +127,7 @@ class RerunLogger(Logger):
         """Add a number, or several, to the curves "metrics/<name>", on the timeline "global_step".
 
         Args:
-            name: "loss/bc"; the part before the first slash is the group, which has its own view and axis.
+            name: "loss/bc"; the part before the first slash is a group with its own view.
             value: a number, or up to 64 of them (a tensor, an array, a list), each a curve; NaN leaves a gap.
             step: the training step; None counts the calls with this name from 0.
         """
@@ -150,11 +146,9 @@ class RerunLogger(Logger):
             self._send(now=len(values) >= BUFFERED_SCALARS)
 
     def log_image(self, name: str, image: Any, step: int | None = None) -> None:
-        """Add an image "images/<name>", a JPEG on the timeline "global_step".
+        """Add an image "images/<name>", a JPEG on the timeline "global_step", at ``step`` as in :meth:`log_scalar`.
 
-        Args:
-            image: H×W, H×W×C or C×H×W, C = 1 or 3; uint8, or floats in [0, 1].
-            step: the training step; None counts the calls with this name from 0.
+        It is H×W, H×W×C or C×H×W, C = 1 or 3, of uint8 or of floats in [0, 1].
         """
         stream, pixels = self._open(), metrics.check_image(name, image)
         with self._lock:
@@ -189,10 +183,7 @@ class RerunLogger(Logger):
             self._send()
 
     def log_hparams(self, cfg: Any) -> None:
-        """Show a mapping (a DictConfig too) as the table "hparams"; nested keys are written "actor.width".
-
-        A later call adds to the table.
-        """
+        """Add a mapping (a DictConfig too) to the table "hparams"; nested keys are written "actor.width"."""
         if not isinstance(cfg, Mapping):
             raise TypeError(f"cfg must be a mapping, got {type(cfg).__name__}")
         stream = self._open()
@@ -206,11 +197,9 @@ class RerunLogger(Logger):
             self._send()
 
     def log_histogram(self, name: str, data: Sequence[float] | Tensor | NDArray[Any], **kwargs: Any) -> None:
-        """Add the counts of ``data`` as a bar chart "histograms/<name>", on the timeline "global_step".
+        """Add the counts of finite numbers as a bar chart "histograms/<name>", on the timeline "global_step".
 
-        Args:
-            data: numbers of any shape, all finite.
-            **kwargs: ``step``, the training step (None counts the calls), and ``bins``, their number or edges (30).
+        ``step`` is that of :meth:`log_scalar`, and ``bins`` the number or the edges of the bins (30).
         """
         chart = metrics.histogram(name, data, kwargs.get("bins", 30))
         with self._lock:
@@ -292,7 +281,7 @@ class RerunLogger(Logger):
 
         A hand and its gripper are drawn if the observation has a known layout: that of the plan's task, of the suite
         that has the task, or Meta-World's 39 numbers. For a robot's own meshes, see :func:`lw_torchrl.log_rollout`. Row
-        t is drawn at step t; success and reward, which result from its action, at t + 1.
+        t is drawn at step t; success and reward, which result from its action, at t + 1. Return the episode's name.
 
         Args:
             rollout: batch size (T,). All keys are optional without a layout: "action" T×A, ("next", "success") T×1,
@@ -305,9 +294,6 @@ class RerunLogger(Logger):
             name: the entity that contains everything, and the tab's title; None takes ``task``, then "task-2".
             step_time: seconds per step; None for the suite's that has the task, else 0.0125.
 
-        Returns:
-            The name.
-
         Example:
             >>> import tempfile, torch
             >>> from torchrl.envs import PendulumEnv
@@ -319,8 +305,7 @@ class RerunLogger(Logger):
         """
         if not isinstance(task, str) or not task.strip():
             raise ValueError(f"task must be a task's name, got {task!r}")
-        suite = known_suite(task)
-        observation = rollout.get("observation", None)
+        suite, observation = known_suite(task), rollout.get("observation", None)
         layout = None if suite is None else suite.layout
         if isinstance(plan, ConditionalPlan):
             layout = plan.definition.layout
@@ -348,37 +333,25 @@ class RerunLogger(Logger):
             candidates = chain([wanted], (f"{wanted}-{i}" for i in count(2)))
             name = next(candidate for candidate in candidates if candidate not in reserved)
             page = send_page(stream, len(self.episodes) + 1, name, heading, episode, motion, ghost, self._meshes)
-            self._tabs.add_page(page)
+            self._tabs.add("page", vars(page))
             self._send()
         return name
 
-    def prepare(self, model: RowModel) -> None:
-        """Add the meshes of a model now, which takes half a second, so that its first page is fast."""
-        with self._lock:
-            log_meshes(self._open(), model, self._meshes)
-
     def show_causes(self, result: EvaluationResult) -> None:
         """Put :func:`lw_torchrl.evaluation.plot_failures` of a result into the overview of several episodes."""
-        picture = io.BytesIO()
+        picture, path = io.BytesIO(), entity_path(OVERVIEW, "causes")
         plot_failures(result).savefig(picture, format="png", dpi=100)
-        encoded = rr.EncodedImage(contents=picture.getvalue(), media_type="image/png")
-        path = entity_path(OVERVIEW, "causes")
         with self._lock:
-            self._open().log(path, encoded, static=True)
-            self._tabs.add_figure(path)
+            self._open().log(path, rr.EncodedImage(contents=picture.getvalue(), media_type="image/png"), static=True)
+            self._tabs.add("figure", path)
 
     def compare(self, names: Sequence[str], title: str = "Side by side") -> None:
-        """Show episodes side by side, in a tab before their own; one cursor moves in all of them.
-
-        Args:
-            names: two or more, as :func:`lw_torchrl.log_rollout` returned them.
-            title: the tab's title.
-        """
+        """Show the episodes of these names side by side, in a tab before their own; one cursor moves in all of them."""
         self._open()
         if isinstance(names, str) or len(names) < 2:
             raise ValueError(f"names must be of two episodes or more, got {names!r}")
         with self._lock:
-            self._tabs.compare(title, [check_choice("names", name, self._tabs.pages) for name in names])
+            self._tabs.add("compare", [title, [check_choice("names", name, self._tabs.pages) for name in names]])
 
 
 def is_complete(path: Path) -> bool:

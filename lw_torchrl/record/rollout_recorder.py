@@ -28,11 +28,11 @@ _AFTER = {"executed_action", "success", "reward"}
 class RolloutRecorder(Transform):
     """Record episodes of chosen rows of an environment while they run.
 
-    At the end of an episode it adds a page; an episode that is cut by a reset, or by closing the environment, is
-    recorded as far as it went. With a :class:`~lw_torchrl.LanguageWorldEnv` the page is like
-    :func:`lw_torchrl.log_rollout`'s; with any other TorchRL environment like :meth:`RerunLogger.log_episode`'s. Put the
-    recorder after :class:`~lw_torchrl.QAFTransform` and before transforms of the observation, and close the environment
-    before the logger. It cannot record a LanguageWorldEnv that runs in another process.
+    At its end, an episode becomes a page like that of :func:`lw_torchrl.log_rollout`, or in an environment other than
+    :class:`~lw_torchrl.LanguageWorldEnv` like that of :meth:`RerunLogger.log_episode`; an episode that is cut by a
+    reset, or by closing the environment, as far as it went. Put the recorder after :class:`~lw_torchrl.QAFTransform`
+    and before transforms of the observation, and close the environment before the logger. It cannot record a
+    LanguageWorldEnv that runs in another process.
 
     Args:
         logger: the recording.
@@ -84,7 +84,6 @@ class RolloutRecorder(Transform):
         return copied
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Join an environment; the meshes of its models are prepared now, in half a second for each."""
         super().set_container(container)
         env = base_env(self)
         if env is None:
@@ -136,8 +135,7 @@ class _Row:
         self._after: dict[str, list[NDArray[Any]]] = {}
         self._recorded = self._stepped = False
 
-    def keep(self, key: str, values: Any, later: bool) -> bool:
-        """Return whether to record an entry."""
+    def keeps(self, key: str, values: Any, later: bool) -> bool:
         return isinstance(values, Tensor) and not key.startswith("_")
 
     def begin(self, *, recorded: bool) -> None:
@@ -147,29 +145,26 @@ class _Row:
     def take(self, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
         """Note a step: the state and action, and their result."""
         self._stepped = True
-        if not self._recorded:
-            return
-        for noted, entries in ((self._before, before), (self._after, after)):
+        dims = len(self.env.batch_size)
+        for noted, entries in ((self._before, before), (self._after, after)) if self._recorded else ():
             for key, values in entries.items():
-                if self.keep(key, values, entries is after):
-                    noted.setdefault(key, []).append(self._own(values))
-
-    def _own(self, values: Tensor) -> NDArray[Any]:
-        """Return a copy of this row's part, since some environments write into their tensors again."""
-        array, dims = values.numpy(force=True), len(self.env.batch_size)
-        return np.array(array.reshape(-1, *array.shape[dims:])[self.row] if dims else array)
+                if self.keeps(key, values, entries is after):
+                    array = values.numpy(force=True)
+                    own = array.reshape(-1, *array.shape[dims:])[self.row] if dims else array
+                    noted.setdefault(key, []).append(np.array(own))  # some environments write into their tensors again
 
     def finish(self) -> TensorDict | None:
         """End the episode and return its rollout (T,); None if no step of it was recorded."""
         self.ended += self._stepped
-        before, after = self._before, self._after
+        before, after = (
+            {key: torch.from_numpy(np.stack(column)) for key, column in noted.items()}
+            for noted in (self._before, self._after)
+        )
         self.begin(recorded=False)
         if not after:
             return None
-        columns = {key: torch.from_numpy(np.stack(column)) for key, column in before.items()}
-        later = {key: torch.from_numpy(np.stack(column)) for key, column in after.items()}
-        length = len(next(iter(later.values())))
-        return TensorDict({**columns, "next": TensorDict(later, [length])}, [length])
+        length = len(next(iter(after.values())))
+        return TensorDict({**before, "next": TensorDict(after, [length])}, [length])
 
     def end(self) -> None:
         """Add the page of the episode if it has begun and is to be recorded."""
@@ -191,21 +186,19 @@ class _OwnRow(_Row):
 
     def __init__(self, env: EnvBase, row: int, recorder: RolloutRecorder) -> None:
         super().__init__(env, row, recorder)
-        self._model: Any = None
         self._poses: list[Any] = []
         self._seed = self.env.seed
         engine: Any = self.env.engine
-        if hasattr(engine, "poses"):  # a custom engine may have no bodies
-            recorder.logger.prepare(engine.model(row))
+        self._model: Any = engine.model(row) if hasattr(engine, "poses") else None  # a custom engine may lack bodies
 
-    def keep(self, key: str, values: Any, later: bool) -> bool:
+    def keeps(self, key: str, values: Any, later: bool) -> bool:
         return key in (_AFTER if later else _BEFORE)
 
     def begin(self, *, recorded: bool) -> None:
         super().begin(recorded=recorded)
         self._seed, self._poses = self.env.seed, []
-        engine: Any = self.env.engine
-        if recorded and hasattr(engine, "poses"):
+        if recorded and self._model is not None:
+            engine: Any = self.env.engine
             self._model = engine.model(self.row)
         self._look()
 
@@ -224,8 +217,7 @@ class _OwnRow(_Row):
         if (rollout := self.finish()) is None:
             return
         about: dict[str, Any] = {"tasks": [self.env.task_of_row[self.row]], "seed": seed, "policy": recorder.policy}
-        step_time = self.env.suite.step_time * self.env.frame_skip
-        about |= {"suite": self.env.suite, "step_time": step_time}
+        about |= {"suite": self.env.suite, "step_time": self.env.suite.step_time * self.env.frame_skip}
         heading, episode = read_rollout(rollout, recorder.plans, **about)
         motion = None
         if self._model is not None:

@@ -74,20 +74,14 @@ def log_rollout(
             episode in each row.
         plans: the plans that ``qaf`` answers; None without plans.
         seed: the environment's seed; with ``episode`` it determines how the episode began.
-        name: the episode's name in the recording, for batch size (T,); None takes "push-7", of task and episode, or
-            "push".
+        name: the episode's name in the recording, for batch size (T,); None takes "push-7", of task and episode.
         policy: the policy's name, for the tab.
         failure: why the episode failed, for the verdict; for N rows a list with one entry each, or None.
         tasks: custom tasks that the plans do not define.
-        suite: the suite that simulates the episode again; None for the one in :data:`~lw_torchrl.suites.SUITES` that
-            has the task.
+        suite: the suite that simulates the episode again; None for the known one that has the task.
 
     Returns:
         The episode's name; for N rows a list of names.
-
-    Raises:
-        ValueError: the rows are of several episodes; ``qaf`` answers other plans; the failure is another episode's.
-        PlanError: (a ValueError) there is no plan for the task.
 
     Example:
         >>> import tempfile
@@ -179,10 +173,7 @@ def simulate_again(
 ) -> Motion | None:
     """Return the motion in an episode, of T + 1 rows, or None if the engine has no ``poses``.
 
-    Raise :class:`DiffersError` if the observations differ.
-
-    The simulation depends on the seed and the actions alone, so equal observations, bit for bit, mean equal motion.
-    Actions are T×A float32 in [-1, 1], as executed; observations T×D float32, those from which they were taken.
+    Equal observations, bit for bit, mean equal motion; otherwise :class:`DiffersError`. Actions are T×A, as executed.
     """
     suite = load_suite("metaworld") if suite is None else suite
     engine: Any = suite.make_engine([task], reward="sparse", num_threads=1)
@@ -192,16 +183,16 @@ def simulate_again(
         seen = engine.reset([0], [episode_seed(suite.tasks[task], seed, episode)])[0].astype(np.float32)
         shape, active = (len(action) + 1, engine.model(0).model.nbody), np.ones(1, bool)
         positions, quaternions = np.empty((*shape, 3), np.float32), np.empty((*shape, 4), np.float32)
-        positions[0], quaternions[0] = engine.poses(0)
-        has_touch = hasattr(engine, "touched")
-        touched = [engine.touched(0) if has_touch else None]
-        for step in range(len(action)):
+        touched = []
+        for step in range(len(action) + 1):
+            positions[step], quaternions[step] = engine.poses(0)
+            touched.append(engine.touched(0) if hasattr(engine, "touched") else None)
+            if step == len(action):
+                break
             if not np.array_equal(seen, observation[step]):
                 off = np.abs(seen.astype(np.float64) - observation[step])
                 raise DiffersError(f"step {step}: number {off.argmax()} is {off.max():.3g} off")
             seen = engine.step(action[step : step + 1], active).observation[0].astype(np.float32)
-            positions[step + 1], quaternions[step + 1] = engine.poses(0)
-            touched.append(engine.touched(0) if has_touch else None)
         return Motion(engine.model(0), positions, quaternions, None if None in touched else tuple(map(str, touched)))
     finally:
         engine.close()
@@ -223,8 +214,7 @@ def _motion(heading: Heading, episode: RecordedEpisode, suite: Suite | None) -> 
 
 
 def _single(rollout: TensorDictBase, key: str, *, required: bool) -> int | None:
-    column = rollout.get(key, None)
-    if column is None:
+    if (column := rollout.get(key, None)) is None:
         if required:
             raise missing_keys(rollout.keys(True, True), key)
         return None
@@ -256,16 +246,8 @@ def run_recorded(
 ) -> list[FinishedEpisode]:
     """Run episodes as :func:`lw_torchrl.evaluate` does, with all keys that :func:`lw_torchrl.log_rollout` shows.
 
-    The arguments are those of :func:`lw_torchrl.evaluate`, except for these.
-
-    Args:
-        plans: the plans whose conditions are answered; None for the actor's own.
-        episodes: indices of each task's episodes.
-        evaluator: a module; the episodes hold its answers and the exact ones.
-        progress: show a progress bar if it takes longer than a second.
-
-    Returns:
-        The episodes, by task in the given order and episode, with steps of batch (T,).
+    The other arguments are those of :func:`lw_torchrl.evaluate`; ``episodes`` are indices of each task's episodes.
+    Return the episodes, by task in the given order and episode; they hold an evaluator's answers and the exact ones.
     """
     answered = actor_plans(actor, plans)
     own_suite, chosen = suite_tasks(tasks, answered, suite)
@@ -320,10 +302,7 @@ def new_recording(path: AnyPath) -> Iterator[RerunLogger]:
 def write_recording(
     path: AnyPath, episodes: Iterable[FinishedEpisode], plans: Plans | None = None, **options: Any
 ) -> None:
-    """Write episodes of :func:`run_recorded` to a rerun file, which is replaced if it exists.
-
-    The options are those of :func:`lw_torchrl.log_rollout`.
-    """
+    """Write episodes of :func:`run_recorded` to a rerun file as :func:`lw_torchrl.log_rollout` does, or replace it."""
     with new_recording(path) as logger:
         for episode in episodes:
             log_rollout(logger, episode.steps, plans, **options)

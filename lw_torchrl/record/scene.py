@@ -94,20 +94,16 @@ def log_scene(
             point(f"names{entity_path(label)}", things[label] + away, label, 0.0005, color)
 
     def lines(path: str, strips: NDArray[np.float32], radius: float, color: Color) -> None:
-        look = {
-            "colors": np.tile(np.array(color, np.uint8), (len(drawn), 1)),
-            "radii": np.full(len(drawn), radius * size),
-        }
+        colors, radii = np.tile(np.array(color, np.uint8), (len(drawn), 1)), np.full(len(drawn), radius * size)
+        look = {"colors": colors, "radii": radii}
         stream.send_columns(f"{scene}/{path}", episode.times(drawn), rr.LineStrips3D.columns(strips=strips, **look))
 
     goal = episode.goal
     # Objects that stand for the goal, like "target location", have its colour, and their own label.
     goals = [] if goal is None else [name for name, at in episode.objects.items() if np.allclose(goal, at, atol=1e-3)]
-    others = [name for name in episode.objects if name != GRIPPER]
-    colors = dict(zip(others, cycle(OBJECT_COLORS), strict=False))
-    if GRIPPER in episode.objects:
-        colors = {GRIPPER: GOLD} | colors
     things = {name: position for name, position in episode.objects.items() if name != GRIPPER}
+    colors: dict[str, Color] = {GRIPPER: GOLD} if GRIPPER in episode.objects else {}
+    colors |= dict(zip(things, cycle(OBJECT_COLORS), strict=False))
     if goal is not None and goal.any() and not goals:
         things.setdefault("goal", goal)
     offsets = name_offsets({name: position[drawn] for name, position in things.items()}, eye)
@@ -139,7 +135,7 @@ def log_scene(
 
 
 def touched_objects(motion: Motion, episode: RecordedEpisode) -> tuple[str, ...] | None:
-    """Return what the fingers touched in each row: the object at the touched body's place, else the body's name."""
+    """Return what the fingers touched in each row: the object where the touched body is, else the body's name."""
     if motion.touched is None:
         return None
     touched = np.array(motion.touched[: len(episode)])
@@ -148,14 +144,10 @@ def touched_objects(motion: Motion, episode: RecordedEpisode) -> tuple[str, ...]
     for body in set(touched.tolist()) & bodies:
         rows = np.flatnonzero(touched == body)
         place = motion.position[rows, motion.model.model.body(body).id]
-        away = {
-            name: float(np.linalg.norm(position[rows] - place, axis=1).mean())
-            for name, position in episode.objects.items()
-            if name != GRIPPER
-        }
-        nearest = min(away, key=away.__getitem__, default=None)
-        if nearest is not None and away[nearest] < SAME_PLACE:
-            names[body] = nearest
+        others = {name: position[rows] - place for name, position in episode.objects.items() if name != GRIPPER}
+        away = [(float(np.linalg.norm(gap, axis=1).mean()), name) for name, gap in others.items()]
+        if away and min(away)[0] < SAME_PLACE:
+            names[body] = min(away)[1]
     return tuple(names.get(body, body) for body in touched.tolist())
 
 
@@ -173,10 +165,7 @@ def log_pictures(stream: Any, root: str, episode: RecordedEpisode, drawn: NDArra
 
 
 def name_offsets(things: dict[str, NDArray[np.float32]], eye: tuple[Point, Point]) -> dict[str, NDArray[np.float32]]:
-    """Return the offset of each name from its object, T×3 metres, as (3,) float32, so that names overlap least.
-
-    They are seen from ``eye``, its place and the place it looks at, in the smallest window. A name has one offset.
-    """
+    """Return the offset (3,) of each name from its object, T×3 metres, to overlap least, seen from ``eye``."""
     place, ahead = np.array(eye[0], np.float32), np.subtract(eye[1], eye[0]).astype(np.float32)
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, [0, 0, 1]).astype(np.float32)

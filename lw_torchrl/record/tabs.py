@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -30,10 +30,9 @@ class Tab(NamedTuple):
 
 
 class Tabs:
-    """The tabs of a recording. They make rerun's blueprint, with any tab in front.
+    """The tabs of a recording, which make rerun's blueprint.
 
-    They are also saved as properties of the recording, so that a reader can bring any tab to the front and restore the
-    blueprint of a recording that was never closed.
+    They are also saved as properties of the recording, for recordings that were never closed, and so have no blueprint.
     """
 
     def __init__(self) -> None:
@@ -44,24 +43,13 @@ class Tabs:
         self._entries: list[str] = []
         self._saved = self._sent = 0
 
-    def add_page(self, page: Page) -> None:
-        """Add the tab of an episode."""
-        self._add("page", vars(page))
-
-    def compare(self, title: str, names: Sequence[str]) -> None:
-        """Add a tab that shows episodes side by side."""
-        self._add("compare", [title, list(names)])
-
-    def add_figure(self, entity: str) -> None:
-        """Show a picture in the overview."""
-        self._add("figure", entity)
-
     def add_view(self, kind: str, name: str = "") -> None:
-        """Show what is logged as ``kind``/``name``; does nothing if it is shown already."""
+        """Show what is logged as ``kind``/``name``, unless it is shown already."""
         if name not in self._views[kind]:
-            self._add("view", [kind, name])
+            self.add("view", [kind, name])
 
-    def _add(self, kind: str, content: Any) -> None:
+    def add(self, kind: str, content: Any) -> None:
+        """Add an episode's "page", title and names to "compare" in a tab, a "figure" in the overview, or a "view"."""
         self._entries.append(json.dumps([kind, content]))
         if kind == "page":
             self.pages[content["row"]["name"]] = Page(**content)
@@ -83,7 +71,7 @@ class Tabs:
         for _, (kind, content) in sorted(entries.items()):
             if kind == "page" and {part.name for part in fields(Page)} != set(content):
                 return None
-            tabs._add(kind, content)
+            tabs.add(kind, content)
         return tabs if entries else None
 
     def save(self, stream: Any) -> None:
@@ -165,11 +153,7 @@ class Tabs:
         return min((self.pages[name].decisive for name in self.tab(tab).episodes), default=None)
 
     def index(self, name: str | None) -> int:
-        """Return the index of the tab with this name or title, or of the only one whose title contains it.
-
-        Raises:
-            ValueError: there is no such tab.
-        """
+        """Return the index of the tab with this name or title, or of the only one whose title contains it."""
         tabs = self.tabs()
         exact = [i for i, tab in enumerate(tabs) if name in (tab.name, tab.title, None)]
         containing = [i for i, tab in enumerate(tabs) if str(name).lower() in tab.title.lower()]
@@ -182,12 +166,12 @@ class Tabs:
         return len(self.pages) > 1 and len(self._compared) != 1
 
     def _ordered(self) -> list[Page]:
-        """The pages from left to right; with an overview in its order, failures first."""
+        """Return the pages from left to right; with an overview in its order, failures first."""
         pages = list(self.pages.values())
         return sorted(pages, key=lambda page: _order(page.row)) if self._has_overview() else pages
 
     def _title(self, page: Page) -> str:
-        """The title of a page; it names the policy unless several episodes have the same one."""
+        """Return the title of a page; it names the policy unless several episodes have the same one."""
         policies = {other.row["policy"] for other in self.pages.values()}
         return page.title(policy=len(policies) > 1 or len(self.pages) == 1)
 
@@ -200,13 +184,12 @@ def _view(kind: str, name: str) -> Any:
         return rrb.TimeSeriesView(origin=origin, name=title, plot_legend=legend)
     if kind == "histograms":
         return rrb.BarChartView(origin=origin, name=title, plot_legend=rrb.PlotLegend(visible=False))
-    if kind == "hparams":
-        return rrb.TextDocumentView(origin=origin, name=title)
-    return rrb.Spatial2DView(origin=origin, name=title)
+    view = rrb.TextDocumentView if kind == "hparams" else rrb.Spatial2DView
+    return view(origin=origin, name=title)
 
 
 def _order(row: dict[str, Any]) -> tuple[Any, ...]:
-    """The sorting key of episodes: failures first, then by task and episode."""
+    """Return the sorting key of episodes: failures first, then by task and episode."""
     return row["ended"] != "failed", row["task"], row["episode"] or 0
 
 

@@ -64,7 +64,7 @@ class Heading:
 def decisive_step(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None) -> int:
     """Return the step to look at first: the failure's, else the first success, else the last.
 
-    If a ghost that succeeds has not parted at that step, or is gone, it is the step of its success.
+    It is the step of a ghost's success if the ghost has not parted at that step, or is gone.
     """
     (_, last), seen = telling_steps(heading, episode, ghost), _decisive(heading, episode)
     if ghost is None or ghost.episode.first_success is None or ghost.parts_at(episode) < seen <= last:
@@ -81,8 +81,7 @@ def _decisive(heading: Heading, episode: RecordedEpisode) -> int:
 def telling_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None) -> tuple[int, int]:
     """Return the first and last step to show: up to a success, around the step at which a failure is seen, or all.
 
-    With a ghost, the steps begin where the two part; if that is long before the failure is seen, they end with the
-    ghost's success.
+    With a ghost, they begin where the two part and, if the failure is seen much later, end with the ghost's success.
     """
     at, length = _decisive(heading, episode), len(episode)
     if ghost is not None:
@@ -98,11 +97,7 @@ def telling_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecor
 
 
 def drawn_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None) -> NDArray[np.int64]:
-    """Return the steps at which the scene is drawn.
-
-    These are the steps to show, every other one if they are many; every eighth of the rest; the decisive one, and the
-    last.
-    """
+    """Return the steps at which the scene is drawn: those to show, few others, the decisive one, and the last."""
     first, last = telling_steps(heading, episode, ghost)
     every, stride = np.arange(len(episode)), 1 if last - first <= AROUND_FAILURE else 2
     drawn = (every >= first) & (every <= last) & (every % stride == 0) | (every % SELDOM == 0)
@@ -113,14 +108,9 @@ def drawn_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecordi
 def verdict(
     heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None, small: bool = False
 ) -> str:
-    """Return the verdict in Markdown, with a ``small`` heading or a large one.
-
-    Without a :class:`Failure`, a failed episode gets the plain facts.
-    """
-    length = len(episode)
-    lines = [f"{length} steps"] if episode.success is None else [heading.ended(episode)]
-    if episode.first_success is not None:
-        assert episode.success is not None
+    """Return the verdict in Markdown, with a ``small`` heading or a large one."""
+    lines = [f"{len(episode)} steps"] if episode.success is None else [heading.ended(episode)]
+    if episode.success is not None and episode.success.any():
         if not episode.success[-1]:
             held = int(episode.success.sum())
             lines.append(f"It did not last: the task was done in {held} steps, but not in the last one.")
@@ -189,33 +179,26 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
     conditions = [condition for condition, _ in episode.steps]
     if _lines(conditions, episode) > PLAN_LINES:
         conditions = list(episode.short_conditions)
-    length = len(episode)
-    columns = [
-        np.full((length, 1), -1) if episode.active is None else episode.active[:, None],
-        *(answers for answers in (episode.qaf, episode.believed) if answers is not None),
-    ]
-    states = np.concatenate(columns, axis=1)
-    changed = changes(states)
+    active = np.full(len(episode), NOBODY) if episode.active is None else episode.active
+    answers = [answers for answers in (episode.qaf, episode.believed) if answers is not None]
+    changed = changes(np.concatenate([active[:, None], *answers], axis=1))
     confidence = [] if episode.confidence is None else [f"*confidence {episode.confidence:.2f}*"]
     texts = []
     for row in changed.tolist():
         parts = list(confidence)
         if episode.active is not None and episode.active[row] == NOBODY:
-            answers = episode.answers
-            none = answers is None or not answers[row].any()
+            none = episode.answers is None or not episode.answers[row].any()
             parts.append(f"**{'No condition holds' if none else 'No step stands out'}: all steps mixed**")
         for step, (_, skill) in enumerate(episode.steps):
             truth = None if episode.qaf is None else bool(episode.qaf[row, step])
             line = f"{MARKS[truth]}  {step + 1}.  if {conditions[step]}"
             if episode.believed is not None and (believed := bool(episode.believed[row, step])) != truth:
                 line += f"  (evaluator: {MARKS[believed]})"
-            leads = episode.active is not None and episode.active[row] == step
-            reason = one_line(episode.reasons[step]) if episode.reasons else ""
-            parts.append(
-                f"**{line}**  \n\u2003\u2003**→ {skill}**" + (f"  \n\u2003*{reason}*" if reason else "")
-                if leads
-                else f"{line}  \n\u2003\u2003{skill}"
-            )
+            if active[row] == step:
+                reason = one_line(episode.reasons[step]) if episode.reasons else ""
+                parts += [f"**{line}**", f"\u2003\u2003**→ {skill}**", *([f"\u2003*{reason}*"] if reason else [])]
+            else:
+                parts += [line, f"\u2003\u2003{skill}"]
         texts.append("  \n".join(parts))
     documents = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
     stream.send_columns(f"{root}/plan", episode.times(changed), documents)
@@ -232,17 +215,22 @@ def _lines(conditions: Sequence[str], episode: RecordedEpisode) -> int:
 
 def farthest(episode: RecordedEpisode) -> float:
     """Return the largest distance to a skill's target, cm; 1 without targets."""
-    distance = episode.distance
-    return 1.0 if distance is None else max(1.0, 100 * float(np.nanmax(distance)))
+    return 1.0 if episode.distance is None else max(1.0, 100 * float(np.nanmax(episode.distance)))
 
 
 def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
     """Log ``root``/action, /distance (cm), /reward, /skill_weights and /corrected, and return those that exist."""
     rows, sent = np.arange(len(episode)), []
+
+    def send(name: str, values: NDArray[Any], names: Sequence[str], *color: Color, later: int = 0) -> None:
+        colors = list(color) or [step_color(i) for i in range(len(names))]
+        stream.log(f"{root}/{name}", rr.SeriesLines(names=names, colors=colors), static=True)
+        columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
+        stream.send_columns(f"{root}/{name}", episode.times(rows + later), columns)
+        sent.append(name)
+
     if numbers := episode.action.shape[1]:
-        names = [str(number) for number in range(numbers)] if episode.layout is None else action_names(episode.layout)
-        _send(stream, f"{root}/action", episode.times(rows), episode.action, names)
-        sent.append("action")
+        send("action", episode.action, action_names(episode.layout) if episode.layout else [*map(str, range(numbers))])
     if (distance := episode.distance) is not None:
         # One line in centimetres, in the colour of the active step.
         assert episode.active is not None
@@ -254,22 +242,13 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
     # A sparse reward is the success, which has a row in the timeline.
     reward: Any = episode.reward
     if reward is not None and not (episode.success is not None and np.array_equal(reward, episode.success)):
-        _send(stream, f"{root}/reward", episode.times(rows + 1), reward[:, None], ["reward"], STEEL)
-        sent.append("reward")
+        send("reward", reward[:, None], ["reward"], STEEL, later=1)
     weights = episode.skill_weights
     if weights is not None and bool(((weights > 1e-3) & (weights < 1 - 1e-3)).any()):  # else the timeline has them
         texts = [f" {skill}" for _, skill in episode.steps] or [""] * weights.shape[1]
-        _send(
-            stream,
-            f"{root}/skill_weights",
-            episode.times(rows),
-            weights,
-            [f"{i}{text}" for i, text in enumerate(texts, 1)],
-        )
-        sent.append("skill_weights")
+        send("skill_weights", weights, [f"{i}{text}" for i, text in enumerate(texts, 1)])
     if episode.corrected is not None:
-        _send(stream, f"{root}/corrected", episode.times(rows), episode.corrected[:, None], ["of the correction"])
-        sent.append("corrected")
+        send("corrected", episode.corrected[:, None], ["of the correction"])
     return sent
 
 
@@ -280,10 +259,3 @@ def action_names(layout: Layout) -> list[str]:
     if layout.gripper is not None:
         names[layout.gripper] = "gripper"
     return names
-
-
-def _send(stream: Any, path: str, times: Any, values: Any, names: Sequence[str], *color: Color) -> None:
-    colors = list(color) or [step_color(i) for i in range(len(names))]
-    stream.log(path, rr.SeriesLines(names=names, colors=colors), static=True)
-    columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
-    stream.send_columns(path, times, columns)

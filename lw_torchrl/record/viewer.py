@@ -58,7 +58,6 @@ def open_viewer(
 
     Raises:
         FileNotFoundError: there is no such file, or rerun's viewer is not installed.
-        ValueError: no recording has such a tab.
         RuntimeError: the viewer ended with an error; the message says what to do about it.
 
     Example:
@@ -71,15 +70,19 @@ def open_viewer(
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         files = [stack.enter_context(readable(recording)) for recording in recordings]
-        layouts = [layout for file in files if (layout := _missing_layout(file, folder)) is not None]
+        layouts: list[Path] = []
         openings: dict[str, Opening] = {}
         unknown: list[ValueError] = []
         for file in files:
+            reader, known, tabs = read_recording(file)
             try:
-                openings |= _opening(file, episode, step)
+                openings[known.recording_id] = _opening(tabs, episode, step)
             except ValueError as error:
                 unknown.append(error)
-                openings |= _opening(file, None, None)
+                openings[known.recording_id] = _opening(tabs, None, None)
+            if tabs is not None and not reader.blueprints():  # it was never closed, and so has no layout
+                layouts.append(folder / f"{known.recording_id}.rbl")
+                tabs.blueprint().save(known.application_id, str(layouts[-1]))
         if len(unknown) == len(files):
             raise unknown[-1]
         port = str(free_port())
@@ -135,6 +138,14 @@ def readable(recording: Path) -> Iterator[Path]:
         yield copy
 
 
+def read_recording(file: Path) -> tuple[Any, Any, Tabs | None]:
+    """Return a reader of a recording, its ids and its tabs; None for another program's, which has its own layout."""
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(file)
+    return reader, reader.recordings()[0], Tabs.read(reader)
+
+
 class Opening(NamedTuple):
     """The place to open a recording at: the index of a tab, a timeline and a step; None leaves the viewer's choice."""
 
@@ -143,30 +154,11 @@ class Opening(NamedTuple):
     step: int | None
 
 
-def _opening(recording: Path, episode: str | None, step: int | None) -> dict[str, Opening]:
-    """Return where to open a recording, by its id."""
-    from rerun.chunk import RrdReader
-
-    reader = RrdReader(recording)
-    recording_id, tabs = reader.recordings()[0].recording_id, Tabs.read(reader)
-    if tabs is None:  # another program's, which has its own layout
-        return {recording_id: Opening(None, None, step)}
+def _opening(tabs: Tabs | None, episode: str | None, step: int | None) -> Opening:
+    if tabs is None:
+        return Opening(None, None, step)
     number = None if episode is None else tabs.index(episode)
-    step = tabs.opening_step(episode) if step is None else step
-    return {recording_id: Opening(number, tabs.tab(episode).timeline, step)}
-
-
-def _missing_layout(recording: Path, folder: Path) -> Path | None:
-    """Write the layout of a recording that was never closed, and so has none, into ``folder``."""
-    from rerun.chunk import RrdReader
-
-    reader = RrdReader(recording)
-    known, tabs = reader.recordings()[0], Tabs.read(reader)
-    if reader.blueprints() or tabs is None:
-        return None
-    file = folder / f"{known.recording_id}.rbl"
-    tabs.blueprint().save(known.application_id, str(file))
-    return file
+    return Opening(number, tabs.tab(episode).timeline, tabs.opening_step(episode) if step is None else step)
 
 
 def _connect(process: subprocess.Popen[bytes], port: str, recordings: int) -> Any:

@@ -22,8 +22,17 @@ from lw_torchrl._checks import checked
 from lw_torchrl._files import AnyPath, replacing
 from lw_torchrl._progress import Progress
 from lw_torchrl.record.entities import EPISODE_TIMELINE
-from lw_torchrl.record.tabs import OVERVIEW, Tabs
-from lw_torchrl.record.viewer import LOCAL, START_SECONDS, failure, find_recordings, free_port, readable, rerun_process
+from lw_torchrl.record.tabs import OVERVIEW
+from lw_torchrl.record.viewer import (
+    LOCAL,
+    START_SECONDS,
+    failure,
+    find_recordings,
+    free_port,
+    read_recording,
+    readable,
+    rerun_process,
+)
 
 LARGE = 30 * 10**6
 
@@ -38,12 +47,8 @@ def write_html(path: AnyPath, page: AnyPath, *, episode: str | None = None, step
 
     Args:
         path: a .rrd file, or a folder, which stands for its newest recording.
-        page: the .html file.
-        episode: as for :func:`open_viewer`.
-        step: as for :func:`open_viewer`.
-
-    Returns:
-        The page's path.
+        page: the .html file, whose path is returned.
+        episode, step: as for :func:`open_viewer`.
 
     Example:
         >>> write_html("runs/demo/rollout.rrd", "rollout.html")  # doctest: +SKIP
@@ -72,14 +77,9 @@ class WebPage(AbstractContextManager["WebPage"]):
     In a notebook, a page that is the last value of a cell shows itself, while the kernel runs.
 
     Args:
-        path: as for :func:`write_html`.
-        episode: as for :func:`open_viewer`.
-        step: as for :func:`open_viewer`.
+        path, episode, step: as for :func:`write_html`.
         port: a port of this machine, 127.0.0.1; 0 takes a free one. Another machine reaches it through a tunnel,
             ``ssh -L 8000:127.0.0.1:PORT``.
-
-    Raises:
-        OSError: the port is taken.
 
     Example:
         >>> with WebPage("runs/demo/rollout.rrd") as page:  # doctest: +SKIP
@@ -130,11 +130,8 @@ _DATA = b"<!-- data -->"
 
 def _page(recording: Path, episode: str | None, step: int | None) -> tuple[bytes, dict[str, bytes]]:
     """Return the page without its parts, in windows-1252, and two parts: the recording and the layouts of its tabs."""
-    from rerun.chunk import RrdReader
-
     with readable(recording) as file, TemporaryDirectory() as folder:
-        reader = RrdReader(file)
-        known, layout = reader.recordings()[0], Tabs.read(reader)
+        reader, known, layout = read_recording(file)
         ids = {"application_id": known.application_id, "recording_id": known.recording_id}
         rows: list[dict[str, Any]] = []
         layouts, data = b"", file
@@ -175,13 +172,12 @@ _LZMA |= {"depth": 4, "dict_size": 1 << 23, "lc": 4, "lp": 0, "pb": 0}
 
 
 def _packed(content: bytes, bar: Progress | None = None) -> bytes:
-    packer = lzma.LZMACompressor(lzma.FORMAT_ALONE, filters=[_LZMA])
-    pieces = []
+    packer, packed = lzma.LZMACompressor(lzma.FORMAT_ALONE, filters=[_LZMA]), b""
     for start in range(0, len(content), 2**20):
-        pieces.append(packer.compress(content[start : start + 2**20]))
+        packed += packer.compress(content[start : start + 2**20])
         if bar is not None:
             bar.update()
-    return b"".join([*pieces, packer.flush()])
+    return packed + packer.flush()
 
 
 @cache

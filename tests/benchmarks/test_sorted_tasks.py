@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 from benchmarks.figures import plot_sorted_tasks
-from lw_torchrl.evaluation import summarize_rates
+from benchmarks.statistics import summarize_rates
 from lw_torchrl.language.tasks import MT50
 
 RATES = {task: number / 50 for number, task in enumerate(MT50)}

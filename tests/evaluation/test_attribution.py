@@ -43,9 +43,8 @@ RUN = {"seed": SEED, "max_steps": STEPS, "progress": False, "num_threads": 1}
 
 
 def evaluated(actor, episodes=1, **options):
-    return lw.evaluate(
-        actor, tasks=TASK, episodes_per_task=episodes, stop_at_success=True, **{**RUN, "attribute": True, **options}
-    )
+    how = {"tasks": TASK, "stop_at_success": True, "attribute": True, **RUN, **options}
+    return lw.evaluate(actor, episodes_per_task=episodes, **how)
 
 
 def clumsy(step=1):
@@ -117,10 +116,7 @@ class Weak(lw.ScriptedSkillActor):
 def test_a_motion_that_is_wrong_in_all_steps_is_no_skill(step, cause):
     """Only one step has far to go on that axis, so a script in it mends either."""
     plans = lw.Plans({"plate-slide-side": lw.load_plans("MT50")["plate-slide-side"]})
-    [failure] = lw.evaluate(
-        Weak(plans, step), tasks="plate-slide-side", episodes_per_task=1, stop_at_success=True, attribute=True,
-        **{**RUN, "max_steps": 120},
-    ).failures  # fmt: skip
+    [failure] = evaluated(Weak(plans, step), tasks="plate-slide-side", max_steps=120).failures
     assert failure.cause == cause
     assert failure.counterfactuals["skill"] is True
     assert (failure.scripted_step is not None) == (step is None)
@@ -198,9 +194,9 @@ def test_what_lacks_time_alone_is_out_of_time():
 
 
 def test_what_nothing_mends_is_undecided():
-    plans = hopeless()
-    [failure] = evaluated(lw.ScriptedSkillActor(plans)).failures
+    [failure] = evaluated(lw.ScriptedSkillActor(hopeless())).failures
     assert (failure.cause, failure.also, failure.counterfactuals) == ("undecided", None, {"time": False})
+    assert failure.mended is None
 
 
 def test_the_rule_alone_runs_nothing_and_is_weaker():
@@ -313,26 +309,23 @@ def test_failures_hang_on_neither_environments_nor_order():
 # ---- what decides
 
 
-def caused(mended, shares, null=0.0):
-    return decide(mended, shares, null).cause
-
-
-def test_what_mends_most_decides_and_of_those_as_good_the_smallest():
-    same = dict.fromkeys(("query", "skill", "plan", "policy", "time"), 0.5)
-    assert caused(["policy", "plan", "skill", "query"], same) == "query"
-    assert caused(["policy", "skill", "time"], same) == "skill"
-    assert caused(["policy", "plan", "skill"], {**same, "skill": 0.9}) == "skill"
-    assert caused(["policy"], same) == "policy"
-    assert caused(["time"], same) == "out of time"
-    assert caused([], same) == "undecided"
-
-
-def test_a_part_is_named_only_if_it_leads():
-    assert caused(["gripper"], {"gripper": 0.9}) == "gripper"
-    assert caused(["gripper", "actuation", "policy"], {"gripper": 0.9, "actuation": 0.8, "policy": 1.0}) == "policy"
-    assert caused(["gripper", "actuation"], {"gripper": 0.9, "actuation": 0.2}) == "gripper"
-    assert caused(["skill", "actuation", "policy"], dict.fromkeys(("skill", "actuation", "policy"), 1.0)) == "skill"
-    assert caused(["gripper"], {"gripper": 0.9}, null=0.7) == "policy", "as good as nothing replaced"
+@pytest.mark.parametrize(
+    ("cause", "shares", "null"),
+    [
+        ("query", {"policy": 0.5, "plan": 0.5, "skill": 0.5, "query": 0.5}, 0.0),
+        ("skill", {"policy": 0.5, "skill": 0.5, "time": 0.5}, 0.0),
+        ("skill", {"policy": 0.5, "plan": 0.5, "skill": 0.9}, 0.0),
+        ("policy", {"policy": 0.5}, 0.0),
+        ("out of time", {"time": 0.5}, 0.0),
+        ("undecided", {}, 0.0),
+        ("gripper", {"gripper": 0.9, "actuation": 0.2}, 0.0),
+        ("policy", {"gripper": 0.9, "actuation": 0.8, "policy": 1.0}, 0.0),  # no part leads
+        ("skill", {"skill": 1.0, "actuation": 1.0, "policy": 1.0}, 0.0),  # the smallest part
+        ("policy", {"gripper": 0.9}, 0.7),  # hardly better than a plain re-run
+    ],
+)
+def test_the_replacement_that_fixes_most_decides(cause, shares, null):
+    assert decide([*shares], shares, null).cause == cause
 
 
 def test_of_two_causes_the_certain_one_comes_first_or_the_one_that_mends_more():
@@ -437,5 +430,3 @@ def test_the_mended_episode_is_kept_and_can_be_simulated_again():
     shown = [mended.steps[key].numpy() for key in ("action", "observation")]
     assert simulate_again(TASK, SEED, 0, *shown) is not None, "bit for bit"
     assert "mended" not in failure.to_json()
-    [failure] = evaluated(lw.ScriptedSkillActor(hopeless())).failures
-    assert failure.mended is None, "nothing mends it"

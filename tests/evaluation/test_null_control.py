@@ -22,10 +22,10 @@ def scripted():
 
 
 def ran(actor, **options):
-    """Its one episode, whatever became of it."""
+    """Return its one episode."""
     seen = []
-    how = {"tasks": TASK, "episodes_per_task": 1, "also_record": RECORDED, "on_episode": seen.append}
-    lw.evaluate(actor, **how, stop_at_success=True, **{**RUN, **options})
+    how = {"tasks": TASK, "also_record": RECORDED, "on_episode": seen.append, **RUN, **options}
+    lw.evaluate(actor, episodes_per_task=1, stop_at_success=True, **how)
     return seen
 
 
@@ -41,10 +41,7 @@ def test_an_episode_that_was_cut_lacks_nothing_but_its_end():
     assert failure.shares["nothing"] == 1.0
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{"evaluator": Jammed(1.0, 1.0, 0.1, 1.0)}, {"noise_scale": 1.0}],
-)
+@pytest.mark.parametrize("options", [{"evaluator": Jammed(1.0, 1.0, 0.1, 1.0)}, {"noise_scale": 1.0}])
 def test_another_environment_or_noise_is_nobody_s_fault(options):
     [failure] = attribute_failures(ran(scripted(), **options), PLANS, actor=scripted(), **RUN)
     assert failure.cause == "not reproducible"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from datetime import UTC, datetime
 from hashlib import sha256
 
@@ -116,7 +115,7 @@ DAMAGE = {
     "a success that is 1": edit(0, success=1),
     "an episode twice": edit(1, episode=0),
     "an episode more than once in full": lambda found: found["episodes"].append(found["episodes"][0]),
-    "an episode that is missing": lambda found: found["episodes"].pop(),
+    "a missing episode": lambda found: found["episodes"].pop(),
     "an empty list of episodes": change(episodes=[]),
     "no tasks and no episodes": lambda found: (found["config"].update(tasks=[]), found.update(episodes=[])),
     "an episode that is negative": edit(0, episode=-1),
@@ -133,7 +132,6 @@ DAMAGE = {
     "a return that is a text": edit(0, episode_return="4.0"),
     "a return of 400 digits": edit(0, episode_return=10**400),
     "a return that is nan": edit(0, episode_return=float("nan")),
-    "a return that is infinite": edit(0, episode_return=float("inf")),
     "a task twice in config": lambda found: found["config"]["tasks"].append("push"),
     "tasks that are a text": configure(tasks="push"),
     "tasks that are numbers": configure(tasks=[1, 2]),
@@ -149,13 +147,10 @@ DAMAGE = {
     "a version that is a list": change(version=[[1]]),
     "another format": change(format="minari"),
     "another version": change(version=2),
-    "no format": lambda found: found.pop("format"),
     "no configuration": lambda found: found.pop("config"),
-    "no episodes": lambda found: found.pop("episodes"),
     "an unknown entry": lambda found: found["episodes"][0].update(colour="red"),
     "a missing entry": lambda found: found["episodes"][0].pop("success"),
     "episodes of another kind": change(episodes=[1, 2]),
-    "a configuration without tasks": change(config={}),
     "a configuration of another kind": change(config=[]),
     "a task without episodes": lambda found: found["config"]["tasks"].append("drawer-open"),
 }
@@ -190,17 +185,6 @@ def test_a_file_of_another_shape_is_refused_or_holds_together(tmp_path, data):
     assert EvaluationResult.load(path) == found
 
 
-NESTED = b'{"format": ' + b"[" * 100_000 + b"]" * 100_000 + b"}"
-TWICE = b'{"format": "lw_torchrl.evaluation", "format": "lw_torchrl.evaluation"}'
-
-
-@pytest.mark.parametrize("content", [NESTED, TWICE, b"1" * 5_000], ids=["nested", "twice", "digits"])
-def test_text_that_is_no_json_is_refused(tmp_path, content):
-    (tmp_path / "results.json").write_bytes(content)
-    with pytest.raises(ValueError, match="is no result of"):
-        EvaluationResult.load(tmp_path / "results.json")
-
-
 def test_our_version_is_that_of_the_code_that_runs(monkeypatch):
     monkeypatch.setattr("lw_torchrl._versions.version", lambda name: "0.0.1")  # as an old editable install says
     found = package_versions()
@@ -221,54 +205,25 @@ def test_it_says_where_it_came_from(tmp_path):
     assert found == make_result(), "where it came from is no part of what was measured"
     make_result().save(tmp_path / "plain.json")
     assert EvaluationResult.load(tmp_path / "plain.json").origin.keys() == {"date", "versions"}
+    content = json.loads((tmp_path / "plain.json").read_text())
+    (tmp_path / "old.json").write_text(json.dumps({key: content[key] for key in content if key != "origin"}))
+    assert EvaluationResult.load(tmp_path / "old.json").origin == {}
     with pytest.raises(FileNotFoundError, match="nowhere"):
         make_result().save(tmp_path / "other.json", checkpoint=tmp_path / "nowhere.safetensors")
     assert not (tmp_path / "other.json").exists()
 
 
-def test_a_file_from_before_origins_were_kept_is_read_and_stays_of_unknown_origin_until_saved(tmp_path):
-    path = tmp_path / "results.json"
-    make_result().save(path)
-    old = json.loads(path.read_text())
-    del old["origin"]
-    path.write_text(json.dumps(old))
-    found = EvaluationResult.load(path)
-    assert found == make_result()
-    assert found.origin == {}
+NESTED = b'{"format": ' + b"[" * 100_000 + b"]" * 100_000 + b"}"
+TWICE = b'{"format": "lw_torchrl.evaluation", "format": "lw_torchrl.evaluation"}'
+CONTENTS = {"empty": b"", "cut": b'{"format": "lw_torchrl.eval', "list": b"[]", "bytes": b"\xff\xfe\x00"}
+CONTENTS |= {"nested": NESTED, "twice": TWICE, "digits": b"1" * 5_000}
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"[]", b"null", b"\xff\xfe\x00", b'"words"'])
-def test_what_is_no_result_is_refused(tmp_path, content):
-    path = tmp_path / "results.json"
-    path.write_bytes(content)
+@pytest.mark.parametrize("name", CONTENTS)
+def test_a_file_that_is_not_a_result_is_refused(tmp_path, name):
+    (tmp_path / "results.json").write_bytes(CONTENTS[name])
     with pytest.raises(ValueError, match="is no result of"):
-        EvaluationResult.load(path)
-    assert path.read_bytes() == content
-
-
-@pytest.mark.parametrize("share", [0.2, 0.7, 0.99])
-def test_a_truncated_file_is_refused(tmp_path, share):
-    path = tmp_path / "results.json"
-    make_result().save(path)
-    content = path.read_bytes().rstrip()
-    path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(ValueError, match="is no result of"):
-        EvaluationResult.load(path)
-
-
-def test_a_disk_that_fills_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "results.json"
-    stopped().save(path)
-    before = path.read_bytes()
-
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.replace", full)
-    with pytest.raises(OSError, match="No space"):
-        make_result().save(path)
-    assert path.read_bytes() == before
-    assert [found.name for found in tmp_path.iterdir()] == ["results.json"]
+        EvaluationResult.load(tmp_path / "results.json")
 
 
 def test_numbers_that_are_none_are_not_written(tmp_path):
@@ -286,14 +241,3 @@ def test_the_table_shows_every_task():
     assert lines[3].split() == ["sweep", "0.00", "0.00", "-"]
     assert lines[4].split() == ["mean", "0.56", "0.44", "-"]
     assert stopped().table().splitlines()[1].split() == ["reach", "0.50", "-", "9"]
-
-
-def test_the_rates_of_many_tasks_take_one_pass():
-    tasks = [f"task-{number}" for number in range(20_000)]
-    result = EvaluationResult(
-        {"tasks": tasks}, tuple(EpisodeResult(task, 0, True, 3, False, 1.0) for task in reversed(tasks))
-    )
-    started = time.perf_counter()
-    assert list(result.success_once) == tasks
-    assert result.mean_success == 1.0
-    assert time.perf_counter() - started < 2.0  # 20,000 x 20,000 comparisons take 10 s

@@ -68,9 +68,8 @@ def test_a_recorder_on_another_environment(tmp_path, make):
         rollouts = [env.rollout(6) for _ in range(2)]
         env.reset()
         env.close()
-        assert logger.episodes[:2] == (
-            ["swing-0", "swing-1"] if len(rows) == 1 else ["swing-0, row 1", "swing-0, row 0"]
-        )
+        names = ["swing-0", "swing-1"] if len(rows) == 1 else ["swing-0, row 1", "swing-0, row 0"]
+        assert logger.episodes[:2] == names
         assert len(logger.episodes) == 2 * len(rows)
     found = Recording(tmp_path / "a.rrd")
     first = rollouts[0] if len(rows) == 1 else rollouts[0][1]

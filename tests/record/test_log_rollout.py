@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
-import warnings
+from itertools import product
 
 import numpy as np
 import pytest
@@ -32,6 +32,14 @@ def pushed():
     return run("push", 60, plans=PLANS)[0]
 
 
+@pytest.fixture
+def failed(pushed):
+    """The same without success."""
+    rollout = pushed.clone()
+    rollout["next", "success"][:] = False
+    return rollout
+
+
 def logged(path, *rollouts, **kwargs):
     with lw.RerunLogger(path) as logger:
         names = [lw.log_rollout(logger, rollout, **kwargs) for rollout in rollouts]
@@ -46,11 +54,9 @@ def poses_in_the_file(found, name, step):
     frames, poses = Tabs.read(found.reader).pages[name].frames, {}
     for mesh, frame in frames.items():
         if frame:
-            pose = [
-                found.in_frame(f"/{name}/scene/bodies", frame, part, step) for part in ("translation", "quaternion")
-            ]
-        else:  # what stands still has its mesh's own pose
-            pose = [found.at(mesh, f"Transform3D:{part}", step)[0] for part in ("translation", "quaternion")]
+            pose = [found.in_frame(f"/{name}/scene/bodies", frame, part, step) for part in POSE]
+        else:  # a body that stands still has its mesh's own pose
+            pose = [found.at(mesh, f"Transform3D:{part}", step)[0] for part in POSE]
         poses[mesh.removeprefix("/meshes/").rpartition("-")[0].replace("\\", "")] = np.concatenate(pose)
     return poses
 
@@ -75,19 +81,11 @@ def check_against_metaworld(found, name, rollout, steps):
     engine.close()
 
 
-def test_bodies_stand_where_mujoco_has_them(tmp_path):
-    rollouts = run(["drawer-open", "soccer"], 30)
+@pytest.mark.parametrize("tasks", [("drawer-open", "soccer"), pytest.param(lw.MT50, marks=pytest.mark.slow)])
+def test_bodies_stand_where_mujoco_has_them(tmp_path, tasks):
+    rollouts = run(tasks, 12)
     names, found = logged(tmp_path / "a.rrd", rollouts, seed=SEED)
-    assert names == [["drawer-open-0", "soccer-0"]]
-    for name, rollout in zip(names[0], rollouts, strict=True):
-        check_against_metaworld(found, name, rollout, (0, 11, 30))
-
-
-@pytest.mark.slow
-def test_all_tasks(tmp_path):
-    rollouts = run("MT50", 12)
-    names, found = logged(tmp_path / "a.rrd", rollouts, seed=SEED, policy="expert")
-    assert names[0] == [f"{task}-0" for task in lw.MT50]
+    assert names == [[f"{task}-0" for task in tasks]]
     for name, rollout in zip(names[0], rollouts, strict=True):
         check_against_metaworld(found, name, rollout, (0, 5, 12))
 
@@ -176,9 +174,7 @@ def failure_of(rollout, **changes):
     return dataclasses.replace(failure, **changes)
 
 
-def test_a_failure_is_the_verdict(tmp_path, pushed):
-    failed = pushed.clone()
-    failed["next", "success"][:] = False
+def test_a_failure_is_the_verdict(tmp_path, failed):
     why = failure_of(failed, counterfactuals={"skill": True, "plan": False, "query": False})
     _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS, seed=SEED, policy="mine", failure=why)
     verdict = found.text("/push-0/verdict")
@@ -194,9 +190,8 @@ def test_a_failure_is_the_verdict(tmp_path, pushed):
     assert "push-0 · mine · failed: skill" in layout
 
 
-def test_what_mends_a_failure_is_a_ghost_beside_it(tmp_path, pushed):
-    failed, mended = pushed.clone(), run("push", 60, plans=PLANS)[0]
-    failed["next", "success"][:] = False
+def test_what_mends_a_failure_is_a_ghost_beside_it(tmp_path, pushed, failed):
+    mended = pushed.clone()
     mended["observation"][30:, 0] += 0.02  # what parts them
     mended["next", "success"][40] = True
     ghost = MendedEpisode("plan", PLANS["push"], mended[:41].exclude("qaf_plan"))
@@ -228,9 +223,7 @@ def test_exact_answers_are_recorded_with_those_of_an_evaluator(in_front):
     assert bool(exact.any())
 
 
-def test_an_overview_lists_failures_first_and_counts_causes(tmp_path, pushed):
-    failed = pushed.clone()
-    failed["next", "success"][:] = False
+def test_an_overview_lists_failures_first_and_counts_causes(tmp_path, failed):
     won = failed.clone()
     won["next", "success"][39] = True
     result = EvaluationResult(
@@ -257,32 +250,24 @@ def test_an_overview_lists_failures_first_and_counts_causes(tmp_path, pushed):
     assert Tabs.read(found.reader).opening_step() == 33
 
 
-def test_a_ghost_of_the_robot_moves_what_moves(tmp_path, pushed):
-    failed = pushed.clone()
-    failed["next", "success"][:] = False
+def test_a_ghost_of_the_robot_moves_what_moves(tmp_path, pushed, failed):
     why = failure_of(failed, mended=MendedEpisode("policy", PLANS["push"], pushed))
     _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS, seed=SEED, failure=why)
     frames = Tabs.read(found.reader).pages["push-0"].frames
     ghosts = {mesh: body for mesh, body in frames.items() if mesh.startswith("/ghosts/")}
-    assert {mesh.replace("ghosts", "meshes") for mesh in ghosts} == {mesh for mesh in frames if frames[mesh]} - set(
-        ghosts
-    )
-    for part in POSE:
-        for step in (0, 17, 60):
-            poses = [
-                {
-                    frame.rpartition("/")[2]: found.in_frame(entity, frame, part, step)
-                    for mesh, frame in frames.items()
-                    if frame and mesh.startswith(kind)
-                }
-                for entity, kind in (("/push-0/scene/ghost", "/ghosts"), ("/push-0/scene/bodies", "/meshes"))
-            ]
-            assert poses[0] == poses[1]
+    moving = {mesh: body for mesh, body in frames.items() if body and mesh not in ghosts}
+    assert {mesh.replace("ghosts", "meshes") for mesh in ghosts} == set(moving)
+
+    def poses(kind, bodies, part, step):
+        """A part of each body's pose at a step."""
+        entity = f"/push-0/scene/{kind}"
+        return {body.rpartition("/")[2]: found.in_frame(entity, body, part, step) for body in bodies.values()}
+
+    for part, step in product(POSE, (0, 17, 60)):
+        assert poses("ghost", ghosts, part, step) == poses("bodies", moving, part, step)
 
 
-def test_without_a_failure_the_verdict_tells_facts(tmp_path, pushed):
-    failed = pushed.clone()
-    failed["next", "success"][:] = False
+def test_without_a_failure_the_verdict_tells_facts(tmp_path, pushed, failed):
     failed["qaf"][:, 1] = False
     _, found = logged(tmp_path / "a.rrd", failed, plans=PLANS)
     verdict = found.text("/push-0/verdict")
@@ -318,17 +303,3 @@ def test_wrong_rollouts_of_tasks_are_named(tmp_path, pushed, change, kwargs, mes
         with pytest.raises(ValueError, match=message):
             lw.log_rollout(logger, change(pushed.clone()), **kwargs)
         assert logger.episodes == []
-
-
-def test_importing_a_recording_loads_no_rendering(tmp_path, pushed, monkeypatch):
-    # The scene is rerun's to draw: neither OpenGL nor MuJoCo's renderer is touched.
-    import mujoco
-
-    def refuse(*_, **__):
-        raise AssertionError("OpenGL was asked for")
-
-    monkeypatch.setattr(mujoco, "MjrContext", refuse)
-    monkeypatch.setattr(mujoco, "Renderer", refuse)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        logged(tmp_path / "a.rrd", pushed, seed=SEED)

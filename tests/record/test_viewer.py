@@ -126,21 +126,15 @@ def test_several_runs_open_at_their_own_steps(tmp_path, seen):
     assert "Verdict" in seen["views"]
 
 
-@pytest.mark.parametrize(("episode", "view"), [("reach-2", "Verdict"), ("metri", "loss")])
-def test_a_tab_is_brought_to_the_front(tmp_path, seen, episode, view):
-    write(tmp_path / "a.rrd", episodes=2)
+@pytest.mark.parametrize(
+    ("episodes", "episode", "view"), [(2, "reach-2", "Verdict"), (2, "metri", "loss"), (0, "Metrics", "loss")]
+)
+def test_a_tab_is_brought_to_the_front(tmp_path, seen, episodes, episode, view):
+    write(tmp_path / "a.rrd", episodes=episodes)
     with needing_a_driver():
         open_viewer(tmp_path / "a.rrd", episode=episode, step=0)
     assert view in seen["views"]
     assert seen["cursors"] == [0]
-
-
-def test_the_only_tab_may_be_named(tmp_path, seen):
-    with RerunLogger(tmp_path / "a.rrd") as logger:
-        logger.log_scalar("loss/bc", 1.0)
-    with needing_a_driver():
-        open_viewer(tmp_path / "a.rrd", episode="Metrics")
-    assert seen["views"] == {"loss"}
 
 
 def test_the_rest_of_a_cut_recording_is_shown(tmp_path, seen):

@@ -59,13 +59,11 @@ def attribute_failures(
     noise and nothing replaced. If it succeeds, the failure is *not reproducible*, and the finding says what differs.
     Otherwise it is re-run with one part replaced by a sound one: the observations, if the policy was shown wrong ones
     (*perception*); the answers, where they were wrong (*query*); the *plan*, by the reference; the policy's action, by
-    that of scripted skills (where a text is no scripted skill, by the expert's), in one step of the plan (*skill*), for
-    the *gripper* or the hand's motion (*actuation*) only, or in all steps (*policy*); or twice the time (*out of
-    time*). If nothing helps, pairs are tried, which give ``cause`` and ``also``. If several replacements help, the one
-    that fixes most of the task's failed episodes counts, and of those about as good the smallest; but a skill does not
-    count if other steps have the same fault. One success may be luck, so ``shares`` holds the share of the task's
-    failed episodes that each replacement fixes, and "nothing" that of the null control. A policy without plans gets no
-    step.
+    that of scripted skills or, where a step has none, the expert's, in one step of the plan (*skill*), for the
+    *gripper* or the hand's motion (*actuation*) only, or in all steps (*policy*); or twice the time (*out of time*). If
+    nothing helps, pairs are tried, which give ``cause`` and ``also``. If several replacements help, the one that fixes
+    most of the task's failed episodes counts, and of those about as good the smallest; but a skill does not count if
+    other steps have the same fault. A policy without plans gets no step.
 
     Args:
         rollouts: episodes as :func:`evaluate` passes them to ``on_episode``, or TensorDicts of batch (T,), each one
@@ -74,12 +72,9 @@ def attribute_failures(
             Optional: the answers that the policy acted on, ``qaf_logits`` (T, S) float32, else ``qaf`` (T, S) bool;
             ``skill_weights`` (T, S) float32, for the active step.
         plans: the plans that were carried out.
-        actor: the policy: anything with ``plans`` and ``with_plans`` that writes ``action`` and ``skill_weights``. One
-            that draws its actions cannot be re-run alike; its counterfactuals mean less.
+        actor: the policy; the counterfactuals of one that draws its actions mean less.
         reference: trusted plans for some of the tasks.
-        evaluator: what answered the conditions instead of the exact function, between it and the actor: a
-            :class:`QueryEvaluator`, or a module, function or :class:`torchrl.envs.Transform` that writes ``qaf``. An
-            evaluator inside the policy is found there.
+        evaluator: as for :func:`evaluate`; an evaluator inside the policy is found there.
         skills: trusted scripted skills by text; None for the suite's, :func:`load_skills` of Meta-World.
         seed, noise_scale, max_steps, suite, engine: those of the episodes. An episode that was cut before ``max_steps``
             is run to its end: if it then succeeds, it is not reproducible.
@@ -92,12 +87,7 @@ def attribute_failures(
         ValueError: a rollout lacks a key, an episode occurs twice, a task has no plan, the plans are not the actor's,
             or an episode does not begin as (task, seed, episode) does.
 
-    Warns:
-        UserWarning: the policy cannot carry out the reference; no plan is replaced.
-
     Example:
-        A wrong offset in the skill that reaches:
-
         >>> import lw_torchrl as lw
         >>> from dataclasses import replace
         >>> plans = lw.Plans({"reach": lw.load_plans("MT10")["reach"]})
@@ -128,19 +118,18 @@ def attribute_failures(
     others = {task: plan for task, plan in given.items() if task in names}
     seen = [states_of(task, k, steps, answered, _answers(steps, actor)) for task, k, steps in failed]
     scripts, theirs = Scripts(answered, table), Scripts(Plans(others), table) if others else None
-    explanations = [explain(one, scripts, theirs) for one in seen]
+    explained = [(one, explain(one, scripts, theirs)) for one in seen]
     if actor is None:
-        return [_by_rule(one, explanation, seed) for one, explanation in zip(seen, explanations, strict=True)]
+        return [_by_rule(*both, seed) for both in explained]
     tasks = {name: own_suite.tasks.get(name, answered[name].definition) for name in names}
     env_options = {"seed": seed, "suite": own_suite, "engine": engine, "num_threads": num_threads}
     env_options["max_steps"] = own_suite.max_steps if max_steps is None else max_steps
     rerun = Rerun(tasks, env_options, noise_scale, num_envs, device, progress)
     null = null_control(rerun, {one.which: one.steps for one in seen}, actor, answered, evaluator)
     tried = Counterfactuals(actor, evaluator, None if theirs is None else theirs.plans, scripts, rerun, null)
-    both = list(zip(seen, explanations, strict=True))
-    tried.run(seen, [one.which for one, explanation in both if explanation.evidence.get("plan_departs") == 0.0])
+    tried.run(seen, [one.which for one, explanation in explained if explanation.evidence.get("plan_departs") == 0.0])
     shares = tried.shares()
-    return [_by_counterfactuals(one, explanation, tried, shares.get(one.task, {}), seed) for one, explanation in both]
+    return [_by_counterfactuals(*both, tried, shares.get(both[0].task, {}), seed) for both in explained]
 
 
 def _failed(rollouts: Iterable[Any], plans: Plans) -> list[tuple[str, int, TensorDictBase]]:
@@ -177,11 +166,9 @@ def _answers(steps: TensorDictBase, actor: Any) -> Tensor | None:
     if not evaluators or "qaf_logits" in steps.keys():
         return None
     read = dict.fromkeys(key for one in evaluators for key in one.in_keys)
-    if missing := [str(key) for key in read if steps.get(key, None) is None]:
-        raise ValueError(
-            f"rollouts must hold {', '.join(missing)}, which the policy's evaluator reads, or its answers, qaf_logits; "
-            "evaluate(..., attribute=True) records them"
-        )
+    if missing := ", ".join(str(key) for key in read if steps.get(key, None) is None):
+        needed = f"rollouts must hold {missing}, which the policy's evaluator reads, or its answers, qaf_logits"
+        raise ValueError(f"{needed}; evaluate(..., attribute=True) records them")
     with torch.no_grad(), evaluating(actor):
         device = device_of(actor)
         logits = [one.logits(*(steps.get(key).to(device) for key in one.in_keys)) for one in evaluators]
@@ -197,9 +184,8 @@ def keys_to_attribute(actor: Any, env: EnvBase) -> list[NestedKey]:
 
 def _by_rule(one: EpisodeStates, explanation: Explanation, seed: int) -> Failure:
     """Return the failure as the states alone show it."""
-    cause = explanation.cause
-    step, at, finding = explanation.blames[cause]
-    return Failure(one.task, seed, one.episode, cause, None, step, at, finding, evidence=explanation.evidence)
+    cause, blames, evidence = explanation
+    return Failure(one.task, seed, one.episode, cause, None, *blames[cause], evidence=evidence)
 
 
 def _by_counterfactuals(
@@ -207,18 +193,15 @@ def _by_counterfactuals(
 ) -> Failure:
     """Return the failure as the counterfactuals show it, with findings from the states."""
     which, null = one.which, tried.null
-    share = null.share(one.task)
-    number = float(sum(task == one.task for task, _ in null.episodes))
+    share, number = null.share(one.task), float(sum(task == one.task for task, _ in null.episodes))
     record: dict[str, Any] = {"evidence": {**explanation.evidence, "failed": number}}
     record["shares"] = {"nothing": share, **shares}
     if null.succeeds(which) or (which in null.differs and share >= MARGIN):
         first = null.differs.get(which, Difference("nothing", len(one.steps) - 1))
         record["succeeds_at"] = null.episodes[which].first_success
         return Failure(one.task, seed, one.episode, "not reproducible", None, None, first.at, first, **record)
-    record["counterfactuals"] = {
-        name: results[which] is not None for name, results in tried.results.items() if which in results
-    }
-    tried_here = record["counterfactuals"]
+    tried_here = {name: results[which] is not None for name, results in tried.results.items() if which in results}
+    record["counterfactuals"] = tried_here
     same = explanation.evidence.get("plan_departs") == 0.0
     counting = [name for name in tried.mending(one) if not (same and name == "plan")]
     decision = decide(counting, shares, share)

@@ -53,11 +53,10 @@ class ScriptComparison(NamedTuple):
         return max(shares, default=0.0)
 
     def often_far(self, steps: Iterable[int]) -> bool:
-        """Return whether the actions are far from the scripts' in many states of one of these steps."""
+        """Return whether :meth:`far` is large; :meth:`seldom_far` whether it is small."""
         return self.far(steps) > _OFTEN
 
     def seldom_far(self, steps: Iterable[int]) -> bool:
-        """Return whether the actions are far from the scripts' in few states of each of these steps."""
         return self.far(steps) < _OFTEN / 2
 
     def in_other_steps(self, step: int) -> bool | None:
@@ -88,10 +87,7 @@ def _off(values: Tensor, where: Tensor) -> float:
 
 
 def compare_with_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> ScriptComparison | None:
-    """Compare a policy's actions in an episode's states with those of scripts.
-
-    Return None if the policy draws its actions, or reads keys that were not recorded.
-    """
+    """Compare them in an episode; return None if the policy draws its actions, or reads keys that were not recorded."""
     keys = [key for key in getattr(actor, "in_keys", ()) if key != "qaf"]
     plans = plans_of(actor)
     is_known = isinstance(actor, TensorDictModuleBase) and not draws(actor)

@@ -61,29 +61,18 @@ def with_true_answers(actor: Any) -> Any:
 
 
 class Counterfactuals:
-    """Run the counterfactuals that can decide something, and keep the results.
-
-    Attributes:
-        results: replacement to the episodes it was tried on; the re-run episode if it succeeds, else None.
-        step: the step in which a scripted skill fixes an episode.
-        comparisons: policy and scripts where the episode failed.
-        with_script: the same, joined with the states of re-runs in which a script controlled a step.
-    """
+    """Run the counterfactuals that can decide something, and keep the results."""
 
     def __init__(
-        self,
-        actor: Any,
-        evaluator: Any,
-        reference: Plans | None,
-        scripts: Scripts,
-        rerun: Rerun,
-        null: NullControl,
+        self, actor: Any, evaluator: Any, reference: Plans | None, scripts: Scripts, rerun: Rerun, null: NullControl
     ) -> None:
         self.actor, self.evaluator, self.scripts, self.rerun, self.null = actor, evaluator, scripts, rerun, null
         self.plans = plans = scripts.plans
+        # Replacement to the episodes it was tried on: the re-run episode if it succeeds, else None.
         self.results: dict[str, dict[EpisodeId, FinishedEpisode | None]] = {}
-        self.step: dict[EpisodeId, int] = {}
-        self.comparisons: dict[EpisodeId, ScriptComparison] = {}
+        self.step: dict[EpisodeId, int] = {}  # the step in which a scripted skill fixes an episode
+        self.comparisons: dict[EpisodeId, ScriptComparison] = {}  # policy and scripts where the episode failed
+        # The same, joined with the states of re-runs in which a script controlled a step.
         self.with_script: dict[EpisodeId, dict[int, ScriptComparison]] = {}
         self.reference: Plans | None = None
         self.other = self.other_evaluator = None  # policy and evaluator for the reference
@@ -185,16 +174,12 @@ class Counterfactuals:
         left = [one for one in ranked if one in parts or self._mends("plan", one)]  # can scripts follow this plan?
         self._run("policy", left, self.actor, self.plans, self.evaluator, wrap=self._scripted(self.plans))
 
-    def _motion(self, comparison: ScriptComparison) -> ScriptComparison:
-        return comparison.part(torch.arange(comparison.done.shape[-1]) != self._gripper_number)
-
-    def _gripper(self, comparison: ScriptComparison) -> ScriptComparison:
-        return comparison.part(torch.arange(comparison.done.shape[-1]) == self._gripper_number)
-
-    @property
-    def _gripper_number(self) -> int:
-        gripper = self.plans.layout.gripper
-        return -1 if gripper is None else gripper
+    def _parts(self, comparison: ScriptComparison) -> tuple[ScriptComparison, ScriptComparison]:
+        """Return the comparison of the hand's motion and that of the gripper."""
+        gripper = torch.zeros(comparison.done.shape[-1], dtype=torch.bool)
+        if self.plans.layout.gripper is not None:
+            gripper[self.plans.layout.gripper] = True
+        return comparison.part(~gripper), comparison.part(gripper)
 
     def _in_one_step(self, which: EpisodeId) -> bool:
         """Return whether the motion is wrong only in the step that a script fixes.
@@ -205,14 +190,14 @@ class Counterfactuals:
             return False
         comparison = self.with_script[which][self.step[which]]
         in_one = len(comparison.active[comparison.unlike()].unique()) == 1
-        return in_one and bool(self._motion(comparison).unlike().any())
+        return in_one and bool(self._parts(comparison)[0].unlike().any())
 
     def mending(self, one: EpisodeStates) -> list[str]:
         """Return the replacements that fix an episode and count.
 
-        Scripts for a part of the action do not count if that part is close to the scripts', and scripts for the other
-        part help too. A script in one step does not count if only the gripper is wrong there, or if the same fault is
-        in other steps, and scripts for that part in all steps help too. If it counts, scripts for the motion do not.
+        Of two that help, scripts for a part of the action that is close to the scripts' do not count. A script in one
+        step does not count if only the gripper is wrong there, or if the same fault is in other steps, and scripts for
+        that part in all steps help too. If it counts, scripts for the motion do not.
         """
         names = [name for name, results in self.results.items() if results.get(one.which) is not None]
         comparison, step = self.comparisons.get(one.which), self.step.get(one.which)
@@ -220,7 +205,7 @@ class Counterfactuals:
         if comparison is None or self.plans.layout.gripper is None:
             return names
         if "gripper" in names and "actuation" in names:
-            motion, fingers = self._motion(comparison), self._gripper(comparison)
+            motion, fingers = self._parts(comparison)
             if fingers.often_far(numbers) and motion.seldom_far(numbers):
                 names.remove("actuation")
             elif motion.often_far(numbers) and fingers.seldom_far(numbers):
@@ -228,7 +213,7 @@ class Counterfactuals:
         if step is None:
             return names
         comparison, others = self.with_script[one.which][step], [other for other in numbers if other != step]
-        motion, fingers = self._motion(comparison), self._gripper(comparison)
+        motion, fingers = self._parts(comparison)
         in_others = motion.in_other_steps(step)
         if in_others is False and "actuation" in names:
             names.remove("actuation")
@@ -241,7 +226,8 @@ class Counterfactuals:
     def step_of_motion(self, one: EpisodeStates) -> int | None:
         """Return the only step in which the motion is wrong; None if others are wrong too, or that is unknown."""
         numbers = range(one.truth.shape[1])
-        for motion in map(self._motion, self.with_script.get(one.which, {}).values()):
+        for comparison in self.with_script.get(one.which, {}).values():
+            motion, _ = self._parts(comparison)
             for step in numbers:
                 others = [other for other in numbers if other != step]
                 if motion.often_far([step]) and motion.in_other_steps(step) is False and not motion.often_far(others):

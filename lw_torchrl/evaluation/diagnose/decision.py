@@ -21,18 +21,16 @@ class Decision(NamedTuple):
 
 
 def decide(mended: Collection[str], shares: Mapping[str, float], null: float = 0.0) -> Decision:
-    """Return the cause of a failed episode.
+    """Return the cause of a failed episode, from the replacements with which it succeeds (``mended``).
+
+    ``shares`` is the share of the task's failed episodes that each replacement fixes, among those it was tried on, and
+    ``null`` that of a plain re-run.
 
     Wrong observations and answers come first, if correcting them helps. Of the other replacements, the one that fixes
     most of the task's failed episodes counts. Among those about as good, the first counts: the plan, unless scripts
     that follow it succeed; a skill in one step; the gripper or the motion. It is the policy, without naming a part, if
     two replacements that do not contain each other are about as good, or if none leads clearly over a plain re-run.
     Time comes last, then pairs.
-
-    Args:
-        mended: the replacements with which the episode succeeds.
-        shares: the share of the task's failed episodes that each replacement fixes, among those it was tried on.
-        null: the same share for a plain re-run.
     """
     single = {name: causes[0] for name, causes in REPLACEMENTS.items() if len(causes) == 1}
     led = {name: shares.get(name, 1.0) for name in single if name in mended}
@@ -54,8 +52,7 @@ def decide(mended: Collection[str], shares: Mapping[str, float], null: float = 0
 
 
 def _best(led: Mapping[str, float]) -> str:
-    facts = [name for name in led if name in _FACTS]
-    if facts:
+    if facts := [name for name in led if name in _FACTS]:
         return max(facts, key=lambda name: led[name])
     best = next(iter(led))
     for name, share in led.items():
@@ -65,11 +62,7 @@ def _best(led: Mapping[str, float]) -> str:
 
 
 def choose_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tuple[Cause, Cause, str] | None:
-    """Return the pair of causes that counts, with its replacement.
-
-    Wrong answers, which are a fact, come first; otherwise the cause whose replacement alone fixes more of the task's
-    failed episodes.
-    """
+    """Return the pair of causes that counts, with its replacement; first wrong answers, else what fixes more alone."""
     alone = {**shares, "skill": max(shares.get("skill", 0.0), shares.get("policy", 0.0))}
     pairs = [name for name in mended if len(REPLACEMENTS[name]) > 1]
     if not pairs:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from reprlib import repr as short
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 from lw_torchrl._checks import Count, Natural, Scale, check_fields
-from lw_torchrl.evaluation.records import is_number, read_records
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
@@ -69,19 +69,15 @@ class NoCondition:
 
 @dataclass(frozen=True)
 class PlanDeparts:
-    """The plan requested another action than the reference in ``states`` of ``of`` states, the last ones if ``late``.
+    """The plan requested another action than the reference in ``states`` of ``of`` states, the last if ``late``."""
 
-    ``step`` and ``skill`` are the plan's in most of these states, ``reference`` is the skill that the reference plan
-    requests there; ``uncovered`` says that no condition of the plan held in most of them.
-    """
-
-    step: Natural
+    step: Natural  # of the plan, in most of these states
     skill: str
-    reference: str
+    reference: str  # the skill that the reference requests there
     states: Natural
     of: Count
     late: bool
-    uncovered: bool
+    uncovered: bool  # no condition of the plan held in most of them
 
 
 @dataclass(frozen=True)
@@ -105,13 +101,10 @@ class Misled:
 
 @dataclass(frozen=True)
 class Difference:
-    """The first difference between two runs of an episode.
+    """The first difference between two runs of an episode, with ``at``, the state to look at.
 
-    Attributes:
-        part: "length", of ``given`` and ``again`` steps; "actions", from step ``at`` on, there by ``size``;
-            "environment", the same action leads to another state ``at``; "states", from ``at`` on, in a rollout without
-            actions; "nothing" that was recorded.
-        at: the state to look at.
+    ``part`` is "length", of ``given`` and ``again`` steps; "actions", which differ there by ``size``; "environment", if
+    the same action leads to another state; "states", in a rollout without actions; or "nothing" that was recorded.
     """
 
     part: Literal["length", "actions", "environment", "states", "nothing"]
@@ -128,17 +121,12 @@ FINDINGS: dict[str, type[Any]] = {kind.__name__: kind for kind in get_args(Findi
 class MendedEpisode(NamedTuple):
     """A failed episode that succeeds when it is re-run with a part replaced.
 
-    Attributes:
-        by: the replacement, one of :data:`REPLACEMENTS`.
-        plan: the plan that was carried out, whose conditions ``steps["qaf"]`` answers.
-        steps: of batch (T,), up to the first success: ``observation`` (T, 39) float32, ``action`` (T, 4) float32 as
-            executed, ``task_id`` (T,) and ``episode`` (T,) int64, ``("next", "success")`` (T, 1) bool and
-            ``("next", "reward")`` (T, 1) float32; where they exist, ``qaf`` (T, S) bool and ``skill_weights`` (T, S)
-            float32.
+    ``steps`` has batch (T,), up to the first success: ``observation``, ``action`` as executed, ``task_id``,
+    ``episode``, ``("next", "success")``, ``("next", "reward")`` and, where they exist, ``qaf`` and ``skill_weights``.
     """
 
-    by: str
-    plan: ConditionalPlan
+    by: str  # the replacement, one of REPLACEMENTS
+    plan: ConditionalPlan  # the plan that was carried out
     steps: TensorDictBase
 
 
@@ -159,10 +147,8 @@ class Failure:
         scripted_step: a step in which a scripted skill also suffices, although other steps have the same fault.
         suspect: the cause that the states alone suggest, if it is undecided.
         evidence: name to number, measured in the episode's states.
-        counterfactuals: each replacement that was tried, and whether the same episode then succeeded. "perception"
-            replaces the observations; "query" the answers; "plan" the plan; "skill" the actions in one step of the
-            plan; "gripper" and "actuation" one part of the action in all steps; "policy" the whole action; "time"
-            doubles the time limit; pairs like "query + plan" replace both, with "skill" in all steps.
+        counterfactuals: each replacement that was tried, see :func:`attribute_failures`, and whether the same episode
+            then succeeded; pairs like "query + plan" replace both, with "skill" in all steps.
         shares: each replacement, and the share of the task's failed episodes that succeed with it; "nothing" is a plain
             re-run.
         mended: the episode with the cause replaced, if it then succeeds; it is not saved.
@@ -204,15 +190,44 @@ def _to_json(value: Any) -> Any:
     return dict(value) if isinstance(value, Mapping) else value
 
 
+def is_number(value: Any) -> bool:
+    """Return whether JSON's value is a number that can be summed."""
+    return type(value) in (int, float) and abs(value) < 1e300
+
+
+def read_records(
+    argument: str,
+    stated: Any,
+    record: Any,
+    faults: Callable[[Any], Iterable[str]],
+    parse: Callable[[str, dict[str, Any]], dict[str, Any]] = lambda where, entry: entry,
+) -> tuple[Any, ...]:
+    """Read a list of JSON objects as dataclasses of exactly their compared fields, each converted by ``parse``.
+
+    ``faults`` yields what is wrong with a record, which raises :class:`ValueError`.
+    """
+    if not isinstance(stated, list):
+        raise ValueError(f"{argument} must be a list, got {short(stated)}")
+    names, records = {field.name for field in fields(record) if field.compare}, []
+    for number, entry in enumerate(stated):
+        where = f"{argument}[{number}]"
+        if not isinstance(entry, dict) or set(entry) != names:
+            raise ValueError(f"{where} must be an object of {', '.join(sorted(names))}, got {short(entry)}")
+        records.append(record(**parse(where, entry)))
+        check_fields(records[-1], f"{where}: ")
+        for fault in faults(records[-1]):
+            raise ValueError(f"{where}: {fault}, got {short(entry)}")
+    return tuple(records)
+
+
 def _read_finding(where: str, stated: Any) -> Any:
     """Return the finding of a file; raise :class:`ValueError` if it is not one."""
     if stated is None:
         return None
     kind = FINDINGS.get(str(stated.get("kind"))) if isinstance(stated, dict) else None
     if kind is None or set(stated) != {"kind", *(one.name for one in fields(kind))}:
-        raise ValueError(
-            f"{where} must be null, or a kind of {', '.join(FINDINGS)} with its fields, got {short(stated)}"
-        )
+        kinds = ", ".join(FINDINGS)
+        raise ValueError(f"{where} must be null, or a kind of {kinds} with its fields, got {short(stated)}")
     finding = kind(**{name: value for name, value in stated.items() if name != "kind"})
     check_fields(finding, f"{where}: ")
     return finding
@@ -247,24 +262,21 @@ def read_failures(stated: Any, config: Mapping[str, Any], failed: Sequence[tuple
     return found
 
 
-def count_causes(tasks: Sequence[str], failures: Sequence[Failure]) -> dict[str, dict[str, int]]:
+def count_causes(tasks: Sequence[str], failures: Sequence[Failure]) -> dict[str, Counter[str]]:
     """Return the number of failures of each cause, by task."""
-    counts = {task: dict.fromkeys(CAUSES, 0) for task in tasks}
-    for failure in failures:
-        counts[failure.task][failure.cause] += 1
-    return counts
+    return {task: Counter(failure.cause for failure in failures if failure.task == task) for task in tasks}
 
 
 def failure_table(tasks: Sequence[str], episodes_per_task: int, failures: Sequence[Failure]) -> str:
     """Return the numbers of failures as text: a row for each task, a column for each cause that occurs."""
     causes = [cause for cause in CAUSES if any(failure.cause == cause for failure in failures)]
-    width = max(len("task"), len("all"), *map(len, tasks))
+    width = max(len("task"), *map(len, tasks))
     lines = [f"{'task':{width}}  {'failed':>10}  " + "  ".join(f"{cause:>5}" for cause in causes)]
     counts = count_causes(tasks, failures)
     if len(tasks) > 1:
-        counts["all"] = {cause: sum(row[cause] for row in counts.values()) for cause in causes}
+        counts["all"] = Counter(failure.cause for failure in failures)
     for task, row in counts.items():
         trials = episodes_per_task * (len(tasks) if task == "all" and len(tasks) > 1 else 1)
-        cells = "  ".join(f"{number:>{max(5, len(cause))}}" for cause, number in row.items() if cause in causes)
+        cells = "  ".join(f"{row[cause]:>{max(5, len(cause))}}" for cause in causes)
         lines.append(f"{task:{width}}  {f'{sum(row.values())} of {trials}':>10}  {cells}")
     return "\n".join(lines)

@@ -27,14 +27,11 @@ class Perception:
     """A context that notes what a policy is shown, or corrects it.
 
     A module that changes the observation for a policy inside it is looked through; a function is not.
-
-    Attributes:
-        misled: (task id, episode) to how the observation differed from the environment's, if it did.
     """
 
     def __init__(self, actor: Any, correct: bool = False) -> None:
         self.actor, self.correct = actor, correct
-        self.misled: dict[tuple[int, int], Misled] = {}
+        self.misled: dict[tuple[int, int], Misled] = {}  # by (task id, episode), where an observation was wrong
         self._now: TensorDictBase | None = None
         self._hooks: list[Any] = []
 
@@ -127,17 +124,11 @@ class Rerun:
 
 
 class NullControl(NamedTuple):
-    """Failed episodes after a plain re-run.
-
-    Attributes:
-        episodes: the episodes of the re-run.
-        misled: the episodes in which the policy was shown a wrong state.
-        differs: the first difference, for episodes that went another way.
-    """
+    """Failed episodes after a plain re-run."""
 
     episodes: Mapping[EpisodeId, FinishedEpisode]
-    misled: Mapping[EpisodeId, Misled]
-    differs: Mapping[EpisodeId, Difference]
+    misled: Mapping[EpisodeId, Misled]  # episodes in which the policy was shown a wrong state
+    differs: Mapping[EpisodeId, Difference]  # the first difference of episodes that went another way
 
     def succeeds(self, which: EpisodeId) -> bool:
         return self.episodes[which].first_success is not None
@@ -158,11 +149,9 @@ def null_control(
     for which, steps in failed.items():
         again = episodes[which].steps
         if not torch.equal(again.get("observation")[0], steps.get("observation")[0]):
-            raise ValueError(
-                f"rollouts: episode {which[1]} of {which[0]!r} does not begin as episode {which[1]} of "
-                f"seed={rerun.env_options['seed']} does; give the seed and the engine that it was run with, and the "
-                "episode from its first state on"
-            )
+            begins = f"does not begin as episode {which[1]} of seed={rerun.env_options['seed']} does"
+            remedy = "give the seed and the engine that it was run with, and the episode from its first state on"
+            raise ValueError(f"rollouts: episode {which[1]} of {which[0]!r} {begins}; {remedy}")
         if (first := difference(steps, again)) is not None:
             differs[which] = first
     numbers = {(task_id(task), k): (task, k) for task, k in failed}

@@ -31,9 +31,9 @@ class Scripts:
         skills: dict[Any, list[ScriptedSkill]] = {}
         for task, plan in plans.items():
             listed = [table.get(step.skill) for step in plan.steps]
-            suitable = [one if one is not None and one.suits(plan.definition) else None for one in listed]
+            suitable = [one.for_task(plan.definition) if one and one.suits(plan.definition) else None for one in listed]
             self.known[task] = [one is not None for one in suitable]
-            skills[plan.definition] = [_REST if one is None else one.for_task(plan.definition) for one in suitable]
+            skills[plan.definition] = [one or _REST for one in suitable]
         rulers: dict[Any, list[ScriptedSkill]] = {}
         for definition, own in skills.items():
             gains: list[Any] = [tuple(_RULER if gain else 0.0 for gain in one.gain) for one in own]
@@ -46,10 +46,9 @@ class Scripts:
 
 
 def attended(weights: Tensor, steps: Tensor) -> Tensor:
-    """Return the active step (...) int64: the first of those with most attention.
+    """Return the active step (...): the first with most attention, ``weights`` (..., S), of ``steps`` (..., S) bool.
 
-    ``weights`` (..., S) float32 is the attention over ``steps`` (..., S) bool. The result is -1 where all steps have
-    the same weight, since no condition holds or all do.
+    It is -1 where all steps have the same weight, since no condition holds or all do.
     """
     most = weights.masked_fill(~steps, -1.0).amax(-1, keepdim=True)
     least = weights.masked_fill(~steps, 2.0).amin(-1, keepdim=True)
@@ -61,14 +60,8 @@ def attended(weights: Tensor, steps: Tensor) -> Tensor:
 class ScriptedControl(nn.Module):
     """A policy under scripted control: its attention mixes the actions of scripted skills, wherever a step is active.
 
-    Where the active step has no scripted skill, the action is the expert's.
-
-    Args:
-        actor: the policy.
-        plans: its plans.
-        scripts: the scripted skills of the plans.
-        steps: (task, episode) to the step in which scripts take control; None for all steps.
-        part: the part of the action, "displacement" or "gripper"; None for all of it.
+    Where the active step has no scripted skill, the action is the expert's. ``steps`` maps (task, episode) to the step
+    in which scripts take control, None for all steps; ``part`` is "displacement" or "gripper", None for all.
     """
 
     def __init__(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from lw_torchrl.evaluation.diagnose.failure import (
     REPLACEMENTS,
     ActiveStep,
@@ -16,45 +14,33 @@ from lw_torchrl.evaluation.diagnose.failure import (
     WrongAnswers,
 )
 
-_SOUND = {
-    "perception": "the true observations",
-    "query": "the true answers",
-    "plan": "the reference plan",
-    "skill": "a scripted skill in one step",
-    "gripper": "the gripper under scripted control",
-    "actuation": "the hand's motion under scripted control",
-    "policy": "scripted skills in every step",
-    "out of time": "twice the time",
+_TEXTS = {
+    "perception": ("the true observations", "the observations"),
+    "query": ("the true answers", "the answers"),
+    "plan": ("the reference plan", "the plan"),
+    "skill": ("a scripted skill in one step", "the skill of one step"),
+    "gripper": ("the gripper under scripted control", "the gripper's commands"),
+    "actuation": ("the hand's motion under scripted control", "the hand's motion"),
+    "policy": ("scripted skills in every step", "all actions"),
+    "out of time": ("twice the time", "the time limit"),
 }
-_REPLACED = {
-    "perception": "the observations",
-    "query": "the answers",
-    "plan": "the plan",
-    "skill": "the skill of one step",
-    "gripper": "the gripper's commands",
-    "actuation": "the hand's motion",
-    "policy": "all actions",
-    "out of time": "the time limit",
-}
+"""The sound part that a replacement for each cause puts in, and the part that it takes out."""
+_IN_PAIRS = _TEXTS | {"skill": ("scripted skills", "all actions")}
 
 
 def replacement_text(name: str) -> str:
-    """Return what a replacement puts in place: "the true answers and scripted skills"."""
-    return _joined(name, _SOUND | {"skill": "scripted skills"} if len(REPLACEMENTS[name]) > 1 else _SOUND)
+    """Return what a replacement puts in: "the true answers and scripted skills"."""
+    return " and ".join(put_in for put_in, _ in _texts(name))
 
 
 def replaced_text(name: str) -> str:
-    """Return what a replacement takes away: "the answers and all actions"."""
-    return _joined(name, _REPLACED | {"skill": "all actions"} if len(REPLACEMENTS[name]) > 1 else _REPLACED)
+    """Return what a replacement takes out: "the answers and all actions"."""
+    return " and ".join(taken_out for _, taken_out in _texts(name))
 
 
-def _joined(name: str, texts: dict[str, str]) -> str:
-    return " and ".join(texts[cause] for cause in REPLACEMENTS[name])
-
-
-def listed(texts: Sequence[str], joint: str) -> str:
-    """Return texts as a list in a sentence: "a, b or c"."""
-    return f" {joint} ".join(texts) if len(texts) < 3 else f"{', '.join(texts[:-1])} {joint} {texts[-1]}"
+def _texts(name: str) -> list[tuple[str, str]]:
+    causes = REPLACEMENTS[name]
+    return [(_IN_PAIRS if len(causes) > 1 else _TEXTS)[cause] for cause in causes]
 
 
 def explain_failure(failure: Failure) -> str:
@@ -74,9 +60,8 @@ def explain_failure(failure: Failure) -> str:
 def _counterfactual_texts(failure: Failure) -> list[str]:
     """Return what re-running the episode showed."""
     if failure.also is not None and failure.replaced is not None:
-        texts = _SOUND | {"skill": "scripted skills"}
-        alone = f"neither {texts[failure.cause]} nor {texts[failure.also]} is enough"
-        return [f"{alone}; with both, the episode succeeds"]
+        first, second = _IN_PAIRS[failure.cause][0], _IN_PAIRS[failure.also][0]
+        return [f"neither {first} nor {second} is enough; with both, the episode succeeds"]
     if failure.replaced is not None:
         parts = [_success_text(failure)]
         if failure.cause == "skill" and failure.replaced == "actuation" and failure.step is not None:
@@ -90,7 +75,8 @@ def _counterfactual_texts(failure: Failure) -> list[str]:
     elif failure.cause == "query":
         parts = ["these answers could not be replaced"]
     elif failure.counterfactuals:
-        parts = [f"it also fails with {listed([*map(replacement_text, failure.counterfactuals)], 'or with')}"]
+        *texts, last = map(replacement_text, failure.counterfactuals)
+        parts = [f"it also fails with {' or with '.join([*filter(None, [', '.join(texts)]), last])}"]
     else:
         parts = ["there is nothing to replace"]
     return parts if failure.suspect is None else [*parts, f"the states alone suggest the {failure.suspect}"]
@@ -116,33 +102,24 @@ def finding_text(finding: Finding) -> str:
             return f"'{condition}' (step {step + 1}) was answered wrongly in {often}"
         case NoCondition(states, of):
             return f"no condition of the plan held in {states} of the last {of} states"
-        case PlanDeparts():
-            often = f"{finding.states} of {'the last ' if finding.late else ''}{finding.of}"
-            departs = (
-                f"the plan requests something else than the reference, in step {finding.step + 1}, '{finding.skill}'"
-            )
-            departs = "no condition of the plan holds" if finding.uncovered else departs
-            return f"in {often} states {departs}, where the reference requests '{finding.reference}'"
+        case PlanDeparts(step, skill, reference, states, of, late, uncovered):
+            departs = f"the plan requests something else than the reference, in step {step + 1}, '{skill}'"
+            departs = "no condition of the plan holds" if uncovered else departs
+            often = f"in {states} of {'the last ' if late else ''}{of} states"
+            return f"{often} {departs}, where the reference requests '{reference}'"
         case ActiveStep(step, skill, states, of, distance):
             text = f"step {step + 1}, '{skill}', was active in {states} of the last {of} states"
             return text if distance is None else f"{text} and ended {100 * distance:.0f} cm from its target"
         case Misled(error, number):
             wrong = f"entry {number} was off by up to {error:.2g}"
             return f"the policy was shown another observation than the true one: {wrong}"
-        case Difference():
-            return f"the first difference is {_difference_text(finding)}"
-
-
-def _difference_text(difference: Difference) -> str:
-    at = difference.at
-    match difference.part:
-        case "length":
-            return f"the length: the rollout has {difference.given} steps, the re-run {difference.again}"
-        case "actions":
-            return f"the executed actions, from step {at} on, there by {difference.size:.2g}: noise or a random policy"
-        case "environment":
-            return f"the environment: the same action in state {at - 1} leads to another state"
-        case "states":
-            return f"the states, from {at} on; the rollout holds no actions, which would tell more"
-        case _:
-            return "in nothing that was recorded"
+        case Difference(part, at, given, again, size):
+            differ = f"from step {at} on, there by {size or 0:.2g}: noise or a random policy"
+            texts = {
+                "length": f"the length: the rollout has {given} steps, the re-run {again}",
+                "actions": f"the executed actions, {differ}",
+                "environment": f"the environment: the same action in state {at - 1} leads to another state",
+                "states": f"the states, from {at} on; the rollout holds no actions, which would tell more",
+                "nothing": "in nothing that was recorded",
+            }
+            return f"the first difference is {texts[part]}"

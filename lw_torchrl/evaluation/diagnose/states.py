@@ -82,10 +82,9 @@ def states_of(task: str, episode: int, steps: TensorDictBase, plans: Plans, give
 
 
 def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
-    """Return the steps that may be to blame for a failure, the likeliest first.
+    """Return the steps that may be to blame for a failure, the likeliest first, by the states ``among`` (T,) bool.
 
-    Among the steps that were active late in the episode these are the furthest and the most frequent one, then the
-    furthest of all, then the others. ``among`` (T,) bool restricts the states.
+    These are the furthest and the most frequent step late in the episode, then those of all states, then the others.
     """
     counted = seen.active >= 0 if among is None else (seen.active >= 0) & among
     if not counted.any():
@@ -185,10 +184,7 @@ def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) ->
 def _departs(
     seen: EpisodeStates, plan: ConditionalPlan, scripts: Scripts, other: ConditionalPlan, other_scripts: Scripts
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return (T,) bool, where the plan's true step requests another action than the reference's, and both steps.
-
-    Skills without a script differ if their texts do.
-    """
+    """Return (T,) bool, where the plan's true step requests another action than the reference's, and both steps."""
     observation, task_id = seen.steps.get("observation"), seen.steps.get("task_id")
     answers = plan_program(Plans([other]))(observation, task_id)
     ours, theirs = chosen(seen.truth, len(plan.steps)), chosen(answers, len(other.steps))
@@ -196,6 +192,7 @@ def _departs(
     done = scripts.program(observation, task_id)[rows, ours]
     wanted = other_scripts.program(observation, task_id)[rows, theirs]
     differ = (done - wanted).abs().amax(-1) > OTHER
+    # Skills without a script differ if their texts do.
     same_text = torch.tensor([[a.skill == b.skill for b in other.steps] for a in plan.steps])[ours, theirs]
     scripted = torch.tensor(scripts.known[plan.task])[ours] & torch.tensor(other_scripts.known[other.task])[theirs]
     return torch.where(scripted, differ, ~same_text), ours, theirs

@@ -5,7 +5,7 @@ import pytest
 import lw_torchrl as lw
 from benchmarks.paper.comparison import MethodComparison
 from benchmarks.paper.published import published, published_curves, published_plans
-from lw_torchrl.evaluation import mean_difference, probability_of_improvement, summarize_rates
+from benchmarks.statistics import mean_difference, probability_of_improvement, summarize_rates
 
 A = summarize_rates({"push": [0.9, 0.7], "assembly": [0.5, 0.3]})
 B = summarize_rates({"assembly": [0.4, 0.4], "push": [0.2, 0.2]})

@@ -1,20 +1,169 @@
-"""Summarize the evaluations of several training seeds as headline numbers and a row per task."""
+"""Statistics over training seeds × tasks: means with their intervals, comparisons, counts of tasks, and summaries.
+
+Every function takes success rates in [0, 1] as an array (seeds, tasks), and the confidence of its interval, in (0, 1).
+Two methods have the same tasks in the same order; their seeds are not paired, and may differ in number. Intervals are
+Student's t over the seeds; the tasks stay the same. The standard error is the jackknife's over seeds, for a mean the
+usual one. Two methods' errors add as in Welch's test. A few seeds give wide intervals: with three, t is 4.3 standard
+errors. In simulation (20 tasks, 20 episodes) the 95 % interval holds the true mean in 0.95 of the cases for 3, 5 and 20
+seeds.
+
+Source: Agarwal et al. 2021, 'Deep Reinforcement Learning at the Edge of the Statistical Precipice', for the statistics;
+Tukey 1958 for the jackknife with Student's t.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from lw_torchrl._checks import checked, counted, shown
-from lw_torchrl.evaluation import statistics
-from lw_torchrl.evaluation.result import EvaluationResult
-from lw_torchrl.evaluation.statistics import Array, Estimate
+from lw_torchrl.evaluation import EvaluationResult
 
+Array = NDArray[np.float64]
 _SETTINGS = ("episodes_per_task", "noise_scale", "max_steps")  # rates are averaged only if these are equal
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An estimate and its interval; the ends are None for a single seed, which gives no interval.
+
+    Example:
+        >>> print(Estimate(0.5, 0.41, 0.6))
+        0.500 [0.410, 0.600]
+    """
+
+    value: float
+    low: float | None = None
+    high: float | None = None
+
+    def __str__(self) -> str:
+        return f"{self.value:.3f}" + ("" if self.low is None else f" [{self.low:.3f}, {self.high:.3f}]")
+
+    def to_json(self) -> dict[str, float | None]:
+        """Return a mapping of plain numbers."""
+        return asdict(self)
+
+
+def check_rates(argument: str, given: Any) -> Array:
+    """Return ``given`` as a float64 array (seeds, tasks) of rates in [0, 1]; refuse NaN."""
+    try:
+        rates = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{argument} must be an array of numbers, (seeds, tasks), got {given!r}") from error
+    if rates.ndim != 2 or rates.size == 0:
+        raise ValueError(f"{argument} must have shape (seeds, tasks), both at least 1, got {rates.shape}")
+    if len(wrong := rates[~((rates >= 0) & (rates <= 1))]):
+        raise ValueError(f"{argument} must be rates in [0, 1], got {wrong[0]}")
+    return rates
+
+
+@checked
+def mean_rate(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
+    """Return the mean success rate over seeds and tasks of ``rates`` (seeds, tasks), in [0, 1], with its interval.
+
+    Example:
+        >>> print(mean_rate([[1.0, 0.2], [0.9, 0.3], [1.0, 0.1]]))
+        0.583 [0.512, 0.655]
+    """
+    return _seed_interval(np.mean, [check_rates("rates", rates)], confidence, least=0.0)
+
+
+@checked
+def interquartile_mean(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
+    """Return the mean of the middle half of all ``rates`` (seeds, tasks), in [0, 1]: a quarter is cut at each end.
+
+    Example:
+        >>> print(interquartile_mean([[1.0, 0.2, 0.6, 0.7], [0.9, 0.3, 0.5, 0.9], [1.0, 0.1, 0.4, 0.8]]))
+        0.650 [0.526, 0.774]
+
+    Source: Agarwal et al. 2021; the same as ``scipy.stats.trim_mean(rates, 0.25, axis=None)``.
+    """
+
+    def middle(rates: Array) -> float:
+        cut = rates.size // 4
+        return np.sort(rates, axis=None)[cut : rates.size - cut].mean()
+
+    return _seed_interval(middle, [check_rates("rates", rates)], confidence, least=0.0)
+
+
+@checked
+def mean_difference(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> Estimate:
+    """Return the mean over tasks of method X's rate minus Y's on the same task.
+
+    ``x`` and ``y`` are (seeds, tasks), in [0, 1].
+
+    Example:
+        >>> print(mean_difference([[1.0, 0.5], [0.9, 0.4]], [[0.6, 0.3], [0.7, 0.3]]))
+        0.225 [-0.121, 0.571]
+    """
+    return _seed_interval(lambda a, b: a.mean() - b.mean(), _pair(x, y), confidence, least=-1.0)
+
+
+@checked
+def probability_of_improvement(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> Estimate:
+    """Return the probability that a seed of method X beats one of Y on a random task; a tie counts half.
+
+    ``x`` and ``y`` are (seeds, tasks), in [0, 1].
+
+    Example:
+        >>> probability_of_improvement([[1.0, 0.5], [0.9, 0.3]], [[0.6, 0.3], [0.7, 0.3]]).value
+        0.875
+
+    Source: Agarwal et al. 2021; the Mann-Whitney statistic of each task, averaged.
+    """
+    beats = _pair(x, y)
+    return _seed_interval(lambda a, b: (0.5 + 0.5 * np.sign(a[:, None] - b)).mean(), beats, confidence, least=0.0)
+
+
+@checked
+def count_solved(rates: ArrayLike, threshold: float = 0.8) -> int:
+    """Return the number of tasks whose mean over seeds is at least ``threshold``, in (0, 1], up to rounding.
+
+    ``rates`` are (seeds, tasks), in [0, 1].
+
+    Example:
+        >>> count_solved([[0.8, 0.2, 1.0], [0.8, 0.9, 0.6]])
+        2
+    """
+    if not 0 < threshold <= 1:
+        raise ValueError(f"threshold must be in (0, 1], got {threshold!r}")
+    return int((check_rates("rates", rates).mean(0) >= threshold - 1e-9).sum())
+
+
+def _pair(x: ArrayLike, y: ArrayLike) -> list[Array]:
+    pair = [check_rates("x", x), check_rates("y", y)]
+    if pair[0].shape[1] != pair[1].shape[1]:
+        raise ValueError(f"y must have x's tasks, {pair[0].shape[1]} columns, got {pair[1].shape[1]}")
+    return pair
+
+
+def _seed_interval(
+    statistic: Callable[..., Any], methods: list[Array], confidence: float, *, least: float, most: float = 1.0
+) -> Estimate:
+    """Return the statistic of the methods' rates and its interval, within the range of the statistic."""
+    from scipy.special import stdtrit
+
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence must be in (0, 1), got {confidence!r}")
+    value = float(statistic(*methods))
+    if min(len(rates) for rates in methods) == 1:
+        return Estimate(value)  # one seed says nothing about others
+    variances = np.zeros(len(methods))  # over the seeds of each method: each is left out once
+    for k, rates in enumerate(methods):
+        without = [np.delete(rates, seed, axis=0) for seed in range(len(rates))]
+        left = [statistic(*methods[:k], others, *methods[k + 1 :]) for others in without]
+        variances[k] = np.var(left) * (len(rates) - 1)
+    if not variances.any():
+        return Estimate(value, value, value)
+    shares = variances / variances.max()  # their squares may be too small for a float
+    freedom = shares.sum() ** 2 / sum(v**2 / (len(x) - 1) for v, x in zip(shares, methods, strict=True))
+    half = float(stdtrit(freedom, (1 + confidence) / 2) * np.sqrt(variances.sum()))
+    return Estimate(value, max(value - half, least), min(value + half, most))
 
 
 @dataclass(frozen=True)
@@ -48,7 +197,7 @@ class Summary:
 
     @property
     def array(self) -> Array:
-        """The rates as a fresh float64 array (n, T), for the functions of :mod:`lw_torchrl.evaluation.statistics`."""
+        """The rates as a fresh float64 array (n, T), for the functions of this module."""
         return np.array(self.rates)
 
     @cached_property
@@ -118,7 +267,7 @@ def summarize_rates(
         raise ValueError(f"rates must hold at least one task, each with at least one rate, got {dict(rates)!r}")
     if len(set(counts.values())) > 1:
         raise ValueError(f"rates must hold a rate per seed for each task, got different numbers: {counts}")
-    array = statistics.check_rates("rates", list(rates.values())).T
+    array = check_rates("rates", list(rates.values())).T
     names = tuple(str(seed) for seed in (range(len(array)) if seeds is None else seeds))
     if len(names) != len(array) or len(set(names)) != len(names):
         raise ValueError(f"seeds must be {len(array)} different names, got {names}")
@@ -126,9 +275,9 @@ def summarize_rates(
         tasks=tuple(rates),
         seeds=names,
         rates=tuple(tuple(row) for row in array.tolist()),
-        mean=statistics.mean_rate(array, confidence=confidence),
-        iqm=statistics.interquartile_mean(array, confidence=confidence),
-        solved=statistics.count_solved(array, threshold),
+        mean=mean_rate(array, confidence=confidence),
+        iqm=interquartile_mean(array, confidence=confidence),
+        solved=count_solved(array, threshold),
         threshold=threshold,
     )
 
@@ -147,7 +296,7 @@ def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResul
         TypeError: a result is not an :class:`EvaluationResult`.
 
     Example:
-        >>> from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, summarize
+        >>> from lw_torchrl.evaluation import EpisodeResult
         >>> episodes = tuple(EpisodeResult("reach", k, k > 0, 9, None, None) for k in range(2))
         >>> result = EvaluationResult({"tasks": ["reach"], "episodes_per_task": 2}, episodes)
         >>> summarize({7: result}).by_seed
