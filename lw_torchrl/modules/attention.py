@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import checked
-from lw_torchrl._keys import as_keys, check_apart, dispatched, key_beside, read, write
+from lw_torchrl._keys import dispatched, key_beside, read, write
 from lw_torchrl.language.task_index import PlanTables, as_plans, pick
 from lw_torchrl.language.value_checks import check_values
+from lw_torchrl.modules.sequence import Part
 
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import AnyPlans
@@ -28,7 +28,7 @@ def attend(logits: Tensor, mask: Tensor) -> Tensor:
     return logits.masked_fill(~mask, -torch.inf).softmax(-1)
 
 
-class PlanAttention(TensorDictModuleBase):
+class PlanAttention(Part):
     """Attention over a plan's steps: the softmax of 10·truth - 5 over the steps that exist.
 
     If no condition is true, the attention is uniform over the plan's steps.
@@ -57,6 +57,7 @@ class PlanAttention(TensorDictModuleBase):
     Source: paper section 'Plan Conditioning'.
     """
 
+    _options = ("plans",)
     mask: Tensor
 
     @checked
@@ -67,21 +68,14 @@ class PlanAttention(TensorDictModuleBase):
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        super().__init__()
-        self.plans = as_plans(plans)
-        self.tasks, self.layout = tuple(self.plans), self.plans.layout
-        self.tables = PlanTables(self.plans)
+        plans = as_plans(plans)
+        tables = PlanTables(plans)
+        has_fallback = not torch.equal(tables.turns[:, 0], tables.turns[:, 1])
+        super().__init__(("qaf", "task_id", "turn")[: 2 + has_fallback], ("skill_weights",), in_keys, out_keys)
+        self.plans, self.tasks, self.layout = plans, tuple(plans), plans.layout
+        self.tables, self.has_fallback = tables, has_fallback
         # (T, 2, S) bool: the plan's own steps, and the fallback steps; both hold all steps of a plan without fallback.
-        self.register_buffer("mask", self.tables.turns, persistent=False)
-        self.has_fallback = not torch.equal(self.mask[:, 0], self.mask[:, 1])
-        self.in_keys = as_keys("in_keys", in_keys, ("qaf", "task_id", "turn")[: 2 + self.has_fallback])
-        self.out_keys = as_keys("out_keys", out_keys, ("skill_weights",))
-        check_apart(self.in_keys, self.out_keys)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
-        return {"plans": self.plans, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
+        self.register_buffer("mask", tables.turns, persistent=False)
 
     @property
     def truth_keys(self) -> tuple[NestedKey, NestedKey]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import add_random_module
@@ -218,6 +218,15 @@ class Concat(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         seen = [part(tensordict.copy()).get(part.out_keys[0]) for part in self.parts]
         return write(tensordict, self, [torch.cat(seen, -1)])
+
+
+def as_features(features: nn.Module | None, layout: Layout, noise: float = 0.0) -> TensorDictModuleBase:
+    """Return features as a TensorDict module: a plain one reads ``observation``, None stands for the differences."""
+    if features is None:
+        return ObservationFeatures(noise=noise, layout=layout)
+    if isinstance(features, TensorDictModuleBase):
+        return features
+    return TensorDictModule(features, in_keys=["observation"], out_keys=["features"])
 
 
 def check_observation(observation: Tensor, layout: Layout) -> None:

@@ -131,20 +131,6 @@ def test_a_state_saved_anywhere_in_an_epoch_gives_the_same_batches_again(base, t
     assert [(batch["row"].tolist(), other.sampler.ran_out) for batch in (other.sample() for _ in range(6))] == expected
 
 
-def test_the_state_goes_through_a_folder(tmp_path):
-    rows = with_episodes((1, 5), (task_id(TARGET), 4), (2, 6))
-    replay = make_replay(rows, 8, CoLearningSampler(TARGET))
-    drawn(replay, 2)
-    replay.sampler.dumps(tmp_path / "sampler")
-    assert not list(tmp_path.rglob("*.pickle"))
-    rng = replay._rng.get_state()
-    expected = drawn(replay, 5)
-    other = make_replay(rows, 8, CoLearningSampler(TARGET), seed=9)
-    other.sampler.loads(tmp_path / "sampler")
-    other._rng.set_state(rng)
-    assert drawn(other, 5) == expected
-
-
 @pytest.mark.parametrize(
     ("other", "name"),
     [
@@ -157,15 +143,6 @@ def test_the_state_of_another_target_or_ratio_is_refused(other, name):
     drawn(replay, 1)
     with pytest.raises(ValueError, match=f"state_dict must be of the same {name}"):
         other.load_state_dict(replay.sampler.state_dict())
-
-
-def test_the_buffers_generator_alone_fixes_the_batches():
-    rows = make_rows([40, 40], 40)
-    one, two = make_replay(rows, 20, seed=5), make_replay(rows, 20, seed=5)
-    first = drawn(one, 5)
-    torch.rand(3)
-    assert drawn(two, 5) == first
-    assert drawn(make_replay(rows, 20, seed=6), 5) != first
 
 
 @settings(max_examples=20, deadline=None)
@@ -203,14 +180,6 @@ def test_of_joined_datasets_a_named_target_is_the_last_ones():
     assert torch.cat([b["row"][~b["is_target"]] for b in batches]).unique().tolist() == [0, 1, 2, 3, 8, 9, 10, 11]
     only_base = joined(target, with_episodes((1, 4)))
     assert int(make_replay(only_base, 8).sample()["is_target"].sum()) == 4
-
-
-def test_a_buffer_that_grows_is_grouped_again():
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(50), sampler=CoLearningSampler(TARGET), batch_size=12)
-    replay.extend(make_rows([4, 4], 4))
-    assert replay.sample()["task_id"].unique(return_counts=True)[1].tolist() == [3, 3, 6]
-    replay.extend(make_rows([4, 4, 4], 4))
-    assert sorted(replay.sample()["task_id"].unique(return_counts=True)[1].tolist()) == [2, 2, 2, 6]
 
 
 @settings(max_examples=30, deadline=None)

@@ -103,14 +103,6 @@ def test_soft_answers_are_the_papers_ten_times_the_probability_less_five():
     assert torch.allclose(found["skill_weights"], logits.softmax(-1), atol=1e-6)
 
 
-def test_with_plans_shares_the_network_alone():
-    policy, other = make_policy(), lw.Plans([PLANS["push"]])
-    found = with_plans(policy, other)
-    assert {id(one) for one in policy[0].parameters()} == {id(one) for one in found[0].parameters()}
-    rows = states(4, other)
-    assert torch.allclose(found(rows.clone())["action"], policy(rows.clone())["action"], atol=1e-6)
-
-
 def test_saved_and_loaded_with_the_policy_to_the_bit(tmp_path):
     policy = make_policy(answers="hard")
     lw.save_actor(policy, tmp_path / "policy.safetensors")

@@ -313,20 +313,3 @@ def test_a_shared_trunk_is_trained_by_both():
     assert len(names) == 1
     found["loss_critic"].backward()
     assert dict(loss.named_parameters())[names[0]].grad.abs().sum() > 0
-
-
-@pytest.mark.parametrize("name", ["SAC", "TD3", "IQL"])
-def test_targets_follow(name):
-    loss, _, _ = make_loss(name, "plan")
-    update = SoftUpdate(loss, eps=0.5)
-    before = loss.target_qvalue_network_params["heads", "0", "0", "weight"].clone()
-    for p in trained(loss).values():
-        p.data.add_(0.1)
-    update.step()
-    assert not torch.equal(loss.target_qvalue_network_params["heads", "0", "0", "weight"], before)
-
-
-def test_a_loss_can_be_copied():
-    loss, _, _ = make_loss("IQL", "plan")
-    other = copy.deepcopy(loss)
-    assert torch.equal(total(other, make_batch()), total(loss, make_batch()))
