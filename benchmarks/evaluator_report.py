@@ -18,9 +18,10 @@ from lw_torchrl.evaluation.evaluator_score import PARTS, clause_logits, score_ev
 from lw_torchrl.evaluation.figures import new_figure, saved, trim
 from lw_torchrl.language.queries import Clause
 from lw_torchrl.language.tasks import task_id
-from lw_torchrl.modules import ImageQueryEvaluator, QueryEvaluator
+from lw_torchrl.modules import ImageQueryEvaluator
 from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
 from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.query_evaluator import evaluators_of
 from lw_torchrl.training import LabelledQueries
 from lw_torchrl.transforms.qaf import plan_program
 
@@ -154,14 +155,14 @@ def condition_drift(policy: Any, states: TensorDictBase) -> list[Drift]:
         policy: an evaluator, or a policy with one.
         states: (R,) rows with ``observation``, ``task_id`` and the evaluator's inputs.
     """
-    evaluator = policy if isinstance(policy, QueryEvaluator) else policy.evaluator
+    evaluator = evaluators_of(policy)[0]
     program, drifts = plan_program(evaluator.plans), []
     for task, plan in evaluator.plans.items():
         rows = states[states.get("task_id") == task_id(task)]
         if not len(rows):
             continue
         with torch.no_grad(), evaluating(evaluator):
-            believed = evaluator.answers(*(rows.get(key) for key in evaluator.in_keys)) > 0
+            believed = evaluator.logits_of(rows) > 0
         exact = program(rows.get("observation"), rows.get("task_id"))
         rates = [part.double().mean(0).tolist() for part in (exact, believed, exact == believed)]
         for number, (step, *numbers) in enumerate(zip(plan.steps, *rates, strict=False)):

@@ -92,16 +92,13 @@ def check_flag(argument: str, given: Any) -> bool:
     return bool(given)
 
 
-def check_text(argument: str, given: Any) -> None:
-    """Raise :class:`TypeError` unless ``given`` is a string."""
-    if not isinstance(given, str):
-        raise _wrong_type(argument, "a string", given)
+def _check_class(argument: str, given: Any, classes: tuple[type, ...], wanted: str) -> None:
+    if not isinstance(given, classes):
+        raise _wrong_type(argument, wanted, given)
 
 
-def check_path(argument: str, given: Any) -> None:
-    """Raise :class:`TypeError` unless ``given`` is a path."""
-    if not isinstance(given, (str, os.PathLike)):
-        raise _wrong_type(argument, "a path", given)
+check_text = functools.partial(_check_class, classes=(str,), wanted="a string")
+check_path = functools.partial(_check_class, classes=(str, os.PathLike), wanted="a path")
 
 
 def _check_real(argument: str, given: Any) -> float | None:
@@ -186,21 +183,17 @@ def _check_of_class(annotation: Any) -> Check | None:
     if getattr(origin, "_is_protocol", False):
         return _check_of_class(Callable) if "__call__" in vars(origin) else None
     names_are_checked_inside = any(get_origin(part) is Literal for part in inside)
-    if (
-        annotation in (Any, object, inspect.Parameter.empty)
-        or isinstance(annotation, TypeVar)
-        or names_are_checked_inside
-    ):
+    anything = annotation in (Any, object, inspect.Parameter.empty) or isinstance(annotation, TypeVar)
+    if anything or names_are_checked_inside:
         return None
     if any(not isinstance(part, type) or part.__name__ == "NestedKey" for part in inside):
         annotation = _without_contents(annotation)  # the function checks the elements itself
 
     def check(argument: str, given: Any) -> None:
         if not _matcher()(given, annotation):
-            kind = (
-                f"the class {given.__name__}" if isinstance(given, type) else f"{shown(given)} ({type(given).__name__})"
-            )
-            raise TypeError(f"{argument} must be {_words(annotation)}, got {kind}")
+            if isinstance(given, type):
+                raise TypeError(f"{argument} must be {_words(annotation)}, got the class {given.__name__}")
+            raise _wrong_type(argument, _words(annotation), given)
 
     return check
 
@@ -253,10 +246,8 @@ def checked(function: Function) -> Function:
         TypeError: filled must be True or False, got 'no' (str)
     """
     signature = inspect.signature(function)
-    single = (
-        name for name, one in signature.parameters.items() if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)
-    )
-    annotations = {name: signature.parameters[name].annotation for name in single}
+    single = [one for one in signature.parameters.values() if one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)]
+    annotations = {one.name: one.annotation for one in single}
 
     @functools.cache
     def checks() -> dict[str, Check]:  # at the first call: by then the module has all names of the annotations

@@ -123,6 +123,15 @@ def test_a_pages_links_lead_somewhere(page):
             assert not anchor or there.suffix != ".md" or anchor in anchors(there), f"{target}#{anchor}"
 
 
+def test_the_files_that_the_design_names_exist():
+    named = re.findall(r"`([a-z_/]+(?:\.py|\.toml|/))`", (ROOT / "docs" / "design.md").read_text("utf-8"))
+    tops = [ROOT / name for name in ("lw_torchrl", "benchmarks", "examples", "tests", "docs")]
+    paths = [path for top in tops for path in (top, *top.rglob("*"))]
+    there = [f"{path.as_posix()}/" if path.is_dir() else path.as_posix() for path in paths]
+    assert len(named) > 50
+    assert not [name for name in named if not any(path.endswith(f"/{name}") for path in there)]
+
+
 def test_every_page_has_a_place_in_the_site():
     told = (ROOT / "mkdocs.yml").read_text("utf-8")
     listed = re.findall(r"^ +- (?:.+: )?(\S+\.md)$", told[told.index("\nnav:") :], re.MULTILINE)

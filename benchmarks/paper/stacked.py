@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Unpack
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
@@ -16,12 +17,13 @@ from lw_torchrl._checks import checked, differences, passes_on
 from lw_torchrl._devices import place
 from lw_torchrl.data.replay_checks import check_replay
 from lw_torchrl.modules.describe import describe
-from lw_torchrl.modules.features import Features
 from lw_torchrl.training.checkpoint import check_can_be_saved, text_vectors
-from lw_torchrl.training.cloning import BehavioralCloningConfig, make_optimizer
+from lw_torchrl.training.cloning import BehavioralCloningConfig
 from lw_torchrl.training.descriptions import describe_data, describe_replay
-from lw_torchrl.training.loop import ReplayState, Training, TrainingOptions, make_schedule
-from lw_torchrl.training.normalization import check_contacts, fit_normalization
+from lw_torchrl.training.loop import Training, TrainingOptions
+from lw_torchrl.training.minibatches import Minibatches
+from lw_torchrl.training.normalization import check_contacts, fit_normalization, statistics_of
+from lw_torchrl.training.optimizer import make_optimizer
 
 
 def _check_actors(actors: Sequence[TensorDictModuleBase]) -> None:
@@ -47,8 +49,8 @@ class StackedBehavioralCloning(Training):
         actors: M policies with the same parts and plans and with their own weights, trained in place.
         replays: M buffers, each with its own sampler; the i-th actor's batches come from the i-th.
         config: how to train each; the i-th has the seed ``config.seed + i``.
-        checkpoint, logger, progress, title: as of :class:`~lw_torchrl.training.loop.Training`, with its errors.
         device: where to train, as for :class:`BehavioralCloningTrainer`; None for where the first actor is.
+        **options: of :class:`~lw_torchrl.training.loop.Training`, with its errors.
 
     Raises:
         ValueError: the numbers of buffers and actors differ, one of them stands twice, or the actors' parts differ.
@@ -71,7 +73,7 @@ class StackedBehavioralCloning(Training):
         if not actors or len(replays) != len(actors):
             raise ValueError(f"replays must be as many as actors, at least one, got {len(replays)} and {len(actors)}")
         options.setdefault("title", f"training {len(actors)} models")
-        super().__init__(config, replays, **options)
+        super().__init__(config, **options)
         self.actors = list(actors)
         self.networks = [*actors]
         _check_actors(actors)
@@ -82,7 +84,7 @@ class StackedBehavioralCloning(Training):
         self.device = place(actors[0], device)
         if self.checkpoint is not None:
             check_can_be_saved(actors[0])
-            self.described = {
+            self.description = {
                 "actor": describe(actors[0]) | {"number": len(actors)},
                 "training": config.describe(),
                 "data": {str(number): describe_data(replay) for number, replay in enumerate(replays)},
@@ -91,8 +93,8 @@ class StackedBehavioralCloning(Training):
         for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
             actor.to(self.device)
             check_replay(actor, replay, config.batch_size)
-            self.states.append(ReplayState(replay, config.seed + number))
-            if config.normalize and any(isinstance(part, Features) for part in actor.modules()):
+            self.minibatches.append(Minibatches(replay, config.batch_size, config.seed + number))
+            if config.normalize and statistics_of(actor):
                 fit_normalization(actor, replay)
             else:
                 check_contacts(actor)
@@ -104,8 +106,7 @@ class StackedBehavioralCloning(Training):
         self._act = vmap(
             lambda p, b, batch: functional_call(actors[0], (p, b), (batch,)).get("action"), randomness="different"
         )
-        self.optimizer = make_optimizer(self._parameters.values(), config)
-        self.schedule = make_schedule(config.schedule, self.optimizer, config.steps)
+        self.optimizer = make_optimizer([(self._parameters.values(), config.learning_rate)], config, self.device)
         self.resume()
 
     def parameters(self) -> dict[str, Tensor]:
@@ -117,15 +118,16 @@ class StackedBehavioralCloning(Training):
     def step(self) -> Tensor:
         """Train every actor on one minibatch and return their losses, (M,) float32, on the device."""
         batches = []
-        for state in self.states:
-            with state.drawing(self.device):
-                batches.append(state.minibatch(self.config.batch_size, self.device).exclude("next"))
-        stacked = torch.stack(batches)
-        targets = stacked.pop("action")
-        with self.states[0].drawing(self.device):  # the features' noise
-            actions = self._act(self._parameters, self._buffers, stacked)
-        losses = distance_loss(actions, targets, self.config.loss_function).flatten(1).mean(1)
-        return self.descend(losses)
+        for minibatches in self.minibatches:
+            with minibatches.drawing(self.device):
+                batches.append(minibatches.draw(self.device).exclude("next"))
+        with self.minibatches[0].drawing(self.device):  # the features' noise
+            return self.train_on(torch.stack(batches))
+
+    def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:
+        actions = self._act(self._parameters, self._buffers, batch.exclude("action"))
+        distances = distance_loss(actions, batch.get("action"), self.config.loss_function)
+        return {"loss": distances.flatten(1).mean(1)}
 
     def clip_gradients(self) -> None:
         gradients = [p.grad for p in self._parameters.values() if p.grad is not None]
@@ -134,15 +136,15 @@ class StackedBehavioralCloning(Training):
         for gradient in gradients:
             gradient.mul_(factor.reshape(-1, *[1] * (gradient.ndim - 1)))
 
-    def train(self, until: int | None = None) -> Tensor:
+    def train(self, until: int | None = None) -> Tensor:  # type: ignore[override]
         """Train to the last step and give the actors their weights; Ctrl-C as in :class:`BehavioralCloningTrainer`.
 
         Returns:
-            (M,) float32, each actor's mean loss over the last 100 steps made; NaN if there were none left to make.
+            (M,) float32, each actor's mean loss over the latest 100 steps; NaN if there were none left.
         """
-        found = self.run(until)
+        losses = self.run(until)
         self.write_back()
-        return found.mean(0) if len(found) else torch.full((len(self.actors),), torch.nan)
+        return losses.mean(0) if len(losses) else torch.full((len(self.actors),), torch.nan)
 
     @torch.no_grad()
     def write_back(self) -> None:

@@ -34,26 +34,18 @@ class LanguageWorldEnv(EnvBase):
     state and goal at every reset, the goal observed, 500 steps, ended only by truncation.
 
     Row i has the task ``tasks[i % n]``. The m-th reset of the r-th of a task's R rows is that task's episode m·R + r;
-    in the w-th of W workers it is (m·W + w)·R + r, so that these run the episodes of one environment with W·R rows. An
-    episode starts as Meta-World's own environment does after ``env.seed(episode_seed(task, seed, episode));
-    env.reset()``, whatever ran before or beside it.
+    in the w-th of W workers it is (m·W + w)·R + r. An episode starts as Meta-World's own environment does after
+    ``env.seed(episode_seed(task, seed, episode)); env.reset()``, whatever ran before. ``env.reset(episode=7)``, or
+    int64 (N,), starts these episodes and counts as a reset; a SerialEnv or ParallelEnv takes
+    ``reset(list_of_kwargs=[{"episode": ...}, ...])``. A reset ignores the ``episode`` in a tensordict.
 
-    ``env.reset(episode=7)`` or ``env.reset(episode=tensor)``, int64 (N,), starts these episodes and counts as a reset.
-    A SerialEnv or ParallelEnv takes ``reset(list_of_kwargs=[{"episode": ...}, ...])``. A reset ignores the ``episode``
-    in a tensordict.
+    Give each worker of a SerialEnv, ParallelEnv, AsyncEnvPool or multi-process collector its own ``worker=(w, W)``, as
+    in ``ParallelEnv(2, [partial(make_env, worker=(w, 2)) for w in range(2)])``; otherwise all run the same episodes.
 
-    TorchRL does not tell the function that makes an environment which worker calls it. So give each worker of a
-    SerialEnv, ParallelEnv, AsyncEnvPool or multi-process collector its own ``worker=(w, W)``, as in
-    ``ParallelEnv(2, [partial(make_env, worker=(w, 2)) for w in range(2)])``; otherwise all run the same episodes.
-
-    ``close()`` frees the simulators, and ends all episodes; the next ``reset()`` makes new ones and continues with the
-    next episodes.
-
-    ``state_dict`` holds the seed and the counters; an environment that loads it must be reset, and continues with the
-    next episodes. A TransformedEnv, and a Collector with it, saves it by its
-    :class:`~lw_torchrl.transforms.QAFTransform` or :class:`~lw_torchrl.transforms.EnvState`.
-
-    The simulation runs on the CPU; with ``device="cuda"``, or after ``env.to("cuda")``, tensors are copied there.
+    ``close()`` frees the simulators; the next ``reset()`` makes new ones and continues with the next episodes.
+    ``state_dict`` holds the seed and the counters; an environment that loads it must be reset, and continues likewise.
+    A TransformedEnv, and a Collector with it, saves it by its :class:`~lw_torchrl.transforms.QAFTransform` or
+    :class:`~lw_torchrl.transforms.EnvState`.
 
     Keys (B = (N,)); a ``_step`` mask leaves rows where they are, a ``_reset`` mask resets only its rows:
         observation: (N, 39) float32, Meta-World's vector: metres, gripper opening in [0, 1], quaternions.
@@ -77,7 +69,7 @@ class LanguageWorldEnv(EnvBase):
         engine: None for the suite's. Of Meta-World that is "vectorized", the fast one; "metaworld" for its own
             environments in a loop, which gives the same numbers; or a callable ``(row_tasks, *, reward, num_threads) ->
             Engine``.
-        num_threads: of the simulation, by default the cores this process may use; never changes a result.
+        num_threads: of the simulation, by default the cores this process may use. It never changes a result.
         reward: "sparse", the success as 0 and 1, or "dense", Meta-World's own.
         max_steps: steps of the simulation until truncation; None for the suite's, Meta-World's 500.
         frame_skip: steps of the simulation for each action; their rewards are added, and any may succeed.
@@ -85,7 +77,7 @@ class LanguageWorldEnv(EnvBase):
         strict: raise on a NaN action, instead of truncating the row with a warning as for an unstable simulation.
         worker: (w, W), the index of this one of W environments; None for the only one.
         batch_size: () for a single environment without the dimension of rows, for AsyncEnvPool.
-        device: where the tensors of resets and steps are; "auto" for this machine's accelerator.
+        device: where the tensors of resets and steps are copied to; "auto" for this machine's accelerator.
 
     Raises:
         RuntimeError: a step of a row that has ended; a reset or step in a forked process that did not make it.
@@ -156,7 +148,7 @@ class LanguageWorldEnv(EnvBase):
         self.is_closed = False  # EnvBase starts with True
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        """Begin at episode 0, with another seed if one is given; returns the seed for the next environment."""
+        """Begin at episode 0, with another seed if one is given; return the seed for the next environment."""
         self._set_seed(seed)
         return seed if seed is None or static_seed else seed_generator(abs(seed))
 
@@ -275,10 +267,10 @@ class LanguageWorldEnv(EnvBase):
     def render(
         self, *, camera: str = "corner2", height: int = 240, width: int = 320, rows: Sequence[int] | None = None
     ) -> Tensor:
-        """Pictures of rows as they are now, for TorchRL's PixelRenderTransform and VideoRecorder, and
-        :class:`CameraTransform`: (len(rows), height, width, 3) uint8, (height, width, 3) with ``batch_size=()``.
+        """Return pictures of rows as they are now, (len(rows), height, width, 3) uint8; without the dimension of rows
+        with ``batch_size=()``. OpenGL draws them; on Linux without a display and MUJOCO_GL it is EGL.
 
-        OpenGL draws them, without shadows; on Linux without a display and MUJOCO_GL it is EGL. With a
+        TorchRL's PixelRenderTransform and VideoRecorder, and our :class:`CameraTransform`, call it. With a
         PixelRenderTransform, read the environment's ``observation_spec`` before the first reset.
 
         Args:
@@ -287,17 +279,9 @@ class LanguageWorldEnv(EnvBase):
             rows: which to draw, by their numbers; None for all.
 
         Raises:
-            RuntimeError: a row that was never reset, or not since ``close()``; or the process was forked from one that
-                took pictures.
+            RuntimeError: a row was not reset, or the process was forked from one that took pictures.
             ImportError: there is no OpenGL; it names what to install.
             NotImplementedError: your own engine has no ``render``.
-
-        Example:
-            >>> env = LanguageWorldEnv("reach")
-            >>> _ = env.reset()
-            >>> env.render(camera="topview", height=48, width=64).shape
-            torch.Size([1, 48, 64, 3])
-            >>> env.close()
         """
         self._check_process()
         check_picture(camera, height, width)

@@ -82,7 +82,7 @@ def _flag(n: int) -> Categorical:
 
 
 def clipped_action(tensordict: TensorDictBase, shape: tuple[int, ...]) -> Tensor:
-    """The action as it is executed, float32 of this shape in [-1, 1]."""
+    """Return the action as it is executed, float32 of this shape in [-1, 1]."""
     action = tensordict.get("action", None)
     if action is None or action.shape != shape or action.dtype != torch.float32:
         given = "none" if action is None else f"{action.dtype} of shape {tuple(action.shape)}"

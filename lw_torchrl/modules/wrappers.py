@@ -112,8 +112,8 @@ class DecidedGripper(_Wrapper):
     Example:
         >>> import lw_torchrl as lw
         >>> actor = lw.modules.DecidedGripper(lw.DescriptorConditionedActor("MT10")).eval()
-        >>> actor(lw.LanguageWorldEnv("reach").reset())["action"][0, 3].abs()
-        tensor(1.)
+        >>> actor(lw.LanguageWorldEnv("reach").reset())["action"][0, 3].abs().item()
+        1.0
     """
 
     @checked

@@ -24,10 +24,7 @@ _LOOKS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  #
 
 
 def _open_gl() -> Any:
-    """A context of OpenGL without a window: MUJOCO_GL's, or EGL's where there is no display either.
-
-    MuJoCo reads MUJOCO_GL when it is imported; robosuite sets it later.
-    """
+    """Open OpenGL without a window: MUJOCO_GL's, which robosuite sets after MuJoCo's import, or EGL without a display."""
     headless = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     backend = os.environ.get("MUJOCO_GL", "").lower().strip() or ("egl" if headless else "")
     if backend == "egl":

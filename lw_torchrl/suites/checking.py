@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import pairwise
@@ -29,15 +29,7 @@ _TABLE, _FLOATING = 0.02, 0.03  # metres: what "touching the table" allows; wher
 
 @dataclass(frozen=True)
 class Finding:
-    """What was measured of one task.
-
-    Attributes:
-        task: its name.
-        what: what was looked at.
-        measured: what was found, in words.
-        wanted: what the layout says.
-        right: whether they agree.
-    """
+    """A measurement: what was looked at in a task, what was measured, what the layout wants, and whether they agree."""
 
     task: str
     what: str
@@ -50,17 +42,13 @@ class Finding:
 def check_suite(suite: Suite, *, seed: int = 0) -> list[Finding]:
     """Run a few steps of each task and compare what happens with the suite's layout; success is never looked at.
 
-    Checked are the engine's answers, that a seed fixes an episode, that a row that is not active rests, the numbers of
-    the step before, each axis of the displacement, how far the hand moves in a step (``reach``) and how long it goes on
-    afterwards, that things stay where they are while it moves, the gripper's opening and closing, whether these take no
-    longer than Meta-World's (``binary_gripper``), and how high things rest above the table.
-
-    Args:
-        suite: its ``make_engine`` is asked for two rows of each task.
-        seed: of the episodes.
+    It checks the engine's answers, that a seed fixes an episode, that inactive rows rest, the numbers of the step
+    before, each axis of the displacement, how far the hand moves in a step (``reach``) and how long it goes on
+    afterwards, that objects stay while it moves, the gripper's opening and closing, whether these take no longer than
+    Meta-World's (``binary_gripper``), and how high objects rest above the table. It needs two rows of each task.
 
     Returns:
-        A :class:`Finding` for each thing that was looked at, in the order of the tasks.
+        A :class:`Finding` for each measurement, in the order of the tasks.
 
     Example:
         >>> from lw_torchrl.suites import check_suite, load_suite
@@ -105,24 +93,17 @@ class _Bench:
         return [self.step(**effort).observation[0].copy() for _ in range(steps)]
 
     def rows(self) -> Iterator[_Row]:
-        shape = _answer(self.engine.reset([0, 1], [self.seed, self.seed]))
-        wanted = f"(2, {self.layout.size}) float64"
-        yield "observations of a reset", shape, wanted, shape == wanted
-        if shape != wanted:
-            return
-        alone, one = _answer(self.engine.reset([0], [self.seed])), f"(1, {self.layout.size}) float64"
-        yield "a reset of one row of two", alone, one, alone == one
-        if alone != one:
-            return
-        step = self.step()
-        if not isinstance(step, EngineStep):
-            yield "a step", type(step).__name__, "EngineStep", False
-            return
-        told = [_answer(step.observation), *(_answer(part) for part in (step.reward, step.success, step.fault))]
-        meant = [wanted, "(2,) float64", "(2,) bool", "(2,) bool"]
-        yield "a step", ", ".join(told), ", ".join(meant), told == meant
-        if told != meant:
-            return
+        one, two = (f"({rows}, {self.layout.size}) float64" for rows in (1, 2))
+        answers: dict[str, tuple[str, Callable[[], Any]]] = {
+            "observations of a reset": (two, lambda: self.engine.reset([0, 1], [self.seed, self.seed])),
+            "a reset of one row of two": (one, lambda: self.engine.reset([0], [self.seed])),
+            "a step": (f"EngineStep of {two}, (2,) float64, (2,) bool, (2,) bool", self.step),
+        }
+        for what, (wanted, ask) in answers.items():
+            measured = _answer(ask())
+            yield what, measured, wanted, measured == wanted
+            if measured != wanted:
+                return
         yield from self._episodes()
         yield from self._axes() if self.layout.displacement is not None else ()
         yield from self._gripper() if self.layout.gripper is not None else ()
@@ -207,7 +188,9 @@ class _Bench:
 
 
 def _answer(found: Any) -> str:
-    """The shape and precision of what an engine returned."""
+    """Describe what an engine returned by its shape and precision."""
+    if isinstance(found, EngineStep):
+        return f"EngineStep of {', '.join(map(_answer, found))}"
     return f"{found.shape} {found.dtype}" if isinstance(found, np.ndarray) else type(found).__name__
 
 

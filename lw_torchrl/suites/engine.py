@@ -15,26 +15,17 @@ from numpy.typing import NDArray
 
 class EngineStep(NamedTuple):
     """The result of one step of all rows, in fresh arrays; rows that were not active repeat their last observation,
-    with reward 0, success False and fault False.
+    with reward 0, success False and fault False."""
 
-    Attributes:
-        observation: (N, D) float64, as the layout says; of Meta-World its 39 numbers (metres; gripper opening in
-            [0, 1]; quaternions).
-        reward, success: (N,) float64, Meta-World's dense reward, or the success as 0 and 1; (N,) bool, Meta-World's
-            success.
-        fault: (N,) bool, true where the simulation became unstable; such a row repeats its last stable observation
-            until it is reset.
-    """
-
-    observation: NDArray[np.float64]
-    reward: NDArray[np.float64]
-    success: NDArray[np.bool_]
-    fault: NDArray[np.bool_]
+    observation: NDArray[np.float64]  # (N, D), as the layout says
+    reward: NDArray[np.float64]  # (N,)
+    success: NDArray[np.bool_]  # (N,)
+    fault: NDArray[np.bool_]  # (N,) unstable: such a row repeats its last stable observation until it is reset
 
 
 class Engine(Protocol):
-    """Simulates N rows of Meta-World tasks. With the ``render`` of :class:`~lw_torchrl.suites.cameras.SeenRows` it also
-    gives pictures, with its ``model`` and ``poses`` recordings of the scene."""
+    """Simulates N rows of tasks. With the ``render`` of :class:`~lw_torchrl.suites.cameras.SeenRows` it also gives
+    pictures, with its ``model`` and ``poses`` recordings of the scene."""
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> NDArray[np.float64]:
         """Start an episode in each of ``rows``, as Meta-World's own ``env.seed(seed); env.reset()`` does, whatever the

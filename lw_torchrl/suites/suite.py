@@ -22,24 +22,17 @@ class Suite:
 
     Attributes:
         name: "fetch"; its tasks are called "fetch/push".
-        layout: what the numbers of observations and actions are.
+        layout: the layout of observations and actions.
         tasks: full name to :class:`Task`, each of this layout.
-        make_engine: ``(row_tasks, *, reward, num_threads) -> Engine``, a row for each of ``row_tasks``, full names;
+        make_engine: ``(row_tasks, *, reward, num_threads) -> Engine``, with a row for each full name in ``row_tasks``;
             ``reward`` is "sparse" or "dense".
-        skills: the scripted skills by their text; None for none.
-        plans: a plan for each task that has one; None for none.
+        skills, plans: scripted skills by their text, and a plan for each task that has one; None for none.
         make_expert: ``(tasks) -> actor``, a demonstrator that writes ``action`` (N, A) float32 in [-1, 1] and
-            ``unclipped_action``, the same before it is cut off; None for the plans with their scripted skills.
-        max_steps: how many steps an episode has, unless the user says another number.
-        step_time: seconds between two actions; recordings show it. The default is Meta-World's, 80 Hz.
+            ``unclipped_action``; None for the plans with their scripted skills.
+        max_steps, step_time: the default length of episodes, and seconds between two actions.
 
     Raises:
         ValueError: a task of another layout, or whose name does not begin with the suite's.
-
-    Example:
-        >>> from lw_torchrl.suites import load_suite
-        >>> load_suite("metaworld").tasks["reach"].name
-        'reach'
 
     Source: ours; as gymnasium's ``EnvSpec``, with words.
     """
@@ -99,11 +92,16 @@ SUITES = Registry("suite", "lw_torchrl.suites", _SHIPPED, _check_suite)
 
 
 def load_suite(suite: str | Suite) -> Suite:
-    """The suite of a name, "fetch"; a :class:`Suite` is returned as it is.
+    """Return the suite of a name, "fetch"; a :class:`Suite` is returned as it is.
 
     Raises:
-        ValueError: there is none of that name; it gives the nearest.
-        ImportError: the simulator is not installed; it says what to install.
+        ValueError: the name is unknown; the message lists the nearest names.
+        ImportError: the simulator is not installed; the message names the extra.
+
+    Example:
+        >>> from lw_torchrl.suites import load_suite
+        >>> load_suite("metaworld").tasks["reach"].name
+        'reach'
     """
     if isinstance(suite, Suite):
         return suite

@@ -69,10 +69,6 @@ class PlanAugmentation(Augmentation):
         self.register_buffer("steps", self._tables.turns, persistent=False)  # (T, 2, S) bool
         return plans
 
-    def step_table(self, name: str, values: Tensor) -> None:
-        """Register a table (T, S, ...) of values of the plans' steps."""
-        self.register_buffer(name, values, persistent=False)
-
     def answers(self, tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> tuple[Tensor, Tensor, Tensor]:
         """Return qaf (B, S), the rows' place in the tables (B,) int64, and the steps of the row's turn (B, S) bool."""
         qaf, task_id = read(tensordict, keys)
@@ -130,7 +126,7 @@ class SwapUnmentioned(PlanAugmentation):
         self.probability = probability
         plans = self._read_plans(plans)
         self._parts = plans.layout.parts
-        self.step_table("mentioned", mentioned(plans, self._tables))
+        self.register_buffer("mentioned", mentioned(plans, self._tables), persistent=False)  # (T, S, P) bool
 
     def _kept(self, tensordict: TensorDictBase) -> Tensor:
         """Return which objects, and the goal, stay where they are, (B, P) bool."""
@@ -248,10 +244,10 @@ class JitterTarget(PlanAugmentation):
         )
         check_apart(self.in_keys, self.out_keys)
         self.std = std
-        self.step_table(
-            "pushes", role_table(self._read_plans(plans), self._tables, lambda role: role.verb in ("push", "pull"))
-        )
-        self.step_table("scale", std * torch.tensor([0.5, 0.5, 1.0]))
+        plans = self._read_plans(plans)
+        pushes = role_table(plans, self._tables, lambda role: role.verb in ("push", "pull"))
+        self.register_buffer("pushes", pushes, persistent=False)  # (T, S) bool
+        self.register_buffer("scale", std * torch.tensor([0.5, 0.5, 1.0]), persistent=False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         active, rows = self.active(tensordict, self.in_keys[::-1])

@@ -63,10 +63,10 @@ def _flat(transform: Transform) -> list[Transform]:
 
 
 class EpisodeTransform(Transform):
-    """A transform that keeps something of each row's episode; a clone, or a loaded one, wants a reset first."""
+    """A transform that keeps a state of each row's episode; a clone, or a loaded one, requires a reset first."""
 
     def _forget_episodes(self) -> None:
-        """No episode has begun."""
+        """Delete the states: no episode has begun."""
 
     def clone(self) -> Self:
         other: Self = super().clone()
@@ -79,16 +79,15 @@ class EpisodeTransform(Transform):
 
 
 class KeepsEnvState(EpisodeTransform):
-    """A transform whose ``state_dict`` holds that of the environment under it, for TorchRL asks no one else."""
+    """A transform whose ``state_dict`` holds that of the environment under it, which TorchRL does not ask for it."""
 
     def get_extra_state(self) -> Tensor:
-        """The environment's ``state_dict``, as bytes (n,) uint8; empty on a replay buffer."""
+        """Return the environment's ``state_dict``, as bytes (n,) uint8; empty on a replay buffer."""
         env = base_env(self)
-        closed = isinstance(env, BatchedEnvBase) and env.is_closed
-        if closed:
-            told = f"this {type(env).__name__} is not running, so the state_dict says nothing of its episodes"
-            warnings.warn(told, stacklevel=2)
-        if env is None or closed:
+        if isinstance(env, BatchedEnvBase) and env.is_closed:
+            name, env = type(env).__name__, None
+            warnings.warn(f"this {name} is not running, so the state_dict lacks its episodes", stacklevel=2)
+        if env is None:
             return torch.zeros(0, dtype=torch.uint8)
         buffer = io.BytesIO()
         torch.save(env.state_dict(), buffer)
@@ -100,7 +99,7 @@ class KeepsEnvState(EpisodeTransform):
         if env is None:
             return
         if not state.numel():
-            raise ValueError("state_dict says nothing of an environment's episodes: none was running when it was taken")
+            raise ValueError("state_dict lacks an environment's episodes: none was running when it was taken")
         env.load_state_dict(torch.load(io.BytesIO(state.cpu().numpy().tobytes()), weights_only=True))
         if (flags := env.__dict__.get("_shm_done_flags")) is not None:
             # TorchRL 0.14.1 leaves them up after loading: a ParallelEnv would answer the next reset too early.
@@ -108,12 +107,11 @@ class KeepsEnvState(EpisodeTransform):
 
 
 class EnvState(KeepsEnvState):
-    """Keeps the environment's seed and episode counters in a TransformedEnv's ``state_dict``, and so in a Collector's.
+    """Keep the environment's seed and episode counters in a TransformedEnv's ``state_dict``, and so in a Collector's.
 
-    Without this one, or a :class:`QAFTransform`, which does the same, a collector that is resumed would run the same
-    episodes again. It changes no entry. After ``load_state_dict`` the environment must be reset
-    (``collector.reset()``). Put it around a ParallelEnv too, whose own ``load_state_dict`` leaves TorchRL 0.14.1 one
-    answer behind, unless it has ``use_buffers=False``.
+    Without it, or a :class:`QAFTransform`, which does the same, a resumed collector would run the same episodes again.
+    After ``load_state_dict`` the environment must be reset (``collector.reset()``). Put it around a ParallelEnv too,
+    whose own ``load_state_dict`` leaves TorchRL 0.14.1 one answer behind, unless it has ``use_buffers=False``.
 
     Raises:
         ValueError: at loading, a state of other tasks or rows, or of no environment.
@@ -125,13 +123,9 @@ class EnvState(KeepsEnvState):
         >>> from torchrl.envs import TransformedEnv
         >>> import lw_torchrl as lw
         >>> env, other = (TransformedEnv(lw.LanguageWorldEnv("reach"), lw.transforms.EnvState()) for _ in range(2))
-        >>> env.reset()["episode"], env.reset()["episode"]
-        (tensor([0]), tensor([1]))
-        >>> other.load_state_dict(env.state_dict())
+        >>> _ = env.reset(), env.reset(), other.load_state_dict(env.state_dict())
         >>> other.reset()["episode"]
         tensor([2])
-        >>> env.close(), other.close()
-        (None, None)
     """
 
     def __init__(self) -> None:

@@ -29,27 +29,24 @@ def _turned(values: Tensor, starts: tuple[int, ...], cos: Tensor, sin: Tensor) -
     return turned
 
 
-def _starts(layout: Layout) -> tuple[int, ...]:
-    return tuple(part.start for part in layout.all_positions)
-
-
 def turn_observation(observation: Tensor, angle: Tensor, layout: Layout = METAWORLD) -> Tensor:
-    """The positions of observations (..., D), turned about the vertical through the origin by (...) radians."""
-    return _turned(observation, _starts(layout), angle.cos(), angle.sin())
+    """Turn the positions in observations (..., D) about the vertical through the origin by (...) radians."""
+    starts = tuple(part.start for part in layout.all_positions)
+    return _turned(observation, starts, angle.cos(), angle.sin())
 
 
 def turn_vectors(vectors: Tensor, angle: Tensor) -> Tensor:
-    """Vectors (..., 3), turned about the vertical by (...) radians."""
+    """Turn vectors (..., 3) about the vertical by (...) radians."""
     return _turned(vectors, (0,), angle.cos(), angle.sin())
 
 
 def yaw_key(observation: NestedKey) -> NestedKey:
-    """Where :class:`RandomYaw` writes the angle: beside ``observation``, ``observation_yaw``."""
+    """Return the key of the angle that :class:`RandomYaw` writes next to ``observation``, ``observation_yaw``."""
     return key_beside(observation, "_yaw")
 
 
 def tilt_key(observation: NestedKey) -> NestedKey:
-    """Where :class:`RandomYaw` writes how a row was tilted: beside ``observation``, ``observation_tilt``."""
+    """Return the key of the rotation that :class:`RandomYaw` writes, ``observation_tilt``."""
     return key_beside(observation, "_tilt")
 
 
@@ -132,13 +129,13 @@ class RandomYaw(PlanAugmentation):
                 raise ValueError(f"layout must be that of the plans, {plans.layout.name!r}, got {layout.name!r}")
             layout = plans.layout
             free = torch.tensor([not has_direction(skill) for skill in plans.skills])
-            self.step_table("free", free[self._tables.skill_index])
+            self.register_buffer("free", free[self._tables.skill_index], persistent=False)  # (T, S) bool
             if tilt:
-                self.step_table("to_places", role_table(plans, self._tables, _moves_to_a_place))
+                self.register_buffer("to_places", role_table(plans, self._tables, _moves_to_a_place), persistent=False)
         elif tilt:
             raise ValueError(f"tilt needs plans, which say what moves freely, and plans is None; got tilt={tilt}")
         self.layout = METAWORLD if layout is None else layout
-        self._begin, self._starts = self.layout.displaced("RandomYaw").start, _starts(self.layout)
+        self._begin = self.layout.displaced("RandomYaw").start
 
     def _angle(self, tensordict: TensorDictBase, observation: Tensor) -> Tensor:
         angle = self.scale * torch.randn(observation.shape[:-1], device=observation.device)
@@ -170,12 +167,11 @@ class RandomYaw(PlanAugmentation):
         tilt = self._tilt(tensordict) if self.tilt else None
         if tilt is not None:
             tensordict.set(tilt_key(seen[1]), tilt)
-        cos, sin = angle.cos(), angle.sin()
-        starts, begin = self._starts, self._begin
-        tensordict.set(seen[1], _turned(observation, starts, cos, sin)).set(yaw_key(seen[1]), angle)
+        cos, sin, begin = angle.cos(), angle.sin(), self._begin
+        tensordict.set(seen[1], turn_observation(observation, angle, self.layout)).set(yaw_key(seen[1]), angle)
         if (following := tensordict.get(unravel_key(("next", seen[0])), None)) is not None:
             after = unravel_key(("next", seen[1]))
-            tensordict.set(after, _turned(following, starts, cos, sin)).set(yaw_key(after), angle)
+            tensordict.set(after, turn_observation(following, angle, self.layout)).set(yaw_key(after), angle)
         for key, turned_key in actions:
             if (action := tensordict.get(key, None)) is None:
                 continue

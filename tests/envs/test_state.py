@@ -209,7 +209,7 @@ def test_on_a_replay_buffer_there_is_no_environment():
     state = transform.state_dict()
     transform.load_state_dict(state)
     env = make_transformed()
-    with pytest.raises(ValueError, match="says nothing of an environment's episodes"):
+    with pytest.raises(ValueError, match="lacks an environment's episodes"):
         env.transform[0].load_state_dict(state)
     env.close()
 

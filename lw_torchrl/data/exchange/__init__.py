@@ -59,11 +59,12 @@ def export_dataset(
     plans: AnyPlans | None = None,
     suite: str | Suite | None = None,
 ) -> Path:
-    """Write a dataset in a format that others read; :func:`import_dataset` restores it bit for bit.
+    """Write a dataset in a format that others read, and return its folder. :func:`import_dataset` restores it bit for
+    bit.
 
-    A row is a step. docs/data.md lists the columns of both formats. Beside the columns of the dataset, files have the
-    task's name and description, the plan's text, and ``plan_holds`` (R, S) bool: which of the plan's conditions hold in
-    the observation, false beyond the last condition. Pictures of :func:`add_pictures` become videos in "lerobot".
+    A row is a step. docs/data.md lists the columns of both formats: those of the dataset, the task's name and
+    description, the plan's text, and ``plan_holds`` (R, S) bool: which of the plan's conditions hold in the
+    observation. Pictures of :func:`add_pictures` become videos in "lerobot".
 
     Args:
         root: the dataset's folder, of :func:`collect_demonstrations`.
@@ -71,9 +72,6 @@ def export_dataset(
         out: the folder to write, new or empty.
         plans: plans for ``plan_holds``; None for the suite's.
         suite: the suite of the dataset's tasks; None for the suite that their names begin with.
-
-    Returns:
-        The folder.
 
     Raises:
         DatasetError: (a ValueError) ``root`` holds no dataset, or a damaged one.
@@ -111,12 +109,12 @@ def import_dataset(
     behaviour: str = "imported",
     episodes_per_task: Count | None = None,
 ) -> Demonstrations:
-    """Make a dataset of files that :func:`export_dataset` wrote, or of other people's demonstrations.
+    """Make a dataset of files that :func:`export_dataset` wrote, or of other people's demonstrations, and return its
+    description.
 
     Our exports are restored bit for bit, so the options after ``format`` are for other people's files. These need
     observations and actions of the suite's sizes. docs/data.md lists the column names that are recognised, and the
-    values of missing columns, which a warning names. Use such datasets with ``label="executed"``: they do not say what
-    an expert would have done.
+    values of missing columns. Use such datasets with ``label="executed"``: they do not say what an expert would do.
 
     Args:
         source: the file or folder.
@@ -127,9 +125,6 @@ def import_dataset(
         suite: the :class:`~lw_torchrl.suites.Suite` of the tasks.
         behaviour: the label of the episodes, for :class:`EpisodeFilter`.
         episodes_per_task: number of episodes of each task, the first ones; None for all.
-
-    Returns:
-        The dataset's description, as :func:`collect_demonstrations` returns it.
 
     Warns:
         UserWarning: columns are missing; the message names the values that are used instead.

@@ -121,10 +121,8 @@ def _converted(name: str, source_name: str, column: Array) -> Array:
         if not np.isfinite(column).all():
             raise ExchangeError(f"{source_name} must hold finite numbers, found NaN or infinity")
         return column
-    if not np.isin(column, (0, 1)).all():
-        raise ExchangeError(
-            f"{source_name} must hold booleans, or 0 and 1, found {column[~np.isin(column, (0, 1))][0]}"
-        )
+    if (odd := column[~np.isin(column, (0, 1))]).size:
+        raise ExchangeError(f"{source_name} must hold booleans, or 0 and 1, found {odd[0]}")
     return column.astype(bool)
 
 

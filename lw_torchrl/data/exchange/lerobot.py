@@ -133,10 +133,8 @@ def _arrow_column(column: Array) -> Any:
     """A column as an Arrow array; lists of one number are numbers in LeRobot's tables."""
     import pyarrow as pa
 
-    flat = pa.array(np.ascontiguousarray(column).reshape(-1))
-    return (
-        flat if column.ndim == 1 or column.shape[1] == 1 else pa.FixedSizeListArray.from_arrays(flat, column.shape[1])
-    )
+    flat, width = pa.array(np.ascontiguousarray(column).reshape(-1)), column.size // len(column)
+    return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
 
 
 def _numbers(name: str, column: Any) -> Array:

@@ -23,9 +23,7 @@ def _files(source: Path) -> list[Path]:
     if source.is_file():
         return [source]
     paths = [path for path in source.iterdir() if path.suffix in (".hdf5", ".h5") and path.name[0] != "."]
-    return sorted(
-        paths, key=lambda path: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
-    )
+    return sorted(paths, key=lambda path: re.sub(r"\d+", lambda digits: digits[0].zfill(20), path.name))
 
 
 def _episode(group: Any) -> dict[str, Array]:

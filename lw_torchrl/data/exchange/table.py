@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,41 +18,34 @@ from lw_torchrl.suites.suite import Suite
 from lw_torchrl.transforms.qaf import plan_program
 
 Array = np.ndarray[Any, Any]
-KEYS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "observation": ("observation",),
-        "action": ("action",),
-        "expert_action": ("expert_action",),
-        "unclipped_action": ("unclipped_action",),
-        "next_observation": ("next", "observation"),
-        "reward_sparse": ("next", "reward_sparse"),
-        "reward_dense": ("next", "reward_dense"),
-        **{name: ("next", name) for name in ("success", "done", "terminated", "truncated")},
-    }
-)
+KEYS: Mapping[str, tuple[str, ...]] = {
+    **{name: (name,) for name in ("observation", "action", "expert_action", "unclipped_action")},
+    "next_observation": ("next", "observation"),
+    **{
+        name: ("next", name) for name in ("reward_sparse", "reward_dense", "success", "done", "terminated", "truncated")
+    },
+}
 """The columns of an exported table, and their keys in a dataset; the other keys follow from the episodes."""
 WIDE = ("observation", "next_observation", "action", "expert_action", "unclipped_action")  # the others are scalars
-NAMES: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "observation": (
-            "observation.state", "observation.environment_state", "observation", "observations",
-            "observations.observation", "obs.state", "obs.flat", "obs", "states", "state",
-        ),
-        "action": ("action", "actions"),
-        "expert_action": ("expert_action", "infos.expert_action"),
-        "unclipped_action": ("unclipped_action", "infos.unclipped_action"),
-        "next_observation": (
-            "next.observation", "next_observation", "infos.next_observation", "next_obs.state", "next_obs.flat",
-            "next_obs", "next_observations",
-        ),
-        "reward_sparse": ("next.reward_sparse", "reward_sparse", "infos.reward_sparse"),
-        "reward_dense": ("next.reward", "next.reward_dense", "reward", "rewards", "reward_dense"),
-        "success": ("next.success", "success", "successes", "is_success", "infos.success", "infos.is_success"),
-        "done": ("next.done", "done", "dones"),
-        "terminated": ("next.terminated", "terminated", "terminations", "terminals"),
-        "truncated": ("next.truncated", "truncated", "truncations", "timeouts"),
-    }
-)  # fmt: skip
+NAMES: Mapping[str, tuple[str, ...]] = {
+    "observation": (
+        "observation.state", "observation.environment_state", "observation", "observations",
+        "observations.observation", "obs.state", "obs.flat", "obs", "states", "state",
+    ),
+    "action": ("action", "actions"),
+    "expert_action": ("expert_action", "infos.expert_action"),
+    "unclipped_action": ("unclipped_action", "infos.unclipped_action"),
+    "next_observation": (
+        "next.observation", "next_observation", "infos.next_observation", "next_obs.state", "next_obs.flat",
+        "next_obs", "next_observations",
+    ),
+    "reward_sparse": ("next.reward_sparse", "reward_sparse", "infos.reward_sparse"),
+    "reward_dense": ("next.reward", "next.reward_dense", "reward", "rewards", "reward_dense"),
+    "success": ("next.success", "success", "successes", "is_success", "infos.success", "infos.is_success"),
+    "done": ("next.done", "done", "dones"),
+    "terminated": ("next.terminated", "terminated", "terminations", "terminals"),
+    "truncated": ("next.truncated", "truncated", "truncations", "timeouts"),
+}  # fmt: skip
 """The names of each column in files, the most likely first; names in groups are joined by dots."""
 KNOWN = frozenset(name for names in NAMES.values() for name in names)
 TASK_NAMES = ("task", "task_name", "language_instruction", "instruction", "task_description", "language")
@@ -106,10 +98,8 @@ def table_of(dataset: Demonstrations, metadata: Mapping[str, Any], suite: Suite,
     """The checked rows of a dataset, with the truth of the conditions of its tasks' plans."""
     verify(dataset, dataset.episodes)
     rows = load_rows(dataset)
-    columns: dict[str, Array] = {}
-    for name, key in KEYS.items():
-        column = np.asarray(rows.get(key))
-        columns[name] = column if name in WIDE else column[:, 0]
+    columns: dict[str, Array] = {name: np.asarray(rows.get(key)) for name, key in KEYS.items()}
+    columns |= {name: column[:, 0] for name, column in columns.items() if name not in WIDE}
     texts = {name: plans[name] for name in dataset.config.tasks if plans is not None and name in plans}
     table = Table(
         columns,

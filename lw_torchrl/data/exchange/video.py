@@ -43,9 +43,8 @@ def feature_of(pictures: Pictures, fps: int) -> dict[str, Any]:
 
 def statistics(values: Array) -> dict[str, Array]:
     """Statistics of the rows (R, n), as LeRobot names them."""
-    return {name: getattr(values, name)(0) for name in ("min", "max", "mean", "std")} | {
-        "count": np.array([len(values)])
-    }
+    found = {name: getattr(values, name)(0) for name in ("min", "max", "mean", "std")}
+    return found | {"count": np.array([len(values)])}
 
 
 def combined(parts: list[dict[str, Array]]) -> dict[str, Array]:

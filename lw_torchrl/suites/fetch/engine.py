@@ -167,25 +167,13 @@ class FetchEngine(ThreadedEngine):
     fingers are: 0 leaves them there, without the force that holds a puck. Reach, push and slide keep them closed.
 
     Observations have 25 numbers (:data:`~lw_torchrl.suites.fetch.FETCH`), in metres and in Meta-World's axes. Reach has
-    no thing: its numbers are zeros, and its goal is where the hand shall be, 3 cm above the grip site's goal. A
-    quaternion has its axis in our axes, see :func:`~lw_torchrl.suites.fetch.engine.our_quaternions`.
-
-    A row faults when its action is not finite, or when its simulation becomes unstable. It then repeats its last stable
-    observation and is not simulated until it is reset.
+    no object: its numbers are zeros, and its goal is the hand's, 3 cm above the grip site's goal. Rows fault as those of
+    :class:`~lw_torchrl.suites.metaworld.vectorized.engine.VectorizedEngine`.
 
     Args:
         tasks: the task of each row.
-        reward: "sparse" for the success as 0 and 1; "dense" for minus the distance from what was achieved to the goal,
-            metres, as the Dense environments give it.
-        num_threads: that simulate; None for one a core.
-
-    Example:
-        >>> engine = FetchEngine(["fetch/reach", "fetch/push"], num_threads=1)
-        >>> engine.reset([0, 1], seeds=[7, 8]).shape
-        (2, 25)
-        >>> engine.step(np.zeros((2, 4), np.float32), np.array([True, True])).success
-        array([False, False])
-        >>> engine.close()
+        reward: "sparse" for the success as 0 and 1; "dense" for minus the distance to the goal, metres.
+        num_threads: number of threads that simulate; None for one a core.
 
     Source: Plappert et al., 'Multi-Goal Reinforcement Learning'; gymnasium-robotics 1.4.2.
     """
@@ -235,7 +223,7 @@ class FetchEngine(ThreadedEngine):
         self._observation[rows, :_NOW] = now
 
     def _now(self, rows: Index) -> Array:
-        """The first 11 numbers of the rows' observations."""
+        """Return the first 11 numbers of the rows' observations."""
         read, origin = self._read[rows], self._origin[rows]
         now = np.zeros((len(rows), _NOW))
         now[:, :3] = our_positions(read[:, :3], origin)

@@ -24,19 +24,18 @@ class ExpertActor(TensorDictModuleBase):
     """Meta-World's scripted policy of each row's task.
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``action`` (B, 4) float32, clipped to [-1,
-    1], and ``unclipped_action`` (B, 4) float32, what the script asked for, usually far more. Rows that a ``_step`` mask
+    1], and ``unclipped_action`` (B, 4) float32, the script's action, usually far larger. Rows that a ``_step`` mask
     (B,) leaves out get zeros. A task_id outside ``tasks`` raises a ValueError.
 
     Args:
-        tasks: the tasks it must know, as for :func:`resolve_tasks`.
-        in_keys, out_keys: other names for these keys, in the order above; nested ones too.
+        tasks: the tasks that it knows, as for :func:`resolve_tasks`.
+        in_keys, out_keys: other names for these keys, in the order above; nested keys are allowed.
 
     Example:
         >>> import lw_torchrl as lw
-        >>> env = lw.LanguageWorldEnv("reach", seed=0)
-        >>> bool(env.rollout(100, lw.ExpertActor("reach"))["next", "success"].any())
-        True
-        >>> env.close()
+        >>> rollout = lw.LanguageWorldEnv("reach", seed=0).rollout(100, lw.ExpertActor("reach"))
+        >>> rollout["next", "success"].any()
+        tensor(True)
 
     Source: ``metaworld.policies``.
     """

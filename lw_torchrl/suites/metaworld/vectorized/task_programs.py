@@ -33,9 +33,8 @@ Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class SharedModel:
-    """A compiled model that many rows use in turn: a reset of a Meta-World task moves bodies and sites of the model
-    itself, so each row keeps its own ``places`` of both, and loads them before its physics unless it is still the
-    ``holder``."""
+    """A compiled model that many rows use in turn. A reset of a Meta-World task moves bodies and sites of the model
+    itself, so each row keeps its own ``places`` of both, and loads them unless it is still the ``holder``."""
 
     def __init__(self, path: str, model: Any, compiled: Places | None = None) -> None:
         self.path, self.model = path, model
@@ -125,20 +124,16 @@ class TaskProgram:
         return program
 
     def start_episode(self, seed: int) -> NDArray[np.float64]:
-        """Reset as Meta-World's ``env.seed(seed); env.reset()`` does; returns the first observation. Meta-World places
+        """Reset as Meta-World's ``env.seed(seed); env.reset()`` does; return the first observation. Meta-World places
         everything twice and moves the hand both times. Of the first round only the random draws and the positions of
         bodies and sites survive, which do not depend on the hand, so here the first round does not move it."""
         self.np_random, _ = seeding.np_random(seed)
-        mujoco.mj_resetData(self.model, self.data)
-        self.data.warning.number[:] = WARNED_ALREADY
-        mujoco.mj_forward(self.model, self.data)
-        self._moves_hand = False
-        self.reset_model()
-
-        mujoco.mj_resetData(self.model, self.data)
-        self.data.warning.number[:] = WARNED_ALREADY
-        self._moves_hand = True
-        observation = self.reset_model()
+        for self._moves_hand in (False, True):
+            mujoco.mj_resetData(self.model, self.data)
+            self.data.warning.number[:] = WARNED_ALREADY
+            if not self._moves_hand:
+                mujoco.mj_forward(self.model, self.data)
+            observation = self.reset_model()
         observation[18:36] = observation[:18]
         return observation
 
