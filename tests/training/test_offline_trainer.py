@@ -16,8 +16,8 @@ from torchrl.objectives import BCLoss, CQLLoss, IQLLoss, REDQLoss, SACLoss, Soft
 from torchrl.record.loggers import Logger
 
 import lw_torchrl as lw
-from lw_torchrl.data.replay_checks import check_minibatches
 from lw_torchrl.training import OfflineConfig, OfflineTrainer, fit_normalization
+from lw_torchrl.training.minibatches import check_minibatches
 
 CONFIG = OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
 CRITIC = dict(width=16, depth=1)
