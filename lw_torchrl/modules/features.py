@@ -122,11 +122,7 @@ class ObservationFeatures(Features):
         return {"kind": self.kind, "noise": self.noise, "layout": self.layout, **keys}
 
     def with_plans(self, plans: AnyPlans) -> ObservationFeatures:
-        """Return the features, with the same statistics, for plans of another layout.
-
-        Raises:
-            ValueError: the features mean something else in that layout.
-        """
+        """Return the features, with the same statistics, for plans of a layout; ValueError if they differ there."""
         layout = as_plans(plans).layout
         if layout == self.layout:
             return self

@@ -22,14 +22,10 @@ _REPLAY_OPTIONS = ("label", "reward", "terminate_on_success", "n_steps", "gamma"
 
 
 class Minibatches:
-    """Minibatches of a buffer. What sampler, transforms and networks draw depends only on the seed and the step.
+    """Minibatches of a buffer, or of anything that has ``sample(size)``.
 
-    Samplers draw on the CPU, so minibatches are the same on every device.
-
-    Args:
-        source: has ``sample(size)``, which returns a TensorDict, as replay buffers do.
-        size: number of rows.
-        seed: any integer.
+    What sampler, transforms and networks draw depends only on the seed and the step. Samplers draw on the CPU, so
+    minibatches are the same on every device.
     """
 
     def __init__(self, source: Any, size: int, seed: int) -> None:
@@ -90,7 +86,7 @@ def check_replay(actor: Any, replay: TensorDictReplayBuffer, size: int) -> None:
 
 
 def describe_data(replay: Any) -> dict[str, Any] | None:
-    """Describe a replay buffer's demonstrations as JSON; None for a buffer without :class:`Demonstrations`."""
+    """Describe a replay buffer's demonstrations as JSON; None for a buffer without."""
     demonstrations = getattr(replay, "demonstrations", None)
     return None if demonstrations is None else demonstrations.config.to_json()
 

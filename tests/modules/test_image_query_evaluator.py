@@ -116,17 +116,6 @@ def test_a_policy_with_it_is_made_again_from_its_file(tmp_path):
     assert torch.equal(other(states())["qaf_logits"], policy[0](states())["qaf_logits"])
 
 
-def test_other_plans_share_its_weights():
-    evaluator = make()
-    drawer = lw.Plans({"drawer-open": PLANS["drawer-open"]})
-    other = evaluator.with_plans(drawer)
-    assert {id(weight) for weight in other.parameters()} == {id(weight) for weight in evaluator.parameters()}
-    found = states()[::2].clone()
-    steps = len(drawer["drawer-open"].steps)
-    expected = evaluator(found.clone())["qaf_logits"][:, :steps]
-    assert torch.allclose(other(found)["qaf_logits"], expected, atol=1e-6)
-
-
 def test_an_encoder_of_ones_own_stays_frozen():
     def frozen():
         return nn.Sequential(nn.Conv2d(3, 4, 4, 4)).requires_grad_(False)

@@ -129,26 +129,6 @@ def test_scripted_skills_act_on_its_answers(tmp_path):
     assert other[0].network.predicates.weight is evaluator.network.predicates.weight
 
 
-def test_scripted_skills_are_evaluated_on_its_answers():
-    class Never(lw.QueryEvaluator):
-        def logits(self, observation, task_id):
-            return torch.full((*task_id.shape, self.plans.num_steps), -1.0)
-
-    seen = []
-    plans = lw.Plans([PLANS["reach"]])
-    lw.evaluate(
-        lw.ScriptedSkillActor(plans),
-        tasks="reach",
-        episodes_per_task=1,
-        seed=1_000,
-        max_steps=5,
-        evaluator=Never(plans),
-        also_record=["qaf"],
-        on_episode=seen.append,
-    )
-    assert not (seen[0].steps["qaf"] > 0.5).any()
-
-
 # ---- refusals
 
 
