@@ -28,6 +28,29 @@ def attend(logits: Tensor, mask: Tensor) -> Tensor:
     return logits.masked_fill(~mask, -torch.inf).softmax(-1)
 
 
+def read_truth(tensordict: TensorDictBase, keys: Sequence[NestedKey], tables: PlanTables) -> tuple[Tensor, Tensor]:
+    """Return the truth (..., S) of a plan's conditions and the rows (...) of its tables; raise for other plans."""
+    qaf, task_id = read(tensordict, keys)
+    rows = tables.rows(task_id)
+    plan = tensordict.get(key_beside(keys[0], "_plan"), None)
+    tables.refuse_others(plan, rows)
+    steps = tables.mask.shape[-1]
+    # Answers for more plans, of which some are longer, have more columns.
+    return (qaf[..., :steps] if plan is not None and qaf.shape[-1] > steps else qaf), rows
+
+
+def check_truth(qaf: Tensor, shape: torch.Size) -> None:
+    """Raise :class:`ValueError` unless truth is bool, or numbers from 0 to 1, of a shape."""
+    if qaf.shape != shape:
+        raise ValueError(
+            f"qaf must have shape {tuple(shape)}, one column for each step of the actor's plans, got "
+            f"{tuple(qaf.shape)}; give QAFTransform the same plans"
+        )
+    if qaf.dtype != torch.bool:
+        problem = "qaf must be bool, or numbers from 0 to 1 for soft truth; it holds other numbers, or NaN"
+        check_values(lambda truth: ((truth >= 0) & (truth <= 1)).all(), qaf, problem)
+
+
 class PlanAttention(Part):
     """Attention over a plan's steps: the softmax of 10·truth - 5 over the steps that exist.
 
@@ -91,24 +114,11 @@ class PlanAttention(Part):
     def weights(self, qaf: Tensor, rows: Tensor, turn: Tensor | None = None) -> Tensor:
         """Return the attention (..., S) float32 for truth (..., S), table rows (...) int64 and turns (...) int64."""
         mask = pick(self.mask.flatten(0, 1), 2 * rows if turn is None else 2 * rows + turn % 2)
-        if qaf.shape != mask.shape:
-            raise ValueError(
-                f"qaf must have shape {tuple(mask.shape)}, one column for each step of the actor's plans, got "
-                f"{tuple(qaf.shape)}; give QAFTransform the same plans"
-            )
-        if qaf.dtype != torch.bool:
-            problem = "qaf must be bool, or numbers from 0 to 1 for soft truth; it holds other numbers, or NaN"
-            check_values(lambda truth: ((truth >= 0) & (truth <= 1)).all(), qaf, problem)
+        check_truth(qaf, mask.shape)
         return attend(2 * TRUE_LOGIT * qaf.to(torch.float32) - TRUE_LOGIT, mask)
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        qaf, task_id = read(tensordict, self.in_keys[:2])
-        rows = self.tables.rows(task_id)
-        plan = tensordict.get(key_beside(self.in_keys[0], "_plan"), None)
-        self.tables.refuse_others(plan, rows)
-        steps = self.mask.shape[-1]
-        if plan is not None and qaf.shape[-1] > steps:  # answers for more plans, of which some are longer
-            qaf = qaf[..., :steps]
+        qaf, rows = read_truth(tensordict, self.in_keys[:2], self.tables)
         turn = tensordict.get(self.in_keys[2], None) if self.has_fallback else None
         return write(tensordict, self, [self.weights(qaf, rows, turn)])

@@ -11,12 +11,12 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import checked, shown
-from lw_torchrl._keys import dispatched, key_beside, read, write
+from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.language.value_checks import check_values
+from lw_torchrl.modules.attention import check_truth, read_truth
 from lw_torchrl.modules.sequence import Part
 
 
@@ -99,19 +99,9 @@ class ScriptedSkillActor(Part):
 
     def skill_weights(self, tensordict: TensorDictBase) -> Tensor:
         """Return the weight of each step, (B, S) float32."""
-        _, task_id, qaf = read(tensordict, self.in_keys)
-        rows = self.tables.rows(task_id)
-        plan = tensordict.get(key_beside(self.in_keys[2], "_plan"), None)
-        self.tables.refuse_others(plan, rows)
-        steps = self.tables.mask.shape[-1]
-        if plan is not None and qaf.shape[-1] > steps:  # answers for more plans, of which some are longer
-            qaf = qaf[..., :steps]
-        if qaf.shape != (shape := (*rows.shape, steps)):
-            raise ValueError(f"qaf must have shape {shape}, one column for each step, got {tuple(qaf.shape)}")
-        if qaf.dtype != torch.bool:
-            problem = "qaf must be bool, or numbers from 0 to 1 for soft truth; it holds other numbers, or NaN"
-            check_values(lambda truth: ((truth >= 0) & (truth <= 1)).all(), qaf, problem)
-            qaf = qaf > 0.5
+        qaf, rows = read_truth(tensordict, self.truth_keys, self.tables)
+        check_truth(qaf, torch.Size((*rows.shape, self.tables.mask.shape[-1])))
+        qaf = qaf > 0.5
         last = torch.nn.functional.one_hot(self._last.to(rows.device)[rows], qaf.shape[-1]).bool()
         true = torch.where(qaf.any(-1, keepdim=True), qaf, last).float()
         if self.select == "mix":

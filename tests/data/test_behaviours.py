@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 
 import pytest
 import torch
@@ -228,12 +227,3 @@ def test_a_policy_trained_on_such_data_says_which_seeds_it_saw(tmp_path, made, c
         assert demonstrated_tasks(path) == tasks
         for seed in seeds:
             assert "is the seed of the demonstrations" in fails(capsys, "evaluate", path, "--seed", seed)
-
-
-def test_a_behaviour_of_ones_own(tmp_path):
-    mine = Behaviour("mine", right=0.5, otherwise="action", shortest=2, longest=3)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        made = collect(tmp_path / "demos", policy=mine)
-    assert made.config.policy.acts == mine
-    assert collect(made.root, policy=mine) == made

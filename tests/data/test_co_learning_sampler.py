@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorStorage
+from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
 from lw_torchrl.data import CoLearningSampler
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject
@@ -156,18 +156,6 @@ def test_it_ran_out_whenever_the_pass_that_takes_most_batches_ends(base, target,
     for batch in range(1, 12):
         replay.sample()
         assert replay.sampler.ran_out == (batch // longest > (batch - 1) // longest)
-
-
-def test_it_draws_from_a_storage_of_two_dimensions():
-    storage = LazyTensorStorage(200, ndim=2)
-    replay = TensorDictReplayBuffer(storage=storage, sampler=CoLearningSampler(TARGET), batch_size=8)
-    task = torch.tensor([1, 2, task_id(TARGET)])[:, None].expand(3, 20)
-    for _ in range(2):
-        replay.extend(TensorDict(task_id=task, row=torch.arange(60).view(3, 20), batch_size=[3, 20]))
-        for batch in (replay.sample() for _ in range(10)):
-            assert batch["task_id"].tolist() == [task_id(TARGET)] * 4 + [1, 1, 2, 2]
-            assert batch["is_target"].tolist() == [True] * 4 + [False] * 4
-            assert (storage[batch["index"].unbind(-1)]["row"] == batch["row"]).all()
 
 
 def test_of_joined_datasets_a_named_target_is_the_last_ones():

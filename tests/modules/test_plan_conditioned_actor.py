@@ -216,15 +216,6 @@ def test_the_gradient_reaches_every_weight():
         assert parameter.grad.abs().sum() > 0, name
 
 
-def test_statistics_are_saved_with_the_actor():
-    actor, other = make_actor(), make_actor(seed=1)
-    actor.features.fit(make_rows(50))
-    other.load_state_dict(actor.state_dict())
-    assert torch.equal(action_of(other, make_rows(6)), action_of(actor, make_rows(6)))
-    assert actor.features.mean.any()
-    assert not any("mean" in name or "std" in name for name, _ in actor.named_parameters())
-
-
 # ---- bad input
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import warnings
 
@@ -12,12 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
 from lw_torchrl.modules import MLPDecoder, ObservationFeatures, Value, descriptor_trunk
-from lw_torchrl.training import fit_normalization
 
 PLANS = lw.load_plans("MT10")
 SMALL = dict(width=16, depth=1)
@@ -121,14 +118,6 @@ def test_weights_are_monotone_and_the_loss_is_within_the_rows(advantages, beta):
     assert loss(best)["loss_actor"] >= found["loss_actor"] - 1e-5
 
 
-@settings(max_examples=20, deadline=None)
-@given(shift=st.floats(-1000, 1000, width=32))
-def test_without_a_largest_weight_a_shift_of_all_changes_nothing(shift):
-    batch, loss = make_batch(spread=0.5), lw.objectives.AdvantageWeightedLoss(ACTOR, max_weight=1e300, beta=0.5)
-    moved = batch.clone().set("advantage", batch["advantage"] + shift)
-    torch.testing.assert_close(loss(moved)["loss_actor"], loss(batch)["loss_actor"], rtol=1e-3, atol=1e-4)
-
-
 @pytest.mark.filterwarnings(  # what PyTorch warns of when it compiles
     "ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning",
     "ignore:.*LeafSpec:FutureWarning",
@@ -149,22 +138,6 @@ def test_compiled_it_is_one_graph_with_the_same_gradients(name, distribution):
         found.append([value.detach(), *(p.grad.clone() for p in loss.parameters() if p.grad is not None)])
     assert len(found[0]) > 5
     assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
-
-
-def test_its_state_goes_round_and_statistics_reach_it():
-    batch = make_batch()
-    loss, other = (lw.objectives.AdvantageWeightedLoss(make_actor()) for _ in range(2))
-    for p in other.parameters():
-        p.data += 0.1
-    assert loss(batch)["loss_actor"] != other(batch)["loss_actor"]
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(12), batch_size=4)
-    replay.extend(batch)
-    before = loss(batch)["loss_actor"]
-    fit_normalization(loss, replay)
-    assert loss(batch)["loss_actor"] != before
-    other.load_state_dict(loss.state_dict())
-    assert torch.equal(loss(batch)["loss_actor"], other(batch)["loss_actor"])
-    assert torch.equal(copy.deepcopy(loss)(batch)["loss_actor"], loss(batch)["loss_actor"])
 
 
 def test_keys_by_other_names_nested_ones_too():
@@ -236,11 +209,6 @@ def test_of_a_task_whose_rows_are_all_alike_there_is_nothing_to_tell(same):
     assert (lw.objectives.standardize_by_task(advantage, torch.zeros(7, dtype=torch.int64)) == 0).all()
     assert (lw.objectives.standardize_by_task(advantage, torch.arange(7)) == 0).all()
     assert lw.objectives.standardize_by_task(torch.zeros(0, 1), torch.zeros(0, dtype=torch.int64)).shape == (0, 1)
-
-
-def test_of_huge_ones_too():
-    advantage = torch.tensor([[3e38], [-3e38]])
-    assert lw.objectives.standardize_by_task(advantage, torch.zeros(2, dtype=torch.int64)).tolist() == [[1.0], [-1.0]]
 
 
 def test_from_the_value_to_the_weights():

@@ -169,17 +169,6 @@ def test_with_either_distribution_the_loss_is_finite_at_the_bounds(name, distrib
     assert all(p.grad.isfinite().all() for p in trained(loss).values())
 
 
-@pytest.mark.parametrize("name", LOSSES)
-def test_its_state_goes_round(name):
-    loss, actor, value = make_loss(name, "plan")
-    other, _, _ = make_loss(name, "plan", seed=1)
-    batch = ready(name, make_batch(), actor, value)
-    if name != "online DT":  # its alpha is learned apart
-        assert total(other, batch) != total(loss, batch)
-    other.load_state_dict(loss.state_dict())
-    assert torch.equal(total(other, batch), total(loss, batch))
-
-
 ABOUT_ITSELF = pytest.mark.filterwarnings(  # what PyTorch warns of when it compiles
     "ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning",
     "ignore:.*LeafSpec:FutureWarning",
