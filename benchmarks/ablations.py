@@ -12,7 +12,7 @@ from unittest.mock import patch
 
 import torch
 import tyro
-from lw_torchrl.modules.relative_positions import PlanRoles
+from tensordict import TensorDictBase
 from torch import Tensor
 
 import lw_torchrl as lw
@@ -25,6 +25,7 @@ from lw_torchrl.evaluation import count_solved
 from lw_torchrl.language.named_objects import NamedObject
 from lw_torchrl.language.task_objects import role_object
 from lw_torchrl.language.tasks import Task
+from lw_torchrl.modules import RoleFeatures
 
 Setting = Literal["few-shot", "zero-shot"]
 FULL: Mapping[str, Preset] = PRESETS["strong"]
@@ -34,33 +35,30 @@ def _without(setting: Setting, name: str, **changes: Any) -> Preset:
     return replace(FULL[setting], name=f"strong-without-{name}", **changes)
 
 
-def _without_plan_options(setting: Setting) -> Preset:
-    plain = tuple(replace(one, plan_actor={}, any_yaw=False, plan_yaw=None, tilt=0.0) for one in FULL[setting].members)
-    return _without(setting, "roles", members=plain)
+def _without_plan_parts(setting: Setting) -> Preset:
+    return _without(setting, "roles", members=tuple(replace(one, plan_parts={}) for one in FULL[setting].members))
 
 
 def _members(**options: Any) -> tuple[Member, ...]:
-    return tuple(replace(member, actor={**member.actor, **options}) for member in FULL["few-shot"].members)
+    return tuple(replace(member, parts={**member.parts, **options}) for member in FULL["few-shot"].members)
 
 
 def _few_shot(name: str, **changes: Any) -> Preset:
     return _without("few-shot", name, **changes)
 
 
-def _zero_shot(name: str, plan_actor: Mapping[str, Any] | None = None, **changes: Any) -> Preset:
-    """With other options of the members, and of their plan's alone."""
-    members = FULL["zero-shot"].members
-    if plan_actor is not None:
-        members = tuple(replace(one, plan_actor={**one.plan_actor, **plan_actor}) for one in members)
-    return _without("zero-shot", name, members=tuple(replace(one, **changes) for one in members))
+def _zero_shot(name: str, **changes: Any) -> Preset:
+    """Return the recipe with other parts of the members that read plans."""
+    members = tuple(replace(one, plan_parts={**one.plan_parts, **changes}) for one in FULL["zero-shot"].members)
+    return _without("zero-shot", name, members=members)
 
 
 def _object_itself(task: Task, name: str) -> NamedObject:
     return replace(role_object(task, name), offset=(0.0, 0.0, 0.0))
 
 
-def _fit_without_contacts(roles: PlanRoles, observation: Tensor, weights: Tensor, rows: Tensor) -> None:
-    roles.demonstrated[rows.unique()] = True
+def _fit_without_contacts(roles: RoleFeatures, rows: TensorDictBase, weights: Tensor | None = None) -> None:
+    roles.demonstrated[roles.tables.rows(rows.get("task_id")).unique()] = True
     roles.fitted.fill_(True)
 
 
@@ -73,7 +71,7 @@ ABLATIONS: Mapping[Setting, Mapping[str, Preset]] = MappingProxyType(
             "rows long after success kept": _few_shot("cutting", after_success=None),
             "the raw observation": _few_shot("differences", members=_members(features="raw")),
             "no feature noise": _few_shot("feature-noise", members=_members(feature_noise=0.0)),
-            "neither focus nor roles": _without_plan_options("few-shot"),
+            "neither focus nor roles": _without_plan_parts("few-shot"),
             "the first member alone": _few_shot("members", members=FULL["few-shot"].members[:1]),
             "a constant learning rate": _few_shot(
                 "cosine", training=replace(FULL["few-shot"].training, schedule="constant")
@@ -81,25 +79,25 @@ ABLATIONS: Mapping[Setting, Mapping[str, Preset]] = MappingProxyType(
         },
         "zero-shot": {
             "the recipe": FULL["zero-shot"],
-            "all differences instead of roles": _without_plan_options("zero-shot"),
+            "all differences instead of roles": _without_plan_parts("zero-shot"),
             "no contacts": _zero_shot("contacts"),
             "objects' own places instead of named points": _zero_shot("points"),
-            "the opening shown": _zero_shot("opening", plan_actor={"features": "opening"}),
-            "turned by 0.3": _zero_shot("any-yaw", plan_yaw=0.3),
-            "not turned": _zero_shot("yaw", plan_yaw=0.0, tilt=0.0),
+            "the opening shown": _zero_shot("opening", features="opening"),
+            "turned by 0.3": _zero_shot("any-yaw", yaw=0.3),
+            "not turned": _zero_shot("yaw", yaw=0.0, tilt=0.0),
             "not tilted": _zero_shot("tilt", tilt=0.0),
-            "fingers half open": _zero_shot("deciding", plan_actor={"decided_gripper": False}),
+            "fingers half open": _zero_shot("deciding", decided_gripper=False),
             "words in demonstrated tasks, too": _without("zero-shot", "seen", demonstrated=()),
-            "no jitter": _zero_shot("jitter", plan_actor={"jitter": 0.0}),
+            "no jitter": _zero_shot("jitter", jitter=0.0),
             "one member": _without("zero-shot", "members", members=FULL["zero-shot"].members[:1]),
         },
     }
 )
 PATCHES: Mapping[str, Callable[[], AbstractContextManager[Any]]] = MappingProxyType(
     {
-        "no contacts": lambda: patch.object(PlanRoles, "fit", _fit_without_contacts),
+        "no contacts": lambda: patch.object(RoleFeatures, "fit", _fit_without_contacts),
         "objects' own places instead of named points": lambda: patch(
-            "lw_torchrl.modules.relative_positions.role_object", _object_itself
+            "lw_torchrl.modules.relative_features.role_object", _object_itself
         ),
     }
 )

@@ -15,8 +15,9 @@ from torch import Tensor
 import lw_torchrl as lw
 from benchmarks.figures import markdown_table
 from lw_torchrl._files import write_json, write_text
+from lw_torchrl.language.canonical import canonical_like
 from lw_torchrl.language.layout import METAWORLD, Layout
-from lw_torchrl.modules import TransferredActor
+from lw_torchrl.modules import TransferredActor, plans_of
 from lw_torchrl.suites import load_suite
 
 TASKS = {"fetch/reach": "reach", "fetch/push": "push", "fetch/pick-and-place": "pick-place"}
@@ -54,7 +55,7 @@ class Arguments:
 class Adapted(TensorDictModuleBase):
     """A policy without plans, shown Fetch's numbers as Meta-World's."""
 
-    def __init__(self, actor: lw.Policy, turned: Any) -> None:
+    def __init__(self, actor: TensorDictModuleBase, turned: Any) -> None:
         super().__init__()
         self.in_keys, self.out_keys = ["observation", "task_id"], ["action"]
         self.actor, self.turned = actor, turned
@@ -82,8 +83,9 @@ def main(arguments: Arguments) -> None:
     rows, found = [], {}
     for method in arguments.methods:
         for seed in arguments.seeds:
-            turner = TransferredActor(trained(arguments.policies, "pcbc", seed), plans, speed=arguments.speed)
-            actor = turner if method == "pcbc" else Adapted(trained(arguments.policies, method, seed), turner.turned)
+            followed = trained(arguments.policies, "pcbc", seed)
+            turner = TransferredActor(followed, canonical_like(plans, plans_of(followed)), speed=arguments.speed)
+            actor = turner if method == "pcbc" else Adapted(trained(arguments.policies, method, seed), turner.converted)
             how: dict[str, Any] = {"tasks": list(TASKS), "episodes_per_task": arguments.episodes}
             how |= {"seed": arguments.seed, "max_steps": arguments.max_steps, "noise_scale": 0.0}
             result = lw.evaluate(actor, **how)
@@ -96,7 +98,7 @@ def main(arguments: Arguments) -> None:
     print(table)
 
 
-def trained(folder: Path, method: str, seed: int) -> lw.Policy:
+def trained(folder: Path, method: str, seed: int) -> Any:
     """The policy that `python -m benchmarks.paper zero-shot` wrote."""
     return lw.load_actor(folder / method / f"seed{seed}" / "policy.safetensors").eval()
 

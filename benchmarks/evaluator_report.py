@@ -155,7 +155,7 @@ def condition_drift(policy: Any, states: TensorDictBase) -> list[Drift]:
         policy: an evaluator, or a policy with one.
         states: (R,) rows with ``observation``, ``task_id`` and the evaluator's inputs.
     """
-    evaluator = evaluators_of(policy)[0]
+    (evaluator,) = evaluators_of(policy)
     program, drifts = plan_program(evaluator.plans), []
     for task, plan in evaluator.plans.items():
         rows = states[states.get("task_id") == task_id(task)]

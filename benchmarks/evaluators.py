@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from tensordict.nn import TensorDictSequential
 
 import lw_torchrl as lw
 from benchmarks.evaluator_report import condition_drift, drift_table, write_report
@@ -17,6 +18,8 @@ from benchmarks.figures import markdown_table
 from lw_torchrl._files import write_text
 from lw_torchrl.cli.demo import DemoConfig
 from lw_torchrl.evaluation import EvaluationResult
+from lw_torchrl.modules import transform_of
+from lw_torchrl.modules.query_evaluator import evaluators_of
 
 RECIPE = DemoConfig()
 WHO = ("expert", "scripted", "spoilt-30", "random")
@@ -85,6 +88,12 @@ def evaluated(file: Path, actor: Any, tasks: Sequence[str], episodes: int, seed:
     return result
 
 
+def in_front(evaluator: lw.QueryEvaluator, actor: Any) -> TensorDictSequential:
+    """Return the policy that acts on an evaluator's answers, as hard as the exact ones that it was trained on."""
+    evaluator.answers = "hard"
+    return TensorDictSequential(evaluator, actor)
+
+
 class Bench:
     """The parts of one seed, each kept in files and done once."""
 
@@ -131,7 +140,7 @@ class Bench:
     def tuned(self, name: str, actor: Any, anchor: float) -> Any:
         """A policy tuned by its demonstrations' loss, its evaluator too if it has one."""
         replay = self.demonstrations()
-        if (transform := actor.transform()) is not None:
+        if (transform := transform_of(actor)) is not None:
             replay.append_transform(transform)
         config = lw.BehavioralCloningConfig(
             steps=50 if self.args.quick else self.args.tuning_steps,
@@ -143,7 +152,7 @@ class Bench:
         )
         file = self.folder / f"{name}.safetensors"
         lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=file).train()
-        if getattr(actor, "evaluator", None) is not None:
+        if evaluators_of(actor):
             drifts = condition_drift(actor, replay[:])
             table = drift_table(drifts, most=8)
             write_text(file.with_suffix(".txt"), table)
@@ -162,12 +171,11 @@ class Bench:
         for share in self.args.labels:
             evaluator = self.evaluator(share)
             told = f"evaluator, {100 * share:g}% of the labels"
-            yield told, self.success(f"evaluator-{share:g}", policy.with_evaluator(evaluator))
+            yield told, self.success(f"evaluator-{share:g}", in_front(evaluator, policy))
             for anchor in self.args.anchors:
                 name = f"evaluator-{share:g}-tuned-{anchor:g}"
-                begun = self.policy().with_evaluator(
-                    lw.training.load_evaluator(self.folder / f"evaluator-{share:g}.safetensors", self.plans)
-                )
+                fresh = lw.training.load_evaluator(self.folder / f"evaluator-{share:g}.safetensors", self.plans)
+                begun = in_front(fresh, self.policy())
                 yield f"{told}, tuned, anchor {anchor:g}", self.success(name, self.tuned(name, begun, anchor))
 
 

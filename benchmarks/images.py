@@ -13,7 +13,7 @@ import tyro
 
 import lw_torchrl as lw
 from benchmarks.evaluator_report import plot_wrong_answers, write_report, wrong_answers
-from benchmarks.evaluators import WHO, demonstrations, evaluated
+from benchmarks.evaluators import WHO, demonstrations, evaluated, in_front
 from benchmarks.figures import markdown_table
 from lw_torchrl._files import write_text
 from lw_torchrl.evaluation import EvaluationResult
@@ -131,12 +131,12 @@ def main(args: Arguments) -> None:
 
     scripted = lw.ScriptedSkillActor(plans)
     note("scripted skills, exact answers", "scripted", scripted)
-    note("scripted skills, pictures", "scripted-pictures", scripted.with_evaluator(eyes))
+    note("scripted skills, pictures", "scripted-pictures", in_front(eyes, scripted))
     for number, file in enumerate(args.policy):
         policy: Any = lw.load_actor(file).with_plans(plans)
         note("PCBC, exact answers", f"pcbc-{number}", policy)
-        note("PCBC, pictures", f"pcbc-{number}-pictures", policy.with_evaluator(eyes))
-        begun = policy.with_evaluator(lw.training.load_evaluator(args.out / "evaluator.safetensors", plans))
+        note("PCBC, pictures", f"pcbc-{number}-pictures", in_front(eyes, policy))
+        begun = in_front(lw.training.load_evaluator(args.out / "evaluator.safetensors", plans), policy)
         name = f"pcbc-{number}-pictures-tuned"
         note("PCBC, pictures, tuned", name, tuned(args, name, begun))
     rows = []

@@ -108,7 +108,7 @@ def acting(args: Arguments) -> list[Acting]:
         if "qaf" not in actor.in_keys:
             raise SystemExit(f"--policy: {file} does not read qaf, so it feels no answers: {actor.in_keys}")
         name = f"{file.stem}-{sha256(file.read_bytes()).hexdigest()[:8]}"
-        found.append(Acting(str(actor.describe()["kind"]), name, actor))
+        found.append(Acting(type(actor).__name__, name, actor))
     if args.scripted:
         loaded = lw.load_plans(args.plans)
         loaded.require(args.tasks)

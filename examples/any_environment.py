@@ -13,11 +13,12 @@ from torchrl.envs.libs.gym import GymEnv
 from torchrl.objectives import SoftUpdate, TD3Loss
 
 import lw_torchrl as lw
+from lw_torchrl.modules import Concat, ObservationFeatures, RoleFeatures
 from lw_torchrl.suites.fetch import load_plans
 from lw_torchrl.transforms import SuiteTransform
 
 gymnasium.register_envs(gymnasium_robotics)
-PLANS = lw.Plans([load_plans()["fetch/reach"]])
+PLANS = lw.canonical_plans([load_plans()["fetch/reach"]])
 
 
 def observe(state: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
@@ -32,15 +33,21 @@ def act(action: torch.Tensor) -> torch.Tensor:
     return torch.stack((action[..., 1], -action[..., 0], action[..., 2], -action[..., 3]), -1)
 
 
+def features() -> Concat:
+    """Differences of positions, and the target's position relative to what the active step moves."""
+    return Concat(ObservationFeatures(layout=PLANS.layout), RoleFeatures(PLANS))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=4_000)
     args = parser.parse_args()
     keys = ["observation", "desired_goal"]
     turned = SuiteTransform(PLANS["fetch/reach"].definition, observe, act=act, in_keys=keys)
-    actor = lw.PlanConditionedActor(PLANS, roles=True)
-    env = TransformedEnv(GymEnv("FetchReachDense-v4"), Compose(turned, actor.transform()))
-    loss = TD3Loss(actor, lw.PlanConditionedQValue(PLANS, roles=True), bounds=(-1.0, 1.0), num_qvalue_nets=2)
+    actor = lw.PlanConditionedActor(PLANS, features=features())
+    env = TransformedEnv(GymEnv("FetchReachDense-v4"), Compose(turned, lw.QAFTransform(PLANS)))
+    critic = lw.PlanConditionedQValue(PLANS, features=features())
+    loss = TD3Loss(actor, critic, bounds=(-1.0, 1.0), num_qvalue_nets=2)
     loss.make_value_estimator(gamma=0.9)
     targets, optimizer = SoftUpdate(loss, eps=0.99), torch.optim.AdamW(loss.parameters(), lr=3e-4)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(args.frames), batch_size=128)

@@ -14,6 +14,7 @@ from torchrl.data import TensorDictReplayBuffer, TensorStorage
 from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
+from lw_torchrl.training import fit_normalization
 
 BASE, TARGET = ["drawer-open", "door-open"], "window-open"
 
@@ -53,8 +54,7 @@ def main() -> None:
             batch_size=100,
         )
         actor = lw.PlanConditionedActor(plans)
-        weights = replay.sampler.row_weights(replay.storage)
-        actor.fit_normalization(replay[:]["observation"], weights)
+        fit_normalization(actor, replay)
         warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss about itself
         loss = BCLoss(actor, loss_function="l2")
         optimizer = torch.optim.AdamW(loss.parameters(), lr=1e-3)

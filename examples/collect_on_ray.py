@@ -28,7 +28,7 @@ def main() -> None:
     parser.add_argument("--batches", type=int, default=4)
     args = parser.parse_args()
     ray.init(num_cpus=args.workers, include_dashboard=False, log_to_driver=False)
-    actor = lw.PlanConditionedActor(lw.load_plans("MT10"), distribution="tanh_normal")
+    actor = lw.PlanConditionedActor(lw.load_plans("MT10")).stochastic("tanh_normal")
     frames = 100 * len(TASKS)
     collector = RayCollector(
         [partial(make_env, worker=(w, args.workers)) for w in range(args.workers)],

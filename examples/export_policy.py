@@ -8,17 +8,19 @@ import argparse
 
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 import lw_torchrl as lw
+from lw_torchrl.modules import transform_of
 
 
 class Deployed(nn.Module):
     """observation (B, 39) float32 and task_id (B,) int64 to the action (B, 4) float32."""
 
-    def __init__(self, actor: lw.Policy) -> None:
+    def __init__(self, actor: TensorDictModuleBase) -> None:
         super().__init__()
-        self.actor, self.reads = actor, actor.transform()
+        self.actor, self.reads = actor, transform_of(actor)
 
     def forward(self, observation: torch.Tensor, task_id: torch.Tensor) -> torch.Tensor:
         state = TensorDict({"observation": observation, "task_id": task_id}, [observation.shape[0]])

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 import lw_torchrl as lw
+from lw_torchrl.modules import Concat, ObservationFeatures, RoleFeatures
 from lw_torchrl.suites import load_suite
 
 TASKS = ["fetch/reach", "fetch/push", "fetch/pick-and-place"]
@@ -22,7 +23,7 @@ parser.add_argument("--episodes", type=int, default=50, help="evaluated of each 
 parser.add_argument("--out", type=Path, default=Path("runs/fetch-few-shot"))
 options = parser.parse_args()
 
-plans = lw.Plans([load_suite("fetch").plans[task] for task in TASKS])
+plans = lw.canonical_plans([load_suite("fetch").plans[task] for task in TASKS])
 for seed in options.seeds:
     folder = options.out / f"seed{seed}"
     lw.collect_demonstrations(
@@ -35,9 +36,10 @@ for seed in options.seeds:
         redraw_failures=True,
     )
     torch.manual_seed(seed)
-    policy = lw.PlanConditionedActor(plans, roles=True, features="opening")
+    features = Concat(ObservationFeatures("opening", 0.05, plans.layout), RoleFeatures(plans, 0.05))
+    policy = lw.PlanConditionedActor(plans, features=features)
     replay = lw.LanguageWorldExperienceReplay(
-        folder / "demonstrations", sampler=lw.TaskBalancedSampler(), transform=policy.transform()
+        folder / "demonstrations", sampler=lw.TaskBalancedSampler(), transform=lw.QAFTransform(plans)
     )
     config = lw.BehavioralCloningConfig(steps=options.steps, batch_size=300, seed=seed)
     lw.BehavioralCloningTrainer(policy, replay, config, checkpoint=folder / "policy.safetensors").train()

@@ -1,4 +1,4 @@
-"""PPO with TorchRL's own loss, from a cloned policy: an actor and a value on one shared plan encoder.
+"""PPO with TorchRL's own loss, from a cloned policy: an actor and a value on one shared trunk.
 
 python examples/ppo.py               # window-open, two demonstrations, 30 updates: about five minutes
 python examples/ppo.py --updates 2   # only to see it run
@@ -36,11 +36,10 @@ def main() -> None:
         config = lw.BehavioralCloningConfig(steps=args.clone, batch_size=100)
         lw.BehavioralCloningTrainer(cloned, replay, config).train()
     actor = cloned.stochastic("normal", init_std=0.2)
-    value = Value(actor.encoder)
+    value = Value(actor.trunk)
 
-    env = TransformedEnv(
-        lw.LanguageWorldEnv(TASK, num_envs=args.rows, reward="dense", max_steps=args.horizon), actor.transform()
-    )
+    env = lw.LanguageWorldEnv(TASK, num_envs=args.rows, reward="dense", max_steps=args.horizon)
+    env = TransformedEnv(env, lw.QAFTransform(plans))
     frames = args.rows * args.horizon
     collector = Collector(
         env,

@@ -17,6 +17,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
+from lw_torchrl.training import fit_normalization
 
 TASKS = ["drawer-open", "window-open"]
 SEED = 1_000
@@ -65,7 +66,7 @@ def main() -> None:
             after_success=20,
         )
         actor = lw.PlanConditionedActor(plans)
-        actor.fit_normalization(replay[:]["observation"])
+        fit_normalization(actor, replay)
         warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss about itself
         loss = BCLoss(actor, loss_function="l2")
         optimizer = torch.optim.AdamW(loss.parameters(), lr=1e-3)

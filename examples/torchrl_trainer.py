@@ -36,14 +36,16 @@ def main() -> None:
     torch.manual_seed(0)
     frames = args.rows * args.horizon
 
-    actor, value = lw.modules.plan_actor_value(lw.load_plans("MT10"), distribution="normal", init_std=0.5)
+    plans = lw.load_plans("MT10")
+    actor = lw.PlanConditionedActor(plans).stochastic("normal", init_std=0.5)
+    value = lw.modules.Value(actor.trunk)
     env = lw.LanguageWorldEnv(TASK, num_envs=args.rows, reward="dense", max_steps=args.horizon)
     collector = Collector(
-        TransformedEnv(env, actor.transform()),
+        TransformedEnv(env, lw.QAFTransform(plans)),
         actor,
         frames_per_batch=frames,
         total_frames=args.updates * frames,
-        auto_register_policy_transforms=False,  # the environment has the actor's transform already
+        auto_register_policy_transforms=False,  # the environment has the transform already
     )
     loss = ClipPPOLoss(actor, value, entropy_coeff=1e-3)
     trainer = Trainer(

@@ -42,7 +42,7 @@ def main() -> None:
             after_success=20,
         )
         actor = lw.PlanConditionedActor(plans)
-        actor.fit_normalization(replay[:]["observation"])
+        lw.training.fit_normalization(actor, replay)
         warnings.filterwarnings("ignore", message=".*target_actor_network_params")  # BCLoss about itself
         loss = BCLoss(actor, loss_function="l2")
         optimizer = torch.optim.AdamW(loss.parameters(), lr=1e-3)

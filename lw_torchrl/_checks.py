@@ -23,6 +23,11 @@ def nearest(given: str, allowed: Iterable[str], *, n: int = 3) -> list[str]:
     return get_close_matches(given, list(allowed), n=n, cutoff=0.4)
 
 
+def did_you_mean(given: str, allowed: Iterable[str]) -> str:
+    """The end of an error's sentence: the allowed name closest in spelling, "" if none is close."""
+    return "".join(f"; did you mean {name!r}?" for name in nearest(given, allowed, n=1))
+
+
 def unknown_name(argument: str, given: object, allowed: Iterable[str]) -> ValueError:
     """The error for a name outside a fixed set, with those close in spelling; the caller raises it."""
     names = list(allowed)

@@ -38,6 +38,17 @@ def absent_policy(path: AnyPath, writer: str = "train") -> str:
 
 
 @contextmanager
+def _naming(target: Path) -> Iterator[None]:
+    """Let errors of the disk name the file: a full disk does not say which it was."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(target)
+        raise
+
+
+@contextmanager
 def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` to write to; it takes the name when the block ends without an error.
 
@@ -51,16 +62,13 @@ def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
     # The suffix stays, because writers choose the format by it.
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(8)}.tmp{target.suffix}")
     try:
-        yield temporary
-        if sync:
-            flush(temporary)
-        os.replace(temporary, target)
-        if sync:
-            flush(target.parent)
-    except OSError as error:
-        if error.errno is not None and error.filename is None:
-            error.filename = str(target)  # a full disk does not say which file it was
-        raise
+        with _naming(target):
+            yield temporary
+            if sync:
+                flush(temporary)
+            os.replace(temporary, target)
+            if sync:
+                flush(target.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -80,15 +88,12 @@ def replacing_folder(path: AnyPath) -> Iterator[Path]:
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
     temporary.mkdir(parents=True)
     try:
-        yield temporary
-        for written in [*temporary.rglob("*"), temporary]:
-            flush(written)
-        os.replace(temporary, target)
-        flush(target.parent)
-    except OSError as error:
-        if error.errno is not None and error.filename is None:
-            error.filename = str(target)
-        raise
+        with _naming(target):
+            yield temporary
+            for written in [*temporary.rglob("*"), temporary]:
+                flush(written)
+            os.replace(temporary, target)
+            flush(target.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

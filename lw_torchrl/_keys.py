@@ -1,6 +1,7 @@
 """Keys of tensordicts as arguments, and modules that are called with a tensordict or with tensors."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import wraps
 from inspect import Parameter, Signature
 from typing import Any
@@ -15,34 +16,33 @@ from torch import Tensor
 from lw_torchrl._checks import missing_keys
 
 
+def _key(given: Any) -> NestedKey | None:
+    """Return a key; None if it is not one. A list is a nested key too, since JSON has no tuples."""
+    with suppress(Exception):  # TorchRL raises different errors
+        key: NestedKey = unravel_key(tuple(given) if isinstance(given, list) else given)
+        return key or None
+    return None
+
+
 def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[str]) -> list[NestedKey]:
-    """The keys ``given``, as many as the default ones and in their order; None for the default. :class:`ValueError` for
-    another number of keys, the same twice, or what is no key."""
+    """Return the keys ``given``, as many as the default ones and in their order; None for the default.
+
+    Another number of keys, the same key twice, and what is not a key are a :class:`ValueError`.
+    """
     if given is None:
         return list(default)
-    error = ValueError(
-        f"{argument} must be a list of {len(default)}, in this order: {', '.join(default)}; got {given!r}"
-    )
-    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != len(default):
-        raise error
-    try:  # a list is a nested key too: JSON has no tuples
-        keys = [unravel_key(tuple(key) if isinstance(key, list) else key) for key in given]
-    except Exception as cause:
-        raise error from cause
-    if len(set(keys)) != len(keys):
-        raise error
+    is_list = isinstance(given, Sequence) and not isinstance(given, str)
+    keys = [key for one in given if (key := _key(one)) is not None] if is_list else []
+    if not is_list or len({*keys}) != len(default) or len(given) != len(default):
+        wanted = f"a list of {len(default)}, in this order: {', '.join(default)}"
+        raise ValueError(f"{argument} must be {wanted}; got {given!r}")
     return keys
 
 
 def check_key(argument: str, given: Any) -> None:
     """Raise :class:`TypeError` unless ``given`` is a key of a tensordict."""
-    error = TypeError(f"{argument} must be a key, a string or a tuple of strings, got {given!r}")
-    if not isinstance(given, (str, tuple)) or not given:
-        raise error
-    try:
-        unravel_key(given)
-    except Exception as cause:
-        raise error from cause
+    if isinstance(given, list) or _key(given) is None:
+        raise TypeError(f"{argument} must be a key, a string or a tuple of strings, got {given!r}")
 
 
 def check_apart(in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> None:
@@ -52,12 +52,12 @@ def check_apart(in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> 
 
 
 def key_beside(key: NestedKey, ending: str) -> NestedKey:
-    """The key beside ``key`` whose name has an ending more."""
+    """Return the key next to ``key`` whose name has an ending more."""
     return key + ending if isinstance(key, str) else (*key[:-1], key[-1] + ending)
 
 
 def read(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> list[Tensor]:
-    """The tensors of ``keys``; :class:`ValueError` names those that are missing."""
+    """Return the tensors of ``keys``; a :class:`ValueError` names those that are missing."""
     found = [tensordict.get(key, None) for key in keys]
     if any(one is None for one in found):
         raise missing_keys(tensordict.keys(True, True), *map(str, keys))
@@ -72,9 +72,8 @@ def write(tensordict: TensorDictBase, module: TensorDictModuleBase, values: Sequ
 
 
 def dispatched(forward: Callable[[Any, TensorDictBase], TensorDictBase]) -> Callable[..., Any]:
-    """Let a module's ``forward`` be called like a TensorDictModule's: with a tensordict, or with the tensors of
-    ``in_keys``, by position or by name, as ``torch.export`` calls it too. Under ``set_skip_existing(True)`` a module
-    whose ``out_keys`` are all there does nothing."""
+    """Let a module's ``forward`` be called with a tensordict, or with the tensors of ``in_keys``, by position or by
+    name, as ``torch.export`` does. Under ``set_skip_existing(True)`` it does nothing if all ``out_keys`` are there."""
 
     @wraps(forward)
     def run(self: TensorDictModuleBase, tensordict: TensorDictBase) -> TensorDictBase:
@@ -96,7 +95,7 @@ _ANY = Parameter("args", Parameter.VAR_POSITIONAL), Parameter("kwargs", Paramete
 
 
 def row_mask(tensordict: TensorDictBase | None, key: str, n: int) -> np.ndarray:
-    """The rows of a mask such as "_reset", (n,) bool; all if there is none."""
+    """Return the rows of a mask such as "_reset", (n,) bool; all if there is none."""
     mask = None if tensordict is None else tensordict.get(key, None)
     if mask is None:
         return np.ones(n, dtype=bool)

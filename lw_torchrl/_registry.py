@@ -50,8 +50,8 @@ class Registry(UserDict[str, Entry]):
     name is first looked up. Installed packages' names are listed too; a package is imported at its first look-up.
 
     Args:
-        kind: what errors call an entry, "policy".
-        group: the group of entry points, "lw_torchrl.policies".
+        kind: what errors call an entry, "method".
+        group: the group of entry points, "lw_torchrl.methods".
         entries: what we ship.
         check: from a name and an object to the entry; raises if the object is of the wrong kind.
 
@@ -60,8 +60,8 @@ class Registry(UserDict[str, Entry]):
         ImportError: an entry cannot be imported or is of the wrong kind; the message names its package.
 
     Example:
-        >>> from lw_torchrl.modules import POLICIES
-        >>> POLICIES["PlanConditionedActor"].__name__
+        >>> from lw_torchrl.modules import METHODS
+        >>> METHODS["pcbc"].__name__
         'PlanConditionedActor'
 
     Source: the entry points of the Python packaging user guide; gymnasium's registry.
@@ -108,19 +108,6 @@ class Registry(UserDict[str, Entry]):
                 raise  # our own modules say which extra to install
             failed = f"{self.kind} {name!r} is {place}{package}, which cannot be loaded"
             raise ImportError(f"{failed} ({type(error).__name__}: {error})") from error
-
-
-def is_class(kind: str, base: type[Entry], own_name: bool = True) -> Callable[[str, Any], type[Entry]]:
-    """Return a check of classes derived from ``base``, registered by their own name, which files store."""
-
-    def check(name: str, entry: Any) -> type[Entry]:
-        if not isinstance(entry, type) or not issubclass(entry, base):
-            raise TypeError(f"{kind} {name!r} must be a class derived from {base.__name__}, got {entry!r:.80}")
-        if own_name and entry.__name__ != name:
-            raise ValueError(f"{kind} {name!r} must have the name of its class, {entry.__name__!r}")
-        return entry
-
-    return check
 
 
 def is_function(name: str, entry: Any) -> Callable[..., Any]:

@@ -153,7 +153,7 @@ def test_ablations_write_a_table_of_what_was_run(setting, monkeypatch, tmp_path,
 def test_truth_writes_a_table_and_a_figure_and_carries_on(tmp_path, monkeypatch, capsys):
     plans = lw.Plans({task: lw.load_plans("MT10")[task] for task in ("push", "reach")})
     file = tmp_path / "untrained.safetensors"
-    lw.save_actor(lw.PlanConditionedActor(plans, width=8), file)
+    lw.save_actor(lw.PlanConditionedActor(plans), file)
     args = truth.Arguments(
         policy=(file,), tasks=("push", "reach"), every=(1, 4), flip=(0.0, 0.5), episodes=2, max_steps=30, out=tmp_path,
     )  # fmt: skip
@@ -191,7 +191,7 @@ def test_truth_says_what_an_evaluator_must_reach():
 
 
 def test_truth_refuses_a_policy_that_reads_no_answers(tmp_path):
-    lw.save_actor(lw.DescriptorConditionedActor(["reach"], width=8), tmp_path / "dc.safetensors")
+    lw.save_actor(lw.DescriptorConditionedActor(["reach"]), tmp_path / "dc.safetensors")
     with pytest.raises(SystemExit, match=r"dc\.safetensors does not read qaf"):
         truth.main(truth.Arguments(policy=(tmp_path / "dc.safetensors",), out=tmp_path))
 

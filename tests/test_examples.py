@@ -145,7 +145,7 @@ def test_offline_rl_runs(tmp_path):
 
 @pytest.mark.slow
 def test_a_policy_is_exported(tmp_path):
-    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), width=16), tmp_path / "policy.safetensors")
+    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10")), tmp_path / "policy.safetensors")
     done = run("export_policy.py", tmp_path, "policy.safetensors", "policy.pt2")
     assert done.stdout.count("at most 0.0e+00 away") == 3
     assert (tmp_path / "policy.pt2").is_file()
@@ -159,7 +159,7 @@ def test_a_trainer_of_torchrls_runs(tmp_path):
     for name in ("reward", "success", "loss_objective"):
         lines = (logged / f"{name}.csv").read_text("utf-8").splitlines()
         assert [line.split(",")[0] for line in lines] == ["100", "200", "300"]
-    assert lw.load_actor(tmp_path / "runs" / "torchrl_trainer" / "policy.safetensors").head.distribution == "normal"
+    assert lw.load_actor(tmp_path / "runs" / "torchrl_trainer" / "policy.safetensors").distribution == "normal"
 
 
 @pytest.mark.slow

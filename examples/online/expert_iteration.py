@@ -78,8 +78,10 @@ def main(args: Args) -> None:
 
     # The start: behavioral cloning of the demonstrations.
     plans = lw.Plans([lw.load_plans("MT50")[args.task]])
-    actor = lw.load_actor(args.start) if args.start else lw.PlanConditionedActor(plans, feature_noise=0.1)
-    options = {"label": "executed", "terminate_on_success": True, "transform": actor.transform()}
+    actor = lw.PlanConditionedActor(plans, features=lw.modules.ObservationFeatures(noise=0.1))
+    if args.start:
+        actor = lw.load_actor(args.start)
+    options = {"label": "executed", "terminate_on_success": True, "transform": lw.modules.transform_of(actor)}
     demonstrations = lw.LanguageWorldExperienceReplay(demos, **options)
     if args.start is None:
         config = lw.BehavioralCloningConfig(args.cloning_steps, args.batch_size, seed=args.seed)
@@ -88,7 +90,7 @@ def main(args: Args) -> None:
 
     # The buffer holds demonstrations and the policy's own successful episodes.
     torch.manual_seed(20_000 + args.seed)
-    options |= {"keys": ["observation", "task_id", "action"], "transform": actor.transform()}
+    options |= {"keys": ["observation", "task_id", "action"], "transform": lw.modules.transform_of(actor)}
     offline = lw.LanguageWorldExperienceReplay(demos, **options)
     replay = OfflineToOnlineReplayBuffer(offline, online_capacity=args.frames, batch_size=args.batch_size)
     keys = list(offline.sample(1).keys())
@@ -100,7 +102,7 @@ def main(args: Args) -> None:
     episodes = {"max_steps": args.max_steps, "terminate_on_success": True, "seed": 20_000 + args.seed}
     env = lw.LanguageWorldEnv(args.task, num_envs=args.num_envs, **episodes)
     collector = Collector(
-        TransformedEnv(env, Compose(actor.transform(), InitTracker())),
+        TransformedEnv(env, Compose(lw.modules.transform_of(actor), InitTracker())),
         TensorDictSequential(actor, PlanNoise(args, demonstrations[:])),
         frames_per_batch=args.max_steps * args.num_envs,  # a round
         total_frames=args.frames,

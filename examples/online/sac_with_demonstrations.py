@@ -20,6 +20,7 @@ from torchrl.objectives import SoftUpdate
 
 import lw_torchrl as lw
 from lw_torchrl.data import REWARDS, ROLLOUT, n_step_returns
+from lw_torchrl.training import fit_normalization
 
 
 @dataclass
@@ -63,8 +64,10 @@ def main(args: Args) -> None:
 
     # The start: behavioral cloning of the demonstrations.
     plans = lw.Plans([lw.load_plans("MT50")[args.task]])
-    actor = lw.load_actor(args.start) if args.start else lw.PlanConditionedActor(plans, feature_noise=0.1)
-    options = {"label": "executed", "terminate_on_success": True, "transform": actor.transform()}
+    actor = lw.PlanConditionedActor(plans, features=lw.modules.ObservationFeatures(noise=0.1))
+    if args.start:
+        actor = lw.load_actor(args.start)
+    options = {"label": "executed", "terminate_on_success": True, "transform": lw.modules.transform_of(actor)}
     demonstrations = lw.LanguageWorldExperienceReplay(demos, **options)
     if args.start is None:
         config = lw.BehavioralCloningConfig(args.cloning_steps, args.batch_size, seed=args.seed)
@@ -72,13 +75,18 @@ def main(args: Args) -> None:
 
     # Half of each minibatch are demonstrations, half the collector's rows; the reward is a cost until success.
     torch.manual_seed(20_000 + args.seed)
-    options |= {"reward": "dense_cost", "n_steps": args.n_steps, "gamma": args.gamma, "transform": actor.transform()}
+    options |= {
+        "reward": "dense_cost",
+        "n_steps": args.n_steps,
+        "gamma": args.gamma,
+        "transform": lw.modules.transform_of(actor),
+    }
     options |= {"keys": [*ROLLOUT, "steps_to_next_obs", "is_demonstration"]}
     offline = lw.LanguageWorldExperienceReplay(demos, **options)
     replay = OfflineToOnlineReplayBuffer(offline, online_capacity=args.frames, batch_size=args.batch_size)
     keys = list(offline.sample(1).keys(True, True))
     critic = lw.PlanConditionedQValue(actor.plans).eval()
-    critic.fit_normalization(demonstrations[:]["observation"])
+    fit_normalization(critic, demonstrations)
     actor = actor.stochastic("tanh_normal", args.init_std).eval()
     options = {"bc_weight": args.bc_weight, "alpha_init": args.alpha}
     loss = lw.objectives.DemonstratedSACLoss(actor, critic, loss_function="l1", **options)
@@ -91,7 +99,7 @@ def main(args: Args) -> None:
     episodes = {"max_steps": args.max_steps, "terminate_on_success": True, "seed": 20_000 + args.seed}
     env = lw.LanguageWorldEnv(args.task, num_envs=args.num_envs, reward="dense", **episodes)
     collector = Collector(
-        TransformedEnv(env, actor.transform()),
+        TransformedEnv(env, lw.modules.transform_of(actor)),
         actor,
         frames_per_batch=args.rollout * args.num_envs,
         total_frames=args.frames,

@@ -31,7 +31,7 @@ class FinishedEpisode(NamedTuple):
 
 
 def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[[TensorDictBase], TensorDictBase]:
-    """The actor, on a device or where it is; networks run on blocks of one size, so no row depends on the others."""
+    """Return the actor on a device; networks run on blocks of one size, so that no row depends on the others."""
     there = place(actor, device)
     policy = actor if getattr(actor, "row_by_row", False) else in_blocks(actor)
     if there == CPU:
@@ -40,7 +40,7 @@ def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[
 
 
 def read_action(tensordict: TensorDictBase, size: int) -> Tensor:
-    """The ``action`` that an actor wrote, (N, size) float32; :class:`ValueError` if it is none."""
+    """Return the ``action`` that an actor wrote, (N, size) float32; another is a :class:`ValueError`."""
     action, shape = tensordict.get("action", None), (*tensordict.batch_size, size)
     if action is None:
         raise ValueError(f"the actor must write 'action', got {', '.join(map(str, tensordict.keys()))}")
@@ -72,10 +72,9 @@ def run_episodes(
         env: a LanguageWorldEnv, with transforms or without.
         policy: called on all N rows, with a ``_step`` mask of those that count.
         episodes: task name to episode indices; one that is listed several times is run as often.
-        keys: what to record of each step, ``("next", "success")`` say; ``action`` is the executed one.
-        noise, noise_hold: episode index to the A standard deviations of the noise added to the action, and the steps
-            for which each draw is kept.
-        after_success: end an episode so many steps after its first successful one; None for never.
+        keys: the keys to record of each step, ``("next", "success")`` say; ``action`` is the executed one.
+        noise, noise_hold: episode index to the A standard deviations of the action's noise; steps of each draw.
+        after_success: end an episode N steps after its first successful one; None for never.
         clean_action, place: keys for the action before the noise, and for the place of each row's episode in its task's
             list, (N,) int64, for the policy to read.
         on_progress: called after each step with the number of steps done, with those that an early end saves.

@@ -34,20 +34,15 @@ _SOURCES = {"plan": "its own steps", "completed": "completed", "fallback": "repl
 class CanonicalReport:
     """How :func:`canonical_plan` read a plan.
 
-    Attributes:
-        written: the plan as it was given.
-        plan: its canonical form.
-        source: "plan", the plan's own steps; "completed", its motion, objects and direction with standard conditions,
-            where its own do not cover the typical states; "fallback", the fallback plan, where it has no motion.
-        read: the plan's own steps as they were read, also where ``plan`` has others.
-        left_out: the skills that could not be read.
+    Its source is "plan", the plan's own steps; "completed", its motion, objects and direction with standard
+    conditions, if its own do not cover the typical states; or "fallback", the fallback plan, if it has no motion.
     """
 
     written: ConditionalPlan
-    plan: ConditionalPlan
+    plan: ConditionalPlan  # the canonical form
     source: Source
-    read: tuple[PlanStep, ...]
-    left_out: tuple[str, ...]
+    read: tuple[PlanStep, ...]  # the plan's own steps as they were read, also where ``plan`` has others
+    left_out: tuple[str, ...]  # the skills that could not be read
 
     def notes(self) -> list[dict[str, Any]]:
         """The result of each step as written, then the steps that replace them, if any, as JSON.
@@ -55,18 +50,17 @@ class CanonicalReport:
         The keys are ``written``, None for a step that the plan lacked; ``skill``, ``verb``, ``moved``, ``target`` and
         ``condition``, None for what was left out; ``confidence``; and ``seen``, whether policies see the step.
         """
+
+        def note(step: PlanStep, seen: bool) -> dict[str, Any]:
+            role = _role(step)
+            names = {"skill": step.skill, "verb": role.verb, "moved": role.moved, "target": role.target}
+            about = {"condition": str(step.condition), "confidence": role.confidence, "seen": seen}
+            return {"written": role.written or None, **names, **about}
+
         own = self.source == "plan"
-        notes = [_note(step, own) for step in self.read]
-        notes += [] if own else [_note(step, True) for step in self.plan.steps]
+        notes = [note(step, own) for step in self.read] + [note(step, True) for step in self.plan.steps if not own]
         nothing = dict.fromkeys(("skill", "verb", "moved", "target", "condition"))
         return notes + [{"written": skill, **nothing, "confidence": 0.0, "seen": False} for skill in self.left_out]
-
-
-def _note(step: PlanStep, seen: bool) -> dict[str, Any]:
-    role = _role(step)
-    names = {"skill": step.skill, "verb": role.verb, "moved": role.moved, "target": role.target}
-    about = {"condition": str(step.condition), "confidence": role.confidence, "seen": seen}
-    return {"written": role.written or None, **names, **about}
 
 
 @checked
@@ -83,9 +77,6 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
         plan: a plan in any words.
         fallback: append the steps of the fallback plan, whose roles say ``fallback=True``. Policies try them when the
             plan makes no progress. Nothing is appended where the plan became the fallback plan, or has one.
-
-    Returns:
-        A plan for the same task with ``step.role`` and ``confidence``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -129,13 +120,13 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
     read = _with_roles(plan, parsed)
     confidence, last = _confidence(task, read), motion_of([_role(step) for step in read])
     source: Source
-    left_out = tuple(step.skill for step, reading in zip(plan.steps, parsed, strict=True) if reading is None)
     if confidence >= MIN_CONFIDENCE and _is_complete(read):
         source, steps = "plan", read
     elif last is not None:
         source, steps = "completed", _completed(task, read, last)
     else:
         source, steps = "fallback", fallback_plan(task).steps
+    left_out = tuple(step.skill for step, reading in zip(plan.steps, parsed, strict=True) if reading is None)
     seen = []
     for number, step in enumerate(steps):
         written = _role(step).written
@@ -154,17 +145,13 @@ def fallback_plan(task: str | Task) -> ConditionalPlan:
     task = get_task(task)
     held = first_object(task)
     if held is not None:
-        return ConditionalPlan(
-            task.name, _completed(task, (), StepRole("move", held, GOAL, "grasp", confidence=0.0)), task
-        )
+        steps = _completed(task, (), StepRole("move", held, GOAL, "grasp", confidence=0.0))
+        return ConditionalPlan(task.name, steps, task)
     named = whole_objects(task)
     goal = next((name for name in named if is_goal(task, name)), None)
     near, target = _gripper_is("near", goal or named[0]), GOAL if goal else named[0]
-    steps = (
-        _step(_negated(near), StepRole("reach", GRIPPER, target, "reach")),
-        _step(near, StepRole("hold", GRIPPER, target, "reach")),
-    )
-    return ConditionalPlan(task.name, steps, task)
+    come = _step(_negated(near), StepRole("reach", GRIPPER, target, "reach"))
+    return ConditionalPlan(task.name, (come, _step(near, StepRole("hold", GRIPPER, target, "reach"))), task)
 
 
 def _role(step: PlanStep) -> StepRole:
@@ -240,14 +227,12 @@ def _at_points(condition: Query, task: Task) -> Query:
     def at(name: str) -> str:
         return point_on(task, name) if name != GRIPPER and first and same_object(task, name, first) else name
 
-    return Query(
-        tuple(
-            replace(clause, subject=at(clause.subject), object=at(clause.object))
-            if clause.object is not None and GRIPPER in (clause.subject, clause.object)
-            else clause
-            for clause in condition.clauses
-        )
-    )
+    def touched(clause: Clause) -> Clause:
+        if clause.object is None or GRIPPER not in (clause.subject, clause.object):
+            return clause
+        return replace(clause, subject=at(clause.subject), object=at(clause.object))
+
+    return Query(tuple(map(touched, condition.clauses)))
 
 
 def _over_walls(steps: Sequence[PlanStep], task: Task) -> list[PlanStep]:
@@ -269,15 +254,12 @@ def _is_complete(steps: Sequence[PlanStep]) -> bool:
     """Return whether a plan moves something and, if it grasps, comes to the object and closes the gripper before."""
     roles = [_role(step) for step in steps]
     verbs = [role.verb for role in roles]
-    moving = [number for number, verb in enumerate(verbs) if verb in ("carry", "move")]
+    moving = next((number for number, verb in enumerate(verbs) if verb in ("carry", "move")), None)
     if any(role.verb == "pull" and "handle" not in role.target.split() for role in roles):
         return False  # a handle can be hooked; anything else is held better in closed fingers
-    if motion_of(roles) is None:
-        return False
-    if not moving:
-        return True
-    closing = verbs.index("close") if "close" in verbs else len(verbs)
-    return closing < min(moving) and any(verb in ("approach", "descend") for verb in verbs[:closing])
+    if moving is None:
+        return motion_of(roles) is not None
+    return "close" in verbs[:moving] and not {"approach", "descend"}.isdisjoint(verbs[: verbs.index("close")])
 
 
 def _completed(task: Task, steps: Sequence[PlanStep], last: StepRole) -> tuple[PlanStep, ...]:
@@ -346,28 +328,15 @@ def _confidence(task: Task, steps: Sequence[PlanStep]) -> float:
 
 
 def worth(plan: ConditionalPlan) -> tuple[bool, float, float]:
-    """Return a key to compare plans for a task without trying them; the larger is better.
-
-    It holds whether the plan has a motion, its confidence, and the mean confidence of its steps.
-    """
+    """Return a key to compare plans for a task, the larger is better: whether the plan has a motion, its confidence,
+    and the mean confidence of its steps."""
     report = explain_canonical(plan)
     steps = sum(_role(step).confidence for step in report.read) / (len(report.read) + len(report.left_out))
     return report.source != "fallback", report.plan.confidence or 0.0, steps
 
 
 def most_confident(plans: Iterable[ConditionalPlan]) -> ConditionalPlan:
-    """Return the plan with the largest :func:`worth`, the first of equals.
-
-    Raises:
-        ValueError: there is no plan.
-
-    Example:
-        >>> import lw_torchrl as lw
-        >>> bad = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "ponder")])
-        >>> good = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "put the puck at the goal")])
-        >>> most_confident([bad, good]) is good
-        True
-    """
+    """Return the plan with the largest :func:`worth`, the first of equals."""
     if not (listed := list(plans)):
         raise ValueError("plans must be at least one, got none")
     return max(listed, key=worth)

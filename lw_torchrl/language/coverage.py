@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.resources import files
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lw_torchrl._files import read_toml
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.named_objects import Coordinate
 from lw_torchrl.language.queries import Clause, Query
@@ -18,43 +20,12 @@ from lw_torchrl.language.tasks import Task
 Floats = NDArray[np.float32]
 _OBJECTS = ((0.0, 0.6, 0.02), (0.2, 0.7, 0.02), (-0.2, 0.7, 0.02), (0.0, 0.8, 0.02))
 _GOAL = (0.1, 0.8, 0.2)
-_State = tuple[tuple[float, float, float], float, float, frozenset[str]]
-
-
-def _states(*rows: tuple[Sequence[tuple[float, float, float]], float, float, str]) -> list[_State]:
-    return [(at, opening, lift, frozenset(verbs.split())) for hands, opening, lift, verbs in rows for at in hands]
-
-
-_COMING = (
-    ([(0.1, 0.1, 0.15), (-0.1, -0.05, 0.1)], 1.0, 0.0, "approach"),
-    ([(0.0, 0.0, 0.12), (0.008, 0.0, 0.06)], 1.0, 0.0, "descend"),
-)
-_TYPICAL: dict[str, list[_State]] = {
-    "grasp": _states(
-        *_COMING,
-        ([(0.0, 0.0, 0.01), (0.01, -0.01, 0.02), (0.0, 0.01, 0.0)], 1.0, 0.0, "close"),
-        ([(0.0, 0.0, 0.01), (0.01, 0.0, 0.02), (0.0, 0.0, -0.01)], 0.4, 0.0, "close carry move"),
-        ([(0.0, 0.0, 0.01), (0.01, 0.0, 0.02), (0.0, 0.0, -0.01)], 0.4, 0.1, "carry move"),
-    ),
-    "pull": _states(*_COMING, ([(0.0, 0.0, -0.01), (0.01, -0.01, -0.02), (0.0, 0.01, -0.03)], 1.0, 0.0, "pull")),
-    "press": _states(
-        ([(0.1, 0.1, 0.15)], 0.3, 0.0, "approach"),
-        ([(0.0, 0.0, 0.1)], 0.3, 0.0, "push approach"),
-        ([(0.005, 0.0, 0.06), (0.005, 0.0, 0.03), (0.005, 0.0, 0.01)], 0.3, 0.0, "push"),
-    ),
-    "push": _states(
-        ([(0.15, 0.1, 0.15)], 0.3, 0.0, "approach beside"),
-        ([(0.0, 0.0, 0.12)], 0.3, 0.0, "beside descend approach"),
-        (
-            [(0.0, 0.0, 0.0), (0.01, 0.0, 0.01), (0.0, 0.015, 0.0), (-0.015, 0.0, 0.0), (0.0, 0.0, 0.02)],
-            0.3,
-            0.0,
-            "push",
-        ),
-    ),
+_MOTIONS = read_toml(files("lw_torchrl.language") / "data" / "motions.toml", ValueError)
+_MOTIONS |= {motion: _MOTIONS["coming"] + _MOTIONS[motion] for motion in ("grasp", "pull")}
+_TYPICAL = {
+    motion: [(offset, opening, lift, {*verbs.split()}) for hands, opening, lift, verbs in rows for offset in hands]
+    for motion, rows in _MOTIONS.items()
 }
-"""Where the hand may be from where it touches, metres; the gripper's opening; how far the object was lifted, metres;
-and the verbs that do there what the motion needs."""
 
 
 def coverage(task: Task, point: str, motion: str, steps: Sequence[tuple[Query, Verb]]) -> float:
@@ -68,7 +39,7 @@ def coverage(task: Task, point: str, motion: str, steps: Sequence[tuple[Query, V
     return good / len(_TYPICAL[motion])
 
 
-def _state(task: Task, point: str, offset: tuple[float, ...], opening: float, lift: float) -> Floats:
+def _state(task: Task, point: str, offset: Sequence[float], opening: float, lift: float) -> Floats:
     touched, layout = role_object(task, point), task.layout
     state = np.zeros(layout.size, np.float32)
     for place, xyz in zip(layout.positions[1:-1], _OBJECTS, strict=False):

@@ -5,23 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any
 
 from lw_torchrl._checks import check_fields, shown
+from lw_torchrl._registry import ReadOnlyDict
 
 
 @dataclass(frozen=True)
 class Slot:
-    """Where an observation tells of one thing.
+    """The numbers of an observation that describe one object."""
 
-    Attributes:
-        position: index of its x; y and z follow.
-        quaternion: index of the first of its four numbers; None where they are not told.
-    """
-
-    position: int
-    quaternion: int | None = None
+    position: int  # index of its x; y and z follow
+    quaternion: int | None = None  # index of the first of its four numbers; None without an orientation
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -39,34 +34,11 @@ class Slot:
 
 @dataclass(frozen=True)
 class Layout:
-    """What the numbers of an observation and of an action are, for all tasks of a suite.
+    """The meaning of the numbers of observations and actions, for all tasks of a suite.
 
-    The frame that suites turn their numbers into: metres, x to the right, y away from the robot, z above the table.
-
-    Attributes:
-        name: the suite's.
-        size: D, how many numbers an observation has.
-        hand: index of the gripper's x; y and z follow.
-        opening: index of the gripper's opening, from 0, closed, to 1, open.
-        things: the things, in the order in which tasks have them. All but the first may be absent: zeros.
-        goal: index of the x of the task's target.
-        past: the numbers of the step before stand at their index + past; after a reset they are the present ones. None
-            without them. The goal has no past.
-        action_size: A, how many numbers an action has, each in [-1, 1].
-        displacement: index of the x of the hand's displacement; y and z follow. None where actions are something else,
-            velocities of joints for one: scripted skills, ``RandomYaw`` and ``TransferredActor`` then refuse it.
-        reach: metres that the hand moves in a step at a displacement of 1, once it moves.
-        gripper: index of the gripper's effort; None where no number is one.
-        closes: the effort's sign that closes, 1 or -1. Skills say 1 to close everywhere; actions and data have this
-            sign.
-        binary_gripper: whether the gripper opens or closes fully within a few steps, so that an effort in between has
-            to be decided.
-        closes_above: the effort above which such a gripper closes. Meta-World's fingers, which close as fast as the
-            effort is large, have closed within a quarter of a second at 0.3.
-        thresholds: relation, of one comparison, to a threshold, metres, where the hand is measured elsewhere.
-
-    Raises:
-        ValueError: an index outside the numbers, a number that is two things, or a wrong sign.
+    Positions are in metres: x to the right, y away from the robot, z above the table. Where an index is of an x, y and
+    z follow. Without a ``displacement`` of the hand, scripted skills, ``RandomYaw`` and ``TransferredActor`` refuse an
+    action. Scripted skills say 1 to close everywhere; actions and data have the sign of ``closes``.
 
     Example:
         >>> METAWORLD.positions
@@ -76,49 +48,45 @@ class Layout:
     """
 
     name: str
-    size: int
-    hand: int
-    opening: int
-    things: tuple[Slot, ...]
-    goal: int
-    past: int | None = None
-    action_size: int = 4
-    displacement: int | None = 0
-    reach: float = 0.01
-    gripper: int | None = 3
-    closes: int = 1
-    binary_gripper: bool = False
-    closes_above: float = 0.3
-    thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)
+    size: int  # D, how many numbers an observation has
+    hand: int  # index of the gripper's x
+    opening: int  # index of the gripper's opening, from 0, closed, to 1, open
+    things: tuple[Slot, ...]  # in the order in which tasks have them; all but the first may be absent: zeros
+    goal: int  # index of the x of the task's target, which has no past
+    past: int | None = None  # numbers of the step before stand at their index + past; after a reset, the present ones
+    action_size: int = 4  # A, how many numbers an action has, each in [-1, 1]
+    displacement: int | None = 0  # index of the x of the hand's displacement; None if actions are something else
+    reach: float = 0.01  # metres that the hand moves in a step at a displacement of 1, once it moves
+    gripper: int | None = 3  # index of the gripper's effort
+    closes: int = 1  # the effort's sign that closes, 1 or -1
+    binary_gripper: bool = False  # whether it opens or closes fully within a few steps: an effort has to be decided
+    closes_above: float = 0.3  # the effort above which such a gripper closes
+    thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)  # metres, by relation, of this suite
 
     def __post_init__(self) -> None:
         check_fields(self)
+        layout = f"layout {self.name!r}"
         if not self.things or not all(isinstance(thing, Slot) for thing in self.things):
-            raise ValueError(f"things of layout {self.name!r} must be at least one Slot, got {self.things!r}")
-        ends = [self.hand + 3, self.opening + 1, self.goal + 3, *(thing.position + 3 for thing in self.things)]
-        ends += [thing.quaternion + 4 for thing in self.things if thing.quaternion is not None]
-        if min(self.hand, self.opening, self.goal) < 0 or max(ends) > self.size:
-            raise ValueError(f"layout {self.name!r} names numbers outside the {self.size} of an observation")
-        places = [*self.present, *(self.a_step_before(part) for part in self.present if self.past is not None)]
-        told = [number for place in places for number in range(place.start, place.stop)]
+            raise ValueError(f"things of {layout} must be at least one Slot, got {self.things!r}")
+        used = [*self.present, *self.positions]
+        if min(part.start for part in used) < 0 or max(part.stop for part in used) > self.size:
+            raise ValueError(f"{layout} names numbers outside the {self.size} of an observation")
+        told = [number for part in (*self.present, *self._past(self.present)) for number in places(part)]
         if twice := sorted({number for number in told if told.count(number) > 1}):
-            raise ValueError(f"layout {self.name!r} says of number {twice[0]} that it is two things")
+            raise ValueError(f"{layout} says of number {twice[0]} that it is two things")
         for name, index, width in (("displacement", self.displacement, 3), ("gripper", self.gripper, 1)):
             if index is not None and not 0 <= index <= self.action_size - width:
-                within = f"within {self.action_size} numbers"
-                raise ValueError(f"{name} of layout {self.name!r} must be {within}, got {index}")
+                raise ValueError(f"{name} of {layout} must be within {self.action_size} numbers, got {index}")
         if self.displacement is not None and self.gripper in range(self.displacement, self.displacement + 3):
-            raise ValueError(
-                f"gripper of layout {self.name!r} must be no number of the displacement, got {self.gripper}"
-            )
+            raise ValueError(f"gripper of {layout} must be no number of the displacement, got {self.gripper}")
         if self.closes not in (1, -1):
-            raise ValueError(f"closes of layout {self.name!r} must be 1 or -1, got {shown(self.closes)}")
+            raise ValueError(f"closes of {layout} must be 1 or -1, got {shown(self.closes)}")
         if self.reach <= 0:
-            raise ValueError(f"reach of layout {self.name!r} must be above 0 metres, got {shown(self.reach)}")
+            raise ValueError(f"reach of {layout} must be above 0 metres, got {shown(self.reach)}")
         for relation, threshold in self.thresholds.items():
             if not isinstance(relation, str) or type(threshold) is not float or abs(threshold) > 1e3:
-                raise ValueError(f"thresholds of layout {self.name!r} must map relations to metres, got {relation!r}")
-        object.__setattr__(self, "thresholds", MappingProxyType(dict(self.thresholds)))
+                raise ValueError(f"thresholds of {layout} must map relations to metres, got {relation!r}")
+        object.__setattr__(self, "thresholds", ReadOnlyDict(dict(self.thresholds)))
         for name in ("present", "positions", "all_positions", "parts"):
             getattr(self, name)  # computed here: torch.compile cannot trace the lock of a cached_property
 
@@ -137,16 +105,13 @@ class Layout:
     @cached_property
     def all_positions(self) -> tuple[slice, ...]:
         """All positions, also those of the step before."""
-        return (*self.positions, *(self.a_step_before(place) for place in self.positions[:-1] if self.past is not None))
+        return (*self.positions, *self._past(self.positions[:-1]))
 
     @cached_property
     def parts(self) -> tuple[tuple[slice, ...], ...]:
         """The numbers of each thing, now and a step before, then those of the goal."""
-        found = []
-        for thing in self.things:
-            now = thing.numbers
-            found.append((*now, *(self.a_step_before(part) for part in now if self.past is not None)))
-        return (*found, (self.positions[-1],))
+        things = [(*thing.numbers, *self._past(thing.numbers)) for thing in self.things]
+        return (*things, (self.positions[-1],))
 
     @property
     def effort(self) -> slice:
@@ -156,8 +121,8 @@ class Layout:
     def displaced(self, what: str) -> slice:
         """The hand's displacement among the numbers of an action; :class:`ValueError` names ``what`` needs one."""
         if self.displacement is None:
-            lacks = "has no displacement of the hand, which it needs"
-            raise ValueError(f"{what}: an action of layout {self.name!r} {lacks}")
+            lacks = f"an action of layout {self.name!r} has no displacement of the hand, which it needs"
+            raise ValueError(f"{what}: {lacks}")
         return slice(self.displacement, self.displacement + 3)
 
     def a_step_before(self, part: slice) -> slice:
@@ -165,6 +130,10 @@ class Layout:
         if self.past is None:
             raise ValueError(f"layout {self.name!r} has no numbers of the step before")
         return slice(part.start + self.past, part.stop + self.past)
+
+    def _past(self, parts: tuple[slice, ...]) -> tuple[slice, ...]:
+        """Return the same parts of the step before, none in a layout without a past."""
+        return () if self.past is None else tuple(map(self.a_step_before, parts))
 
     def to_json(self) -> dict[str, Any]:
         """What :meth:`from_json` reads back."""
@@ -185,9 +154,6 @@ class Layout:
             return cls(**{**found, "things": tuple(Slot(*one) for one in things)})
         except TypeError as error:
             raise ValueError(f"layout: {error}") from error
-
-    def __reduce__(self) -> Any:
-        return Layout.from_json, (self.to_json(),)
 
 
 def places(part: slice) -> tuple[int, ...]:

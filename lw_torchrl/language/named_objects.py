@@ -46,19 +46,14 @@ def coordinate_indices(position: Sequence[Coordinate], constants: list[float], s
 class NamedObject:
     """An object that queries can name.
 
-    Attributes:
-        name: "drawer handle", in lower case and without an article.
-        position: x, y and z: an int is an index into the numbers of the observation, a float is in metres.
-        offset: added to it, metres; for a point beside an object.
-        ours: a point that we named, which the published object list lacks.
-        opening: index of a number of the observation, from 0, closed, to 1, open, that queries call "open" and
-            "closed"; None for what does not open, turn or slide. The gripper's is the layout's.
+    ``opening`` is the index of a number of the observation, from 0, closed, to 1, open; None for what does not open,
+    turn or slide. The gripper's is the layout's.
     """
 
-    name: str
-    position: tuple[Coordinate, Coordinate, Coordinate]
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    ours: bool = False
+    name: str  # "drawer handle", in lower case and without an article
+    position: tuple[Coordinate, Coordinate, Coordinate]  # x, y and z
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # metres, added to the position; for a point on an object
+    ours: bool = False  # a point that we named, which the published object list lacks
     opening: int | None = None
 
     def __post_init__(self) -> None:
@@ -87,13 +82,6 @@ def read_position(name: str, at: Any) -> tuple[Coordinate, Coordinate, Coordinat
             x, y, z = (c if isinstance(o, str) else float(c) for c, o in zip(found, at, strict=True))
             return (x, y, z)
     raise ValueError(f"position of {name!r} must be like 'obs[4:7]' or [0.1, 'obs[37]', 0.0], got {shown(at)}")
-
-
-def write_position(position: tuple[Coordinate, Coordinate, Coordinate]) -> str | list[str | float]:
-    first = position[0]
-    if isinstance(first, int) and position == (first, first + 1, first + 2):
-        return f"obs[{first}:{first + 3}]"
-    return [f"obs[{c}]" if isinstance(c, int) else c for c in position]
 
 
 def read_object(name: str, at: Any) -> NamedObject:
@@ -154,7 +142,10 @@ def write_objects(objects: Sequence[NamedObject]) -> dict[str, dict[str, Any]]:
     row: dict[str, dict[str, Any]] = {"objects": {}, "points": {}}
     published = {typed(named.position): named.name for named in reversed(objects) if not named.ours}
     for named in objects[1:]:
-        at: Any = write_position(named.position)
+        x, *_ = named.position
+        at: Any = [f"obs[{c}]" if isinstance(c, int) else c for c in named.position]
+        if isinstance(x, int) and named.position == (x, x + 1, x + 2):
+            at = f"obs[{x}:{x + 3}]"
         if any(named.offset):
             at = {"object": published.get(typed(named.position), ""), "offset": list(named.offset)}
         elif named.opening is not None:

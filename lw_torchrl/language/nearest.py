@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
 from rapidfuzz import fuzz, process
 
 from lw_torchrl._checks import check_choice, checked, shown
@@ -19,6 +18,10 @@ from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.skills import ScriptedSkill, SkillError, Skills, load_skills, skills_for
 from lw_torchrl.language.tasks import Task, get_task
 from lw_torchrl.language.words import WORDS
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 _NEGATIONS = frozenset(("not", "no", "never", "without", "cannot"))
 # Words that do not tell which query is meant.
@@ -60,13 +63,9 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
 
     Args:
         text: any words, of at most 64 parts.
-        task: a task or its name, whose objects the query may name.
         by: "edit", closest in spelling; "embedding", closest in meaning (an ImportError without the extra ``[text]``).
 
     Example:
-        >>> match = nearest_query("the gripper isn't touching the puck", "push")
-        >>> str(match.query), match.score > 0.5
-        ("the robot's gripper is not around the puck", True)
         >>> str(nearest_query("gripper open and over the target locaton", "push").query)
         "the robot's gripper is open and the robot's gripper is above the target location"
 
@@ -102,8 +101,10 @@ def _nearest_part(part: str, task: Task, by: str) -> QueryPart:
     if by == "edit":
         _, similarity, at = process.extractOne(_content(words), contents, scorer=fuzz.ratio)
         score = similarity / 100
-    else:
-        at, score = _nearest_meaning(" ".join(words), tuple(map(str, clauses)))
+    else:  # an encoder cannot read a lone surrogate
+        vector = sentence_vectors([" ".join(words).encode("utf-8", "replace").decode()])[0]
+        alike = _vectors(tuple(map(str, clauses))) @ vector
+        at, score = int(alike.argmax()), float(alike.max().clip(0.0, 1.0))
     return QueryPart(part, Query((replace(clauses[at], negated=negated),)), score)
 
 
@@ -125,13 +126,6 @@ def _choices(task: Task, relations: tuple[str, ...]) -> tuple[tuple[Clause, ...]
     return affirmed, tuple(_content(str(clause).split()) for clause in affirmed)
 
 
-def _nearest_meaning(text: str, choices: tuple[str, ...]) -> tuple[int, float]:
-    """Return the index of the choice that is nearest in meaning, and its cosine similarity, at least 0."""
-    # An encoder cannot read a lone surrogate.
-    alike = _vectors(choices) @ sentence_vectors([text.encode("utf-8", "replace").decode()])[0]
-    return int(alike.argmax()), float(alike.max().clip(0.0, 1.0))
-
-
 @lru_cache(maxsize=256)
 def _vectors(texts: tuple[str, ...]) -> NDArray[np.float32]:
     return sentence_vectors(texts)
@@ -139,14 +133,11 @@ def _vectors(texts: tuple[str, ...]) -> NDArray[np.float32]:
 
 @checked
 def nearest_skill(
-    text: str,
-    task: str | Task | None = None,
-    skills: Skills | Iterable[str] | None = None,
+    text: str, task: str | Task | None = None, skills: Skills | Iterable[str] | None = None
 ) -> tuple[ScriptedSkill, float]:
     """Return the scripted skill with the closest text, by edit distance, and how close it is, in [0, 1].
 
     Args:
-        text: what to do, in any words.
         task: consider only skills whose objects this task has; with none it is a :class:`SkillError`.
         skills: to choose from; None for the shipped ones.
 
@@ -215,26 +206,25 @@ class StepMapper:
 @lru_cache(maxsize=4096)
 def _nearest_condition(text: str, task: Task) -> tuple[Query | None, float]:
     words = _phrases("conditions").sub(lambda found: WORDS["conditions"][found[0]], _with_target(text, task))
-    try:
+    with suppress(QueryError):
         match = nearest_query(words, task)
-    except QueryError:
-        return None, 1.0
-    if len(match.parts) > _MOST_CLAUSES:
-        return None, 1.0
-    return match.query, 1.0 - min(part.score for part in match.parts)
+        if len(match.parts) <= _MOST_CLAUSES:
+            return match.query, 1.0 - min(part.score for part in match.parts)
+    return None, 1.0
 
 
 def _with_target(text: str, task: Task) -> str:
     """The text in lower case, with the task's own name for its goal, which models call "goal" or "target position"."""
-    lower = text.casefold()
     name = next((name for name in _TARGETS if name in task.object_names), None)
-    if name is None:
-        return lower
-    return _TARGET.sub(lambda found: found[0] if found[0] in task.object_names else f"the {name}", lower)
+
+    def named(goal: re.Match[str]) -> str:
+        return goal[0] if name is None or goal[0] in task.object_names else f"the {name}"
+
+    return _TARGET.sub(named, text.casefold())
 
 
 @cache
 def _phrases(kind: str) -> re.Pattern[str]:
-    """Any phrase of the table, the longest first; one that our own words begin with is left alone."""
+    """Any phrase of the table, the longest first."""
     longest = sorted(WORDS[kind], key=len, reverse=True)
     return re.compile(rf"\b(?:{'|'.join(map(re.escape, longest))})\b")

@@ -38,21 +38,18 @@ class DecodedStep:
 
 @dataclass(frozen=True)
 class DecodedPlan:
-    """What :func:`decode_plan` made of a text.
+    """The plan that :func:`decode_plan` read from a text.
 
     Attributes:
-        plan: the plan, its conditions as queries and its skills in the text's words; None if there is none.
+        plan: its conditions as queries and its skills in the text's words; None if there is none.
         scripted: the same with the nearest scripted skills, without the steps that are near none; None if none is left.
-        reason: why there is no plan; "" if there is one.
-        notes: what was left out or changed, in the order of the lines.
-        steps: the clauses for the task, also those that were dropped.
     """
 
     plan: ConditionalPlan | None
     scripted: ConditionalPlan | None
-    reason: str
-    notes: tuple[Note, ...]
-    steps: tuple[DecodedStep, ...]
+    reason: str  # why there is no plan; "" if there is one
+    notes: tuple[Note, ...]  # what was left out or changed, in the order of the lines
+    steps: tuple[DecodedStep, ...]  # the clauses for the task, also those that were dropped
 
     @property
     def all_scripted(self) -> bool:
@@ -65,12 +62,7 @@ _LONGEST = 65_536  # characters of a text that are read
 
 @checked
 def decode_plan(
-    text: str,
-    task: str | Task,
-    format: str,
-    *,
-    skills: Skills | None = None,
-    tasks: Tasks = TASKS,
+    text: str, task: str | Task, format: str, *, skills: Skills | None = None, tasks: Tasks = TASKS
 ) -> DecodedPlan:
     """Read a plan from whatever a language model wrote. No text is an error, and none is executed.
 
@@ -84,22 +76,15 @@ def decode_plan(
 
     Args:
         text: the answer; what follows 65,536 characters or 1,000 steps is left out.
-        task: the task that was asked for, or its name.
         format: the format that was asked for, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
         skills: the scripted skills to choose from; None for the shipped ones.
         tasks: where a task's name is looked up, as from :func:`~lw_torchrl.load_tasks`.
 
     Example:
-        >>> answer = '''Sure! Here you go:
-        ... def push(robot):
-        ...     if check("the gripper isn't above puck"):
-        ...         robot.put("gripper above puck")
-        ...     if check("the gripper is holding the'''
-        >>> decoded = decode_plan(answer, "push", "basic_py")
-        >>> print(decoded.scripted.steps[0].condition, "->", decoded.scripted.steps[0].skill)
+        >>> answer = "When the gripper isn't above puck, the robot should put gripper above puck."
+        >>> step = decode_plan(answer, "push", "basic_md").scripted.steps[0]
+        >>> print(step.condition, "->", step.skill)
         the robot's gripper is not above the puck -> place the gripper above the puck
-        >>> print(decoded.notes[-1])
-        line 5: is cut off: 'if check("the gripper is holding the'
 
     Source: paper sections 'Conditional Plan Generation' and 'LLM Experiments'.
     """
@@ -170,7 +155,6 @@ def _in_words(goal: str) -> str:
 
 
 def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedStep:
-
     def note(text: str) -> None:
         notes.append(Note(clause.line, text))
 

@@ -34,7 +34,6 @@ def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks
         tasks: whose objects the conditions name, by task name, as from :func:`~lw_torchrl.load_tasks`.
 
     Raises:
-        FileNotFoundError: there is no such file or folder, or the folder holds no plans.
         PlanError: (a ValueError) a file holds no valid plan, or one for another task than the one it is named after.
 
     Example:
@@ -62,16 +61,15 @@ def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks
 
 
 def _read_all(found: list[Traversable], tasks: Tasks) -> Plans:
-    plans: dict[str, ConditionalPlan] = {}
-    source: dict[str, str] = {}
+    plans: dict[str, tuple[str, ConditionalPlan]] = {}
     for file in found:
         stem = file.name.removesuffix(".plan").replace("__", "/")
         text = read_text(file, PlanError, limit=PLAN_LIMIT)
         plan = parse_plan(text, stem if stem in tasks else None, file.name, tasks)
-        if plan.task in plans:
-            raise PlanError(f"{file.name}: a second plan for {plan.task!r}; {source[plan.task]} holds one, too")
-        plans[plan.task], source[plan.task] = plan, file.name
-    return Plans(plans)
+        first, _ = plans.setdefault(plan.task, (file.name, plan))
+        if first != file.name:
+            raise PlanError(f"{file.name}: a second plan for {plan.task!r}; {first} holds one, too")
+    return Plans([plan for _, plan in plans.values()])
 
 
 def _read_pairs(path: Path, tasks: Tasks) -> Plans:

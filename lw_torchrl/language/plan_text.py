@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from lw_torchrl._checks import check_text, nearest, shown
+from lw_torchrl._checks import check_text, did_you_mean, shown
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.tasks import Task, Tasks
 
@@ -41,8 +41,7 @@ def too_many_steps(what: str, number: int) -> str:
 
 def no_task(where: str, name: str, tasks: Tasks) -> str:
     """What is wrong with a name that is none of ``tasks``."""
-    near = "".join(f"; did you mean {other!r}?" for other in nearest(name, tasks, n=1))
-    return f"{where}: {shown(name)} is no task{near}"
+    return f"{where}: {shown(name)} is no task{did_you_mean(name, tasks)}"
 
 
 def read_plan_text(

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from hashlib import sha256
+from types import NoneType
 from typing import Any, NoReturn
 
 from lw_torchrl._checks import Probability, check_fields, checked, shown
@@ -54,25 +55,18 @@ class PlanStep:
         names = {name for clause in clauses for name in (clause.subject, clause.object) if name is not None}
         if self.role is not None:
             return names.union(self.role.objects)
-        text = self.skill
-        for name in sorted(task.object_names, key=len, reverse=True):  # "drawer handle" is not "drawer"
-            text, found = re.subn(rf"(?<![\w-]){re.escape(name)}(?![\w-])", " ", text)
-            if found:
-                names.add(name)
-        return names
+        longest = sorted(task.object_names, key=len, reverse=True)  # "drawer handle" is not "drawer"
+        return names.union(re.findall(rf"(?<![\w-])(?:{'|'.join(map(re.escape, longest))})(?![\w-])", self.skill))
 
 
 @dataclass(frozen=True)
 class ConditionalPlan:
     """The steps that carry out one task, as in the paper's section 'Conditional Plan Generation'.
 
-    Attributes:
-        task: the task's name.
-        steps: 1 to 1,000 of :class:`PlanStep`, in canonical spelling, so that the plan's text reads back as the same
-            plan: conditions as ``str(query)``, "the" before nouns. Equal conditions, skills and goals make equal plans.
-        definition: the :class:`Task` whose objects the conditions name; None for ours of that name.
-        confidence: of a plan of :func:`~lw_torchrl.canonical_plan`, the fraction of typical states in which the plan,
-            as written, does what its motion needs.
+    It has 1 to 1,000 steps, in canonical spelling, so that its text reads back as the same plan: conditions as
+    ``str(query)``, "the" before nouns. Equal conditions, skills and goals make equal plans. A plan of
+    :func:`~lw_torchrl.canonical_plan` has as its confidence the fraction of typical states in which the plan, as
+    written, does what its motion needs.
 
     Example:
         >>> plan = ConditionalPlan.from_pairs("reach", [("gripper is open", "move the gripper to the target")])
@@ -82,6 +76,7 @@ class ConditionalPlan:
 
     task: str
     steps: tuple[PlanStep, ...]
+    # The task whose objects the conditions name; None for ours of that name.
     definition: Task = field(default=None, compare=False, repr=False)  # type: ignore[assignment]
     confidence: Probability | None = None
 
@@ -89,19 +84,18 @@ class ConditionalPlan:
         check_fields(self)
         if isinstance(self.steps, str) or not isinstance(self.steps, Iterable):
             raise TypeError(f"steps must be a tuple of PlanStep, got {shown(self.steps)}")
-        if self.definition is not None and not isinstance(self.definition, Task):
+        if not isinstance(self.definition, (Task, NoneType)):
             raise TypeError(f"definition must be a Task, got {shown(self.definition)}")
-        listed = tuple(self.steps)
+        listed, definition = tuple(self.steps), self.definition or TASKS[check_task(self.task)]
         if len(listed) > MOST_STEPS:
             raise PlanError(too_many_steps(f"plan of task {self.task!r}", len(listed)))
-        definition = TASKS[check_task(self.task)] if self.definition is None else self.definition
         if definition.name != self.task:
             raise PlanError(f"definition of plan {self.task!r} is of another task, {definition.name!r}")
         object.__setattr__(self, "definition", definition)
         steps = []
         for number, step in enumerate(listed, 1):
             where = f"step {number} of plan {self.task!r}"
-            if not isinstance(step, PlanStep) or not isinstance(step.skill, str):
+            if not isinstance(step, PlanStep):
                 raise TypeError(f"{where} must be a PlanStep with a skill in words, got {step!r}")
             try:
                 condition, skill = check_query(step.condition, definition), canonical_skill(step.skill, definition)
@@ -193,8 +187,8 @@ def parse_plan(text: str, task: str | None = None, source: str = "plan", tasks: 
 
     Args:
         text: the plan; its first fault is a :class:`PlanError` with the line.
-        task: the task it must be for; None takes the one its ``def`` line names.
-        source: what to call the text in errors, a file's name.
+        task: the task it must be for; None for the one that its ``def`` line names.
+        source: the text's name in errors.
         tasks: whose objects the conditions name, by task name, as from :func:`~lw_torchrl.load_tasks`.
 
     Source: paper section 'Conditional Plan Generation' and its figure of a chain_py plan.
@@ -219,13 +213,7 @@ def _read(text: str, task: str | None, source: str, tasks: Tasks, report: Callab
 
 
 class Plans(Mapping[str, ConditionalPlan]):
-    """An immutable mapping from task names, sorted, to their plans.
-
-    Attributes:
-        layout: of the tasks' observations and actions.
-        num_steps: S, the steps of the longest plan.
-        skills: every skill text once, sorted.
-    """
+    """An immutable mapping from task names, sorted, to their plans. ``layout`` is that of the tasks."""
 
     @checked
     def __init__(self, plans: Mapping[str, ConditionalPlan] | Iterable[ConditionalPlan]) -> None:
@@ -261,10 +249,12 @@ class Plans(Mapping[str, ConditionalPlan]):
 
     @cached_property
     def num_steps(self) -> int:
+        """S, the steps of the longest plan."""
         return max(len(plan.steps) for plan in self.values())
 
     @cached_property
     def skills(self) -> tuple[str, ...]:
+        """Every skill text once, sorted."""
         return tuple(sorted({step.skill for plan in self.values() for step in plan.steps}))
 
     @property
@@ -290,33 +280,22 @@ class Plans(Mapping[str, ConditionalPlan]):
         Plans with the same fingerprint give the same ``qaf``. Reasons and descriptions do not count.
         """
         used = {clause.predicate for plan in self.values() for step in plan.steps for clause in step.condition.clauses}
+
+        def facts(plan: ConditionalPlan) -> dict[str, Any]:
+            objects = [(one.name, one.position, list(map(float, one.offset))) for one in plan.definition.objects]
+            return {"steps": [(str(step.condition), step.skill) for step in plan.steps], "objects": objects}
+
         told = {
             "steps": self.num_steps,
             "predicates": {name: [asdict(part) for part in comparisons(name, self.layout)] for name in sorted(used)},
-            "plans": {
-                task: {
-                    "steps": [(str(step.condition), step.skill) for step in plan.steps],
-                    "objects": [
-                        (named.name, named.position, [float(metres) for metres in named.offset])
-                        for named in plan.definition.objects
-                    ],
-                }
-                for task, plan in self.items()
-            },
+            "plans": {task: facts(plan) for task, plan in self.items()},
         }
         if self.layout != METAWORLD:
             told["layout"] = self.layout.to_json()
         return sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:32]
 
     def to_json(self) -> dict[str, Any]:
-        """Each task's plan as :meth:`ConditionalPlan.to_json` has it.
-
-        Example:
-            >>> from lw_torchrl.language.plan_files import load_plans
-            >>> plans = load_plans("MT10")
-            >>> Plans.from_json(plans.to_json()).fingerprint == plans.fingerprint
-            True
-        """
+        """Return each task's plan as :meth:`ConditionalPlan.to_json` has it."""
         return {task: plan.to_json() for task, plan in self.items()}
 
     @classmethod
@@ -351,6 +330,4 @@ def as_plans(plans: AnyPlans, argument: str = "plans") -> Plans:
     try:
         return Plans(plans)
     except (TypeError, PlanError) as error:
-        if argument == "plans":
-            raise
-        raise type(error)(f"{argument}: {error}") from None
+        raise (error if argument == "plans" else type(error)(f"{argument}: {error}")) from None

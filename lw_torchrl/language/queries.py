@@ -61,6 +61,7 @@ def check_length(text: str, parts: Sequence[str]) -> None:
         raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} clauses, got {len(parts)}")
 
 
+@lru_cache(maxsize=256)
 def base_clauses(task: Task, said: tuple[str, ...]) -> tuple[Clause, ...]:
     """The clauses that :func:`supported_queries` lists as texts; ``said`` names the relations and states."""
     relations, states = ([name for name in said if name in table] for table in (RELATIONS, STATES))
@@ -77,11 +78,6 @@ def base_clauses(task: Task, said: tuple[str, ...]) -> tuple[Clause, ...]:
     return (*clauses, Clause(GRIPPER, "open"), Clause(GRIPPER, "closed"))
 
 
-@lru_cache(maxsize=256)
-def _supported(task: Task, said: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(map(str, base_clauses(task, said)))
-
-
 @checked
 def supported_queries(task: str | Task, published_only: bool = False) -> tuple[str, ...]:
     """The base queries of a task, in canonical spelling.
@@ -90,14 +86,14 @@ def supported_queries(task: str | Task, published_only: bool = False) -> tuple[s
     the negations of open, closed and other states, and conjunctions of all these.
 
     Args:
-        published_only: the paper's queries alone, without the points that we named and relations that were added.
+        published_only: only the paper's queries, without the points that we named and relations that were added.
 
     Example:
         >>> len(supported_queries("reach")), supported_queries("reach")[0]
         (52, "the robot's gripper is near the reach target")
     """
-    found = get_task(task)
-    return _supported(found.published, PUBLISHED) if published_only else _supported(found, tuple(PREDICATES))
+    found, said = (get_task(task).published, PUBLISHED) if published_only else (get_task(task), tuple(PREDICATES))
+    return tuple(map(str, base_clauses(found, said)))
 
 
 def _cut(text: str, most: int = 80) -> str:
@@ -132,8 +128,8 @@ class _ClauseParser:
         said = (self.inferred + " ".join(self.words))[:300]
         found = process.extract(said, named[1:], scorer=fuzz.partial_ratio, limit=_MOST_COMPARED - 1)
         kept = {GRIPPER, *(name for name, _, _ in found)}
-        fewer = replace(self.task, objects=tuple(one for one in self.task.objects if one.name in kept))
-        return tuple(map(str, base_clauses(fewer, tuple(PREDICATES))))
+        objects = tuple(one for one in self.task.objects if one.name in kept)
+        return supported_queries(replace(self.task, objects=objects))
 
     def take(self, phrase: str) -> bool:
         words = phrase.split()
@@ -144,8 +140,7 @@ class _ClauseParser:
 
     def name(self) -> str | None:
         start = self.at
-        if self.at_article():
-            self.at += 1
+        self.at += self.at_article()
         for name in sorted(self.names, key=len, reverse=True):
             if self.take(name):
                 return self.names[name]
@@ -153,8 +148,7 @@ class _ClauseParser:
         return None
 
     def name_error(self, expected: str = "") -> QueryError:
-        if self.at_article():
-            self.at += 1  # the noun is wrong, not its article
+        self.at += self.at_article()  # the noun is wrong, not its article
         return self.error(expected or "one of " + ", ".join(repr(f"the {name}") for name in self.task.object_names))
 
     def at_article(self) -> bool:
@@ -202,7 +196,6 @@ def parse_query(text: str, task: str | Task) -> Query:
     Args:
         text: "Is the gripper open and not above the puck?", or any other accepted spelling, of at most 64 clauses. For
             any other text a :class:`QueryError` points at the word and names the nearest query.
-        task: the task whose objects the query names.
 
     Example:
         >>> str(parse_query("the gripper above the puck", task="push"))

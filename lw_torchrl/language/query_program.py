@@ -46,13 +46,10 @@ class QueryProgram(nn.Module):
         layout: of the tasks.
 
     Example:
-        >>> import torch
         >>> from lw_torchrl.language.tasks import task_id
         >>> program = QueryProgram({"reach": ["the gripper is near the reach target", "the gripper is open"]})
-        >>> observation = torch.zeros(1, 39)
-        >>> observation[0, 3] = 1.0
-        >>> program(observation, torch.tensor([task_id("reach")]))
-        tensor([[True, True]])
+        >>> program(torch.zeros(1, 39), torch.tensor([task_id("reach")]))
+        tensor([[ True, False]])
 
     Source: paper section 'Query Answering Function'.
     """
@@ -95,12 +92,12 @@ class QueryProgram(nn.Module):
         """Answer the queries.
 
         Args:
-            observation: (..., D) float, as the tasks' layout says; Meta-World's 39 numbers, metres.
-            task_id: (...) int64.
+            observation: (..., D) float, as the tasks' layout says; Meta-World's 39 numbers, metres. NaN or infinity is
+                a :class:`ValueError`.
+            task_id: (...) int64, of tasks with queries.
 
         Returns:
-            (..., S) bool on the observation's device, in the order of the task's list; padding is false. NaN or
-            infinity in the observation, or a task without queries, is a :class:`ValueError`.
+            (..., S) bool on the observation's device, in the order of the task's list; padding is false.
         """
         _check_batch(observation, task_id, self.layout.size)
         if (kernel := self._kernel(observation, task_id)) is not None:
@@ -125,12 +122,6 @@ class QueryProgram(nn.Module):
 
         Returns:
             (..., S) float32 logits on the observation's device, of size 1e-6 to 1e4; padding is -1e4.
-
-        Example:
-            >>> import torch, lw_torchrl as lw
-            >>> program = QueryProgram({"reach": ["the gripper is near the reach target"]})
-            >>> program.logits(torch.zeros(1, 39), torch.tensor([lw.task_id("reach")])).item() > 0
-            True
         """
         if not isinstance(temperature, Real) or not 1e-6 <= temperature <= 1e6:
             raise ValueError(f"temperature must be a number between 1e-6 and 1e6, got {temperature!r}")

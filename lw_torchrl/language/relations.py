@@ -17,23 +17,14 @@ from lw_torchrl.language.named_objects import is_number
 
 @dataclass(frozen=True)
 class Comparison:
-    """One comparison: a length or a coordinate of d against a threshold.
+    """One comparison: a length or a coordinate of d against a threshold."""
 
-    Attributes:
-        axes: the axes of d that count, "x", "xy", "xyz", ...
-        sense: how the value is compared with the threshold.
-        threshold: in metres.
-        length: the Euclidean length over the axes; otherwise the signed coordinate of the one axis.
-        raise_z: added to dz first, in metres.
-        temperature: of the soft truth, metres (or shares of an opening) to one logit, above 0.
-    """
-
-    axes: str
+    axes: str  # the axes of d that count, "x", "xy", "xyz", ...
     sense: Literal["<", ">", "<="]
-    threshold: float
-    length: bool = True
-    raise_z: float = 0.0
-    temperature: float = 0.01
+    threshold: float  # metres
+    length: bool = True  # compare the Euclidean length over the axes, not the signed coordinate of the one axis
+    raise_z: float = 0.0  # metres, added to dz first
+    temperature: float = 0.01  # of the soft truth: metres (or shares of an opening) to one logit, above 0
 
     def __post_init__(self) -> None:
         if not self.axes or self.axes != "".join(axis for axis in "xyz" if axis in self.axes):
@@ -62,9 +53,9 @@ PREDICATES = ChainMap[str, tuple[Comparison, ...]]()
 
 def _check_predicate(name: str, parts: Any, others: Iterable[str]) -> tuple[Comparison, ...]:
     """Return the comparisons of a predicate; :class:`ValueError` for a name that a query cannot contain."""
-    words = name.split() if isinstance(name, str) else []
-    if not words or name != " ".join(words) or not re.fullmatch(r"[a-z][a-z '-]*", name):
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z'-]*( [a-z'-]+)*", name):
         raise ValueError(f"a relation must be named by lower-case words, like 'left of', got {shown(name)}")
+    words = name.split()
     reserved = [name] * (name in others) + [word for word in words[:1] if word in ("is", "isn't", "not")]
     if reserved := reserved + [word for word in words if word in ("and", "the", "a", "an")]:
         raise ValueError(f"a relation may not be named {name!r}: {reserved[0]!r} has its own meaning in a query")
@@ -78,11 +69,11 @@ def _check_relation(name: str, parts: Any) -> tuple[Comparison, ...]:
 
 
 def _check_state(name: str, parts: Any) -> tuple[Comparison, ...]:
-    for part in parts if isinstance(parts, tuple) else ():
-        if isinstance(part, Comparison) and (part.axes, part.length) != ("z", False):
+    for part in _check_predicate(name, parts, {*_OF_POSITION, *PREDICATES.maps[-1]}):
+        if (part.axes, part.length) != ("z", False):
             needed = "compare the opening, Comparison('z', ..., length=False)"
             raise ValueError(f"state {name!r} must {needed}, got {shown(part)}")
-    return _check_predicate(name, parts, {*_OF_POSITION, *PREDICATES.maps[-1]})
+    return tuple(parts)
 
 
 _OF_POSITION: Mapping[str, tuple[Comparison, ...]] = MappingProxyType(_predicates("unary"))

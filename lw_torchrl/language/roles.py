@@ -15,60 +15,32 @@ Verb = Literal["approach", "beside", "descend", "close", "open", "push", "pull",
 Manner = Literal["grasp", "push", "press", "pull", "reach"]
 """The purpose of a step, which says how the hand comes: to grasp from above, to push from the side."""
 Direction = Literal["left", "right", "away", "toward", "up", "down", "goal"]
-VECTORS: dict[str, tuple[float, float, float]] = {
-    "left": (1.0, 0.0, 0.0),
-    "right": (-1.0, 0.0, 0.0),
-    "away": (0.0, 1.0, 0.0),
-    "toward": (0.0, -1.0, 0.0),
-    "up": (0.0, 0.0, 1.0),
-    "down": (0.0, 0.0, -1.0),
-}
+VECTORS: dict[str, tuple[float, float, float]] = {way: tuple(xyz) for way, xyz in WORDS["roles"]["vectors"].items()}
 """Directions as unit vectors in the suites' frame; "left" and "right" are those of the query language."""
 BY_HAND = ("approach", "descend", "beside", "open")
 """The verbs of a step that only brings the gripper to its place."""
-_SKILLS: dict[Verb, str] = {
-    "approach": "place the gripper above the {target}",
-    "descend": "lower the gripper around the {target}",
-    "beside": "move the gripper beside the {target}",
-    "open": "open the gripper above the {target}",
-    "close": "close the gripper around the {target}",
-    "push": "push the {target}",
-    "pull": "pull the {target}",
-    "carry": "carry the {moved} to the {target}",
-    "move": "slide the {moved} to the {target}",
-    "reach": "move the gripper to the {target}",
-    "hold": "hold the gripper at the {target}",
-}
-_WAYS = {"left": "to the left", "right": "to the right", "away": "away from the robot", "toward": "toward the robot"}
+_OWN_MOTIONS: list[list[str]] = WORDS["canonical"]["own"]
+_SAME_MOTION: dict[str, Verb] = {"carry": "move", "open": "descend", "hold": "reach"}
+_VERBS = [verb for verb in get_args(Verb) if verb not in _SAME_MOTION]
+_SKILLS, _WAYS = WORDS["roles"]["skills"], WORDS["roles"]["ways"]
 
 
 @dataclass(frozen=True)
 class StepRole:
     """What one step of a plan does, as :func:`~lw_torchrl.canonical_plan` reads it.
 
-    Attributes:
-        verb: what is done.
-        moved, target: what is to arrive where: names of the task's objects, or "target location", the goal.
-        manner: what it is done for.
-        direction: where an object is pushed, pulled or moved to; also given for a hand that comes to do so.
-        toward: the object that the direction "goal" leads to; None for the task's goal.
-        written: the skill in the plan's own words; "" for a step that the plan lacked.
-        confidence: from 0, a guess, to 1, stated in the plan's words.
-        fallback: whether the step belongs to the fallback plan, which is tried when the plan makes no progress.
-
-    Raises:
-        ValueError: an unknown verb, manner or direction, or a confidence outside [0, 1].
+    What is moved, and its target, are names of the task's objects, or "target location", the goal.
     """
 
     verb: Verb
     moved: str
     target: str
     manner: Manner
-    direction: Direction | None = None
-    toward: str | None = None
-    written: str = ""
-    confidence: Probability = 1.0
-    fallback: bool = False
+    direction: Direction | None = None  # where an object is moved to, also of a hand that comes to do so
+    toward: str | None = None  # the object that the direction "goal" leads to; None for the task's goal
+    written: str = ""  # the skill in the plan's own words; "" for a step that the plan lacked
+    confidence: Probability = 1.0  # from 0, a guess, to 1, stated in the plan's words
+    fallback: bool = False  # whether the step is of the fallback plan, which is tried when the plan makes no progress
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -129,8 +101,3 @@ def role_vectors(roles: Sequence[StepRole]) -> list[list[float]]:
         ones += [last is not None and [last.moved, last.target] == pair for pair in _OWN_MOTIONS]
         vectors.append(list(map(float, ones)))
     return vectors
-
-
-_OWN_MOTIONS: list[list[str]] = WORDS["canonical"]["own"]
-_SAME_MOTION: dict[str, Verb] = {"carry": "move", "open": "descend", "hold": "reach"}
-_VERBS = [verb for verb in get_args(Verb) if verb not in _SAME_MOTION]

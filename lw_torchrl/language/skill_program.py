@@ -31,12 +31,7 @@ class SkillProgram(nn.Module):
         skills: task name (or :class:`Task`) to its skills, each a :class:`ScriptedSkill` or the text of one.
         table: where texts are looked up; None for the shipped skills.
 
-    Attributes:
-        num_skills: S, the length of the longest list.
-        layout: of the tasks.
-
     Example:
-        >>> import torch
         >>> from lw_torchrl.language.tasks import task_id
         >>> program = SkillProgram({"push": ["place the gripper above the puck"]})
         >>> program(torch.zeros(1, 39), torch.tensor([task_id("push")])).shape
@@ -49,19 +44,19 @@ class SkillProgram(nn.Module):
         known = load_skills() if table is None else table
         if not skills:
             raise ValueError("skills must name at least one task, got an empty mapping")
-        for name, listed in skills.items():
-            if isinstance(listed, (str, ScriptedSkill)) or not listed:
-                given = get_task(name).name
-                raise ValueError(f"skills[{given!r}] must be a list of at least one skill, got {listed!r}")
 
         def look_up(skill: str | ScriptedSkill) -> ScriptedSkill:
             return skill if isinstance(skill, ScriptedSkill) else known[check_choice("skill", skill, known)]
 
-        found = {get_task(task): [look_up(one).for_task(task) for one in listed] for task, listed in skills.items()}
+        found: dict[Task, list[ScriptedSkill]] = {}
+        for task, listed in ((get_task(name), listed) for name, listed in skills.items()):
+            if isinstance(listed, (str, ScriptedSkill)) or not listed:
+                raise ValueError(f"skills[{task.name!r}] must be a list of at least one skill, got {listed!r}")
+            found[task] = [look_up(skill).for_task(task) for skill in listed]
         super().__init__()
         self.layout = layout = one_layout(found)
         self._displaced = layout.displaced("scripted skills")
-        self.num_skills = max(map(len, found.values()))
+        self.num_skills = max(map(len, found.values()))  # S, the length of the longest list
         index = TaskIndex(task_ids(task.name for task in found))
         constants = [0.0]
         place = torch.full((len(found), 2, self.num_skills, 3), layout.size)

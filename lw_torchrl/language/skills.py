@@ -11,7 +11,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from lw_torchrl._checks import check_choice, checked, nearest, shown
+from lw_torchrl._checks import check_choice, checked, did_you_mean, shown
 from lw_torchrl._files import AnyPath, read_toml
 from lw_torchrl._registry import ReadOnlyDict
 from lw_torchrl.language.named_objects import GRIPPER, is_number, is_triple
@@ -29,15 +29,7 @@ class SkillError(ValueError):
 class ScriptedSkill:
     """A linear controller: action xyz = clip(gain · (target + offset - moved), -1, 1), with a constant gripper effort.
 
-    Attributes:
-        text: what it does, in plain English: "place the gripper above the puck".
-        target: the object or point to go to; the robot's gripper makes the offset relative to the hand.
-        moved: what is to arrive there: the robot's gripper, or an object that it holds or pushes.
-        offset: added to the target, metres. x points to the robot's right, y away from it, z up.
-        gain: per axis, at least 0, action per metre; 0 leaves an axis alone.
-        gripper: effort in [-1, 1]; -1 opens, 1 closes.
-        goal: the state it steers to, as a query of the tasks that it suits; "" where the language has no words for it.
-        variants: task name to what differs there, any of the above but the text.
+    The target is an object or point; the robot's gripper makes the offset relative to the hand.
 
     Example:
         >>> skill = ScriptedSkill("place the gripper above the puck", "puck", offset=(0.0, 0.0, 0.1), gripper=-1.0)
@@ -49,12 +41,12 @@ class ScriptedSkill:
 
     text: str
     target: str
-    moved: str = GRIPPER
-    offset: Triple = (0.0, 0.0, 0.0)
-    gain: Triple = (10.0, 10.0, 10.0)
-    gripper: float = 0.0
-    goal: str = ""
-    variants: Mapping[str, ScriptedSkill] = field(default_factory=dict, hash=False, repr=False)
+    moved: str = GRIPPER  # what is to arrive at the target: the robot's gripper, or an object that it holds or pushes
+    offset: Triple = (0.0, 0.0, 0.0)  # metres, added to the target: x to the robot's right, y away from it, z up
+    gain: Triple = (10.0, 10.0, 10.0)  # per axis, at least 0, action per metre; 0 leaves an axis alone
+    gripper: float = 0.0  # effort in [-1, 1]; -1 opens, 1 closes
+    goal: str = ""  # the state it steers to, as a query of the tasks that it suits; "" if no query says it
+    variants: Mapping[str, ScriptedSkill] = field(default_factory=dict, hash=False, repr=False)  # by task name
 
     def __post_init__(self) -> None:
         def check(name: str, allowed: str, holds: Callable[[Any], bool]) -> None:
@@ -76,8 +68,7 @@ class ScriptedSkill:
         for name in (skill.target, skill.moved):
             if name not in found.object_names:
                 lacks = f"needs {name!r}, which task {found.name!r} lacks; it has {', '.join(found.object_names)}"
-                near = "".join(f"; did you mean {other!r}?" for other in nearest(name, found.object_names, n=1))
-                raise SkillError(f"skill {self.text!r} {lacks}{near}")
+                raise SkillError(f"skill {self.text!r} {lacks}{did_you_mean(name, found.object_names)}")
         return skill
 
     def suits(self, task: str | Task) -> bool:
@@ -131,20 +122,18 @@ def _read(file: Path | Traversable, tasks: Tasks) -> dict[str, ScriptedSkill]:
 
 @checked
 def load_skills(path: AnyPath | None = None, *, tasks: Tasks = TASKS) -> Skills:
-    """The scripted skills by their text.
+    """Return the scripted skills by their text.
 
     Args:
         path: a file like data/skills.toml, whose skills join ours or replace those with the same text; None for
-            ours alone. One that is no TOML in UTF-8, or has a malformed skill, is a :class:`SkillError`.
+            only ours. A malformed file is a :class:`SkillError`.
         tasks: whose names its ``for`` tables may have, as from :func:`~lw_torchrl.load_tasks`.
 
     Example:
         >>> load_skills()["place the gripper above the puck"].target
         'puck'
     """
-    if path is None:
-        return _shipped()
-    return ReadOnlyDict({**_shipped(), **_read(Path(path), tasks)})
+    return _shipped() if path is None else ReadOnlyDict({**_shipped(), **_read(Path(path), tasks)})
 
 
 @lru_cache(maxsize=256)
@@ -155,16 +144,16 @@ def _foreign_words(task: Task) -> frozenset[str]:
 
 
 def skills_for(task: Task, skills: Skills | None = None) -> Skills:
-    """The skills that a task may use, of the shipped ones if none are given: it has the objects that they name, and
-    their texts name nothing that only other tasks have, or they have a variant for it."""
+    """Return the skills that a task may use, of the shipped ones if none are given: it has the objects that they name,
+    and their texts name nothing that only other tasks have, or they have a variant for it."""
     if skills is None:
         return _shipped_for(task)
     foreign = _foreign_words(task)
-    return {
-        text: skill
-        for text, skill in skills.items()
-        if skill.suits(task) and (task.name in skill.variants or not foreign & set(text.split()))
-    }
+
+    def allows(skill: ScriptedSkill, text: str) -> bool:
+        return skill.suits(task) and (task.name in skill.variants or not foreign & set(text.split()))
+
+    return {text: skill for text, skill in skills.items() if allows(skill, text)}
 
 
 @lru_cache(maxsize=256)
@@ -177,8 +166,8 @@ _LONGEST_BEFORE = max(map(len, _BEFORE_NOUN))
 
 
 def canonical_skill(skill: str, task: Task) -> str:
-    """The skill in plain English: articles go before the nouns that lack one, as in the paper, at the beginning and
-    after a word like "above"; else ("the coffee mug") a noun is left alone."""
+    """Return the skill in plain English: nouns at the beginning and after a word like "above" get an article, as in
+    the paper; other nouns ("the coffee mug") are left alone."""
     first, _, details = " ".join(skill.split()).partition(" ")
     verb, *rest = first.replace("_", " ").split() or [""]
     if not re.fullmatch(r"[A-Za-z]\w*", verb):
@@ -200,5 +189,5 @@ def _with_articles(details: str, task: Task) -> str:
 
 
 def has_direction(skill: str) -> bool:
-    """Whether a skill says a direction in the plane, "to the left", "into the hole"; "above the puck" says none."""
+    """Return whether a skill says a direction in the plane, "to the left", "into the hole"."""
     return not _DIRECTIONS.isdisjoint(skill.split())

@@ -27,23 +27,14 @@ _TOOL = re.compile(r"(?<!line )(?<!level )(?<!aligned )\bwith <([^>]*)>")
 
 @dataclass(frozen=True)
 class ParsedStep:
-    """The meaning of one step.
-
-    Attributes:
-        verb: what is done.
-        moved: what is to arrive at the target: the robot's gripper, or an object that it holds; None if unknown.
-        target: the object or point to go to; None if unknown.
-        direction: where an object is pushed, pulled or moved to; "goal" leads from it to ``toward``.
-        confidence: 1 where the words say it, less where it follows from the condition, or from what is usual.
-        toward: an object; None for the task's goal.
-    """
+    """The meaning of one step."""
 
     verb: Verb
-    moved: str | None
-    target: str | None
-    direction: Direction | None = None
-    confidence: float = 1.0
-    toward: str | None = None
+    moved: str | None  # what is to arrive at the target: the robot's gripper, or an object that it holds
+    target: str | None  # the object or point to go to; like ``moved``, None if unknown
+    direction: Direction | None = None  # where an object is pushed, pulled or moved to; "goal" leads to ``toward``
+    confidence: float = 1.0  # less where it follows from the condition, or from what is usual
+    toward: str | None = None  # an object; None for the task's goal
 
 
 def compared_with_gripper(step: PlanStep) -> tuple[str, ...]:
@@ -123,8 +114,8 @@ def _resolve_it(texts: Iterable[str], facts: Iterable[_Facts], task: Task) -> li
 
 def _only_sent(step: ParsedStep | None, text: str) -> ParsedStep | None:
     """In a plan that does nothing else, "move the gripper to the block" is the whole motion."""
-    to_it = step is not None and step.verb == "descend" and re.match(rf"\w+ <{GRIPPER}> (?:to|at|toward|onto) <", text)
-    return replace(step, verb="reach") if step is not None and to_it else step
+    to_it = step and step.verb == "descend" and re.match(rf"\w+ <{GRIPPER}> (?:to|at|toward|onto) <", text)
+    return replace(step, verb="reach") if step and to_it else step
 
 
 def _grasps(text: str, facts: _Facts) -> bool:
@@ -216,12 +207,9 @@ class _StepParser:
             return ParsedStep("carry", self.first, target if elsewhere else GOAL)
         if above or self.verb == "raise":
             return ParsedStep("approach", GRIPPER, target)
-        if "front" in self.words:
-            return ParsedStep("beside", GRIPPER, target, "away")
-        if "behind" in self.words:
-            return ParsedStep("beside", GRIPPER, target, "toward")
-        if self.words & _PLACES["beside"]:
-            return ParsedStep("beside", GRIPPER, target)
+        if self.words & (_PLACES["beside"] | {"front", "behind"}):
+            side: Direction | None = "away" if "front" in self.words else "toward" if "behind" in self.words else None
+            return ParsedStep("beside", GRIPPER, target, side)
         if self.verb == "align":
             return ParsedStep("descend" if self.facts.aligned else "approach", GRIPPER, target)
         down = self.verb in ("lower", "drop") or self.words & _PLACES["around"]
@@ -233,20 +221,17 @@ class _StepParser:
         moved = self.tool if self.tool is not None and (target is None or not is_goal(self.task, target)) else noun
         if target is not None:
             moved = self._compared_point(moved, target)
+        lifts, carries = self.verb in _VERBS["lift"], self.verb in _VERBS["carry"]
+        direction: Direction | None = self.direction
+        if direction == "down" and (self.grasping or self.verb not in ("push", "press")):
+            direction = None
         if self.grasping:
             if target is not None:
-                lifted = self.verb in _VERBS["carry"] or self.words & _PLACES["above"]
-                return ParsedStep("carry" if lifted else "move", moved, target)
-            direction: Direction | None = self.direction if self.direction != "down" else None
-            if self.verb in _VERBS["lift"]:
-                direction = "up"
-            if direction is not None:
-                return ParsedStep("move", moved, moved, direction)
-            return ParsedStep("carry" if self.verb in _VERBS["carry"] else "move", moved, GOAL, confidence=0.7)
-        direction = self.direction
-        if direction == "down" and self.verb not in ("push", "press"):
-            direction = None
-        if self.verb in _VERBS["lift"] and direction is None:
+                return ParsedStep("carry" if carries or self.words & _PLACES["above"] else "move", moved, target)
+            if lifts or direction is not None:
+                return ParsedStep("move", moved, moved, "up" if lifts else direction)
+            return ParsedStep("carry" if carries else "move", moved, GOAL, confidence=0.7)
+        if lifts and direction is None:
             return ParsedStep("pull", GRIPPER, moved, "up")
         if self.verb == "press" or direction == "down":
             return ParsedStep("push", GRIPPER, moved, direction or "goal")
@@ -258,8 +243,7 @@ class _StepParser:
 
     def _target(self, noun: str) -> str | None:
         """Return where an object is moved to, by the words, or by what the condition compares it with."""
-        goals = [name for name in self.named if is_goal(self.task, name)]
-        if goals:
+        if goals := [name for name in self.named if is_goal(self.task, name)]:
             return goals[-1]
         for name in reversed(self.named[1:] if self.tool is None else self.named):
             if not same_object(self.task, name, noun) or self.tool is not None:

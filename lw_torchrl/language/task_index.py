@@ -28,11 +28,6 @@ class TaskIndex:
 
     Args:
         task_ids: task name to id, as :attr:`Plans.task_ids`; two tasks of one id are a ValueError.
-
-    Example:
-        >>> index = TaskIndex({"reach": 35, "stack-blocks": 650718257, "push": 32})
-        >>> index.tasks, index.rows(torch.tensor([35, 32]), "tasks without a plan").tolist()
-        (('push', 'reach', 'stack-blocks'), [1, 0])
     """
 
     def __init__(self, task_ids: Mapping[str, int]) -> None:
@@ -53,11 +48,9 @@ class TaskIndex:
         if task_id.dtype not in (torch.int64, torch.int32):
             raise ValueError(f"task_id must be int64, got {task_id.dtype}")
         kept = plain(task_id)
-        ids = self._ids
-        if ids.device != task_id.device:
-            ids = ids.to(task_id.device)
-            if kept:
-                self._ids = ids
+        ids = self._ids.to(task_id.device)
+        if kept:
+            self._ids = ids
         given = task_id.long().contiguous()
         if kept or asserted(task_id):
             rows = torch.searchsorted(ids[:-1], given)
@@ -65,19 +58,16 @@ class TaskIndex:
             rows = (given.unsqueeze(-1) > ids[:-1]).sum(-1)
         found = ids.index_select(0, rows.reshape(-1)).reshape(rows.shape)
         if kept and not waits(task_id):
-            if not torch.equal(found, given):
-                raise _unknown_ids(given[found != given].unique().tolist()[:5], problem)
-            return rows
+            if torch.equal(found, given):
+                return rows
+            from lw_torchrl.language.tasks import MT50  # here: only the message needs the names of other tasks
+
+            wrong = given[found != given].unique().tolist()[:5]
+            names = (MT50[i] if 0 <= i < len(MT50) else f"{i} (none of the 50)" for i in wrong)
+            raise ValueError(f"task_id names {problem}: {', '.join(names)}")
         if asserted(task_id):
             torch._assert_async((found == given).all(), f"task_id names {problem}")
         return torch.where(found == given, rows, len(self.tasks))
-
-
-def _unknown_ids(ids: list[int], problem: str) -> ValueError:
-    from lw_torchrl.language.tasks import MT50  # here: only the message needs the names of other tasks
-
-    names = (MT50[i] if 0 <= i < len(MT50) else f"{i} (none of the 50)" for i in ids)
-    return ValueError(f"task_id names {problem}: {', '.join(names)}")
 
 
 def as_plans(plans: AnyPlans) -> Plans:
@@ -126,11 +116,9 @@ class PlanTables:
         ``number``, (...) int64, is that plan's; 0 where unknown, None for all."""
         if number is None:
             return
-        numbers = self.number
-        if number.device != numbers.device:
-            numbers = numbers.to(number.device)
-            if plain(number, rows):
-                self.number = numbers
+        numbers = self.number.to(number.device)
+        if numbers is not self.number and plain(number, rows):
+            self.number = numbers
         if asserted(number, rows):
             own = numbers[rows]
             torch._assert_async(((own == number) | (number == 0)).all(), "qaf answers other plans than the actor's")

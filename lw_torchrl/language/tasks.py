@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
@@ -11,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lw_torchrl._checks import check_choice, check_fields, checked, nearest, shown, unknown_name
+from lw_torchrl._checks import check_choice, check_fields, checked, did_you_mean, shown, unknown_name
 from lw_torchrl._files import AnyPath, read_toml
 from lw_torchrl._registry import ReadOnlyDict
 from lw_torchrl.language.layout import METAWORLD, Layout
@@ -34,17 +35,13 @@ class TaskError(ValueError):
 class Task:
     """One manipulation task in words.
 
-    Attributes:
-        name: "drawer-open", Meta-World's name without its version; or your own, lower-case words joined by hyphens,
-            after a suite's name and a slash if it is one of a suite: "fetch/push".
-        description: one sentence that says what is to be done.
-        objects: at most 64 with different names: the robot's gripper first, the points that we named last.
-        layout: what the numbers of its observations and actions are.
+    Its name is "drawer-open", Meta-World's without its version; or your own, lower-case words joined by hyphens, after
+    a suite's name and a slash if it is one of a suite: "fetch/push".
     """
 
     name: str
-    description: str
-    objects: tuple[NamedObject, ...]
+    description: str  # one sentence
+    objects: tuple[NamedObject, ...]  # at most 64: the robot's gripper first, the points that we named last
     layout: Layout = METAWORLD
 
     def __post_init__(self) -> None:
@@ -101,22 +98,14 @@ class Task:
         return {named.name: position(named) for named in self.objects}
 
     def to_json(self) -> dict[str, Any]:
-        """The task as a row of tasks.toml; a :class:`TaskError` where a row cannot hold it, another gripper's say.
-
-        Example:
-            >>> TASKS["reach"].to_json()["objects"]
-            {'reach target': 'obs[36:39]'}
-        """
+        """Return the task as a row of tasks.toml; a :class:`TaskError` if a row cannot hold it."""
         row = {"description": self.description, **write_objects(self.objects)}
         if self.layout != METAWORLD:
             row["layout"] = self.layout.to_json()
-        try:
-            same = Task.from_json(self.name, row) == self
-        except TaskError:
-            same = False
-        if not same:
-            raise TaskError(f"task {self.name!r} cannot be written as a row of tasks.toml, it holds {self.objects!r}")
-        return {key: found for key, found in row.items() if found}
+        with suppress(TaskError):
+            if Task.from_json(self.name, row) == self:
+                return {key: value for key, value in row.items() if value}
+        raise TaskError(f"task {self.name!r} cannot be written as a row of tasks.toml, it holds {self.objects!r}")
 
     @classmethod
     def from_json(cls, name: str, row: Any, layout: Layout = METAWORLD) -> Task:
@@ -181,8 +170,8 @@ def _unknown_task(argument: str, name: str, tasks: Tasks) -> ValueError:
 
 @checked
 def task_id(name: str) -> int:
-    """The integer of a task: of the 50, the rank among the sorted names, from 0; of any other, a number from 50 to
-    2³¹ - 1 that depends only on the name. So it is the same in every process and file. A misspelt name has an id too.
+    """Return the integer of a task: of the 50, the rank among the sorted names, from 0; of any other, a number from
+    50 to 2³¹ - 1 that depends only on the name. A misspelt name has an id too.
 
     Example:
         >>> task_id("assembly"), task_id("window-open"), task_id("stack-blocks")
@@ -200,7 +189,7 @@ def task_ids(names: Iterable[str]) -> dict[str, int]:
 
 
 def resolve_tasks(names: str | Iterable[str], *, tasks: Tasks = TASKS) -> tuple[str, ...]:
-    """The names behind a set, a task, or a list of tasks, sorted by name.
+    """Return the names of a set, a task, or a list of tasks, sorted.
 
     Args:
         names: "MT10", "MT50", one task's name, or an iterable of names.
@@ -213,11 +202,9 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Tasks = TASKS) -> tuple[
     if not isinstance(tasks, Mapping):
         raise TypeError(f"tasks must map names to Task, got {shown(tasks)} ({type(tasks).__name__})")
     if isinstance(names, str):
-        if names in _SETS:
-            return resolve_tasks(_SETS[names], tasks=tasks)
-        if names not in tasks:
+        if names not in tasks and names not in _SETS:
             raise _unknown_task("tasks", names, tasks)
-        return (names,)
+        names = _SETS.get(names, (names,))
     if not isinstance(names, Iterable):
         raise TypeError(f"tasks must be 'MT10', 'MT50', a task's name or a list of names, got {shown(names)}")
     found = [check_task(name, tasks) for name in names]
@@ -230,23 +217,21 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Tasks = TASKS) -> tuple[
 
 
 def named_tasks(tasks: TaskList, *, known: Tasks = TASKS) -> dict[str, Task]:
-    """Task names, sorted, to the tasks of a set, a name, a Task, or a list of names and Tasks.
+    """Return the tasks of a set, a name, a Task, or a list of names and Tasks, by name, sorted.
 
     Args:
         tasks: as for :func:`resolve_tasks`; a :class:`Task` counts for itself, whatever else has its name. Plans stand
             for the tasks that they are for.
         known: the tasks that names stand for, as from :func:`~lw_torchrl.load_tasks`.
     """
-    if isinstance(tasks, Mapping):
-        plans: Mapping[str, Any] = tasks
-        tasks = [getattr(one, "definition", one) for one in plans.values()]
-    if isinstance(tasks, str) or not isinstance(tasks, (Task, Iterable)):
-        return {name: known[name] for name in resolve_tasks(tasks, tasks=known)}
-    listed = [tasks] if isinstance(tasks, Task) else list(tasks)
-    own = {task.name: task for task in listed if isinstance(task, Task)}
-    names = [task.name if isinstance(task, Task) else task for task in listed]
-    there = {**known, **own} if own else known
-    return {name: there[name] for name in resolve_tasks(names, tasks=there)}
+    names: Any = [tasks] if isinstance(tasks, Task) else tasks
+    if isinstance(names, Mapping):
+        names = [getattr(one, "definition", one) for one in names.values()]
+    if not isinstance(names, str) and isinstance(names, Iterable):
+        listed = list(names)
+        own = {task.name: task for task in listed if isinstance(task, Task)}
+        known, names = {**known, **own} if own else known, [getattr(task, "name", task) for task in listed]
+    return {name: known[name] for name in resolve_tasks(names, tasks=known)}
 
 
 def get_task(task: str | Task, tasks: Tasks = TASKS) -> Task:
@@ -265,14 +250,13 @@ def one_layout(tasks: Iterable[Task]) -> Layout:
 
 @checked
 def load_tasks(path: AnyPath) -> Tasks:
-    """All 50 tasks and those of your own file: some of the 50 with other objects, points or words, or new tasks.
+    """Return all 50 tasks and those of your file, by name: some of the 50 with other objects or words, or new tasks.
+
+    Pass one wherever a task is accepted, or all of them to :func:`~lw_torchrl.load_plans` and
+    :func:`~lw_torchrl.resolve_tasks`.
 
     Args:
         path: a file in the format of data/tasks.toml, else a :class:`TaskError`. A new task must name its objects.
-
-    Returns:
-        Task name to :class:`Task`, sorted; pass one wherever a task is asked for, or all of them to
-        :func:`~lw_torchrl.load_plans` and :func:`~lw_torchrl.resolve_tasks`.
 
     Example:
         >>> row = "[push]\\ndescription = 'Push the disc.'\\nobjects.disc = 'obs[4:7]'"
@@ -286,7 +270,7 @@ def load_tasks(path: AnyPath) -> Tasks:
         try:
             found[name] = Task.from_json(name, row)
             if name not in TASKS and len(found[name].objects) == 1:
-                near = "".join(f"; did you mean {other!r}?" for other in nearest(name, TASKS, n=1))
+                near = did_you_mean(name, TASKS)
                 raise TaskError(f"task {name!r}: is none of the 50, so it must name its objects{near}")
         except TaskError as error:
             raise TaskError(f"{file}, {error}") from error

@@ -41,9 +41,9 @@ def encode_texts(texts: Sequence[str]) -> Tensor:
     The shipped texts have shipped vectors; for all others the extra ``[text]`` is needed, an ImportError without it.
     """
     shipped = _shipped()
-    new = sorted({text for text in texts if text not in shipped})
-    found = dict(zip(new, sentence_encoder(new), strict=True)) if new else {}
-    return torch.stack([shipped[text] if text in shipped else found[text] for text in texts])
+    new = sorted({*texts} - shipped.keys())
+    vectors = shipped | (dict(zip(new, sentence_encoder(new), strict=True)) if new else {})
+    return torch.stack([vectors[text] for text in texts])
 
 
 def encoded(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:

@@ -129,6 +129,8 @@ def from_description(
 
 class _Decoder:
     def __init__(self, plans: list[Plans], text_encoder: TextEncoder | None, parts: Sequence[type[nn.Module]]) -> None:
+        if wrong := [part for part in parts if not (isinstance(part, type) and issubclass(part, nn.Module))]:
+            raise TypeError(f"parts must be classes of modules, got {shown(wrong[0])}")
         self.plans, self.text_encoder = plans, text_encoder
         self.own = {f"{kind.__module__}:{kind.__qualname__}": kind for kind in parts}
         self.own |= {f"__main__:{kind.__qualname__}": kind for kind in parts}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import nn
-from torchrl.data import Bounded, Composite
+from torchrl.data import Composite
 
 from lw_torchrl._checks import checked
 from lw_torchrl.language.task_index import as_plans
@@ -18,7 +18,7 @@ from lw_torchrl.modules.attention import PlanAttention
 from lw_torchrl.modules.decoder import MLPDecoder, as_decoder
 from lw_torchrl.modules.features import as_features
 from lw_torchrl.modules.mixer import SkillMixer
-from lw_torchrl.modules.sequence import NamedParts, trunk_attributes
+from lw_torchrl.modules.sequence import NamedParts, action_spec, trunk_attributes
 
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import AnyPlans
@@ -103,9 +103,7 @@ class ConditionedActor(NamedParts):
     @property
     def spec(self) -> Composite:
         """The specification of the action, (A,) float32 in [-1, 1], which TorchRL's losses read."""
-        spec = Composite()
-        spec[self.decoder.out_keys_source[0]] = Bounded(-1.0, 1.0, (self.layout.action_size,))
-        return spec
+        return action_spec(self.decoder.out_keys_source[0], self.layout)
 
     def with_plans(self, plans: AnyPlans) -> Self:
         """Return an actor with the same networks that follows other plans: training either trains both."""

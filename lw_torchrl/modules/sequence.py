@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import nn
+from torchrl.data import Bounded, Composite
 
 from lw_torchrl._keys import any_arguments, as_keys, check_apart
 
@@ -34,6 +35,10 @@ class Part(TensorDictModuleBase):
         """The keyword arguments that rebuild it."""
         options = {name: getattr(self, name) for name in self._options}
         return {**options, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
+
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.layout import Layout
 
 
 class RenamedInputs(TensorDictModuleBase):
@@ -103,9 +108,30 @@ class NamedParts(RenamedInputs, TensorDictSequential):
         parts[name] = self.as_part(name, value)
         self._update_keys()
 
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """What is written. Parts have their own ``out_keys``: assign theirs, or give them to the constructor."""
+        return self._out_keys_apparent
+
+    @out_keys.setter
+    def out_keys(self, keys: Sequence[NestedKey]) -> None:
+        if list(keys) != self._complete_out_keys:
+            raise ValueError(
+                f"out_keys of a {type(self).__name__} cannot be assigned, got {list(keys)}; give out_keys= to its "
+                "constructor, or use select_out_keys to write fewer"
+            )
+        self._out_keys = self._out_keys_apparent = list(keys)
+
     def _update_keys(self) -> None:
         self._in_keys, out_keys = self._compute_in_and_out_keys(list(self.module.values()))
         self._out_keys = self._out_keys_apparent = self._complete_out_keys = out_keys
+
+
+def action_spec(key: NestedKey, layout: Layout) -> Composite:
+    """Return the specification of actions of a layout, (A,) float32 in [-1, 1]."""
+    spec = Composite()
+    spec[key] = Bounded(-1.0, 1.0, (layout.action_size,))
+    return spec
 
 
 def trunk_attributes(trunk: TensorDictSequential) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from tensordict.nn import (
     TensorDictModuleBase,
     TensorDictSequential,
 )
+from torch import nn
 from torchrl.data import Composite
 from torchrl.modules import IndependentNormal, TanhNormal
 
@@ -22,13 +23,13 @@ from lw_torchrl._keys import any_arguments, key_beside
 from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
 from lw_torchrl.modules.features import Features
 from lw_torchrl.modules.networks import materialize
-from lw_torchrl.modules.sequence import RenamedInputs, encoding_width, trunk_attributes
+from lw_torchrl.modules.sequence import NamedParts, action_spec, encoding_width, trunk_attributes
 
 DistributionName = Literal["tanh_normal", "normal"]
 DISTRIBUTIONS: dict[str, Any] = {"tanh_normal": TanhNormal, "normal": IndependentNormal}
 
 
-class StochasticActor(RenamedInputs, ProbabilisticTensorDictSequential):
+class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
     """A policy whose actions are drawn from a Normal, as TorchRL's ``ProbabilisticActor``.
 
     Reads what the trunk reads; writes what the trunk writes, ``loc`` and ``scale`` (B, A) float32, ``action`` (B, A)
@@ -39,7 +40,6 @@ class StochasticActor(RenamedInputs, ProbabilisticTensorDictSequential):
         trunk: a sequence of named parts, as for :class:`ConditionedActor`.
         decoder: writes the Normal's mean and standard deviation.
         distribution: "tanh_normal", a Normal through tanh; "normal", whose actions the environment clips.
-        spec: the specification of the action.
         action: the key of the action.
 
     Example:
@@ -58,7 +58,6 @@ class StochasticActor(RenamedInputs, ProbabilisticTensorDictSequential):
         decoder: TensorDictModuleBase,
         distribution: DistributionName = "tanh_normal",
         *,
-        spec: Composite | None = None,
         action: Any = "action",
     ) -> None:
         check_choice("distribution", distribution, DISTRIBUTIONS)
@@ -76,7 +75,6 @@ class StochasticActor(RenamedInputs, ProbabilisticTensorDictSequential):
         )
         super().__init__(OrderedDict(**dict(trunk.module.items()), decoder=decoder, sampler=sampler))
         self.plans, self.tasks, self.layout = trunk_attributes(trunk).values()
-        self.spec = spec
         self.distribution, self.action = distribution, action
 
     @any_arguments
@@ -116,13 +114,21 @@ class StochasticActor(RenamedInputs, ProbabilisticTensorDictSequential):
         action = actor.decoder.out_keys_source[0]
         keys = ["loc", "scale"] if isinstance(action, str) else [(*action[:-1], name) for name in ("loc", "scale")]
         decode = Decode(decoder, in_keys=actor.decoder.in_keys, out_keys=keys)
-        return cls(trunk, decode, distribution, spec=actor.spec, action=action).train(actor.training)
+        return cls(trunk, decode, distribution, action=action).train(actor.training)
 
     @property
     def config(self) -> dict[str, Any]:
         """The keyword arguments that rebuild it."""
         made = {"distribution": self.distribution, "action": self.action}
         return {"trunk": self.trunk, "decoder": self.module["decoder"], **made}
+
+    def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
+        raise TypeError(f"{name} of a StochasticActor cannot be replaced; replace the deterministic actor's part first")
+
+    @property
+    def spec(self) -> Composite:
+        """The specification of the action, (A,) float32 in [-1, 1], which TorchRL's losses read."""
+        return action_spec(self.action, self.layout)
 
     @property
     def trunk(self) -> TensorDictSequential:
@@ -132,5 +138,5 @@ class StochasticActor(RenamedInputs, ProbabilisticTensorDictSequential):
     def with_plans(self, plans: Any) -> StochasticActor:
         """Return a policy with the same networks that follows other plans: training either trains both."""
         parts = {n: p.with_plans(plans) if hasattr(p, "with_plans") else p for n, p in self.trunk.module.items()}
-        options: dict[str, Any] = {**self.config, "trunk": TensorDictSequential(OrderedDict(parts)), "spec": self.spec}
+        options: dict[str, Any] = {**self.config, "trunk": TensorDictSequential(OrderedDict(parts))}
         return StochasticActor(**options).train(self.training)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from hashlib import sha256
@@ -140,10 +141,12 @@ def recorded_answers(source: AnyPath) -> dict[str, dict[_Place, str | Path]]:
     path = Path(source)
     if not path.exists():
         raise FileNotFoundError(f"source: there is no file or folder {str(path)!r}")
-    answers = _answers_in_folder(path) if path.is_dir() else _answers_in_lines(path)
+    answers = defaultdict[str, dict[_Place, str | Path]](dict)
+    for model, place, answer in _answers_in_folder(path) if path.is_dir() else _answers_in_lines(path):
+        answers[model][place] = answer
     if not answers:
         raise ValueError(f"source: {str(path)!r} holds no answers, <model>/<format>/<task>-<attempt>.<ext>")
-    return answers
+    return dict(answers)
 
 
 def answer_text(answer: str | Path) -> str:
@@ -151,18 +154,15 @@ def answer_text(answer: str | Path) -> str:
     return storable(read_text(answer, ValueError) if isinstance(answer, Path) else answer)
 
 
-def _answers_in_folder(root: Path) -> dict[str, dict[_Place, str | Path]]:
-    answers: dict[str, dict[_Place, str | Path]] = {}
+def _answers_in_folder(root: Path) -> Iterator[tuple[str, _Place, Path]]:
     for name, format in PLAN_FORMATS.items():
         for path in root.glob(f"*/{name}/*.{format.extension}"):
             match = re.fullmatch(r"([a-z][a-z0-9-]*)-(\d{1,9})", path.stem)
             if match and path.parts[-3][0] != ".":
-                answers.setdefault(path.parts[-3], {})[name, match[1], int(match[2])] = path
-    return answers
+                yield path.parts[-3], (name, match[1], int(match[2])), path
 
 
-def _answers_in_lines(file: Path) -> dict[str, dict[_Place, str | Path]]:
-    answers: dict[str, dict[_Place, str | Path]] = {}
+def _answers_in_lines(file: Path) -> Iterator[tuple[str, _Place, str]]:
     models: dict[str, str] = {}
     for number, line in enumerate(read_text(file, ValueError).split("\n"), 1):
         if not line.strip():
@@ -179,8 +179,7 @@ def _answers_in_lines(file: Path) -> dict[str, dict[_Place, str | Path]]:
         if models.setdefault(name, row["llm"]) != row["llm"]:
             both = f"the models {models[name]!r} and {row['llm']!r} would both be {name!r}"
             raise ValueError(f"{where}: {both}; give one of them another name")
-        answers.setdefault(name, {})[row["format"], row["task"], row["attempt"]] = row["completion"]
-    return answers
+        yield name, (row["format"], row["task"], row["attempt"]), row["completion"]
 
 
 class AnswerCache:
@@ -196,13 +195,12 @@ class AnswerCache:
 
     def read(self, request: Mapping[str, Any]) -> Reply | None:
         """Return the reply to a request; None if there is none, or if its file is damaged."""
-        try:
+        with suppress(FileNotFoundError, ValueError, KeyError, TypeError):  # the question can be asked again
             answer = read_json(self.path(request), "the cached answer")["answer"]
             reply = Reply(**{**answer, "tokens": Tokens(**answer["tokens"]), "notes": tuple(answer["notes"])})
-        except (FileNotFoundError, ValueError, KeyError, TypeError):  # the question can be asked again
-            return None
-        texts = (reply.text, reply.finish, reply.refusal, *reply.notes)
-        return reply if all(isinstance(text, str) for text in texts) else None
+            texts = (reply.text, reply.finish, reply.refusal, *reply.notes)
+            return reply if all(isinstance(text, str) for text in texts) else None
+        return None
 
     def write(self, request: Mapping[str, Any], reply: Reply) -> None:
         write_json(self.path(request), {"request": request, "answer": asdict(reply)})
@@ -225,11 +223,8 @@ class Planner(Protocol):
         Args:
             tasks: "MT10", "MT50", a task's name, a :class:`~lw_torchrl.Task`, or a list of names and tasks.
             format: a name in :data:`~lw_torchrl.PLAN_FORMATS`.
-            attempts: answers to each question.
+            attempts: answers to each question. If one is missing, it is a :class:`PlannerError`; the others are kept.
             out: a folder; each answer is written to ``out/<name>/<format>/<task>-<attempt>.<ext>`` as it arrives.
-
-        Raises:
-            PlannerError: an answer is missing. Earlier answers are kept.
         """
         ...
 
@@ -242,20 +237,15 @@ class FilePlanner:
             object of "llm", "format", "task", "attempt" and "completion" on each line.
         model: the model whose answers to read; None if there is only one.
 
-    Attributes:
-        name: the model's name, as a folder's name.
-        recorded: (format, task, attempt) of each answer, sorted.
+    ``name`` is the model's name, as a folder's name; ``recorded`` has (format, task, attempt) of each answer, sorted.
 
     Example:
         >>> import json, pathlib, lw_torchrl as lw
         >>> row = {"llm": "by hand", "format": "chain_py", "task": "push", "attempt": 0}
         >>> row["completion"] = lw.encode_plan(lw.load_plans("MT10")["push"], "chain_py")
         >>> _ = pathlib.Path("answers.jsonl").write_text(json.dumps(row))
-        >>> planner = FilePlanner("answers.jsonl")
-        >>> planner.name, planner.recorded
-        ('by hand', (('chain_py', 'push', 0),))
-        >>> planner.plans("push", format="chain_py")[0].decoded.plan == lw.load_plans("MT10")["push"]
-        True
+        >>> FilePlanner("answers.jsonl").plans("push", format="chain_py")[0].decoded.plan.task
+        'push'
     """
 
     @checked

@@ -17,7 +17,7 @@ from lw_torchrl._files import parse_json
 OPENAI = "https://api.openai.com/v1"
 REPLY_LIMIT = 4 * 2**20  # bytes
 _KEY = "OPENAI_API_KEY"
-_PROXIES, _CERTIFICATES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY"), ("SSL_CERT_FILE", "SSL_CERT_DIR")
+_PROXIES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY")
 # What to send to a server that refuses a field, and how its error names the field.
 _FALLBACKS = {
     "max_completion_tokens": "max_completion_tokens",  # instead of max_tokens
@@ -29,8 +29,7 @@ _FALLBACKS = {
 class PlannerError(RuntimeError):
     """A planner could not answer a question; the message names the model, the question, the cause and a remedy.
 
-    Attributes:
-        fatal: every other question to the same planner would fail in the same way.
+    After a ``fatal`` error, every other question to the same planner would fail in the same way.
     """
 
     def __init__(self, message: str, *, fatal: bool = False) -> None:
@@ -77,12 +76,7 @@ def server_address(base_url: str | None) -> str:
 
 
 class ChatClient:
-    """A client of one model, for any number of threads; the arguments are those of :class:`OpenAIPlanner`.
-
-    Raises:
-        ImportError: the extra ``[llm]`` is not installed.
-        PlannerError: the key is missing or cannot be sent, or the HTTP client refuses an environment variable.
-    """
+    """A client of one model, for any number of threads; the arguments are those of :class:`OpenAIPlanner`."""
 
     def __init__(self, model: str, base_url: str | None, timeout: float, retries: int) -> None:
         try:
@@ -90,23 +84,22 @@ class ChatClient:
         except ImportError as error:
             needs = "asking a model needs the extra [llm]: pip install 'lw_torchrl[llm]'"
             raise ImportError(f"{needs} ({error})") from error
-        self._openai, self.model, self.address = openai, model, server_address(base_url)
-        self._timeout = timeout
-        key = os.environ.get(_KEY, "").strip()
+        self._openai, self.model, self.address, self._timeout = openai, model, server_address(base_url), timeout
+        self._key = key = os.environ.get(_KEY, "").strip()
         if self.address == OPENAI and not key:
             advice = f"set the environment variable {_KEY}, or give the base_url of a server that needs none"
             raise PlannerError(f"{model!r} at {self.address} needs a key: {advice}", fatal=True)
         if not (key.isascii() and key.isprintable()):
             raise PlannerError(f"the key in {_KEY} has characters that no key has; set it again", fatal=True)
-        self._key = key
         self._fallbacks = frozenset({"max_completion_tokens"} if self.address == OPENAI else ())
         options: Any = {"timeout": openai.Timeout(timeout, connect=min(timeout, 10.0))}
         try:
             options |= {"http_client": _limited(openai, timeout)(**options), "max_retries": retries}
             self._client = openai.OpenAI(api_key=key or "none", base_url=base_url, **options)
         except (ValueError, ImportError, OSError) as error:
-            what, variables = f"the HTTP client cannot be made ({excerpt(str(error))})", (*_PROXIES, *_CERTIFICATES)
-            raise PlannerError(f"{what}; check the environment variables {', '.join(variables)}", fatal=True) from None
+            advice = f"check the environment variables {', '.join(_PROXIES)}, SSL_CERT_FILE, SSL_CERT_DIR"
+            what = f"the HTTP client cannot be made ({excerpt(str(error))})"
+            raise PlannerError(f"{what}; {advice}", fatal=True) from None
 
     def close(self) -> None:
         self._client.close()
@@ -226,11 +219,10 @@ def _request_fields(model: str, request: Mapping[str, Any], fallbacks: frozenset
     limit = "max_completion_tokens" if "max_completion_tokens" in fallbacks else "max_tokens"
     fields = {"model": model, "messages": messages, limit: request["max_tokens"], "extra_body": request["options"]}
     fields |= {name: request[name] for name in ("temperature", "seed") if request[name] is not None}
-    if schema and "json_object" in fallbacks:
-        fields["response_format"] = {"type": "json_object", "schema": schema}
-    elif schema:
-        json_schema = {"name": "plan", "schema": schema, "strict": True}
-        fields["response_format"] = {"type": "json_schema", "json_schema": json_schema}
+    if schema:
+        strict = {"type": "json_schema", "json_schema": {"name": "plan", "schema": schema, "strict": True}}
+        plain = {"type": "json_object", "schema": schema}
+        fields["response_format"] = plain if "json_object" in fallbacks else strict
     return fields
 
 
@@ -249,21 +241,17 @@ def read_completion(content: bytes) -> tuple[Reply, str]:
     if len(content) > REPLY_LIMIT:
         size = f"the reply is larger than {REPLY_LIMIT // 2**20} MiB"
         raise PlannerError(f"{size}. Give fewer max_tokens, and no options that make it long")
-    text = excerpt(content.decode("utf-8", "replace"))
-    not_completion = f"the reply is not a chat completion: {text}"
-    not_completion += ". Check that base_url is the address of an OpenAI-compatible server; it usually ends in /v1"
     try:
         body = parse_json(content)
-    except ValueError as error:
-        if content.strip()[:1] not in (b"", b"{"):
-            raise PlannerError(not_completion, fatal=True) from None
-        raise PlannerError(f"the reply was cut off or is not JSON: {excerpt(str(error))}. Ask again") from None
-    try:
         choice = body["choices"][0]
         message = choice["message"]
         answer = message["content"]
-    except (KeyError, IndexError, TypeError):
-        raise PlannerError(not_completion, fatal=True) from None
+    except (ValueError, KeyError, IndexError, TypeError) as error:
+        if isinstance(error, ValueError) and content.strip()[:1] in (b"", b"{"):
+            raise PlannerError(f"the reply was cut off or is not JSON: {excerpt(str(error))}. Ask again") from None
+        advice = "Check that base_url is the address of an OpenAI-compatible server; it usually ends in /v1"
+        text = excerpt(content.decode("utf-8", "replace"))
+        raise PlannerError(f"the reply is not a chat completion: {text}. {advice}", fatal=True) from None
     notes: tuple[str, ...] = ()
     if isinstance(answer, list):  # parts: thoughts, and texts
         answer = "".join(_text(part.get("text")) for part in answer if isinstance(part, dict))

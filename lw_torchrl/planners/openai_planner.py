@@ -49,24 +49,19 @@ class OpenAIPlanner:
         constrain: restrict the model to a JSON Schema of the task's plans (:func:`plan_schema`); it answers in JSON.
         free_skills: with ``constrain``, allow skills in any words, not only the scripted ones.
         skills: the scripted skills to choose from; None for the shipped ones.
-        plans: the plans that prompts show as examples; None for the hand-written ones of MT10.
-        vocabulary: prompts also list the task's objects and the relations between them.
-        temperature: the sampling temperature; None for the server's default.
+        plans, vocabulary: see :func:`plan_prompt`.
+        temperature: None for the server's default.
         max_tokens: maximum tokens of an answer; reasoning models need more.
         seed: attempt k is sent ``seed + k``; None sends none.
         options: further fields of the request, ``{"top_p": 0.9}``.
         name: the folder for the answers; None for the model's name, with "-constrained" if it is constrained.
         cache: the folder of cached answers.
         concurrency: questions at once.
-        retries: maximum number of retries after a rate limit, or an error of the server or the connection; the
-            ``openai`` client chooses the wait.
+        retries: retries after a rate limit, or an error of the server or the connection; ``openai`` chooses the wait.
         timeout: seconds for one try, from the request to the end of the answer.
 
     Example:
-        >>> planner = OpenAIPlanner("meta-llama/Llama-3.1-8B", base_url="http://127.0.0.1:8000/v1", constrain=True)
-        >>> planner
-        OpenAIPlanner('meta-llama/Llama-3.1-8B', base_url='http://127.0.0.1:8000/v1', constrain=True)
-        >>> planner.name
+        >>> OpenAIPlanner("meta-llama/Llama-3.1-8B", base_url="http://127.0.0.1:8000/v1", constrain=True).name
         'meta-llama_Llama-3.1-8B-constrained'
 
     Source: paper section 'LLM Experiments'.
@@ -97,16 +92,21 @@ class OpenAIPlanner:
             raise TypeError(f"model must be a model's name, got {shown(model)}")
         if free_skills and not constrain:
             raise ValueError("free_skills needs constrain; without it, skills are in any words")
-        self.model, self.base_url, self.constrain, self.free_skills = model, base_url, constrain, free_skills
-        self.skills, self.vocabulary = skills, vocabulary
+        self.model, self.base_url, self.address = model, base_url, server_address(base_url)
+        self.constrain, self.free_skills, self.skills, self.vocabulary = constrain, free_skills, skills, vocabulary
         self.examples = None if plans is None else as_plans(plans)
-        self.address = server_address(base_url)
-        self.temperature = None if temperature is None else float(temperature)
-        self.max_tokens, self.seed = int(max_tokens), None if seed is None else int(seed)
-        self.options = _request_options(options)
+        self.temperature = None if temperature is None else float(temperature)  # 1 and 1.0 are one request
+        self.max_tokens, self.seed = max_tokens, seed
+        try:
+            self.options = json.loads(json.dumps(dict(options or {}), allow_nan=False)) or None
+        except (TypeError, ValueError, RecursionError) as error:
+            raise TypeError(f"options must be fields of a request in JSON, got {shown(options)}") from error
+        if own := sorted(_OWN_FIELDS & set(self.options or ())):
+            others = ", ".join(sorted(_OWN_FIELDS))
+            raise ValueError(f"options must be other fields than {others}, got {', '.join(own)}")
         self.name = folder_name(name or (f"{model}-constrained" if constrain else model))
         self.cache = AnswerCache(cache)
-        self.concurrency, self.retries, self.timeout = int(concurrency), int(retries), float(timeout)
+        self.concurrency, self.retries, self.timeout = concurrency, retries, timeout
 
     def __repr__(self) -> str:
         return f"OpenAIPlanner({self.model!r}, base_url={self.address!r}, constrain={self.constrain})"
@@ -145,9 +145,8 @@ class OpenAIPlanner:
         """Ask for plans, several at a time.
 
         Args:
-            tasks, format, attempts: see :meth:`Planner.plans`.
-            out: a folder; each answer is written to ``out/<name>/<format>/<task>-<attempt>.<ext>`` as it arrives, with
-                the JSON of a constrained model beside it, and the settings to ``out/<name>/settings.json``.
+            tasks, format, attempts, out: see :meth:`Planner.plans`. The JSON of a constrained model is written beside
+                its answer, and the settings to ``out/<name>/settings.json``.
             recorded: read the answers that are in ``out``, and ask only for the others.
             progress: show a progress bar.
 
@@ -177,14 +176,10 @@ class OpenAIPlanner:
         Args:
             answers: answers in one format.
             facts: a report on each, as :func:`~lw_torchrl.planners.repairing.plan_facts` writes it.
-            round: the number of the round, which is part of the folder's name.
             tasks: where tasks' names are looked up.
-            out: a folder; answers are written to ``out/<name>-round<round>/<format>/<task>-<attempt>.<ext>``.
+            out: as for :meth:`plans`; the folder's name ends in ``-round<round>``. Another answer of this round in it
+                is a :class:`ValueError`.
             progress: show a progress bar.
-
-        Raises:
-            PlannerError: see :meth:`plans`.
-            ValueError: ``out`` has another answer of this round.
         """
         before, reports = list(answers), list(facts)
         formats = {answer.format for answer in before}
@@ -216,7 +211,7 @@ class OpenAIPlanner:
         written = 0
         for question in questions:
             reply = self.cache.read(question.request)
-            answer = None if reply is None else replace(self._read(reply, question, format), cached=True)
+            answer = None if reply is None else self._read(reply, question, format)
             path = answer_path(out or "", name, format, question.task.name, question.attempt)
             if out is not None and existing != "replace" and path.is_file():
                 written += 1
@@ -226,11 +221,10 @@ class OpenAIPlanner:
                         what = f"{str(path)!r} holds an answer to another question; it is not replaced"
                         raise ValueError(f"out: {what}: give the new answers another name (--name) or out")
                     answer = read_reply(Reply(text), question.task, format, question.attempt, self.skills)
-                    answer = replace(answer, cached=True)
             if answer is None:
                 missing.append(question)
             else:
-                answers.append(answer)
+                answers.append(replace(answer, cached=True))
         if out is not None:
             write_settings(Path(out) / folder_name(name), self.settings(), reading=written == len(questions))
             for answer in answers:
@@ -267,31 +261,18 @@ class OpenAIPlanner:
                 return question, None
             try:
                 reply = client.ask(question.request, str(question))
-                self.cache.write(question.request, reply)
-                return question, reply
             except PlannerError as error:
                 if error.fatal:
                     stopped.set()
                 return question, error
+            self.cache.write(question.request, reply)
+            return question, reply
 
         with (
             closing(ChatClient(self.model, self.base_url, self.timeout, self.retries)) as client,
             ThreadPool(min(self.concurrency, len(questions))) as pool,  # of daemons, which Ctrl-C does not wait for
         ):
             try:
-                for question, result in pool.imap_unordered(ask, questions):
-                    if result is not None:
-                        yield question, result
+                yield from ((asked, result) for asked, result in pool.imap_unordered(ask, questions) if result)
             finally:
                 stopped.set()
-
-
-def _request_options(options: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return further fields of a request as JSON has them, or raise an error for a field that the planner sends."""
-    try:
-        fields = json.loads(json.dumps(dict(options or {}), allow_nan=False))
-    except (TypeError, ValueError, RecursionError) as error:
-        raise TypeError(f"options must be fields of a request in JSON, got {shown(options)}") from error
-    if own := sorted(_OWN_FIELDS & set(fields)):
-        raise ValueError(f"options must be other fields than {', '.join(sorted(_OWN_FIELDS))}, got {', '.join(own)}")
-    return fields or None

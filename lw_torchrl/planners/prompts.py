@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Mapping
 from functools import cache
 from typing import Any, NamedTuple
@@ -30,7 +31,6 @@ def prompt_examples(task: str | Task, plans: AnyPlans | None = None) -> tuple[Co
     They are up to three, without the task's own. The nearest by edit distance comes last, next to the question.
 
     Args:
-        task: a task or its name.
         plans: the plans to choose from; None for the hand-written ones of MT10.
 
     Example:
@@ -51,26 +51,26 @@ def prompt_examples(task: str | Task, plans: AnyPlans | None = None) -> tuple[Co
     return (first, *reversed(nearest)) if first.task == _ALWAYS else (*reversed(nearest), first)
 
 
+@cache
+def _shipped() -> Plans:
+    return load_plans("MT10")
+
+
 def example_plans(plans: AnyPlans | None) -> Plans:
-    """Return the plans that examples are chosen from; None for the hand-written ones of MT10."""
-    return _load("MT10") if plans is None else as_plans(plans)
-
-
-_load = cache(load_plans)
+    """Return the plans that examples are chosen from."""
+    return _shipped() if plans is None else as_plans(plans)
 
 
 @checked
 def plan_prompt(
     task: str | Task, format: str, *, plans: AnyPlans | None = None, vocabulary: bool = False, tasks: Tasks = TASKS
 ) -> str:
-    """Return the text that asks a language model for a plan.
+    """Return the text that asks a language model for a plan, whose answer :func:`~lw_torchrl.decode_plan` reads.
 
-    It shows the plans of :func:`prompt_examples`, and ends with the task's name and description, in the format. A
-    model that completes texts continues from there; :func:`~lw_torchrl.decode_plan` reads its answer.
+    It shows the plans of :func:`prompt_examples`, and ends with the task's name and description, in the format.
 
     Args:
-        task, format, tasks: see :func:`~lw_torchrl.decode_plan`.
-        plans: the plans to choose the examples from; None for the hand-written ones of MT10.
+        plans: see :func:`prompt_examples`.
         vocabulary: also list the task's objects and the relations between them.
 
     Example:
@@ -102,18 +102,17 @@ class Question(NamedTuple):
 def chat_messages(
     task: Task, format: str, plans: AnyPlans | None, vocabulary: bool, constrain: bool
 ) -> list[dict[str, str]]:
-    """Return a system message that asks a chat model for the plan alone, and the prompt.
-
-    If the model is constrained to a schema, the system message shows the last example as JSON.
-    """
-    system = f"You write plans for a robot arm. Answer with the plan for `{task.name}` alone, "
+    """Return a system message that asks a chat model only for the plan, with the last example as JSON if the model is
+    constrained to a schema, and the prompt."""
+    how = (
+        "the whole of it, in the form of the plans that you are shown: no other tasks, and nothing before or after it."
+    )
     if constrain:
         example = prompt_examples(task, plans)[-1]
-        system += f"as JSON. The plans that you are shown are in another form; this is the one for `{example.task}` as "
-        system += "JSON:\n" + write_structured(example, PLAN_FORMATS[format].style)
-    else:
-        system += "the whole of it, in the form of the plans that you are shown: no other tasks, and nothing before or "
-        system += "after it."
+        json = write_structured(example, PLAN_FORMATS[format].style)
+        how = "as JSON. The plans that you are shown are in another form; "
+        how += f"this is the one for `{example.task}` as JSON:\n{json}"
+    system = f"You write plans for a robot arm. Answer with the plan for `{task.name}` alone, {how}"
     prompt = plan_prompt(task, format, plans=plans, vocabulary=vocabulary)
     return [{"role": "system", "content": system}, {"role": "user", "content": prompt}]
 
@@ -126,11 +125,7 @@ _BECAUSE = "^[A-Za-z0-9,.:;'-]+( [A-Za-z0-9,.:;'-]+){1,29}$"
 
 @checked
 def plan_schema(
-    task: str | Task,
-    format: str = "basic_py",
-    *,
-    skills: Skills | None = None,
-    free_skills: bool = False,
+    task: str | Task, format: str = "basic_py", *, skills: Skills | None = None, free_skills: bool = False
 ) -> dict[str, Any]:
     """Return the JSON Schema of plans of a task, as :mod:`~lw_torchrl.language.formats.structured` writes them.
 
@@ -138,17 +133,12 @@ def plan_schema(
     is three choices, not one of hundreds: OpenAI allows 1,000 words to choose from; the largest task has 320.
 
     Args:
-        task: a task or its name.
         format: determines the style: a reason before each clause if it explains, a goal in a goal format.
         skills: the scripted skills to choose from; None for the shipped ones. If none suits, it is a ValueError.
         free_skills: allow skills in any words.
 
     Example:
-        >>> schema = plan_schema("reach")
-        >>> step = schema["properties"]["steps"]["items"]["properties"]
-        >>> step["condition"]["items"]["anyOf"][0]["properties"]["is"]["enum"][:2]
-        ['near', 'not near']
-        >>> step["skill"]["enum"][0]
+        >>> plan_schema("reach")["properties"]["steps"]["items"]["properties"]["skill"]["enum"][0]
         'hold the gripper at the reach target'
     """
     task = get_task(task)
@@ -170,8 +160,7 @@ def passes(value: Any, schema: Mapping[str, Any]) -> bool:
         return any(passes(value, one) for one in schema["anyOf"])
     if "enum" in schema:
         return value in schema["enum"]
-    if schema["type"] == "object":
-        properties = schema["properties"]
+    if properties := schema.get("properties"):
         complete = isinstance(value, dict) and {*value} == {*properties}
         return complete and all(passes(value[name], properties[name]) for name in properties)
     if schema["type"] == "array":
@@ -182,19 +171,17 @@ def passes(value: Any, schema: Mapping[str, Any]) -> bool:
 
 def _clauses(task: Task) -> list[dict[str, Any]]:
     """Return schemas for the base queries: for each subject and predicate, only the objects that complete a query."""
-    seconds: dict[tuple[str, str], list[str | None]] = {}
+    seconds = defaultdict[tuple[str, str], list[str | None]](list)
     for clause in base_clauses(task, tuple(PREDICATES)):
         predicate = f"not {clause.predicate}" if clause.negated else clause.predicate
-        seconds.setdefault((clause.subject, predicate), []).append(clause.object)
-    groups: dict[tuple[str, tuple[str | None, ...]], list[str]] = {}
+        seconds[clause.subject, predicate].append(clause.object)
+    groups = defaultdict[tuple[str, tuple[str | None, ...]], list[str]](list)
     for (subject, predicate), objects in seconds.items():
-        groups.setdefault((subject, tuple(objects)), []).append(predicate)
+        groups[subject, tuple(objects)].append(predicate)
     schemas = []
     for (subject, others), predicates in groups.items():
-        properties = {"first": _choice([f"the {subject}"]), "is": _choice(predicates)}
-        if others != (None,):
-            properties["second"] = _choice([f"the {name}" for name in others])
-        schemas.append(_object(properties))
+        second = {} if others == (None,) else {"second": _choice([f"the {name}" for name in others])}
+        schemas.append(_object({"first": _choice([f"the {subject}"]), "is": _choice(predicates), **second}))
     return schemas
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -93,13 +92,10 @@ def check_plan(
         ((), 1.0, 1.0)
     """
     task = get_task(task, tasks)
-    decoded = decode_plan(text, task, format, skills=skills, tasks=tasks)
-    return _check_decoded(decoded, task, episodes, seed, skills)
+    return _check_decoded(decode_plan(text, task, format, skills=skills, tasks=tasks), task, episodes, seed, skills)
 
 
-def _check_decoded(
-    decoded: DecodedPlan, task: Task, episodes: int, seed: int, skills: Skills | None = None
-) -> PlanCheck:
+def _check_decoded(decoded: DecodedPlan, task: Task, episodes: int, seed: int, skills: Skills | None) -> PlanCheck:
     if decoded.plan is None:
         return PlanCheck(task.name, decoded)
     expert = expert_use({task.name: decoded.plan}, task.name, episodes_per_task=episodes, seed=seed)[task.name]
@@ -137,8 +133,7 @@ class Repair:
     @property
     def best(self) -> int:
         """The round with the most successful plan, the earliest if several are equal; 0 is the first answer."""
-        rates = [check.success for check in self.checks]
-        return rates.index(max(rates))
+        return max(range(len(self.checks)), key=lambda round: self.checks[round].success)
 
 
 def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
@@ -157,10 +152,9 @@ def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
     if check.decoded.plan is None:
         reason = check.decoded.reason
         return "\n".join([f"The answer was read, and no plan was found in it: {reason}.", *unread, again])
-    lines = [f"The plan was carried out, and succeeded in {check.success:.0%} of episodes."]
-    if check.own is None:
-        lines = ["The plan was not carried out: the robot has no skill that is near one of its steps."]
-    lines += unread
+    carried_out = f"The plan was carried out, and succeeded in {check.success:.0%} of episodes."
+    no_skill = "The plan was not carried out: the robot has no skill that is near one of its steps."
+    lines = [no_skill if check.own is None else carried_out, *unread]
     for step in check.never:
         condition = check.decoded.plan.steps[step].condition
         lines.append(f"The condition of step {step + 1}, '{condition}', held at no time.")
@@ -210,12 +204,7 @@ def repair_plans(
         rounds: maximum number of rounds.
         enough: a plan with at least this success rate is not revised.
         episodes, seed: the episodes in which scripted skills carry out each plan. Compare plans with another seed.
-        tasks: where tasks' names are looked up.
-        out: see :meth:`OpenAIPlanner.revise`; each round is written like the answers of a model of its own.
-        progress: show progress bars.
-
-    Raises:
-        PlannerError: an answer is missing; the others are cached.
+        tasks, out, progress: see :meth:`OpenAIPlanner.revise`.
     """
     check_int("rounds", rounds, minimum=1)
 
@@ -235,13 +224,12 @@ def repair_plans(
         if not failing:
             break
         before = [repairs[k].answers[-1] for k in failing]
-        checks = [repairs[k].checks[-1] for k in failing]
         facts = [
-            plan_facts(check, get_task(answer.task, tasks), answer.notes)
-            for check, answer in zip(checks, before, strict=True)
+            plan_facts(repairs[k].checks[-1], get_task(answer.task, tasks), answer.notes)
+            for k, answer in zip(failing, before, strict=True)
         ]
-        options: dict[str, Any] = {"round": number, "tasks": tasks, "out": out, "progress": progress}
-        revised = {(answer.task, answer.attempt): answer for answer in planner.revise(before, facts, **options)}
+        answered = planner.revise(before, facts, round=number, tasks=tasks, out=out, progress=progress)
+        revised = {(answer.task, answer.attempt): answer for answer in answered}
         after = [revised[answer.task, answer.attempt] for answer in before]
         for k, answer, checked in zip(failing, after, run(after), strict=True):
             repairs[k] = Repair((*repairs[k].answers, answer), (*repairs[k].checks, checked))

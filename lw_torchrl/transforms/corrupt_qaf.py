@@ -31,11 +31,9 @@ class CorruptQAF(EpisodeTransform):
       every · ⌊max(t - delay, 0) / every⌋;
     - **flip** (wrong): in each step, the reset included, each answer is then inverted with this probability.
 
-    The random draws depend only on (task, seed, episode, step) and the answer's place in its plan. A larger probability
-    inverts all that a smaller one inverts. In :func:`lw_torchrl.evaluate` it can be the ``evaluator``.
-
-    A learned evaluator in front of a policy overwrites ``qaf``. To corrupt its answers, run it in the environment: by a
-    transform before this one that calls it in ``_reset`` and ``_call``, and adapts the spec of ``qaf``.
+    The draws depend only on (task, seed, episode, step) and the answer's place in its plan; a larger probability
+    inverts all that a smaller one inverts. In :func:`lw_torchrl.evaluate` it can be the ``evaluator``. To corrupt a
+    learned evaluator's answers, run that by a transform before this one, which calls it in ``_reset`` and ``_call``.
 
     Args:
         plans: the plans whose conditions ``qaf`` answers.
@@ -46,8 +44,7 @@ class CorruptQAF(EpisodeTransform):
         in_keys: other names for qaf, task_id and episode, in this order.
 
     Raises:
-        ValueError: ``qaf`` is missing, has another shape or dtype, or belongs to other plans; or the transform is used
-            in a replay buffer, whose rows do not record the steps of their episodes.
+        ValueError: ``qaf`` is missing, or of another shape, dtype or plan; or the transform is used in a replay buffer.
         RuntimeError: a step of an environment that was never reset, or not since ``load_state_dict``.
 
     Example:

@@ -29,9 +29,8 @@ class FallbackTurns(Transform):
     """Count the turns of an episode: the plan's own steps have the even turns, the fallback plan's steps the odd ones.
 
     A turn ends when neither the hand nor an object has moved farther than ``still`` for ``patience`` steps, and at the
-    latest after ``longest`` steps. It does not depend on rewards or success.
-    :class:`~lw_torchrl.modules.PlanAttention` reads the turn if its plans have fallback steps, see
-    :func:`~lw_torchrl.canonical_plans`.
+    latest after ``longest`` steps. :class:`~lw_torchrl.modules.PlanAttention` reads the turn if its plans have fallback
+    steps, see :func:`~lw_torchrl.canonical_plans`.
 
     In an environment it reads ``observation`` (B, 39) float32, metres, and writes ``turn`` (B,) int64, from 0. Rows of
     a replay buffer keep the turn with which they were collected; rows without one get 0.
@@ -52,7 +51,6 @@ class FallbackTurns(Transform):
         >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.transforms.FallbackTurns(patience=5))
         >>> env.rollout(12, lambda td: td.set("action", td["observation"].new_zeros(1, 4)))["turn"].max()
         tensor(2)
-        >>> env.close()
 
     Source: ours; time-outs of a behaviour tree's fallback node.
     """

@@ -59,7 +59,7 @@ def one_per_row(values: Tensor, rows: torch.Size) -> Tensor:
 
 
 class QAFTransform(KeepsEnvState):
-    """Writes ``qaf``, in an environment and on a replay buffer.
+    """Answer the conditions of each row's plan, in an environment and on a replay buffer.
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``qaf`` (B, S) bool, the truth of each
     condition of the row's plan, in the order of its steps, false beyond its last, and ``qaf_plan`` (B,) int64, that
@@ -67,14 +67,13 @@ class QAFTransform(KeepsEnvState):
     writes ``("next", "qaf")`` too, wherever ``("next", "observation")`` is. In an environment its ``state_dict`` holds
     the environment's, as :class:`EnvState` does.
 
-    Conditions speak of metres, so it comes before whatever changes the observation: a normaliser, :class:`RandomYaw`.
-    A transform that comes first and names the observation in its ``out_keys`` is refused; those in the workers of a
-    SerialEnv or ParallelEnv cannot be seen.
+    Conditions are about metres, so put it before transforms that change the observation, such as a normaliser or
+    :class:`RandomYaw`: one before it is refused, except in the workers of a SerialEnv or ParallelEnv.
 
     Args:
         plans: a plan for each task that will be seen.
-        in_keys: where observation and task_id are, in this order.
-        out_keys: where the truth goes; the plan's number goes beside it, under that name and ``_plan``.
+        in_keys: other names for observation and task_id, in this order.
+        out_keys: another name for qaf; the plan's number gets this name and ``_plan``.
 
     Raises:
         PlanError: (a ValueError) the environment has a task without a plan.
@@ -87,7 +86,6 @@ class QAFTransform(KeepsEnvState):
         >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), lw.QAFTransform(lw.load_plans("MT10")))
         >>> env.reset()["qaf"].dtype
         torch.bool
-        >>> env.close()
 
     Source: paper section 'Query Answering Function'.
     """

@@ -70,24 +70,22 @@ class RandomYaw(PlanAugmentation):
     A policy then learns to move towards the goal, and not in the direction that the demonstrations happened to have.
     For replay buffers, after a :class:`QAFTransform`: conditions such as "left of" hold in the scene as it was.
 
-    Changes ``observation`` (B, 39) float32, ``action`` (B, 4) float32, and, where they exist, ``expert_action`` and
-    ``unclipped_action`` (B, 4) float32 and ``("next", "observation")``. Writes ``observation_yaw`` (B,) float32, the
-    angle in radians, and ``("next", "observation_yaw")``; features of fixed places turn these by the angle. An action's
-    displacement in the plane is shortened where turning would lead it out of [-1, 1]. Orientations are not turned: use
-    features without them, "differences" or "relative". Angles are drawn from PyTorch's global generator.
+    Changes ``observation`` (B, 39), ``action`` (B, 4), and, where they exist, ``expert_action``, ``unclipped_action``
+    (B, 4) and ``("next", "observation")``, all float32. Writes the angle in radians, ``observation_yaw`` (B,) float32,
+    and ``("next", "observation_yaw")``; features of fixed places turn these by it. An action's displacement in the
+    plane is shortened if turning would lead it out of [-1, 1]. Orientations are not turned: use features without them,
+    "differences" or "relative". Angles are drawn from PyTorch's global generator.
 
     Args:
         scale: standard deviation of the angle, in radians; 10 is any angle.
         plans: the actor's plans. Rows whose true conditions lead to no direction ("move the puck to the target
-            location") are then turned by any angle, by ``qaf`` (B, S) and ``task_id`` (B,) int64; None turns all rows
-            alike.
-        tilt: the probability that a row is also turned in space, by any rotation, if its steps move something freely
-            to a place. It needs canonical plans, see :func:`~lw_torchrl.canonical_plans`. Such a row's
-            ``observation_tilt`` (B, 3, 3) float32 turns the relative position that
-            :class:`~lw_torchrl.modules.RoleFeatures` shows; for all other rows it is the identity.
+            location"), by ``qaf`` (B, S) and ``task_id`` (B,) int64, are then turned by any angle.
+        tilt: the probability that a row whose steps move something freely to a place is also turned in space, by any
+            rotation, ``observation_tilt`` (B, 3, 3) float32, by which :class:`~lw_torchrl.modules.RoleFeatures` turns
+            the relative position. It needs canonical plans, see :func:`~lw_torchrl.canonical_plans`.
         layout: of the observations and actions; None for that of the plans, or Meta-World's without plans.
-        in_keys: other names for observation, action, the expert's action and the unclipped one, in this order.
-        out_keys: where the turned ones go; None for the same places.
+        in_keys: other names for observation, action, expert_action and unclipped_action, in this order.
+        out_keys: names for the turned ones; None for the same names.
 
     Raises:
         ValueError: a wrong argument; a sample without observation or action, or, with plans, without their answers.

@@ -1,4 +1,4 @@
-"""SuiteTransform: somebody else's environment, seen and moved as a layout says."""
+"""SuiteTransform: another library's environment with a layout's observations and actions."""
 
 from __future__ import annotations
 
@@ -17,32 +17,30 @@ from lw_torchrl.language.tasks import Task, task_id
 
 
 class SuiteTransform(Transform):
-    """Turns the keys of any TorchRL environment into a layout's ``observation``, and says which task it is.
+    """Write the layout's ``observation`` and the ``task_id`` from the keys of any TorchRL environment.
 
-    Behind it :class:`QAFTransform`, our actors, TorchRL's collectors and its losses work as they do with
-    :class:`~lw_torchrl.LanguageWorldEnv`.
+    After it, :class:`QAFTransform`, actors, collectors and losses work as with :class:`~lw_torchrl.LanguageWorldEnv`.
 
-    Reads ``in_keys``; writes ``observation`` (..., D) float32 and ``task_id`` (...) int64. Where the layout has numbers
-    of the step before, it fills them; at a reset they are those of now. With ``act``, ``action`` (..., A) float32 in
-    [-1, 1] is an action of the layout.
+    Reads ``in_keys``; writes ``observation`` (..., D) float32 and ``task_id`` (...) int64. It fills the numbers of the
+    step before, if the layout has them; at a reset they are the present ones. With ``act``, ``action`` (..., A) float32
+    in [-1, 1] is an action of the layout.
 
     Args:
-        task: what is to be done; its layout says what D and A are.
+        task: the task, whose layout has D numbers and A actions.
         observe: from the tensors of ``in_keys`` to (..., D) numbers in the layout's order and frame; any for the past.
-        act: from an action of the layout (..., A) to one of the environment; None where they are the same.
-        in_keys: what ``observe`` is given.
+        act: from an action of the layout (..., A) to one of the environment; None if they are the same.
+        in_keys: the keys that ``observe`` reads.
 
     Raises:
-        ValueError: at call time, a missing key, or another number of numbers than the layout's.
+        ValueError: at call time, a missing key, or an observation of another size than the layout's.
 
     Example:
         >>> import lw_torchrl as lw, torch
         >>> from lw_torchrl.transforms import SuiteTransform
         >>> from torchrl.envs import TransformedEnv
         >>> env = TransformedEnv(lw.LanguageWorldEnv("reach"), SuiteTransform(lw.TASKS["push"], lambda seen: seen))
-        >>> env.reset()["task_id"].tolist() == [lw.task_id("push")]
-        True
-        >>> env.close()
+        >>> env.reset()["observation"].shape
+        torch.Size([1, 39])
 
     Source: as ``torchrl.envs.transforms.CatTensors``, with a meaning for each number.
     """

@@ -183,11 +183,6 @@ def test_a_run_that_is_left_half_way_leaves_no_trace():
     assert all(same(steps, alone(*key)) for key, steps in found.items())
 
 
-def test_no_episodes_is_nothing_to_do():
-    assert run(plain_env(2), wavy, {}) == {}
-    assert run(plain_env(2), wavy, {"push": []}) == {}
-
-
 # --- on any number of rows -----------------------------------------------------------------------------------------
 
 
@@ -220,31 +215,6 @@ def test_blocks_give_what_the_policy_gives(network):
         assert part["row"].tolist() == list(range(size))
     order = torch.randperm(200, generator=torch.Generator().manual_seed(0))
     assert torch.equal(in_blocks(network)(states[order].clone())["action"], whole["action"][order])
-
-
-def test_blocks_are_of_one_size():
-    sizes = []
-
-    def policy(tensordict: TensorDictBase) -> TensorDictBase:
-        sizes.append(tensordict.batch_size)
-        return wavy(tensordict)
-
-    for rows in (1, 64, 70, 129):
-        in_blocks(policy)(TensorDict({"observation": torch.zeros(rows, 39)}, [rows]))
-    assert sizes == [torch.Size([64])] * (1 + 1 + 2 + 3)
-
-
-def test_blocks_keep_what_else_the_policy_writes():
-    def policy(tensordict: TensorDictBase) -> TensorDictBase:
-        return (
-            wavy(tensordict).set("weights", tensordict["observation"][:, :3].softmax(-1)).set("row", -tensordict["row"])
-        )
-
-    states = TensorDict({"observation": torch.randn(70, 39), "row": torch.arange(70)}, [70])
-    out = in_blocks(policy)(states)
-    assert out is states
-    assert out["weights"].shape == (70, 3)
-    assert torch.equal(out["row"], -torch.arange(70))
 
 
 # --- noise ---------------------------------------------------------------------------------------------------------
@@ -354,6 +324,7 @@ def test_blocks_are_as_small_as_a_module_asks():
             return tensordict.set("seen", tensordict.get("observation") + 1)
 
     states = TensorDict(observation=torch.rand(10, 3), batch_size=10)
-    found = in_blocks(torch.nn.Sequential(Sees()))(states.clone())
+    found = in_blocks(torch.nn.Sequential(Sees()))(states)
     assert sizes == [4, 4, 4]
+    assert found is states
     assert torch.equal(found["seen"], states["observation"] + 1)

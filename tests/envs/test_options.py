@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 from torchrl.envs import SerialEnv, TransformedEnv
@@ -87,6 +89,7 @@ def test_a_single_environment_has_no_dimension_of_rows(options):
     assert torch.equal(env.reset(episode=3)["episode"], torch.tensor(3))
     env.close()
     other.close()
-    several = SerialEnv(2, lambda: lw.LanguageWorldEnv("reach", batch_size=(), **options))
+    make = partial(lw.LanguageWorldEnv, "reach", batch_size=(), **options)
+    several = SerialEnv(2, [partial(make, worker=(w, 2)) for w in range(2)])
     assert several.rollout(3)["episode"].tolist() == [[0] * 3, [1] * 3]
     several.close()

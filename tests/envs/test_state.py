@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import io
-import json
 import pickle
 
 import pytest
@@ -176,14 +175,6 @@ def test_a_state_of_other_rows_is_refused(other, message):
     assert (env.seed, env.reset()["episode"].tolist()) == (5, [2, 1, 3]), "nothing was taken"
     env.close()
     foreign.close()
-
-
-def as_state(content: object) -> dict[str, torch.Tensor]:
-    return {"_extra_state": torch.frombuffer(bytearray(json.dumps(content).encode()), dtype=torch.uint8)}
-
-
-def deep(levels: int) -> dict[str, torch.Tensor]:
-    return {"_extra_state": torch.full((levels,), ord("["), dtype=torch.uint8)}
 
 
 def test_it_is_a_modules_state_like_any_other():

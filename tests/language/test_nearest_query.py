@@ -9,10 +9,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lw_torchrl.language import nearest
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject
 from lw_torchrl.language.nearest import QueryMatch, nearest_query
 from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
-from lw_torchrl.language.tasks import MT50, Task
+from lw_torchrl.language.tasks import MT50
 
 tasks = st.sampled_from(MT50)
 WORDS = sorted({
@@ -145,16 +144,6 @@ def test_by_embedding_finds_the_meaning_and_encodes_a_tasks_list_once(monkeypatc
 def test_a_query_needs_no_text_model(monkeypatch):
     monkeypatch.setattr(nearest, "sentence_vectors", lambda texts: pytest.fail("encoded"))
     assert nearest_query("gripper open", "push", by="embedding").score == 1.0
-
-
-def with_point():
-    puck, point = NamedObject("puck", (4, 5, 6)), NamedObject("puck edge", (4, 5, 6), (0.03, 0.0, 0.0), ours=True)
-    return Task("push", "Push it.", (NamedObject(GRIPPER, (0, 1, 2)), puck, point))
-
-
-def test_named_points_are_found():
-    match = nearest_query("gripper near the puck edge", with_point())
-    assert (str(match.query), match.score) == ("the robot's gripper is near the puck edge", 1.0)
 
 
 def test_a_wrong_way_or_task_names_the_nearest():

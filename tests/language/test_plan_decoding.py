@@ -1,9 +1,7 @@
 """decode_plan: what models really write becomes a plan and notes, or a reason; no error, and nothing is executed."""
 
 import json
-import os
 import random
-from pathlib import Path
 from time import thread_time
 
 import pytest
@@ -31,7 +29,7 @@ def decoded(name):
 def test_what_models_write(name):
     answer, found = ANSWERS[name], decoded(name)
     steps = found.plan.steps if found.plan else ()
-    assert [(str(step.condition), step.skill) for step in steps] == answer.steps
+    assert [[str(step.condition), step.skill] for step in steps] == answer.steps
     assert answer.reason in found.reason
     assert bool(found.reason) == (found.plan is None) == (not answer.steps)
     for note in answer.notes:
@@ -318,39 +316,3 @@ def test_of_more_steps_than_a_plan_has_the_rest_is_left_out():
     found = lw.decode_plan("if check('gripper open'):\n robot.a()\n" * 1_500, "push", "basic_py")
     assert len(found.plan.steps) == len(found.steps) == 1_000
     assert "line 2001: begins what is more than 1000 steps; 500 are left out" in map(str, found.notes)
-
-
-NO_CLAUSE = {  # answers of the recorded file that say nothing for the task they were asked about: refusals, other tasks
-    ("GPT-3.5", "basic_py", "coffee-push", 0), ("GPT-3.5", "basic_py", "coffee-push", 1),
-    ("GPT-3.5", "goal_py", "door-lock", 0), ("PaLM 2", "basic_py_md", "coffee-push", 0),
-    ("PaLM 2", "basic_py_md", "coffee-push", 1), ("PaLM 2", "basic_py_md", "door-lock", 0),
-    ("PaLM 2", "chain_py_md", "door-lock", 0), ("PaLM 2", "chain_py_md", "plate-slide", 0),
-    ("PaLM 2", "chain_py_md", "plate-slide", 1), ("PaLM 2", "chain_py_md", "stick-pull", 0),
-    ("PaLM 2", "chain_py_md", "stick-pull", 1), ("PaLM 2", "goal_py_md", "coffee-push", 0),
-    ("PaLM 2", "basic_md", "door-lock", 1), ("PaLM 2", "basic_md", "plate-slide", 1),
-    ("PaLM 2", "chain_md", "door-lock", 0), ("PaLM 2", "chain_md", "plate-slide", 1),
-    ("PaLM 2", "chain_md", "stick-pull", 1), ("PaLM 2", "goal_md", "coffee-push", 1),
-    ("PaLM 2", "goal_md", "door-lock", 0), ("PaLM 2", "goal_md", "door-lock", 1),
-    ("PaLM 2", "goal_md", "plate-slide", 1),
-}  # fmt: skip
-
-
-def test_recorded_answers_of_three_models():
-    """Which answers have a clause was decided by reading all of them, before the decoder read any."""
-    path = os.environ.get("LW_TORCHRL_COMPLETIONS", "")
-    if not path:
-        pytest.skip("LW_TORCHRL_COMPLETIONS names no file of recorded answers")
-    rows = [json.loads(line) for line in Path(path).read_text("utf-8").splitlines()]
-    kept, written, with_clause = 0, 0, 0
-    for row in rows:
-        found = lw.decode_plan(row["completion"], row["task"], row["format"])
-        assert (found.plan is None) == bool(found.reason)
-        if (row["llm"], row["format"], row["task"], row["attempt"]) in NO_CLAUSE:
-            assert found.plan is None
-        else:
-            with_clause += found.plan is not None
-            written += len(found.steps)
-            kept += sum(not step.dropped for step in found.steps)
-    assert len(rows) == 216
-    assert with_clause >= 0.95 * (len(rows) - len(NO_CLAUSE))
-    assert kept >= 0.95 * written

@@ -45,11 +45,6 @@ def test_indentation_and_spaces_play_no_part():
     assert parse_plan(text).steps == plan().steps
 
 
-def test_comments_play_no_part_in_what_a_plan_does():
-    bare = "\n".join(line for line in DRAWER.splitlines() if not line.strip().startswith("#"))
-    assert parse_plan(bare) == parse_plan(DRAWER)
-
-
 @pytest.mark.parametrize(
     ("task", "written", "skill"),
     [

@@ -9,7 +9,7 @@ from relation_truth import relation_holds
 from states import random_states
 
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject
-from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
+from lw_torchrl.language.queries import parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.relations import RELATIONS
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
@@ -83,33 +83,3 @@ def test_touching_the_table_counts_the_offset():
     state[6] = 0.06
     answer = QueryProgram({task: ["puck touching the table", "low place touching the table"]})
     assert answer(state, torch.tensor(task_id("push"))).tolist() == [False, True]
-
-
-@pytest.mark.parametrize("name", ["push", "peg-insert-side", "button-press-wall"])
-def test_soft_truth_and_mixed_batches_take_points_too(name):
-    task, (states, ids) = with_points(name), states_of(name)
-    queries = list(supported_queries(task))
-    program = QueryProgram({task: queries, "reach": ["gripper open"]})
-    hard = program(states, ids)
-    assert torch.equal(hard, QueryProgram({task: queries})(states, ids))
-    states.requires_grad_()
-    logits = program.logits(states, ids)
-    assert torch.equal(logits > 0, hard)
-    assert torch.autograd.grad(logits.sum(), states)[0].isfinite().all()
-    mixed = program(
-        torch.cat([states.detach(), states.detach()]), torch.cat([ids, torch.full_like(ids, task_id("reach"))])
-    )
-    assert torch.equal(mixed[:100], hard)
-
-
-def test_without_the_point_its_name_is_an_error():
-    assert parse_query("gripper near fixed place", with_points("push"))
-    with pytest.raises(QueryError, match=r"'fixed' \(word 3\)"):
-        parse_query("gripper near fixed place", with_points("push").published)
-
-
-def test_shipped_points_are_marked_and_named_apart():
-    for task in TASKS.values():
-        assert all(point.ours for point in task.objects[len(task.published.objects) :])
-        assert all(not thing.ours for thing in task.published.objects)
-        assert task.published.published == task.published

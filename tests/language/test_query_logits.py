@@ -1,7 +1,6 @@
 """QueryProgram.logits: the sign is the hard truth everywhere, and gradients are finite and reach what decides."""
 
 import functools
-import math
 import random
 
 import numpy as np
@@ -56,13 +55,6 @@ def test_soft_and_hard_truth_agree(seeds, n, pairs):
             for dtype in (torch.float32, torch.float64):
                 compared += same_sign(everything(), torch.from_numpy(found).to(dtype), ids)
     assert compared > pairs
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("task", MT50)
-def test_soft_and_hard_truth_agree_on_real_states(task):
-    states = torch.from_numpy(real_states(task))
-    assert same_sign(everything(), states, torch.full((len(states),), task_id(task))) > 5_000
 
 
 @pytest.mark.parametrize("task", ["reach", "peg-insert-side", "drawer-open"])
@@ -179,27 +171,6 @@ def test_following_the_gradient_makes_a_query_true():
         (gradient,) = torch.autograd.grad(logits.clamp(max=0.2).sum(), state)
         state = (state + 8e-5 * gradient).detach().requires_grad_()
     assert program(state.detach(), ids).float().mean() > 0.95
-
-
-@pytest.mark.parametrize("shape", [(), (3,), (2, 5), (0,), (2, 0)])
-def test_any_leading_shape(shape):
-    n = math.prod(shape)
-    states = torch.from_numpy(random_states("push", n=10))[:n].reshape(*shape, 39)
-    ids = torch.full(shape, task_id("push"))
-    logits = everything().logits(states, ids)
-    assert logits.shape == (*shape, everything().num_queries)
-    assert torch.equal(logits > 0, everything()(states, ids))
-
-
-def test_a_wrong_state_is_refused_as_by_the_hard_truth():
-    program = QueryProgram({"push": ["gripper open"]})
-    for states, ids, says in (
-        (torch.zeros(38), torch.tensor(task_id("push")), "39"),
-        (torch.full((39,), math.nan), torch.tensor(task_id("push")), "NaN"),
-        (torch.zeros(39), torch.tensor(task_id("reach")), "reach"),
-    ):
-        with pytest.raises(ValueError, match=says):
-            program.logits(states, ids)
 
 
 def test_asking_for_logits_leaves_the_hard_truth_alone():

@@ -33,20 +33,6 @@ def test_a_mixed_batch_is_each_tasks_own_evaluation_and_padding_is_false():
         assert torch.equal(program(states[row], ids[row]), answer[row])
 
 
-def test_a_row_does_not_depend_on_the_rows_beside_it():
-    queries, states, ids = all_tasks()
-    program = QueryProgram(queries)
-    order = torch.randperm(600, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(program(states[order], ids[order]), program(states, ids)[order])
-
-
-def test_the_order_of_the_tasks_plays_no_part():
-    queries, states, ids = all_tasks()
-    backwards = dict(reversed(queries.items()))
-    assert QueryProgram(backwards).tasks == MT50
-    assert torch.equal(QueryProgram(backwards)(states, ids), QueryProgram(queries)(states, ids))
-
-
 @pytest.mark.parametrize("shape", [(), (1,), (600,), (20, 30), (2, 3, 100), (0,), (4, 0)])
 def test_any_leading_shape(shape):
     queries, states, ids = all_tasks()

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 import lw_torchrl as lw
 from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.nearest import nearest_skill
-from lw_torchrl.language.skills import ScriptedSkill, SkillError, load_skills, skills_for
+from lw_torchrl.language.skills import SkillError, load_skills, skills_for
 
 
 def written(tmp_path, text):
@@ -77,11 +77,6 @@ def test_a_faulty_file_is_refused(tmp_path, text, message):
         load_skills(written(tmp_path, text))
 
 
-def test_a_missing_file_says_so(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        load_skills(tmp_path / "none.toml")
-
-
 def test_a_skill_for_objects_that_a_task_lacks():
     with pytest.raises(SkillError, match=r"needs 'puck', which task 'drawer-open' lacks; it has .*drawer handle"):
         load_skills()["place the gripper above the puck"].for_task("drawer-open")
@@ -114,19 +109,6 @@ def test_nearest_skill_wants_words():
         nearest_skill(3)
     with pytest.raises(SkillError, match="no scripted skill suits task 'push'"):
         nearest_skill("push", "push", {})
-
-
-def test_a_skill_is_checked_where_it_is_made():
-    with pytest.raises(SkillError, match="gripper of skill 'squeeze'"):
-        ScriptedSkill("squeeze", "puck", gripper=float("nan"))
-
-
-BAD = '["wait"]\ntarget = "puck"\n'
-
-
-def test_a_byte_order_mark_before_skills(tmp_path):
-    (tmp_path / "skills.toml").write_bytes(b"\xef\xbb\xbf" + BAD.encode())
-    assert load_skills(tmp_path / "skills.toml")["wait"].target == "puck"
 
 
 def test_a_task_can_use_the_skills_of_its_shipped_plan():

@@ -134,31 +134,20 @@ def test_resolve_tasks_takes_a_set_a_name_or_names(given, expected):
     ("given", "error", "says"),
     [
         ("pick-plaec", ValueError, ["'pick-plaec'", "did you mean", "'pick-place'"]),
-        ("pick-place-v3", ValueError, ["'pick-place'"]),
         ("MT5", ValueError, ["'MT5'", "'MT50'"]),
         ("mt10", ValueError, ["'MT10'"]),
-        ("", ValueError, ["''"]),
         (["reach", "drawer-opne"], ValueError, ["'drawer-opne'", "'drawer-open'"]),
         (["MT10"], ValueError, ["'MT10'"]),
         (["push", "reach", "push"], ValueError, ["once", "push"]),
         ([], ValueError, ["at least one task", "empty"]),
         (3, TypeError, ["tasks", "3"]),
-        (None, TypeError, ["tasks", "None"]),
-        ([1, 2], TypeError, ["1", "int"]),
         ([None], TypeError, ["None"]),
-        (b"reach", TypeError, ["int"]),
     ],
 )
 def test_resolve_tasks_names_what_is_wrong(given, error, says):
     with pytest.raises(error) as caught:
         resolve_tasks(given)
     assert all(word in str(caught.value) for word in says), str(caught.value)
-
-
-def test_a_repeated_name_is_named_alone():
-    with pytest.raises(ValueError, match="more than once") as caught:
-        resolve_tasks(["push", "reach", "push"])
-    assert "reach" not in str(caught.value)
 
 
 @pytest.mark.parametrize("function", [check_task, get_task])
@@ -315,11 +304,6 @@ def test_our_own_table_is_such_a_file():
     assert load_tasks(files("lw_torchrl.language") / "data" / "tasks.toml") == TASKS
 
 
-def test_a_byte_order_mark_is_no_part_of_the_first_key(tmp_path):
-    (tmp_path / "mine.toml").write_bytes(b"\xef\xbb\xbf" + PUSH.encode())
-    assert load_tasks(tmp_path / "mine.toml")["push"].object_names == (GRIPPER, "disc")
-
-
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -331,16 +315,13 @@ def test_a_byte_order_mark_is_no_part_of_the_first_key(tmp_path):
         (PUSH + 'point.puck = "obs[4:7]"', ["'push'", "'point'", "'points'"]),
         (PUSH.replace("description", "desciption"), ["'desciption'", "'description'"]),
         ('[push]\nobjects.disc = "obs[4:7]"', ["'push'", "description must be a sentence"]),
-        (PUSH.replace("Push the disc.", ""), ["'push'", "description must be a sentence"]),
         ("[push]\ndescription = 3", ["'push'", "description must be a sentence", "3"]),
         (PUSH.replace("obs[4:7]", "obs[4:8]"), ["'push'", "'disc'", "'obs[4:8]'", "'obs[4:7]'"]),
         (PUSH.replace("obs[4:7]", "obs[37:40]"), ["'push'", "'disc'", "obs[39]", "0 to 38"]),
         (PUSH.replace("obs[4:7]", "state[4:7]"), ["'push'", "'disc'", "'obs[4:7]'"]),
         (PUSH.replace('"obs[4:7]"', "[0.1, 0.2]"), ["'push'", "'disc'", "[0.1, 0.2]"]),
         (PUSH.replace('"obs[4:7]"', "[0.1, nan, 0.2]"), ["'push'", "'disc'", "nan"]),
-        (PUSH.replace('"obs[4:7]"', "[0.1, true, 0.2]"), ["'push'", "'disc'", "True"]),
         (PUSH.replace('"obs[4:7]"', f"[0.1, {10**400}, 0.2]"), ["'push'", "'disc'"]),
-        (PUSH.replace('"obs[4:7]"', "7"), ["'push'", "'disc'", "7"]),
         (PUSH.replace(".disc", '."The Disc"'), ["'push'", "'The Disc'", "lower-case"]),
         (PUSH.replace(".disc", '."robot\'s gripper"'), ["'push'", "robot's gripper", "every task has"]),
         ('[push]\ndescription = "Push."\nobjects = ["disc"]', ["'push'", "objects must be a table", "disc"]),
@@ -349,17 +330,12 @@ def test_a_byte_order_mark_is_no_part_of_the_first_key(tmp_path):
         (PUSH + "points.edge = {object = 'disc'}", ["'edge'", "object and offset"]),
         (PUSH + "points.edge = {objekt = 'disc', offset = [0, 0, 0]}", ["'edge'", "'objekt'", "did you mean 'object'"]),
         (PUSH + "points.edge = {object = 'disc', offset = [0, 0]}", ["'edge'", "three numbers", "[0, 0]"]),
-        (PUSH + "points.edge = {object = 'disc', offset = ['a', 0, 0]}", ["'edge'", "three numbers", "'a'"]),
-        (PUSH + "points.edge = {object = 'disc', offset = 0.1}", ["'edge'", "three numbers", "0.1"]),
         (PUSH + "points.edge = {object = ['disc'], offset = [0, 0, 0]}", ["'edge'", "['disc']"]),
         (PUSH + "points.edge = 'obs[4]'", ["'edge'", "'obs[4:7]'"]),
         (PUSH + "points.disc = [0, 0, 0]", ["'push'", "different names", "'disc'"]),
         (PUSH + "points.disc = ", ["Invalid value"]),
         (PUSH + "points.disc = " + "[" * 5000, ["mine.toml"]),
         (PUSH + "points.disc = " + "9" * 5000, ["4300 digits"]),
-        (PUSH + "points.disc = [0, 0, " + "9" * 400 + "]", ["'disc'"]),
-        (PUSH + "points.disc = " + "[" * 60 + "]" * 60, ["'disc'"]),
-        (PUSH + f"points.disc = 'obs[{'4' * 5000}:7]'", ["'disc'"]),
     ],
 )
 def test_a_file_of_tasks_says_what_is_wrong_and_where(tmp_path, text, says):

@@ -206,6 +206,7 @@ MAKERS = {
     "SwapUnmentioned": lambda: lw.transforms.SwapUnmentioned(CANONICAL, 0.5),
     "HideOpening": lambda: lw.transforms.HideOpening(0.5),
     "JitterTarget": lambda: lw.transforms.JitterTarget(CANONICAL, 0.03),
+    "RandomYaw": lambda: lw.RandomYaw(0.1),
 }
 
 
@@ -255,4 +256,4 @@ def test_wrong_arguments_are_refused():
 def test_it_compiles_to_one_graph(name):
     torch._dynamo.reset()
     compiled = torch.compile(MAKERS[name](), fullgraph=True, backend="eager")
-    assert compiled(rows(plans=CANONICAL)).batch_size == (8,)
+    assert compiled(rows(plans=CANONICAL).set("action", torch.zeros(8, 4))).batch_size == (8,)

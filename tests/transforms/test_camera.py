@@ -6,7 +6,7 @@ import pytest
 import torch
 from pictures import why_no_pictures
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs import Compose, SerialEnv, TransformedEnv, check_env_specs
+from torchrl.envs import SerialEnv, TransformedEnv, check_env_specs
 
 import lw_torchrl as lw
 
@@ -91,14 +91,6 @@ def test_pictures_do_not_depend_on_what_stands_beside():
     alone.close()
 
 
-def test_a_picture_changes_nothing():
-    seen, plain = opened(), lw.LanguageWorldEnv(["reach", "drawer-open"], seed=5)
-    rollouts = [env.rollout(6, moving) for env in (seen, plain)]
-    assert torch.equal(rollouts[0]["next", "observation"], rollouts[1]["next", "observation"])
-    seen.close()
-    plain.close()
-
-
 def test_its_state_is_the_environments_and_wants_a_reset():
     env, other = opened(["reach"]), opened(["reach"])
     env.reset()
@@ -130,16 +122,6 @@ def test_a_replay_buffer_is_told_of_add_pictures():
     env.close()
     with pytest.raises(ValueError, match=r"lw\.data\.add_pictures.*load_pictures"):
         buffer.sample()
-
-
-def test_it_stands_beside_query_answers():
-    env = TransformedEnv(
-        lw.LanguageWorldEnv("reach"),
-        Compose(lw.QAFTransform(lw.load_plans("MT10")), lw.transforms.CameraTransform(**SIZE)),
-    )
-    state = env.rollout(2)
-    assert {"qaf", "pixels"} <= {*state.keys()}
-    env.close()
 
 
 def test_rows_that_are_not_there_are_refused():

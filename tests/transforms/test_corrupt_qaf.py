@@ -206,12 +206,6 @@ def test_a_collector():
     assert torch.equal(found["qaf"], straight["qaf"])
 
 
-def test_the_specs_know_it():
-    env = both(lw.LanguageWorldEnv(["push", "reach"], num_envs=3, max_steps=6), flip=0.1, delay=1)
-    check_env_specs(env)
-    env.close()
-
-
 def test_an_environment_that_is_resumed_goes_on_with_the_same_errors():
     def make() -> TransformedEnv:
         return both(lw.LanguageWorldEnv(["push", "reach"], seed=3, max_steps=9), flip=0.3, delay=1)

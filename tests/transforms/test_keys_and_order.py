@@ -160,10 +160,6 @@ def test_the_right_order_answers_on_the_observation_as_it_was():
     plain.close()
 
 
-def normed() -> TransformedEnv:
-    return TransformedEnv(make_env(), Compose(StepCounter(), norm()))
-
-
 def test_queries_in_the_workers_may_be_followed_by_a_normaliser():
     env = TransformedEnv(SerialEnv(2, lambda: TransformedEnv(make_env(), Compose(queries(), norm()))), StepCounter())
     assert env.reset()["qaf"].shape[:2] == (2, 2)

@@ -85,11 +85,6 @@ def test_it_is_the_programs_answer_at_every_step(rollout):
     assert not torch.equal(rollout["qaf"][:, STEPS], rollout["next", "qaf"][:, STEPS - 1]), "a reset answers afresh"
 
 
-def test_one_call_answers_like_the_program(rollout, few_plans):
-    program = lw.QueryProgram({task: [step.condition for step in plan.steps] for task, plan in few_plans.items()})
-    assert torch.equal(rollout["qaf"], program(rollout["observation"], rollout["task_id"]))
-
-
 def test_the_specs_know_it(env):
     spec = env.observation_spec["qaf"]
     assert isinstance(spec, Binary)
@@ -205,12 +200,6 @@ def test_a_task_without_a_plan_is_named_at_once(few_plans):
     env.close()
 
 
-def test_more_plans_than_tasks_are_welcome(few_plans):
-    env = TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(few_plans))
-    assert env.reset()["qaf"].shape == (1, WIDTH)
-    env.close()
-
-
 @pytest.mark.parametrize(
     ("plans", "error", "message"),
     [
@@ -279,15 +268,3 @@ def test_a_missing_entry_is_named(few_plans, key):
     data = TensorDict({"observation": torch.zeros(3, 39), "task_id": torch.full((3,), lw.task_id("reach"))}, [3])
     with pytest.raises((KeyError, ValueError), match=key):
         lw.QAFTransform(few_plans)(data.exclude(key))
-
-
-def test_an_instance_has_one_environment(few_plans):
-    transform = lw.QAFTransform(few_plans)
-    first, second = lw.LanguageWorldEnv("reach"), lw.LanguageWorldEnv("push")
-    taken = TransformedEnv(first, transform)
-    with pytest.raises(AttributeError, match=r"parent of transform .*QAFTransform.* already set"):
-        TransformedEnv(second, transform)
-    copied = TransformedEnv(second, transform.clone())
-    assert copied.reset()["qaf"].shape == taken.reset()["qaf"].shape == (1, WIDTH)
-    first.close()
-    second.close()

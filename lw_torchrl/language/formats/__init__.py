@@ -38,10 +38,9 @@ def encode_plan(plan: ConditionalPlan, format: str) -> str:
     Reasons are written where a format explains; a goal other than its skill's usual one only in the goal formats.
 
     Example:
-        >>> from lw_torchrl.language.plan_files import load_plans
-        >>> print(encode_plan(load_plans("MT10")["window-open"], "basic_md").splitlines()[2])
-        - When the robot's gripper is not almost vertically aligned with the window handle, the robot should place the \
-gripper above the window handle.
+        >>> plan = ConditionalPlan.from_pairs("reach", [("gripper is open", "move the gripper to the target")])
+        >>> print(encode_plan(plan, "basic_md").splitlines()[2])
+        - When the robot's gripper is open, the robot should move the gripper to the target.
 
     Source: paper section 'Conditional Plan Generation'.
     """

@@ -22,20 +22,15 @@ class Style:
 class PlanFormat:
     """A way to write a plan.
 
-    Attributes:
-        extension: of files that hold such texts, "py" or "md".
-        encode: writes a plan.
-        read: finds the clauses in any text; it never raises. ``decode_plan`` makes a plan of them.
-        prompt: ``(examples, task, hints)`` to the text that asks a model for a plan of the task: the plans of other
-            tasks, lines of hints, then the task's name and description.
-        style: what it says of each step, for models that must keep to a schema.
+    ``prompt`` maps ``(examples, task, hints)`` to the text that asks a model for a plan of the task: the plans of other
+    tasks, lines of hints, then the task's name and description.
     """
 
-    extension: str
+    extension: str  # of files that hold such texts, "py" or "md"
     encode: Callable[[ConditionalPlan], str]
-    read: Callable[[str], Reading]
+    read: Callable[[str], Reading]  # finds the clauses in any text; it never raises
     prompt: Callable[[Sequence[ConditionalPlan], Task, Sequence[str]], str]
-    style: Style = Style()
+    style: Style = Style()  # what it says of each step, for models that must keep to a schema
 
 
 STYLES = {"basic": Style(), "chain": Style(explains=True), "goal": Style(explains=True, goals=True)}

@@ -167,7 +167,7 @@ class FetchEngine(ThreadedEngine):
     fingers are: 0 leaves them there, without the force that holds a puck. Reach, push and slide keep them closed.
 
     Observations have 25 numbers (:data:`~lw_torchrl.suites.fetch.FETCH`), in metres and in Meta-World's axes. Reach has
-    no object: its numbers are zeros, and its goal is the hand's, 3 cm above the grip site's goal. Rows fault as those of
+    no object: its numbers are zeros, and its goal is the hand's, 3 cm above the grip site's goal. Rows fault as in
     :class:`~lw_torchrl.suites.metaworld.vectorized.engine.VectorizedEngine`.
 
     Args:

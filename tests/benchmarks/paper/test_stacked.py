@@ -82,7 +82,7 @@ def test_it_resumes_from_its_checkpoint_and_writes_the_weights_back(demos, tmp_p
 def test_actors_that_differ_in_more_than_weights_are_refused(demos):
     """With the same shapes, they would be trained as the first one is."""
     actors = [lw.PlanConditionedActor(PLANS, decoder=MLPDecoder(squash=squash)) for squash in (True, False)]
-    with pytest.raises(ValueError, match="actors must have the same parts and plans, 0 and 1 differ in .*squash"):
+    with pytest.raises(ValueError, match=r"actors must have the same parts and plans, 0 and 1 differ in .*squash"):
         StackedBehavioralCloning(actors, [replay(demos), replay(demos)], CONFIG)
     with pytest.raises(ValueError, match="actors must not share weights"):
         StackedBehavioralCloning([actors[0], actors[0]], [replay(demos), replay(demos)], CONFIG)
