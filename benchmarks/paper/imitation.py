@@ -23,7 +23,7 @@ from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.modules import METHODS, DemonstratedActor, ScriptedSkillActor
 from lw_torchrl.training import BehavioralCloningTrainer
 from lw_torchrl.training.checkpoint import check_description, load_actor, save_actor
-from lw_torchrl.training.descriptions import describe_data
+from lw_torchrl.training.minibatches import describe_data
 
 SCRIPTED = "scripted"
 """Plans with scripted skills: a method beside those of :data:`lw_torchrl.modules.METHODS`, without training."""

@@ -21,7 +21,7 @@ from lw_torchrl.language.tasks import TASKS
 from lw_torchrl.suites.suite import find_suite
 from lw_torchrl.training import load_actor, save_actor
 from lw_torchrl.training.checkpoint import check_description, training_file
-from lw_torchrl.training.descriptions import describe_data
+from lw_torchrl.training.minibatches import describe_data
 
 EVALUATION_SEED = 10_000  # training seeds count from 0; the evaluation of training seed k has seed 10000 + k
 RESULTS = "results.json"

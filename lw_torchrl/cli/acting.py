@@ -12,10 +12,8 @@ from tyro.conf import arg
 
 import lw_torchrl as lw
 from lw_torchrl.cli import options
-from lw_torchrl.language.canonical import canonical_like
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.modules.policy import layout_of, plans_of, with_plans
 
 
 @dataclass(kw_only=True)
@@ -66,7 +64,7 @@ class Acting:
         policy, plans = self._policy(who, tasks)
         if self.evaluator is None:
             return policy, plans, None
-        if (own := plans_of(policy)) is None:
+        if (own := lw.modules.plans_of(policy)) is None:
             raise ValueError(f"--evaluator requires a policy with plans; {who} has none")
         evaluator = read_evaluator(self.evaluator, own, self.text_encoder)
         evaluator.answers = "hard"  # the policy was trained on exact answers
@@ -97,21 +95,28 @@ class Acting:
         if is_object(who):
             policy = read_object(who)
             policy = policy if plans is None else _with_plans(policy, plans)
-            return policy, plans_of(policy)
+            return policy, lw.modules.plans_of(policy)
         if self.seed in demonstration_seeds(who):
             raise ValueError(f"--seed {self.seed} is the seed of the demonstrations; evaluate on a different one")
         policy = lw.load_actor(who, text_encoder=options.read_encoder(self.text_encoder))
-        if suite is not None and layout_of(policy) != suite.layout:
+        if suite is not None and lw.modules.layout_of(policy) != suite.layout:
             if (plans := plans or suite.plans) is None:
                 raise ValueError(f"suite {suite.name!r} has no plans; give some by --plans")
-            policy = TransferredActor(policy, canonical_like(plans, plans_of(policy)), speed=self.speed)
+            policy = TransferredActor(policy, _like(plans, policy), speed=self.speed)
         elif plans is not None:
             policy = _with_plans(policy, plans)
-        return policy, plans_of(policy)
+        return policy, lw.modules.plans_of(policy)
 
 
 def _with_plans(policy: Any, plans: Plans) -> Any:
-    return with_plans(policy, canonical_like(plans, plans_of(policy)))
+    return lw.modules.with_plans(policy, _like(plans, policy))
+
+
+def _like(plans: Plans, policy: Any) -> Plans:
+    """Return plans in the form of those that a policy was trained with."""
+    from lw_torchrl.language.canonical import canonical_like
+
+    return canonical_like(plans, lw.modules.plans_of(policy))
 
 
 def is_object(who: str) -> bool:

@@ -99,8 +99,7 @@ class Show:
 
     def run(self) -> Output:
         from lw_torchrl.data.dataset import read_metadata
-        from lw_torchrl.data.replay_checks import check_behaviours
-        from lw_torchrl.data.selection import returns_of
+        from lw_torchrl.data.selection import check_behaviours, returns_of
 
         parts = [read_metadata(folder) for folder in self.folders]
         check_behaviours(parts)

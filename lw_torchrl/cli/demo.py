@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -48,23 +49,15 @@ class Demo:
 
     def run(self) -> None:
         options.use_one_thread()
-        run_demo(
-            self.out or Path("runs/demo-quick" if self.quick else "runs/demo"), QUICK if self.quick else DemoConfig()
-        )
+        out = self.out or Path("runs/demo-quick" if self.quick else "runs/demo")
+        run_demo(out, QUICK if self.quick else DemoConfig())
 
 
 def run_demo(out: Path, config: DemoConfig) -> lw.EvaluationResult:
-    """Run the demo, or the rest of it, and print its results.
-
-    Writes config.json, demonstrations/, checkpoint.safetensors, results.json, success.png and rollout.rrd to ``out``.
-
-    Raises:
-        ValueError: ``out`` holds a demo with another configuration.
-    """
+    """Run the demo, or the rest of it, write its files to ``out`` and print its results."""
     from lw_torchrl._files import locked, read_json, write_json
 
-    stated = {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(config).items()}
-    path = out / "config.json"
+    stated, path = json.loads(json.dumps(asdict(config))), out / "config.json"
     with locked(out, "out", folder=True):
         if not path.is_file():
             write_json(path, stated)

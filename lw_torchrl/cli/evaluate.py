@@ -15,7 +15,6 @@ from lw_torchrl.cli import options
 from lw_torchrl.cli.acting import Acting, is_object, policy_name
 from lw_torchrl.cli.output import Output
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.modules.policy import plans_of, tasks_of
 
 _TASKS = "MT10, MT50, a suite, or names of tasks; by default those of --plans or of the demonstrations"
 
@@ -77,7 +76,7 @@ class Evaluate:
         from lw_torchrl.record.rollouts import run_recorded, write_recording
         from lw_torchrl.training.checkpoint import policy_file
 
-        plans = plans_of(policy)
+        plans = lw.modules.plans_of(policy)
         origin: dict[str, Any] = {"plans": None if plans is None else plans.fingerprint}
         for name, file in (("checkpoint", policy_file(self.policy)), ("evaluator", Path(self.acting.evaluator or ""))):
             origin[name] = file if file.is_file() else None
@@ -109,7 +108,7 @@ def _default_tasks(policy: Any, demonstrated: set[str], suite: lw.suites.Suite |
     """Return the policy's demonstrated tasks, or all its tasks if none is recorded, that a suite simulates."""
     from lw_torchrl.suites.suite import known_suite
 
-    if (known := tasks_of(policy)) is None:
+    if (known := lw.modules.tasks_of(policy)) is None:
         raise ValueError("--tasks is required: the policy has neither tasks nor plans")
     chosen = [task for task in known if task in demonstrated] or list(known)
     tasks = [task for task in chosen if (known_suite(task) if suite is None else task in suite.tasks)]

@@ -13,7 +13,6 @@ import lw_torchrl as lw
 from lw_torchrl.cli import options
 from lw_torchrl.cli.acting import Acting, policy_name
 from lw_torchrl.cli.output import Output
-from lw_torchrl.modules.policy import plans_of
 
 
 @dataclass(kw_only=True)
@@ -47,7 +46,7 @@ class Record:
                 stop = self.acting.stop_at_success
                 episodes = run_recorded(policy, tasks, stop_at_success=stop, progress=True, **asked)
                 failures: dict[tuple[str, int], Any] = {}
-                if self.acting.attribute and shown is not None and plans_of(policy) is not None:
+                if self.acting.attribute and shown is not None and lw.modules.plans_of(policy) is not None:
                     again: dict[str, Any] = {"actor": policy, "reference": reference, "evaluator": evaluator, **run}
                     attributed = lw.attribute_failures(episodes, shown, **again)
                     failures = {(failure.task, failure.episode): failure for failure in attributed}

@@ -16,9 +16,17 @@ from lw_torchrl._devices import check_device
 from lw_torchrl._files import AnyPath
 from lw_torchrl.data.dataset import DatasetError, Demonstrations, read_metadata
 from lw_torchrl.data.memory_map import load_rows, verify
-from lw_torchrl.data.replay_checks import check_behaviours, check_label
 from lw_torchrl.data.rewards import REWARDS, RewardName
-from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, Label, choose_episodes, kept_rows, returns_of
+from lw_torchrl.data.selection import (
+    EpisodeChoice,
+    EpisodeFilter,
+    Label,
+    check_behaviours,
+    check_label,
+    choose_episodes,
+    kept_rows,
+    returns_of,
+)
 from lw_torchrl.data.storage import DATASET, DEMONSTRATION, DONE, REWARD, STEPS, TRAJECTORY, column_name
 from lw_torchrl.language.value_checks import finite
 

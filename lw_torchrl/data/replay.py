@@ -16,7 +16,7 @@ from torch.utils.data import get_worker_info
 from torchrl.data import ImmutableDatasetWriter
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers.samplers import Sampler
-from torchrl.envs import Transform
+from torchrl.envs import Compose, MultiStepTransform, Reward2GoTransform, Transform
 
 from lw_torchrl._checks import Count, Natural, checked
 from lw_torchrl._files import AnyPath, reading
@@ -24,7 +24,6 @@ from lw_torchrl._tensor_files import pop_state, read_tensors, write_tensors
 from lw_torchrl.data.dataset import DATA, Demonstrations, read_metadata
 from lw_torchrl.data.loading import load
 from lw_torchrl.data.memory_map import verify
-from lw_torchrl.data.replay_checks import check_transform
 from lw_torchrl.data.rewards import RewardName
 from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, JoinedDemonstrations, Label
 from lw_torchrl.data.storage import DatasetStorage
@@ -37,6 +36,18 @@ def _fingerprint(parts: Sequence[Demonstrations], *cuts: Any) -> str:
     """A digest of the rows of these episodes, cut short as ``cuts`` say."""
     listed = [[[e.task, e.episode, e.start, e.length, e.checksum] for e in part.episodes] for part in parts]
     return sha256(json.dumps([listed, *cuts]).encode()).hexdigest()
+
+
+def _check_transform(transform: Any) -> None:
+    """Raise for TorchRL's transforms that act only on written rows: they would do nothing to samples."""
+    if isinstance(transform, Compose):
+        for part in transform:
+            _check_transform(part)
+    elif isinstance(transform, (MultiStepTransform, Reward2GoTransform)):
+        instead = "compute it once with add_column"
+        if isinstance(transform, MultiStepTransform):
+            instead = f"use n_steps={transform.n_steps}, gamma={transform.gamma}"
+        raise ValueError(f"transform: {type(transform).__name__} does nothing to samples; {instead}")
 
 
 class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
@@ -98,7 +109,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         check: bool = True,
         **kwargs: Any,
     ) -> None:
-        check_transform(transform)
+        _check_transform(transform)
         if (prefetch := kwargs.get("prefetch") or 0) > 1:
             raise ValueError(f"prefetch must be None, 0 or 1, got {prefetch}: several threads draw in no fixed order")
         several = not isinstance(root, (str, os.PathLike))

@@ -191,3 +191,21 @@ class JoinedDemonstrations:
             for episode in part.episodes:
                 chosen[-1].setdefault(episode.task, []).append(episode.episode)
         return JoinedConfig(tuple(part.config for part in self.parts), tuple(chosen))
+
+
+def check_label(label: str, parts: Sequence[Demonstrations]) -> None:
+    """Raise if the label needs an expert's actions, and another policy acted."""
+    others = sorted({part.config.behaviour for part in parts if part.config.policy.kind != "expert"})
+    if others and label != "executed":
+        needs = f"label={label!r} needs an expert's actions, but this dataset was collected by {', '.join(others)!r}"
+        raise ValueError(f"{needs}; use label='executed'")
+
+
+def check_behaviours(parts: Sequence[Demonstrations]) -> None:
+    """Raise :class:`ValueError` if two behaviours have the same label."""
+    first: dict[str, Demonstrations] = {}
+    for part in parts:
+        before = first.setdefault(part.config.behaviour, part)
+        if before.config.policy.acts != part.config.policy.acts:
+            folders = f"{str(before.root)!r} and {str(part.root)!r}"
+            raise ValueError(f"root: {part.config.behaviour!r} names different behaviours in {folders}")

@@ -1,11 +1,15 @@
 """Sentence embeddings in NumPy: the model of the extra ``[text]``."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 @lru_cache(maxsize=1)
@@ -32,4 +36,4 @@ def sentence_vectors(texts: Sequence[str]) -> NDArray[np.float32]:
         what = f"the text {texts[0]!r} is not among the shipped ones, and encoding it needs the text model"
         raise ImportError(f"{what}: pip install 'lw_torchrl[text]'") from error
     vectors = model.encode(list(texts), convert_to_numpy=True, normalize_embeddings=True)  # type: ignore[attr-defined]
-    return np.asarray(vectors, np.float32)
+    return vectors.astype("float32")  # type: ignore[no-any-return]

@@ -7,10 +7,8 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
 from rapidfuzz import fuzz, process
 
 from lw_torchrl._checks import check_choice, checked, shown
@@ -20,6 +18,10 @@ from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.skills import ScriptedSkill, SkillError, Skills, load_skills, skills_for
 from lw_torchrl.language.tasks import Task, get_task
 from lw_torchrl.language.words import WORDS
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 _NEGATIONS = frozenset(("not", "no", "never", "without", "cannot"))
 # Words that do not tell which query is meant.

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import checked
-from lw_torchrl._keys import as_keys, check_apart, dispatched, key_beside, read, write
+from lw_torchrl._keys import dispatched, key_beside, read, write
 from lw_torchrl.language.task_index import PlanTables, as_plans, pick
 from lw_torchrl.language.value_checks import check_values
+from lw_torchrl.modules.sequence import Part
 
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import AnyPlans
@@ -28,7 +28,30 @@ def attend(logits: Tensor, mask: Tensor) -> Tensor:
     return logits.masked_fill(~mask, -torch.inf).softmax(-1)
 
 
-class PlanAttention(TensorDictModuleBase):
+def read_truth(tensordict: TensorDictBase, keys: Sequence[NestedKey], tables: PlanTables) -> tuple[Tensor, Tensor]:
+    """Return the truth (..., S) of a plan's conditions and the rows (...) of its tables; raise for other plans."""
+    qaf, task_id = read(tensordict, keys)
+    rows = tables.rows(task_id)
+    plan = tensordict.get(key_beside(keys[0], "_plan"), None)
+    tables.refuse_others(plan, rows)
+    steps = tables.mask.shape[-1]
+    # Answers for more plans, of which some are longer, have more columns.
+    return (qaf[..., :steps] if plan is not None and qaf.shape[-1] > steps else qaf), rows
+
+
+def check_truth(qaf: Tensor, shape: torch.Size) -> None:
+    """Raise :class:`ValueError` unless truth is bool, or numbers from 0 to 1, of a shape."""
+    if qaf.shape != shape:
+        raise ValueError(
+            f"qaf must have shape {tuple(shape)}, one column for each step of the actor's plans, got "
+            f"{tuple(qaf.shape)}; give QAFTransform the same plans"
+        )
+    if qaf.dtype != torch.bool:
+        problem = "qaf must be bool, or numbers from 0 to 1 for soft truth; it holds other numbers, or NaN"
+        check_values(lambda truth: ((truth >= 0) & (truth <= 1)).all(), qaf, problem)
+
+
+class PlanAttention(Part):
     """Attention over a plan's steps: the softmax of 10·truth - 5 over the steps that exist.
 
     If no condition is true, the attention is uniform over the plan's steps.
@@ -57,6 +80,7 @@ class PlanAttention(TensorDictModuleBase):
     Source: paper section 'Plan Conditioning'.
     """
 
+    _options = ("plans",)
     mask: Tensor
 
     @checked
@@ -67,21 +91,14 @@ class PlanAttention(TensorDictModuleBase):
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        super().__init__()
-        self.plans = as_plans(plans)
-        self.tasks, self.layout = tuple(self.plans), self.plans.layout
-        self.tables = PlanTables(self.plans)
+        plans = as_plans(plans)
+        tables = PlanTables(plans)
+        has_fallback = not torch.equal(tables.turns[:, 0], tables.turns[:, 1])
+        super().__init__(("qaf", "task_id", "turn")[: 2 + has_fallback], ("skill_weights",), in_keys, out_keys)
+        self.plans, self.tasks, self.layout = plans, tuple(plans), plans.layout
+        self.tables, self.has_fallback = tables, has_fallback
         # (T, 2, S) bool: the plan's own steps, and the fallback steps; both hold all steps of a plan without fallback.
-        self.register_buffer("mask", self.tables.turns, persistent=False)
-        self.has_fallback = not torch.equal(self.mask[:, 0], self.mask[:, 1])
-        self.in_keys = as_keys("in_keys", in_keys, ("qaf", "task_id", "turn")[: 2 + self.has_fallback])
-        self.out_keys = as_keys("out_keys", out_keys, ("skill_weights",))
-        check_apart(self.in_keys, self.out_keys)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
-        return {"plans": self.plans, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
+        self.register_buffer("mask", tables.turns, persistent=False)
 
     @property
     def truth_keys(self) -> tuple[NestedKey, NestedKey]:
@@ -97,24 +114,11 @@ class PlanAttention(TensorDictModuleBase):
     def weights(self, qaf: Tensor, rows: Tensor, turn: Tensor | None = None) -> Tensor:
         """Return the attention (..., S) float32 for truth (..., S), table rows (...) int64 and turns (...) int64."""
         mask = pick(self.mask.flatten(0, 1), 2 * rows if turn is None else 2 * rows + turn % 2)
-        if qaf.shape != mask.shape:
-            raise ValueError(
-                f"qaf must have shape {tuple(mask.shape)}, one column for each step of the actor's plans, got "
-                f"{tuple(qaf.shape)}; give QAFTransform the same plans"
-            )
-        if qaf.dtype != torch.bool:
-            problem = "qaf must be bool, or numbers from 0 to 1 for soft truth; it holds other numbers, or NaN"
-            check_values(lambda truth: ((truth >= 0) & (truth <= 1)).all(), qaf, problem)
+        check_truth(qaf, mask.shape)
         return attend(2 * TRUE_LOGIT * qaf.to(torch.float32) - TRUE_LOGIT, mask)
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        qaf, task_id = read(tensordict, self.in_keys[:2])
-        rows = self.tables.rows(task_id)
-        plan = tensordict.get(key_beside(self.in_keys[0], "_plan"), None)
-        self.tables.refuse_others(plan, rows)
-        steps = self.mask.shape[-1]
-        if plan is not None and qaf.shape[-1] > steps:  # answers for more plans, of which some are longer
-            qaf = qaf[..., :steps]
+        qaf, rows = read_truth(tensordict, self.in_keys[:2], self.tables)
         turn = tensordict.get(self.in_keys[2], None) if self.has_fallback else None
         return write(tensordict, self, [self.weights(qaf, rows, turn)])

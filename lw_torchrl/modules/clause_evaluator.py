@@ -52,10 +52,9 @@ def conjunction(logits: Tensor, mask: Tensor) -> Tensor:
 class ClauseEvaluator(QueryEvaluator):
     """Answers conditions by a network that was trained on the answers of the query answering function.
 
-    Reads its view of a state and ``task_id`` (B,) int64; writes ``qaf`` and ``qaf_logits`` as :class:`QueryEvaluator`
-    does, -1e4 beyond a plan's last step. A condition's clauses are answered one by one and combined by
-    :func:`conjunction`. A subclass sets ``network``, which maps views of B states and their clauses (B, C) to logits
-    (B, C), and ``seen_dims``, the number of dimensions of a view.
+    Reads a view of a state and ``task_id``; writes as :class:`QueryEvaluator`, -1e4 beyond a plan's last step. Clauses
+    are answered one by one and combined by :func:`conjunction`. A subclass sets ``network``, from views of B states and
+    their clauses (B, C) to logits (B, C), and ``seen_dims``, the number of dimensions of a view.
 
     Args:
         plans, answers: as for :class:`QueryEvaluator`.
@@ -64,8 +63,6 @@ class ClauseEvaluator(QueryEvaluator):
 
     Raises:
         ValueError: a plan uses another predicate or object; at call time, a wrong shape, or a task_id without a plan.
-
-    Source: paper section 'Differentiability and Optimization', which names a visual question answering model.
     """
 
     network: nn.Module

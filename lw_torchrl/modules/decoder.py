@@ -13,9 +13,9 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from lw_torchrl._checks import check_scale, checked
-from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
+from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.modules.networks import MLP, materialize
-from lw_torchrl.modules.sequence import encoding_width
+from lw_torchrl.modules.sequence import Part, encoding_width
 
 LEAST_STD = 1e-3
 
@@ -81,8 +81,8 @@ class GaussianDecoder(MLP):
             raise ValueError(f"init_std must be above {LEAST_STD}, got {init_std}")
         super().__init__(2 * actions, width=width, depth=depth)
         self.actions, self.squash = actions, squash
-        self.config: dict[str, Any] = {"width": width, "depth": depth, "actions": actions, "squash": squash}
-        self.config["init_std"] = init_std
+        options = {"width": width, "depth": depth, "actions": actions, "squash": squash}
+        self.config: dict[str, Any] = {**options, "init_std": init_std}
         self._offset = math.log(math.expm1(init_std - LEAST_STD)) if init_std < 20 else init_std
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
@@ -102,7 +102,7 @@ class GaussianDecoder(MLP):
         last.bias[: self.actions] = trained.bias
 
 
-class Decode(TensorDictModuleBase):
+class Decode(Part):
     """A decoder as a TensorDict module.
 
     Reads ``skill_latent`` (B, D) float32 and ``features`` (B, F) float32; writes what the network returns, by default
@@ -113,19 +113,13 @@ class Decode(TensorDictModuleBase):
         in_keys, out_keys: other names for what it reads and writes; nested keys are allowed.
     """
 
+    _options = ("network",)
+
     def __init__(
         self, network: nn.Module, *, in_keys: Sequence[NestedKey] | None = None, out_keys: Sequence[NestedKey]
     ) -> None:
-        super().__init__()
+        super().__init__(("skill_latent", "features"), list(map(str, out_keys)) or ("action",), in_keys, out_keys)
         self.network = network
-        self.in_keys = as_keys("in_keys", in_keys, ("skill_latent", "features"))
-        self.out_keys = list(out_keys)
-        check_apart(self.in_keys, self.out_keys)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
-        return {"network": self.network, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -140,5 +134,4 @@ def as_decoder(decoder: nn.Module, trunk: TensorDictSequential, out_keys: Sequen
         materialize(getattr(decoder, "network", decoder), torch.zeros(1, width))
     if isinstance(decoder, TensorDictModuleBase):
         return decoder
-    keys = as_keys("out_keys", out_keys, list(map(str, out_keys)) or ["action"])
-    return Decode(decoder, in_keys=trunk.out_keys_source[-2:], out_keys=keys)
+    return Decode(decoder, in_keys=trunk.out_keys_source[-2:], out_keys=out_keys)

@@ -4,28 +4,29 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from lw_torchrl._checks import checked
-from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
+from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.task_index import TaskIndex, pick
 from lw_torchrl.language.tasks import MT50, Task, named_tasks, one_layout, task_ids
 from lw_torchrl.language.text import TextEncoder, encoded
-from lw_torchrl.modules.features import ObservationFeatures
+from lw_torchrl.modules.features import as_features
 from lw_torchrl.modules.mixer import SkillEncoder, unit_scale
 from lw_torchrl.modules.networks import evaluating, materialize
 from lw_torchrl.modules.plan_conditioned_actor import ConditionedActor
+from lw_torchrl.modules.sequence import Part
 
 Condition = Literal["description", "one-hot"]
 
 
-class TaskLatent(TensorDictModuleBase):
+class TaskLatent(Part):
     """Encode the task's description, or its number, to a latent.
 
     Reads ``task_id`` (B,) int64; writes ``task_latent`` (B, D) float32.
@@ -43,6 +44,7 @@ class TaskLatent(TensorDictModuleBase):
     Source: paper section 'Conditional Plan Experiments'.
     """
 
+    _options = ("condition", "encoder")
     vectors: Tensor
 
     @checked
@@ -56,13 +58,10 @@ class TaskLatent(TensorDictModuleBase):
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(("task_id",), ("task_latent",), in_keys, out_keys)
         self.definitions = named_tasks(tasks)
         self.tasks, self.layout = tuple(self.definitions), one_layout(self.definitions.values())
         self.condition, self.text_encoder = condition, text_encoder
-        self.in_keys = as_keys("in_keys", in_keys, ("task_id",))
-        self.out_keys = as_keys("out_keys", out_keys, ("task_latent",))
-        check_apart(self.in_keys, self.out_keys)
         own = (lambda texts: torch.eye(len(texts))) if text_encoder is None and condition == "one-hot" else text_encoder
         vectors = encoded([task.description for task in self.definitions.values()], own)
         self.index = TaskIndex(task_ids(self.tasks))
@@ -81,10 +80,9 @@ class TaskLatent(TensorDictModuleBase):
         return self.vectors
 
     @property
-    def config(self) -> dict[str, Any]:
+    def config(self) -> dict[str, object]:
         """The keyword arguments that rebuild it."""
-        made = {"tasks": list(self.definitions.values()), "condition": self.condition, "encoder": self.encoder}
-        return {**made, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
+        return {"tasks": list(self.definitions.values()), **super().config}
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -130,8 +128,7 @@ class DescriptorConditionedActor(ConditionedActor):
         out_keys: Sequence[NestedKey] = ("action",),
     ) -> None:
         known = named_tasks(tasks)
-        if features is None:
-            features = ObservationFeatures(noise=0.05, layout=one_layout(known.values()))
+        features = as_features(features, one_layout(known.values()), noise=0.05)
         trunk = descriptor_trunk(
             known.values(), condition=condition, task_encoder=task_encoder, features=features, text_encoder=text_encoder
         )
@@ -151,8 +148,4 @@ def descriptor_trunk(
     The arguments are :class:`DescriptorConditionedActor`'s.
     """
     latent = TaskLatent(tasks, condition, task_encoder, text_encoder=text_encoder)
-    if features is None:
-        features = ObservationFeatures(layout=latent.layout)
-    elif not isinstance(features, TensorDictModuleBase):
-        features = TensorDictModule(features, in_keys=["observation"], out_keys=["features"])
-    return TensorDictSequential(OrderedDict(latent=latent, features=features))
+    return TensorDictSequential(OrderedDict(latent=latent, features=as_features(features, latent.layout)))

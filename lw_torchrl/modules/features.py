@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import add_random_module
@@ -122,11 +122,7 @@ class ObservationFeatures(Features):
         return {"kind": self.kind, "noise": self.noise, "layout": self.layout, **keys}
 
     def with_plans(self, plans: AnyPlans) -> ObservationFeatures:
-        """Return the features, with the same statistics, for plans of another layout.
-
-        Raises:
-            ValueError: the features mean something else in that layout.
-        """
+        """Return the features, with the same statistics, for plans of a layout; ValueError if they differ there."""
         layout = as_plans(plans).layout
         if layout == self.layout:
             return self
@@ -218,6 +214,15 @@ class Concat(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         seen = [part(tensordict.copy()).get(part.out_keys[0]) for part in self.parts]
         return write(tensordict, self, [torch.cat(seen, -1)])
+
+
+def as_features(features: nn.Module | None, layout: Layout, noise: float = 0.0) -> TensorDictModuleBase:
+    """Return features as a TensorDict module: a plain one reads ``observation``, None stands for the differences."""
+    if features is None:
+        return ObservationFeatures(noise=noise, layout=layout)
+    if isinstance(features, TensorDictModuleBase):
+        return features
+    return TensorDictModule(features, in_keys=["observation"], out_keys=["features"])
 
 
 def check_observation(observation: Tensor, layout: Layout) -> None:

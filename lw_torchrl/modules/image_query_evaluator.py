@@ -51,12 +51,6 @@ class PointingNetwork(ClauseNetwork):
     places attends to one of them. From the mean coordinates and features there, and the coordinates of landmarks that
     all objects share, an MLP estimates the object's position in metres and how far it is open.
 
-    Args:
-        encoder: maps pictures (n, 3, H, W) float32 in [0, 1] to ``features`` (n, F, h, w).
-        features: F.
-        cameras, names: the number of cameras and of objects.
-        **trunk: as for :class:`ClauseNetwork`.
-
     Source: the spatial softmax of 'Deep spatial autoencoders for visuomotor learning' (Finn et al., 2016).
     """
 

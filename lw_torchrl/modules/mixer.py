@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Self
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from lw_torchrl._checks import check_int, checked
-from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
+from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.task_index import PlanTables, as_plans, pick
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.networks import MLP, evaluating, materialize
+from lw_torchrl.modules.sequence import Part
 
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import AnyPlans, Plans
@@ -45,14 +45,13 @@ class SkillEncoder(MLP):
         self.config = {"latent_size": latent_size, "width": width, "depth": depth}
 
 
-class _Mixer(TensorDictModuleBase):
+class _Mixer(Part):
     """Base of the mixers: the vector of each different skill, and which of them each step has."""
 
     index: Tensor
     vectors: Tensor
 
-    def __init__(self, plans: AnyPlans, encoder: nn.Module | None, text_encoder: TextEncoder | None) -> None:
-        super().__init__()
+    def _encode(self, plans: AnyPlans, encoder: nn.Module | None, text_encoder: TextEncoder | None) -> None:
         self.plans, self.text_encoder = as_plans(plans), text_encoder
         self.tables = PlanTables(self.plans)
         if self.plans.has_roles:
@@ -71,6 +70,11 @@ class _Mixer(TensorDictModuleBase):
     def text_vectors(self) -> Tensor | None:
         """The vectors of the skills' texts, (K, E) float32; None for skills that are encoded by their roles."""
         return None if self.plans.has_roles else self.vectors
+
+    def with_plans(self, plans: AnyPlans) -> Self:
+        """Return a mixer of other plans' skills with the same networks: training either trains both."""
+        other = type(self)(**{**self.config, "plans": plans, "text_encoder": self.text_encoder})
+        return other.to(self.index.device).train(self.training)
 
     def latents(self) -> Tensor:
         """Return the latent of each different skill, (K, D)."""
@@ -110,6 +114,8 @@ class SkillMixer(_Mixer):
     Source: paper section 'Plan Conditioning'.
     """
 
+    _options = ("plans", "encoder")
+
     @checked
     def __init__(
         self,
@@ -120,22 +126,8 @@ class SkillMixer(_Mixer):
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        super().__init__(plans, encoder, text_encoder)
-        self.in_keys = as_keys("in_keys", in_keys, ("skill_weights", "task_id"))
-        self.out_keys = as_keys("out_keys", out_keys, ("skill_latent",))
-        check_apart(self.in_keys, self.out_keys)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
-        keys = {"in_keys": self.in_keys, "out_keys": self.out_keys_source}
-        return {"plans": self.plans, "encoder": self.encoder, **keys}
-
-    def with_plans(self, plans: AnyPlans) -> SkillMixer:
-        """Return a mixer of other plans' skills with the same encoder: training either trains both."""
-        options: dict[str, Any] = {"text_encoder": self.text_encoder, "in_keys": self.in_keys}
-        other = SkillMixer(plans, self.encoder, out_keys=self.out_keys_source, **options)
-        return other.to(self.index.device).train(self.training)
+        super().__init__(("skill_weights", "task_id"), ("skill_latent",), in_keys, out_keys)
+        self._encode(plans, encoder, text_encoder)
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -152,7 +144,7 @@ class ActionMixer(_Mixer):
     (B,) int64 and ``features`` (B, F) float32; writes ``action`` (B, A) float32.
 
     Args:
-        plans, encoder, text_encoder: as for :class:`SkillMixer`.
+        plans, encoder, text_encoder, in_keys, out_keys: as for :class:`SkillMixer`.
         decoder: any module from a latent and the features, (..., D + F) float32, to an action (..., A).
 
     Example:
@@ -167,6 +159,8 @@ class ActionMixer(_Mixer):
     Source: a mixture of experts; the paper mixes latents.
     """
 
+    _options = ("plans", "decoder", "encoder")
+
     @checked
     def __init__(
         self,
@@ -175,20 +169,12 @@ class ActionMixer(_Mixer):
         encoder: nn.Module | None = None,
         *,
         text_encoder: TextEncoder | None = None,
+        in_keys: Sequence[NestedKey] | None = None,
+        out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        super().__init__(plans, encoder, text_encoder)
+        super().__init__(("skill_weights", "task_id", "features"), ("action",), in_keys, out_keys)
+        self._encode(plans, encoder, text_encoder)
         self.decoder = decoder
-        self.in_keys, self.out_keys = ["skill_weights", "task_id", "features"], ["action"]
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
-        return {"plans": self.plans, "decoder": self.decoder, "encoder": self.encoder}
-
-    def with_plans(self, plans: AnyPlans) -> ActionMixer:
-        """Return a mixer of other plans' skills with the same networks: training either trains both."""
-        other = ActionMixer(plans, self.decoder, self.encoder, text_encoder=self.text_encoder)
-        return other.to(self.index.device).train(self.training)
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -16,13 +16,9 @@ Module = TypeVar("Module", bound=nn.Module)
 
 
 class MLP(TorchRLMLP):
-    """TorchRL's MLP with ReLU. Its input width is that of the first input; several inputs are concatenated.
+    """TorchRL's MLP with ReLU, whose input width is that of the first input. Several inputs are concatenated.
 
-    Args:
-        out_features: the output width.
-        width: units of each hidden layer; a sequence gives a width for each layer and replaces ``depth``.
-        depth: the number of hidden layers.
-        layer_norm: apply a LayerNorm after each hidden layer.
+    A sequence of widths gives the hidden layers and replaces ``depth``.
     """
 
     def __init__(
@@ -61,11 +57,7 @@ def evaluating(network: nn.Module) -> Iterator[None]:
 
 
 def with_weights_of(own: nn.Module, other: Module) -> Module:
-    """Return the other module, a fresh one, on the weights and saved buffers of ``own``: training either trains both.
-
-    Raises:
-        RuntimeError: their names or shapes differ.
-    """
+    """Return the other, fresh module on the weights and saved buffers of ``own``: training either trains both."""
     other.load_state_dict(own.state_dict())
     for name, module in other.named_modules():
         mine, passing = own.get_submodule(name), module._non_persistent_buffers_set

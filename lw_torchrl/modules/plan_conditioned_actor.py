@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Self
 
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.data import Composite
@@ -16,7 +16,7 @@ from lw_torchrl.language.task_index import as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.attention import PlanAttention
 from lw_torchrl.modules.decoder import MLPDecoder, as_decoder
-from lw_torchrl.modules.features import ObservationFeatures
+from lw_torchrl.modules.features import as_features
 from lw_torchrl.modules.mixer import SkillMixer
 from lw_torchrl.modules.sequence import NamedParts, action_spec, trunk_attributes
 
@@ -38,11 +38,8 @@ def plan_trunk(
     (B, S), ``skill_latent`` (B, D) and ``features`` (B, F) float32. The arguments are :class:`PlanConditionedActor`'s.
     """
     attention, mixer = PlanAttention(plans), SkillMixer(plans, skill_encoder, text_encoder=text_encoder)
-    if features is None:
-        features = ObservationFeatures(layout=mixer.plans.layout)
-    elif not isinstance(features, TensorDictModuleBase):
-        features = TensorDictModule(features, in_keys=["observation"], out_keys=["features"])
-    return TensorDictSequential(OrderedDict(attention=attention, mixer=mixer, features=features))
+    seen = as_features(features, mixer.plans.layout)
+    return TensorDictSequential(OrderedDict(attention=attention, mixer=mixer, features=seen))
 
 
 class ConditionedActor(NamedParts):
@@ -174,7 +171,6 @@ class PlanConditionedActor(ConditionedActor):
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] = ("action",),
     ) -> None:
-        if features is None:
-            features = ObservationFeatures(noise=0.05, layout=as_plans(plans).layout)
+        features = as_features(features, as_plans(plans).layout, noise=0.05)
         trunk = plan_trunk(plans, skill_encoder=skill_encoder, features=features, text_encoder=text_encoder)
         super().__init__(trunk, decoder, in_keys=in_keys, out_keys=out_keys)

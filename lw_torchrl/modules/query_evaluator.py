@@ -114,11 +114,7 @@ class QueryEvaluator(TensorDictModuleBase):
         return None
 
     def with_plans(self, plans: AnyPlans) -> QueryEvaluator:
-        """Return an evaluator on the same weights for other plans.
-
-        Raises:
-            RuntimeError: the weights differ in names or shapes.
-        """
+        """Return an evaluator on the same weights for other plans; RuntimeError if the weights differ in shape."""
         options: dict[str, Any] = dict(self.config)
         if "text_encoder" in signature(type(self)).parameters:
             options["text_encoder"] = self.text_encoder

@@ -85,13 +85,9 @@ class _RelativePositions(Features):
         return type(self)(**{**self.config, "plans": plans}).to(self.offset.device).train(self.training)
 
     def positions(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
-        """Return the relative positions (..., P, 3) in metres.
+        """Return the relative positions (..., P, 3) in metres, by the attention (..., S) over the steps of table rows.
 
-        Args:
-            observation: (..., D) float32.
-            weights: the attention over steps (..., S) float32.
-            rows: rows of the plans' tables, (...) int64.
-            yaw: the angle (...) in radians by which :class:`RandomYaw` turned the observation; turns fixed places too.
+        ``yaw`` (...) is the angle in radians by which :class:`RandomYaw` turned the observation (..., D).
         """
         if yaw is not None:
             observation = turn_observation(observation, -yaw, self.layout)
@@ -261,10 +257,6 @@ class RoleFeatures(_RelativePositions):
 
         A contact is the median of hand minus object while a step is active that closes the gripper around the first
         object, pushes or pulls it, or moves it, but not while it is pressed from above.
-
-        Args:
-            rows: R rows with ``observation`` (R, D) float32 and ``task_id`` (R,) int64.
-            weights: not used.
         """
         observation, task_id = read(rows, [self.in_keys[0], self.in_keys[2]])
         observation, task_id = observation.reshape(-1, self.layout.size), task_id.reshape(-1)

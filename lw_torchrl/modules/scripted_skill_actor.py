@@ -7,20 +7,20 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
 from lw_torchrl._checks import checked, shown
-from lw_torchrl._keys import as_keys, check_apart, dispatched, key_beside, read, write
+from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import PlanTables
-from lw_torchrl.language.value_checks import check_values
+from lw_torchrl.modules.attention import check_truth, read_truth
+from lw_torchrl.modules.sequence import Part
 
 
-class ScriptedSkillActor(TensorDictModuleBase):
+class ScriptedSkillActor(Part):
     """A plan that is carried out by scripted skills: the skill of a true step acts, or the last step's if none is true.
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool, or float in [0, 1] for soft
@@ -47,6 +47,8 @@ class ScriptedSkillActor(TensorDictModuleBase):
     Source: paper sections 'Scripted Skills' and 'Conditional Plan Generation'.
     """
 
+    _options = ("plans", "select", "seed")
+
     @checked
     def __init__(
         self,
@@ -58,12 +60,9 @@ class ScriptedSkillActor(TensorDictModuleBase):
         in_keys: Sequence[NestedKey] | None = None,
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(("observation", "task_id", "qaf"), ("action", "skill_weights"), in_keys, out_keys)
         self.plans = as_plans(plans)
         self.tasks, self.layout = tuple(self.plans), self.plans.layout
-        self.in_keys = as_keys("in_keys", in_keys, ("observation", "task_id", "qaf"))
-        self.out_keys = as_keys("out_keys", out_keys, ("action", "skill_weights"))
-        check_apart(self.in_keys, self.out_keys)
         if not -(2**63) <= seed < 2**64:
             raise ValueError(f"seed must be from -2**63 to 2**64 - 1, got {shown(seed)}")
         self.select, self.seed = select, seed
@@ -80,8 +79,7 @@ class ScriptedSkillActor(TensorDictModuleBase):
         """The keyword arguments that rebuild it; :class:`TypeError` with custom skills, which no file holds."""
         if self._skills is not None:
             raise TypeError("a ScriptedSkillActor with custom skills cannot be saved; keep the file of the skills")
-        keys = {"in_keys": self.in_keys, "out_keys": self.out_keys_source}
-        return {"plans": self.plans, "select": self.select, "seed": self.seed, **keys}
+        return super().config
 
     @property
     def truth_keys(self) -> tuple[NestedKey, NestedKey]:
@@ -96,25 +94,14 @@ class ScriptedSkillActor(TensorDictModuleBase):
 
     def with_plans(self, plans: AnyPlans) -> ScriptedSkillActor:
         """Return the same skills under other plans."""
-        keys = {"in_keys": self.in_keys, "out_keys": self.out_keys_source}
-        other = ScriptedSkillActor(plans, self.select, skills=self._skills, seed=self.seed, **keys)
-        return other.train(self.training)
+        options = {**super().config, "plans": plans, "skills": self._skills}
+        return ScriptedSkillActor(**options).train(self.training)
 
     def skill_weights(self, tensordict: TensorDictBase) -> Tensor:
         """Return the weight of each step, (B, S) float32."""
-        _, task_id, qaf = read(tensordict, self.in_keys)
-        rows = self.tables.rows(task_id)
-        plan = tensordict.get(key_beside(self.in_keys[2], "_plan"), None)
-        self.tables.refuse_others(plan, rows)
-        steps = self.tables.mask.shape[-1]
-        if plan is not None and qaf.shape[-1] > steps:  # answers for more plans, of which some are longer
-            qaf = qaf[..., :steps]
-        if qaf.shape != (shape := (*rows.shape, steps)):
-            raise ValueError(f"qaf must have shape {shape}, one column for each step, got {tuple(qaf.shape)}")
-        if qaf.dtype != torch.bool:
-            problem = "qaf must be bool, or numbers from 0 to 1 for soft truth; it holds other numbers, or NaN"
-            check_values(lambda truth: ((truth >= 0) & (truth <= 1)).all(), qaf, problem)
-            qaf = qaf > 0.5
+        qaf, rows = read_truth(tensordict, self.truth_keys, self.tables)
+        check_truth(qaf, torch.Size((*rows.shape, self.tables.mask.shape[-1])))
+        qaf = qaf > 0.5
         last = torch.nn.functional.one_hot(self._last.to(rows.device)[rows], qaf.shape[-1]).bool()
         true = torch.where(qaf.any(-1, keepdim=True), qaf, last).float()
         if self.select == "mix":

@@ -1,17 +1,41 @@
-"""NamedParts: a sequence of TensorDict modules whose parts are attributes, can be replaced, and read renamed keys."""
+"""Parts of policies, and NamedParts: a sequence whose parts are attributes, can be replaced, and read renamed keys."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.data import Bounded, Composite
 
-from lw_torchrl._keys import any_arguments, as_keys
+from lw_torchrl._keys import any_arguments, as_keys, check_apart
+
+
+class Part(TensorDictModuleBase):
+    """Base of the parts of a policy. ``reads`` and ``writes`` are the default names of its keys."""
+
+    _options: ClassVar[Sequence[str]] = ()  # arguments of the constructor, which are attributes of the same names
+
+    def __init__(
+        self,
+        reads: Sequence[str],
+        writes: Sequence[str],
+        in_keys: Sequence[NestedKey] | None,
+        out_keys: Sequence[NestedKey] | None,
+    ) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = as_keys("in_keys", in_keys, reads), as_keys("out_keys", out_keys, writes)
+        check_apart(self.in_keys, self.out_keys)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        options = {name: getattr(self, name) for name in self._options}
+        return {**options, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
+
 
 if TYPE_CHECKING:
     from lw_torchrl.language.layout import Layout

@@ -22,12 +22,7 @@ _SCALES = (0.005, 0.02, 0.1, 0.5)  # metres: the scales at which tanh squashes a
 
 class ClauseNetwork(nn.Module):
     """The logit of a clause: a trunk reads the difference of two positions, and a learned vector of the predicate
-    weighs its output. "not" changes the sign.
-
-    Args:
-        width, depth: hidden layers of the trunk.
-        predicates: the number of predicates.
-    """
+    weighs its output. "not" changes the sign."""
 
     numbers: int = 3  # of a difference
 

@@ -77,7 +77,27 @@ class ActorEnsemble(RenamedInputs):
         return ActorEnsemble([with_plans(member, plans) for member in self.members]).train(self.training)
 
 
-class DecidedGripper(RenamedInputs):
+class _Wrapper(RenamedInputs):
+    """Base of the wrappers of one actor, which change its action."""
+
+    def __init__(self, actor: TensorDictModuleBase) -> None:
+        super().__init__()
+        self.actor = actor
+        self.plans, self.tasks, self.layout = plans_of(actor), tasks_of(actor), layout_of(actor)
+        self.in_keys, self.out_keys = list(actor.in_keys), list(actor.out_keys)
+
+    def converted(self, action: Tensor) -> Tensor:
+        """Return the actor's actions, (..., A), as this policy's."""
+        raise NotImplementedError(f"{type(self).__name__} must override converted")
+
+    @dispatched
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        outputs, key = self.actor(tensordict.copy()), _action(self.actor)
+        outputs.set(key, self.converted(outputs.get(key)))
+        return write(tensordict, self, [outputs.get(key) for key in self.actor.out_keys])
+
+
+class DecidedGripper(_Wrapper):
     """Open or close the gripper fully while not training.
 
     Half open fingers push objects over, and half closed ones lose them.
@@ -100,24 +120,17 @@ class DecidedGripper(RenamedInputs):
     def __init__(
         self, actor: TensorDictModuleBase, closes_above: float | None = None, layout: Layout | None = None
     ) -> None:
-        super().__init__()
-        self.actor, self.closes_above = actor, closes_above
-        self.action_layout = layout or layout_of(actor)
-        self.plans, self.tasks, self.layout = plans_of(actor), tasks_of(actor), layout_of(actor)
-        self.in_keys, self.out_keys = list(actor.in_keys), list(actor.out_keys)
+        super().__init__(actor)
+        self.closes_above, self.action_layout = closes_above, layout or self.layout
 
     @property
     def config(self) -> dict[str, Any]:
         """The keyword arguments that rebuild it."""
         return {"actor": self.actor, "closes_above": self.closes_above, "layout": self.action_layout}
 
-    @dispatched
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        outputs = self.actor(tensordict.copy())
-        if not self.training:
-            action = outputs.get(_action(self.actor))
-            outputs.set(_action(self.actor), decided(action, self.action_layout, self.closes_above))
-        return write(tensordict, self, [outputs.get(key) for key in self.actor.out_keys])
+    def converted(self, action: Tensor) -> Tensor:
+        """Return actions whose effort is -1 or 1; while training, the same actions."""
+        return action if self.training else decided(action, self.action_layout, self.closes_above)
 
     def with_plans(self, plans: AnyPlans) -> DecidedGripper:
         """Return the policy with the same networks that follows other plans."""
@@ -200,7 +213,7 @@ class DemonstratedActor(RenamedInputs):
         return DemonstratedActor(self.demonstrated, others).train(self.training)
 
 
-class TransferredActor(RenamedInputs):
+class TransferredActor(_Wrapper):
     """An actor with the same weights for another suite's plans, whose actions are converted to that suite's.
 
     A displacement keeps its metres a step, times ``speed``: it is multiplied by the ratio of the layouts' ``reach`` and
@@ -235,28 +248,20 @@ class TransferredActor(RenamedInputs):
     def __init__(
         self, actor: TensorDictModuleBase, plans: AnyPlans, *, speed: float = 1.0, trained: Layout | None = None
     ) -> None:
-        super().__init__()
         if speed <= 0:
             raise ValueError(f"speed must be above 0, got {shown(speed)}")
-        self.trained, self.speed = trained or layout_of(actor), speed
-        self.plans = plans = as_plans(plans)
+        plans, before = as_plans(plans), trained or layout_of(actor)
         same = getattr(plans_of(actor), "fingerprint", None) == plans.fingerprint
-        self.actor = actor if same else with_plans(actor, plans)
-        self.tasks, self.layout = tuple(plans), plans.layout
+        super().__init__(actor if same else with_plans(actor, plans))
+        self.trained, self.speed = before, speed
+        self.plans, self.tasks, self.layout = plans, tuple(plans), plans.layout
         for layout in (self.trained, self.layout):
             layout.displaced("TransferredActor")
-        self.in_keys, self.out_keys = list(self.actor.in_keys), list(self.actor.out_keys)
 
     @property
     def config(self) -> dict[str, Any]:
         """The keyword arguments that rebuild it."""
         return {"actor": self.actor, "plans": self.plans, "speed": self.speed, "trained": self.trained}
-
-    @dispatched
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        outputs = self.actor(tensordict.copy())
-        outputs.set(_action(self.actor), self.converted(outputs.get(_action(self.actor))))
-        return write(tensordict, self, [outputs.get(key) for key in self.actor.out_keys])
 
     def converted(self, action: Tensor) -> Tensor:
         """Return actions of the layout that was trained with, (..., A), as actions of this layout."""

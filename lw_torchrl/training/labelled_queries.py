@@ -229,8 +229,7 @@ def _draw_pairs(fraction: float, tasks: Sequence[Task], generator: torch.Generat
 def _held_out_rows(episode: Tensor, ids: Tensor, fraction: float) -> Tensor:
     """Return a mask (R,) bool of the rows of a fraction of each task's episodes, spread evenly over them.
 
-    It holds at least one episode of a task that has others, unless the fraction is 0. Episodes of the same number start
-    in the same state in every dataset, so they are held out together.
+    Episodes of the same number start in the same state in every dataset, so they are held out together.
     """
     held_out = torch.zeros_like(ids, dtype=torch.bool)
     for number in ids.unique().tolist():

@@ -27,11 +27,8 @@ _CHUNK = 20_000  # rows whose advantages are computed together
 def make_loss(name: str, actor: TensorDictModuleBase, plans: Plans, replay: TensorDictReplayBuffer) -> LossModule:
     """Return the loss of that name for an actor, with plan-conditioned critics normalised to the buffer's rows.
 
-    Args:
-        name: "advantage" (imitation weighted by the column ``advantage``), "iql", "td3-bc" or "cql".
-        actor: with the distribution in :data:`DISTRIBUTIONS`.
-        plans: of the critics.
-        replay: rows :data:`N_STEPS` ahead with the discount :data:`GAMMA`, except for "advantage".
+    The actor has the distribution in :data:`DISTRIBUTIONS`. "advantage" reads the column ``advantage``; for the others
+    the buffer looks :data:`N_STEPS` ahead with the discount :data:`GAMMA`.
 
     Source: Kostrikov et al., "Implicit Q-Learning"; Fujimoto and Gu, "A Minimalist Approach to Offline Reinforcement
     Learning"; Kumar et al., "Conservative Q-Learning".
@@ -59,12 +56,7 @@ def learn_advantages(
 ) -> Tensor:
     """Train a value by expectile regression and return each row's advantage, standardised by task, (R, 1) float32.
 
-    Args:
-        plans: of the value.
-        replay: rows :data:`N_STEPS` ahead with the discount :data:`GAMMA`.
-        config: of the value's training.
-        device: where to train.
-        **options: of :class:`~lw_torchrl.training.loop.Training`.
+    The buffer's rows look :data:`N_STEPS` ahead with the discount :data:`GAMMA`.
     """
     value = PlanConditionedValue(plans, ensemble=2).to(device)
     loss = ExpectileValueLoss(value, expectile=0.7).make_value_estimator(gamma=GAMMA)

@@ -1,25 +1,31 @@
-"""Minibatches of a buffer, whose random draws depend only on a seed and the number of the minibatch."""
+"""Minibatches of a buffer, what a buffer must be for a training, and its description in checkpoints."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import torch
+from torch import nn
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
+from torchrl.envs import Compose, Transform
 
 from lw_torchrl._devices import CPU, seeded
+from lw_torchrl.data.samplers import GroupSampler
+from lw_torchrl.data.storage import DatasetStorage, device_of_rows
+from lw_torchrl.modules.critics import Value
+from lw_torchrl.modules.policy import plans_of
+
+_REPLAY_OPTIONS = ("label", "reward", "terminate_on_success", "n_steps", "gamma", "columns")
 
 
 class Minibatches:
-    """Minibatches of a buffer. What sampler, transforms and networks draw depends only on the seed and the step.
+    """Minibatches of a buffer, or of anything that has ``sample(size)``.
 
-    Samplers draw on the CPU, so minibatches are the same on every device.
-
-    Args:
-        source: has ``sample(size)``, which returns a TensorDict, as replay buffers do.
-        size: number of rows.
-        seed: any integer.
+    What sampler, transforms and networks draw depends only on the seed and the step. Samplers draw on the CPU, so
+    minibatches are the same on every device.
     """
 
     def __init__(self, source: Any, size: int, seed: int) -> None:
@@ -47,3 +53,60 @@ class Minibatches:
         self.step = state["step"]
         if state["sampler"]:
             self.source.sampler.load_state_dict(state["sampler"])
+
+
+def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, size: int) -> None:
+    """Raise :class:`ValueError` unless networks can be trained on a buffer's minibatches, and training be resumed."""
+    for network in networks:
+        own = plans_of(network)
+        for answered in map(plans_of, replay.transform):
+            if own is not None and answered is not None and (different := answered.differences(own)):
+                name = "critic" if isinstance(network, Value) else "actor"
+                plans = f"the {name}'s plans, they differ for {', '.join(different)}"
+                raise ValueError(f"replay's QAFTransform must have {plans}; use {name}.transform()")
+    if replay._prefetch:
+        raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
+    if replay.batch_size not in (None, size):
+        wanted = f"None or the configuration's, {size}, got {replay.batch_size}"
+        raise ValueError(f"batch_size of the replay buffer must be {wanted}")
+    rows, sampler = replay.storage, replay.sampler
+    if isinstance(sampler, PrioritizedSampler):
+        raise ValueError("replay: the trainers update no priorities, so a PrioritizedSampler draws uniformly")
+    on_cpu = isinstance(sampler, GroupSampler) or (isinstance(rows, DatasetStorage) and type(sampler) is RandomSampler)
+    if not on_cpu and (device := device_of_rows(rows)).type != "cpu":
+        sampled = f"replay: a {type(sampler).__name__} draws on {device} with its own generator, which is not saved"
+        raise ValueError(f"{sampled}; use a TaskBalancedSampler or CoLearningSampler, or keep the rows on the CPU")
+
+
+def check_replay(actor: Any, replay: TensorDictReplayBuffer, size: int) -> None:
+    """As :func:`check_minibatches`, for a network that writes ``action``."""
+    if "action" not in actor.out_keys:
+        raise ValueError(f"actor must write 'action', it writes {', '.join(map(str, actor.out_keys))}")
+    check_minibatches([actor], replay, size)
+
+
+def describe_data(replay: Any) -> dict[str, Any] | None:
+    """Describe a replay buffer's demonstrations as JSON; None for a buffer without."""
+    demonstrations = getattr(replay, "demonstrations", None)
+    return None if demonstrations is None else demonstrations.config.to_json()
+
+
+def describe_replay(replay: Any) -> dict[str, Any]:
+    """Describe how a replay buffer makes its batches, as JSON."""
+    transforms = [one for one in replay.transform.modules() if isinstance(one, Transform)]
+    options = {name: getattr(replay, name) for name in _REPLAY_OPTIONS if hasattr(replay, name)}
+    return options | {
+        "rows": None if describe_data(replay) is None else len(replay),  # after_success leaves so many
+        "sampler": type(replay.sampler).__name__,
+        "transforms": [
+            {"class": type(one).__name__} | {name: repr(value) for name, value in plain_options(one).items()}
+            for one in transforms
+            if not isinstance(one, Compose)
+        ],
+    }
+
+
+def plain_options(module: nn.Module) -> dict[str, bool | int | float | str]:
+    """Return the attributes of a transform or a loss that are flags, numbers and texts."""
+    options = {name: value for name, value in vars(module).items() if name[0] != "_" and name != "training"}
+    return {name: value for name, value in options.items() if isinstance(value, (bool, int, float, str))}

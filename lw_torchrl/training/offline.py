@@ -15,13 +15,17 @@ from torchrl.envs import MultiStepTransform
 from torchrl.objectives import LossModule, SoftUpdate
 
 from lw_torchrl._checks import Count, Positive, Probability, Scale, check_fields, checked, passes_on
-from lw_torchrl.data.replay_checks import check_minibatches
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.objectives.reduction import with_n_steps
 from lw_torchrl.training.checkpoint import check_can_be_saved
-from lw_torchrl.training.descriptions import describe_data, describe_replay, plain_options
 from lw_torchrl.training.loop import Training, TrainingOptions
-from lw_torchrl.training.minibatches import Minibatches
+from lw_torchrl.training.minibatches import (
+    Minibatches,
+    check_minibatches,
+    describe_data,
+    describe_replay,
+    plain_options,
+)
 from lw_torchrl.training.normalization import fit_untrained, statistics_of
 from lw_torchrl.training.optimizer import make_optimizer
 

@@ -106,7 +106,7 @@ def test_collect_by_experts_and_by_a_policy(capsys, tmp_path):
     assert "another configuration" in fails(capsys, "collect", "push", *args[1:])
     torch.manual_seed(0)
     policy = tmp_path / "tiny.safetensors"
-    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10"), decoder=lw.modules.MLPDecoder(width=8)), policy)
+    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10")), policy)
     for name, more in (("tiny", ()), ("mine", ("--behaviour", "mine"))):
         out = ("--policy", policy, "--episodes", 1, "--out", tmp_path / name)
         run(capsys, "collect", "reach", *out, *more)

@@ -1,10 +1,6 @@
 """``lw-torchrl plan``: the prompt that asks a language model for a plan, and asking one."""
 
 import re
-import signal
-import subprocess
-import sys
-import time
 
 import pytest
 from commands import document, fails, run
@@ -141,35 +137,6 @@ def test_generate_fails_in_one_line(capsys, tmp_path):
     assert "push" in fails(capsys, *generate("http://x/v1", tmp_path, "psuh"))
     assert "--format must be one of" in fails(capsys, *generate("http://x/v1", tmp_path, "push", "--format", "chain"))
     assert "OPENAI_API_KEY" in fails(capsys, "plan", "generate", "push", "--model", "m", "--cache", tmp_path / "kept")
-
-
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no such signal there")
-@pytest.mark.usefixtures("_no_key")
-def test_a_killed_run_asks_only_for_what_is_missing(capsys, tmp_path):
-    server = FakeServer(wait=0.05)
-    with serving(server) as address:
-        asked = [str(part) for part in generate(address, tmp_path, "MT10", "--concurrency", 2)]
-        process = subprocess.Popen([sys.executable, "-m", "lw_torchrl", *asked], stdout=subprocess.DEVNULL)
-        try:
-            deadline = time.monotonic() + 120
-            while server.served < 7 and time.monotonic() < deadline:
-                time.sleep(0.01)
-        finally:
-            process.kill()
-            process.wait()
-        before = -1
-        while before != len(server.requests):  # what was under way when it was killed
-            before = len(server.requests)
-            time.sleep(1.0)
-        # A hidden file is one that was being written; it counts for nothing.
-        kept = len([path for path in (tmp_path / "kept").rglob("*.json") if not path.name.startswith(".")])
-        assert 3 <= kept <= before < 20
-        printed = run(capsys, *asked)
-    assert len(server.requests) == before + 20 - kept
-    assert before - kept <= 4  # those under way
-    assert "2200 tokens" in printed
-    answers = [file for file in (tmp_path / "plans/a_model/chain_py").glob("*.py") if file.name[0] != "."]
-    assert len(answers) == 20
 
 
 # ---- repair

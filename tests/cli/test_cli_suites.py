@@ -8,6 +8,7 @@ pytest.importorskip("gymnasium_robotics")
 
 import lw_torchrl as lw
 from lw_torchrl.cli.main import main
+from lw_torchrl.modules import Concat, MLPDecoder, ObservationFeatures, RoleFeatures
 from lw_torchrl.suites import SUITES, load_suite
 from lw_torchrl.suites import suite as suite_module
 
@@ -31,8 +32,9 @@ def own(tmp_path, monkeypatch):
 
 
 def test_a_policy_of_meta_world_is_evaluated_with_another_robot(capsys, tmp_path):
-    plans, decoder = lw.canonical_plans(lw.load_plans("MT10")), lw.modules.MLPDecoder(width=8, depth=1)
-    actor = lw.PlanConditionedActor(plans, features=lw.modules.RoleFeatures(plans), decoder=decoder)
+    plans = lw.canonical_plans(lw.load_plans("MT10"))
+    features = Concat(ObservationFeatures("opening"), RoleFeatures(plans))
+    actor = lw.PlanConditionedActor(plans, features=features, decoder=MLPDecoder(width=8, depth=1))
     lw.save_actor(actor, tmp_path / "mt10.safetensors")
     options = ["--suite", "fetch", "--tasks", "reach", "--episodes", "1", "--max-steps", "5", "--json"]
     main(["evaluate", str(tmp_path / "mt10.safetensors"), *options])
@@ -121,10 +123,7 @@ def test_what_names_no_suite_is_told(capsys, own, name, says):
 
 
 def test_an_unknown_suite_gets_the_nearest(capsys, tmp_path):
-    lw.save_actor(
-        lw.PlanConditionedActor(lw.load_plans("MT10"), decoder=lw.modules.MLPDecoder(width=8)),
-        tmp_path / "mt10.safetensors",
-    )
+    lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10")), tmp_path / "mt10.safetensors")
     with pytest.raises(SystemExit):
         main(["evaluate", str(tmp_path / "mt10.safetensors"), "--suite", "fetsh"])
     assert "suite must be one of 'metaworld', 'fetch', got 'fetsh'; did you mean 'fetch'?" in capsys.readouterr().err

@@ -106,9 +106,7 @@ def test_a_task_that_the_simulator_lacks_is_named(capsys, tmp_path):
     plans = lw.load_plans(tmp_path / "plans.json", tasks=lw.load_tasks(tmp_path / "tasks.toml"))
     both = lw.Plans({**plans, "reach": lw.load_plans("MT10")["reach"]})
     for name, some in (("alone", plans), ("both", both)):
-        lw.save_actor(
-            lw.PlanConditionedActor(some, decoder=lw.modules.MLPDecoder(width=8)), tmp_path / f"{name}.safetensors"
-        )
+        lw.save_actor(lw.PlanConditionedActor(some), tmp_path / f"{name}.safetensors")
     error = fails(capsys, "evaluate", tmp_path / "alone.safetensors", "--tasks", "stack-cup")
     assert "A task of your own is a Task with an engine=, see docs/training.md" in error
     assert "no simulator has the policy's tasks, stack-cup" in fails(capsys, "evaluate", tmp_path / "alone.safetensors")

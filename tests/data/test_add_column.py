@@ -96,12 +96,6 @@ def test_beside_a_transform_and_a_co_learning_sampler(roots):
     assert torch.equal(batch["advantage"], batch["index"])
 
 
-def test_steps_of_several_steps_are_taken(roots):
-    replay = opened(roots, "n steps")
-    with pytest.raises(ValueError, match="steps_to_next_obs"):
-        replay.add_column("steps_to_next_obs", torch.zeros(len(replay)))
-
-
 @pytest.mark.parametrize(
     ("name", "values", "message"),
     [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 
 import pytest
 import torch
@@ -138,17 +137,6 @@ def test_all_right_is_the_scripted_skill_actor(tmp_path):
             assert torch.equal(rows["observation"][span], ours[info.task, info.episode]["observation"])
 
 
-def test_random_holds_one_action_a_piece(tmp_path):
-    made = collect(tmp_path / "demos", policy="random", noise_scale=0.0, max_steps=120, episodes_per_task=2)
-    rows = load_rows(made)
-    for info in made.episodes:
-        held = pieces(rows["action"][info.start : info.start + info.length])
-        assert all(8 <= length <= 24 for length in held[:-1])
-        assert len(held) >= 5
-    assert torch.equal(rows["action"], rows["expert_action"])
-    assert torch.equal(rows["action"], rows["unclipped_action"])
-
-
 def test_wrong_does_what_skills_of_the_plan_do(tmp_path):
     """Each action is one of the plan's skills', in the state that it was taken in."""
     from lw_torchrl.language.skill_program import SkillProgram
@@ -159,13 +147,6 @@ def test_wrong_does_what_skills_of_the_plan_do(tmp_path):
         rows["observation"].clone(), rows["task_id"].clone()
     )
     assert (offered == rows["unclipped_action"].unsqueeze(1)).all(-1).any(-1).all()
-
-
-def test_noise_is_drawn_beside_who_acts(made):
-    rows = load_rows(made["random"])
-    noisy = rows["episode"] % 2 == 1  # NOISE is (0.0, 0.3)
-    assert not torch.equal(rows["action"][noisy], rows["expert_action"][noisy])
-    assert torch.equal(rows["action"][~noisy], rows["expert_action"][~noisy])
 
 
 # ---- what replays make of them
@@ -246,17 +227,3 @@ def test_a_policy_trained_on_such_data_says_which_seeds_it_saw(tmp_path, made, c
         assert demonstrated_tasks(path) == tasks
         for seed in seeds:
             assert "is the seed of the demonstrations" in fails(capsys, "evaluate", path, "--seed", seed)
-
-
-def test_a_behaviour_comes_back_from_its_json():
-    behaviour = Behaviour("mine", right=0.3, otherwise="action", shortest=3, longest=70)
-    assert Behaviour.from_json(json.loads(json.dumps(behaviour.to_json()))) == behaviour
-
-
-def test_a_behaviour_of_ones_own(tmp_path):
-    mine = Behaviour("mine", right=0.5, otherwise="action", shortest=2, longest=3)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        made = collect(tmp_path / "demos", policy=mine)
-    assert made.config.policy.acts == mine
-    assert collect(made.root, policy=mine) == made

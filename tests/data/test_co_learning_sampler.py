@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, TensorStorage
+from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
 from lw_torchrl.data import CoLearningSampler
 from lw_torchrl.language.named_objects import GRIPPER, NamedObject
@@ -131,20 +131,6 @@ def test_a_state_saved_anywhere_in_an_epoch_gives_the_same_batches_again(base, t
     assert [(batch["row"].tolist(), other.sampler.ran_out) for batch in (other.sample() for _ in range(6))] == expected
 
 
-def test_the_state_goes_through_a_folder(tmp_path):
-    rows = with_episodes((1, 5), (task_id(TARGET), 4), (2, 6))
-    replay = make_replay(rows, 8, CoLearningSampler(TARGET))
-    drawn(replay, 2)
-    replay.sampler.dumps(tmp_path / "sampler")
-    assert not list(tmp_path.rglob("*.pickle"))
-    rng = replay._rng.get_state()
-    expected = drawn(replay, 5)
-    other = make_replay(rows, 8, CoLearningSampler(TARGET), seed=9)
-    other.sampler.loads(tmp_path / "sampler")
-    other._rng.set_state(rng)
-    assert drawn(other, 5) == expected
-
-
 @pytest.mark.parametrize(
     ("other", "name"),
     [
@@ -157,15 +143,6 @@ def test_the_state_of_another_target_or_ratio_is_refused(other, name):
     drawn(replay, 1)
     with pytest.raises(ValueError, match=f"state_dict must be of the same {name}"):
         other.load_state_dict(replay.sampler.state_dict())
-
-
-def test_the_buffers_generator_alone_fixes_the_batches():
-    rows = make_rows([40, 40], 40)
-    one, two = make_replay(rows, 20, seed=5), make_replay(rows, 20, seed=5)
-    first = drawn(one, 5)
-    torch.rand(3)
-    assert drawn(two, 5) == first
-    assert drawn(make_replay(rows, 20, seed=6), 5) != first
 
 
 @settings(max_examples=20, deadline=None)
@@ -181,18 +158,6 @@ def test_it_ran_out_whenever_the_pass_that_takes_most_batches_ends(base, target,
         assert replay.sampler.ran_out == (batch // longest > (batch - 1) // longest)
 
 
-def test_it_draws_from_a_storage_of_two_dimensions():
-    storage = LazyTensorStorage(200, ndim=2)
-    replay = TensorDictReplayBuffer(storage=storage, sampler=CoLearningSampler(TARGET), batch_size=8)
-    task = torch.tensor([1, 2, task_id(TARGET)])[:, None].expand(3, 20)
-    for _ in range(2):
-        replay.extend(TensorDict(task_id=task, row=torch.arange(60).view(3, 20), batch_size=[3, 20]))
-        for batch in (replay.sample() for _ in range(10)):
-            assert batch["task_id"].tolist() == [task_id(TARGET)] * 4 + [1, 1, 2, 2]
-            assert batch["is_target"].tolist() == [True] * 4 + [False] * 4
-            assert (storage[batch["index"].unbind(-1)]["row"] == batch["row"]).all()
-
-
 def test_of_joined_datasets_a_named_target_is_the_last_ones():
     base = with_episodes((1, 4), (task_id(TARGET), 4), (2, 4))
     target = with_episodes((task_id(TARGET), 3)).apply(lambda column: column + 0)
@@ -203,14 +168,6 @@ def test_of_joined_datasets_a_named_target_is_the_last_ones():
     assert torch.cat([b["row"][~b["is_target"]] for b in batches]).unique().tolist() == [0, 1, 2, 3, 8, 9, 10, 11]
     only_base = joined(target, with_episodes((1, 4)))
     assert int(make_replay(only_base, 8).sample()["is_target"].sum()) == 4
-
-
-def test_a_buffer_that_grows_is_grouped_again():
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(50), sampler=CoLearningSampler(TARGET), batch_size=12)
-    replay.extend(make_rows([4, 4], 4))
-    assert replay.sample()["task_id"].unique(return_counts=True)[1].tolist() == [3, 3, 6]
-    replay.extend(make_rows([4, 4, 4], 4))
-    assert sorted(replay.sample()["task_id"].unique(return_counts=True)[1].tolist()) == [2, 2, 2, 6]
 
 
 @settings(max_examples=30, deadline=None)

@@ -9,7 +9,7 @@ import metaworld
 import numpy as np
 import pytest
 import torch
-from collecting import EPISODES, NOISE, SEED, STEPS, TASKS, collect, tree
+from collecting import EPISODES, NOISE, SEED, STEPS, TASKS, collect
 
 import lw_torchrl as lw
 from lw_torchrl.data import CollectConfig
@@ -169,13 +169,6 @@ def test_replayed_in_meta_worlds_own_environment_the_actions_give_the_observatio
             assert np.array_equal(part["next", "observation"][t].numpy(), observation.astype(np.float32))
             assert bool(part["next", "success"][t]) == bool(info["success"])
     env.close()
-
-
-def test_a_single_number_is_the_same_as_a_sequence_of_one(tmp_path):
-    one, other = tmp_path / "one", tmp_path / "other"
-    collect(one, "reach", episodes_per_task=1, noise_scale=0.3)
-    collect(other, "reach", episodes_per_task=1, noise_scale=[0.3])
-    assert tree(one) == tree(other)
 
 
 # ---- arguments

@@ -72,7 +72,3 @@ def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
     with pytest.raises(ValueError, match="root must be a folder"):
         collect(path)
     assert path.read_text() == "a file"
-
-
-def test_an_empty_folder_is_fine(tmp_path, made):
-    assert collect(tmp_path).episodes == made.episodes

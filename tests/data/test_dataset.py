@@ -92,12 +92,6 @@ def test_damaged_metadata_are_named(root, change):
     refuse(root, "metadata.json' are damaged .*; delete the folder and collect the dataset again")
 
 
-def test_truncated_metadata_are_named(root):
-    path = root / "metadata.json"
-    path.write_bytes(path.read_bytes()[:-40])
-    refuse(root, "metadata.json' are damaged")
-
-
 @pytest.mark.parametrize("damage", ["missing", "truncated", "longer", "empty"])
 def test_a_column_of_another_size_is_named(root, damage):
     path = root / "data" / "next" / "observation.memmap"

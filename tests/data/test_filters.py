@@ -240,7 +240,7 @@ def test_a_part_left_without_episodes_is_sampled_as_if_it_were_not_there(made, s
 
 def test_a_trainer_of_another_choice_is_told_apart(made):
     """What a policy file says of its data names the chosen episodes."""
-    from lw_torchrl.training.descriptions import describe_data
+    from lw_torchrl.training.minibatches import describe_data
 
     one, other = (opened(made, "scripted", episodes={"reach": 5}, keep=EpisodeFilter(success=s)) for s in (True, False))
     assert describe_data(one) != describe_data(other)

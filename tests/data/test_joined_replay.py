@@ -6,7 +6,6 @@ import json
 
 import pytest
 import torch
-from torchrl.data import SliceSampler
 
 from lw_torchrl.data import (
     CoLearningSampler,
@@ -140,43 +139,6 @@ def test_one_demonstration_beside_the_base_tasks(base, target):
     assert seen["episode"].unique().tolist() == [1]
     assert seen["collector", "traj_ids"].unique().tolist() == [6 + 1]
     assert torch.equal(seen["observation"].unique(dim=0), demonstration["observation"].unique(dim=0))
-
-
-def test_the_same_dataset_can_be_base_and_target(base):
-    replay = LanguageWorldExperienceReplay(
-        [base.root, base.root], episodes=[None, {"push": 1}], batch_size=8, sampler=CoLearningSampler("push")
-    )
-    batch = replay.sample()
-    assert batch["collector", "traj_ids"][batch["is_target"]].unique().tolist() == [6 + 2]
-
-
-def test_a_buffer_goes_on_after_its_state_is_restored(base, target, tmp_path):
-    def make(seed):
-        return LanguageWorldExperienceReplay(
-            [base.root, target.root],
-            batch_size=16,
-            sampler=CoLearningSampler("reach"),
-            generator=torch.Generator().manual_seed(seed),
-        )
-
-    replay, other = make(0), make(1)
-    for _ in range(9):
-        replay.sample()
-    state = replay.state_dict()
-    torch.save(state, tmp_path / "state")
-    assert (tmp_path / "state").stat().st_size < 100_000, "the rows are not in the state"
-    expected = torch.stack([replay.sample() for _ in range(20)])
-    other.load_state_dict(state)
-    assert (torch.stack([other.sample() for _ in range(20)]) == expected).all()
-
-
-def test_slices_of_torchrls_own_sampler_stay_within_an_episode(base, target):
-    sampler = SliceSampler(slice_len=10, traj_key=("collector", "traj_ids"), cache_values=True)
-    replay = LanguageWorldExperienceReplay(
-        [base.root, target.root], batch_size=40, sampler=sampler, label="executed", after_success=20
-    )
-    slices = replay.sample().reshape(4, 10)
-    assert torch.equal(slices["observation"][:, 1:], slices["next", "observation"][:, :-1])
 
 
 def test_a_policy_trains_on_joined_data_and_a_checkpoint_knows_the_episodes(base, target, tmp_path):

@@ -61,16 +61,6 @@ def test_what_is_written_to_rows_stays_in_memory(root, kind, way):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_batches_are_ones_own(root, kind):
-    replay = open_replay(root, kind)
-    expected = replay[:].clone()
-    for index in (3, [3], torch.tensor([3])):
-        replay[index].zero_()
-    replay.sample().zero_()
-    assert (replay[:] == expected).all()
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_rows_are_not_assigned_to(root, kind):
     replay, before = open_replay(root, kind), tree(root)
     rows, row = replay[:], replay[0]

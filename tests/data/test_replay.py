@@ -13,8 +13,6 @@ from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.transforms import QAFTransform
 
 STEPS = 50
-OWN = {"behaviour", "is_demonstration"}  # of the buffer, not of the files
-WITHOUT_NEXT = {"observation", "task_id", "episode", "action", ("collector", "traj_ids"), *OWN}
 
 
 @pytest.fixture(scope="module")
@@ -36,33 +34,6 @@ def rows(made):
 @pytest.fixture(scope="module")
 def plans():
     return load_plans("MT10")
-
-
-def test_the_label_is_what_the_expert_wanted(made, rows):
-    replay = LanguageWorldExperienceReplay(made.root)
-    found = replay[:]
-    assert torch.equal(found["action"], rows["expert_action"])
-    assert set(found.keys(True, True)) == WITHOUT_NEXT
-    assert torch.equal(found["observation"], rows["observation"])
-
-
-def test_or_what_its_script_asked_for(made, rows):
-    found = LanguageWorldExperienceReplay(made.root, label="unclipped")[:]
-    assert torch.equal(found["action"], rows["unclipped_action"])
-    assert found["action"].abs().max() > 1
-    assert set(found.keys(True, True)) == WITHOUT_NEXT
-
-
-@pytest.mark.parametrize("reward", ["sparse", "dense"])
-def test_or_what_was_executed_with_its_consequences(made, rows, reward):
-    replay = LanguageWorldExperienceReplay(made.root, label="executed", reward=reward)
-    found = replay[:]
-    assert not torch.equal(rows["action"], rows["expert_action"])
-    assert set(found.keys(True, True)) == {*rows.keys(True, True), ("next", "reward"), *OWN}
-    assert (found.exclude(("next", "reward"), *OWN) == rows).all()
-    assert torch.equal(found["next", "reward"], rows["next", f"reward_{reward}"])
-    assert not torch.equal(rows["next", "reward_sparse"], rows["next", "reward_dense"])
-    assert (replay.label, replay.reward) == ("executed", reward)
 
 
 @pytest.mark.parametrize("label", ["expert", "executed"])

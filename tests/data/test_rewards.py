@@ -66,15 +66,3 @@ def test_costs_end_at_nought_where_episodes_end_at_success(made, name, least, mo
     assert (reward[~terminated] < 0).all()
     assert reward.min() >= least
     assert reward.max() <= most
-
-
-@pytest.mark.parametrize("name", list(REWARDS))
-def test_n_steps_are_summed_of_the_reward_named(made, name):
-    options = dict(label="executed", reward=name, terminate_on_success=True)
-    one = lw.LanguageWorldExperienceReplay(made.root, **options)[:]
-    three = lw.LanguageWorldExperienceReplay(made.root, n_steps=3, gamma=0.5, **options)[:]
-    reward, traj = one["next", "reward"].flatten().tolist(), one["collector", "traj_ids"].tolist()
-    for row in range(len(reward)):
-        ahead = [n for n in range(row, min(row + 3, len(reward))) if traj[n] == traj[row]]
-        expected = sum(reward[n] * 0.5 ** (n - row) for n in ahead)
-        assert float(three["next", "reward"][row]) == pytest.approx(expected, abs=1e-5)

@@ -7,8 +7,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
-from lw_torchrl.data import CoLearningSampler, TaskBalancedSampler
-from lw_torchrl.language.tasks import task_id
+from lw_torchrl.data import TaskBalancedSampler
 
 TARGET = "coffee-push"
 
@@ -76,10 +75,3 @@ def test_a_damaged_file_is_refused(tmp_path):
     with pytest.raises(ValueError, match=rf"path: '{tmp_path}' holds no sampler's state"):
         replay.sampler.loads(tmp_path)
     assert len(replay.sample()) == 4
-
-
-@pytest.mark.parametrize("name", ["target", "target_fraction"])
-def test_the_state_of_another_co_learning_sampler_is_refused(name):
-    replay = make((1, 1, 1, 1, *[task_id(TARGET)] * 4), CoLearningSampler(TARGET))
-    with pytest.raises(ValueError, match=f"state_dict must be of the same {name}"):
-        replay.sampler.load_state_dict(replay.sampler.state_dict() | {name: torch.tensor([0.5])})

@@ -72,14 +72,6 @@ def test_within_a_task_every_row_comes_once_before_any_comes_again(sizes, count,
 
 
 @settings(max_examples=20, deadline=None)
-@given(sizes, counts, seeds)
-def test_the_generator_fixes_the_batches(sizes, count, seed):
-    one, two = (make_replay(make_rows(sizes), count * len(sizes), seed) for _ in range(2))
-    torch.rand(3)  # the global generator plays no part
-    assert drawn(one, 4) == drawn(two, 4)
-
-
-@settings(max_examples=20, deadline=None)
 @given(sizes, counts, seeds, st.integers(0, 5))
 def test_a_state_saved_anywhere_gives_the_same_batches_again(sizes, count, seed, before):
     rows = make_rows(sizes)
@@ -197,26 +189,12 @@ def test_a_buffer_that_grows_is_grouped_again():
     assert seen == set(range(14))
 
 
-def test_a_full_buffer_that_is_overwritten_is_grouped_again():
-    replay = make_replay(make_rows([4, 4]), 4, capacity=8)
-    drawn(replay, 1)
-    replay.extend(make_rows([2, 6], first_task=30))
-    for _ in range(4):
-        assert replay.sample()["task_id"].bincount(minlength=33)[[30, 32]].tolist() == [2, 2]
-
-
 def test_an_emptied_buffer_can_be_filled_again():
     replay = make_replay(make_rows([4, 4]), 4, capacity=8)
     drawn(replay, 1)
     replay.empty()
     replay.extend(make_rows([2, 6], first_task=30))
     assert replay.sample()["task_id"].bincount(minlength=33)[[30, 32]].tolist() == [2, 2]
-
-
-def test_the_task_key_can_be_another():
-    rows = make_rows([4, 4]).rename_key_("task_id", "kind")
-    replay = make_replay(rows, 4, sampler=TaskBalancedSampler(task_key="kind"))
-    assert replay.sample()["kind"].bincount().tolist() == [0, 0, 0, 2, 0, 2]
 
 
 @settings(max_examples=60, deadline=None)
@@ -264,27 +242,6 @@ def test_of_a_storage_of_two_dimensions_every_row_comes_once_before_any_comes_ag
     rows = len(storage) // 4
     mine = torch.cat([batch["index"][batch["task_id"] == 3] for batch in batches])[:rows]
     assert len(mine.unique(dim=0)) == rows
-
-
-def test_of_a_storage_of_two_dimensions_the_state_goes_on(tmp_path):
-    one, two = (
-        TensorDictReplayBuffer(
-            storage=LazyTensorStorage(200, ndim=2),
-            sampler=TaskBalancedSampler(),
-            batch_size=6,
-            generator=torch.Generator().manual_seed(seed),
-        )
-        for seed in range(2)
-    )
-    one.extend(make_grid(20, 3, 5, 7))
-    two.extend(make_grid(20, 3, 5, 7))
-    drawn(one, 3), drawn(two, 1)
-    one.sampler.dumps(tmp_path)
-    two.sampler.loads(tmp_path)
-    two._rng.set_state(one._rng.get_state())
-    assert drawn(two, 20) == drawn(one, 20)
-    one.extend(make_grid(20, 3, 5, 7))
-    assert one.sample()["task_id"].bincount().tolist() == [0, 0, 0, 2, 0, 2, 0, 2]
 
 
 def test_rows_of_a_collector_in_a_storage_of_two_dimensions():

@@ -46,22 +46,6 @@ def test_without_a_true_condition_attention_is_uniform():
     torch.testing.assert_close(found, torch.tensor([[0.25] * 4, [0.5, 0.5, 0, 0], [1.0, 0, 0, 0]]))
 
 
-def test_if_all_conditions_are_true_attention_is_uniform():
-    qaf = torch.tensor([[True] * 4, [True, True, False, False]])
-    torch.testing.assert_close(weights(qaf, [PUSH, REACH]), torch.tensor([[0.25] * 4, [0.5, 0.5, 0, 0]]))
-
-
-def test_padding_has_no_weight():
-    torch.testing.assert_close(weights([[False, False, True, True]], [REACH]), torch.tensor([[0.5, 0.5, 0, 0]]))
-
-
-def test_soft_truth_moves_the_weight_smoothly():
-    found = weights(torch.tensor([[0.5, 0.7, 0.0, 0.0]]), [REACH])
-    odds = math.exp(10 * 0.2)
-    torch.testing.assert_close(found, torch.tensor([[1 / (1 + odds), odds / (1 + odds), 0, 0]]))
-    torch.testing.assert_close(weights([[1.0, 0, 1, 0]], [PUSH]), weights([[True, False, True, False]], [PUSH]))
-
-
 def test_the_gradient_reaches_soft_truth_but_not_padding():
     qaf = torch.full((1, 4), 0.5, requires_grad=True)
     weights(qaf, [REACH])[0, 0].backward()
@@ -85,14 +69,6 @@ def test_weights_sum_to_one_over_the_real_steps_for_any_leading_shape(shape, see
     assert (found[~padding] > 0).all()
 
 
-def test_a_row_does_not_depend_on_its_neighbours():
-    generator = torch.Generator().manual_seed(0)
-    qaf = torch.rand(20, 4, generator=generator) > 0.5
-    task_ids = torch.tensor(list(LENGTH))[torch.randint(3, (20,), generator=generator)]
-    together = weights(qaf, task_ids)
-    assert torch.equal(together, torch.stack([weights(qaf[i], task_ids[i]) for i in range(20)]))
-
-
 def test_a_task_without_a_plan_is_named():
     with pytest.raises(ValueError, match=r"without a plan.*: box-close, lever-pull"):
         weights(torch.zeros(3, 4), [task_id("lever-pull"), REACH, task_id("box-close")])
@@ -114,10 +90,6 @@ def test_a_plain_mapping_is_accepted_as_plans():
     plan = make_plan("reach", 2)
     found = PlanAttention({"reach": plan})(TensorDict(qaf=torch.zeros(2), task_id=torch.tensor(REACH)))
     assert found["skill_weights"].tolist() == [0.5, 0.5]
-
-
-def test_the_mask_is_not_saved():
-    assert PlanAttention(PLANS).state_dict() == {}
 
 
 @pytest.mark.parametrize("wrong", [math.nan, 100.0, -0.1, math.inf])

@@ -12,7 +12,6 @@ from torch import nn
 from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
-from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.modules import IMAGE_ENCODERS
 
 TASKS = ("drawer-open", "reach")
@@ -98,16 +97,6 @@ def test_a_thing_that_moves_in_the_picture_is_pointed_at():
     assert (seen.amax((-1, -2)) > 0.99).all()
 
 
-def test_not_is_the_opposite_with_structure():
-    texts = ["the gripper is above the drawer handle", "the gripper is not above the drawer handle"]
-    steps = [PlanStep(lw.parse_query(text, "drawer-open"), "open the drawer") for text in texts]
-    plans = lw.Plans([lw.ConditionalPlan("drawer-open", tuple(steps))])
-    found = states()[::2].clone()
-    logits = make(plans=plans)(found)["qaf_logits"]
-    assert torch.allclose(logits[:, 0], -logits[:, 1], atol=1e-5)
-    assert (logits[:, 0] != 0).all()
-
-
 @pytest.mark.filterwarnings("ignore:.*target_actor_network_params")
 def test_imitation_reaches_it_through_the_softmax():
     policy = make_policy(answers="hard").train()
@@ -125,17 +114,6 @@ def test_a_policy_with_it_is_made_again_from_its_file(tmp_path):
     lw.training.save_evaluator(policy[0], tmp_path / "evaluator.safetensors")
     other = lw.training.load_evaluator(tmp_path / "evaluator.safetensors", PLANS, text_encoder=letters)
     assert torch.equal(other(states())["qaf_logits"], policy[0](states())["qaf_logits"])
-
-
-def test_other_plans_share_its_weights():
-    evaluator = make()
-    drawer = lw.Plans({"drawer-open": PLANS["drawer-open"]})
-    other = evaluator.with_plans(drawer)
-    assert {id(weight) for weight in other.parameters()} == {id(weight) for weight in evaluator.parameters()}
-    found = states()[::2].clone()
-    steps = len(drawer["drawer-open"].steps)
-    expected = evaluator(found.clone())["qaf_logits"][:, :steps]
-    assert torch.allclose(other(found)["qaf_logits"], expected, atol=1e-6)
 
 
 def test_an_encoder_of_ones_own_stays_frozen():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -136,12 +134,6 @@ def test_under_vmap_over_the_rows_it_steps_aside():
 
     with pytest.raises(ValueError, match=REFUSED):  # over weights the numbers can be read
         torch.vmap(act)(params)
-
-
-def test_the_number_travels_with_a_pickle():
-    actor = pickle.loads(pickle.dumps(lw.PlanConditionedActor(PLANS)))
-    with pytest.raises(ValueError, match=REFUSED):
-        actor(state(OTHERS["another skill"]))
 
 
 def test_compiled_it_refuses_when_it_is_run():

@@ -71,15 +71,6 @@ def test_mixing_step_by_step_by_hand():
         torch.testing.assert_close(out["action"][row], actor.decoder.network(torch.cat((mixed, features), -1)))
 
 
-def test_the_plan_decides_the_action():
-    actor, rows, actions = make_actor(), make_rows(1, seed=3), []
-    rows["task_id"][:] = lw.task_id("reach")
-    for step in range(2):
-        rows["qaf"] = torch.arange(PLANS.num_steps).unsqueeze(0) == step
-        actions.append(action_of(actor, rows))
-    assert not torch.allclose(*actions, atol=1e-5)
-
-
 def test_it_sees_the_plans_that_it_is_given():
     assert make_actor().plans is PLANS
     canonical = lw.canonical_plans({"coffee-pull": lw.load_plans("MT50")["coffee-pull"]}, fallback=True)
@@ -94,23 +85,6 @@ def test_it_sees_the_plans_that_it_is_given():
     written = lw.QAFTransform(lw.load_plans("MT50"))(make_rows(6, plans=canonical, answered=False))
     with pytest.raises(ValueError, match="qaf answers other plans than the actor's, for coffee-pull"):
         actor(written)
-
-
-def test_two_actors_of_one_seed_are_equal():
-    rows = make_rows(7)
-    assert torch.equal(action_of(make_actor(seed=3), rows), action_of(make_actor(seed=3), rows))
-    assert not torch.equal(action_of(make_actor(seed=4), rows), action_of(make_actor(seed=3), rows))
-
-
-def test_features_are_noisy_while_training_only():
-    rows = make_rows(7)
-    actor, plain = (make_actor(features=ObservationFeatures(noise=noise)) for noise in (0.3, 0.0))
-    assert torch.equal(action_of(actor, rows), action_of(plain, rows))
-    assert torch.equal(action_of(plain.train(), rows), action_of(plain.eval(), rows))
-    first, second = (actor.train()(rows.copy()) for _ in range(2))
-    assert not torch.equal(first["action"], second["action"])
-    assert torch.equal(first["skill_latent"], second["skill_latent"])
-    assert lw.PlanConditionedActor(PLANS).features.noise == 0.05
 
 
 # ---- replaced parts
@@ -187,16 +161,6 @@ def test_with_plans_shares_the_weights_both_ways():
         assert not any(torch.allclose(action_of(each, rows[each]), old) for each, old in zip(rows, before, strict=True))
 
 
-def test_with_plans_follows_the_other_plans():
-    actor = make_actor(text_encoder=letters)
-    other, rows = actor.with_plans(other_plans()), make_rows(6, plans=other_plans())
-    assert (type(other), other.tasks) == (lw.PlanConditionedActor, ("reach", "sweep"))
-    assert other(rows.copy())["skill_weights"].shape == (6, 2)
-    fresh = make_actor(other_plans(), seed=1, text_encoder=letters)
-    fresh.load_state_dict(actor.state_dict())
-    assert torch.equal(action_of(fresh, rows), action_of(other, rows))
-
-
 @pytest.mark.parametrize("training", [True, False])
 def test_with_plans_keeps_statistics_and_mode(training):
     actor = make_actor(text_encoder=letters).train(training)
@@ -250,15 +214,6 @@ def test_the_gradient_reaches_every_weight():
     for name, parameter in actor.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.abs().sum() > 0, name
-
-
-def test_statistics_are_saved_with_the_actor():
-    actor, other = make_actor(), make_actor(seed=1)
-    actor.features.fit(make_rows(50))
-    other.load_state_dict(actor.state_dict())
-    assert torch.equal(action_of(other, make_rows(6)), action_of(actor, make_rows(6)))
-    assert actor.features.mean.any()
-    assert not any("mean" in name or "std" in name for name, _ in actor.named_parameters())
 
 
 # ---- bad input

@@ -103,14 +103,6 @@ def test_soft_answers_are_the_papers_ten_times_the_probability_less_five():
     assert torch.allclose(found["skill_weights"], logits.softmax(-1), atol=1e-6)
 
 
-def test_with_plans_shares_the_network_alone():
-    policy, other = make_policy(), lw.Plans([PLANS["push"]])
-    found = with_plans(policy, other)
-    assert {id(one) for one in policy[0].parameters()} == {id(one) for one in found[0].parameters()}
-    rows = states(4, other)
-    assert torch.allclose(found(rows.clone())["action"], policy(rows.clone())["action"], atol=1e-6)
-
-
 def test_saved_and_loaded_with_the_policy_to_the_bit(tmp_path):
     policy = make_policy(answers="hard")
     lw.save_actor(policy, tmp_path / "policy.safetensors")
@@ -135,26 +127,6 @@ def test_scripted_skills_act_on_its_answers(tmp_path):
     assert torch.equal(lw.load_actor(tmp_path / "policy.safetensors")(states())["action"], found["action"])
     other = with_plans(policy, lw.Plans([PLANS["push"]]))
     assert other[0].network.predicates.weight is evaluator.network.predicates.weight
-
-
-def test_scripted_skills_are_evaluated_on_its_answers():
-    class Never(lw.QueryEvaluator):
-        def logits(self, observation, task_id):
-            return torch.full((*task_id.shape, self.plans.num_steps), -1.0)
-
-    seen = []
-    plans = lw.Plans([PLANS["reach"]])
-    lw.evaluate(
-        lw.ScriptedSkillActor(plans),
-        tasks="reach",
-        episodes_per_task=1,
-        seed=1_000,
-        max_steps=5,
-        evaluator=Never(plans),
-        also_record=["qaf"],
-        on_episode=seen.append,
-    )
-    assert not (seen[0].steps["qaf"] > 0.5).any()
 
 
 # ---- refusals

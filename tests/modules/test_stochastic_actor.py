@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
-
 import pytest
 import torch
 from small_actors import (
@@ -112,12 +109,6 @@ def test_it_is_saved_and_loaded(distribution, tmp_path):
     out, expected = loaded(rows.clone()), actor.eval()(rows.clone())
     assert all(torch.equal(out[key], expected[key]) for key in actor.out_keys)
     assert loaded.distribution == distribution
-
-
-def test_it_can_be_pickled_and_copied():
-    actor, rows = make(), make_rows(5)
-    for other in (pickle.loads(pickle.dumps(actor)), copy.deepcopy(actor)):
-        assert torch.equal(other(rows.clone())["loc"], actor(rows.clone())["loc"])
 
 
 def test_a_nested_action_keeps_its_place(tmp_path):

@@ -18,7 +18,6 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
 from lw_torchrl.language.layout import METAWORLD, Layout, Slot
@@ -77,13 +76,6 @@ def test_any_modules_are_members():
     ensemble, rows = ActorEnsemble([PLAIN, PLAIN]), make_rows(3)
     assert ensemble.in_keys == ["observation"]
     torch.testing.assert_close(action_of(ensemble, rows), action_of(PLAIN, rows))
-
-
-def test_an_ensemble_acts_in_an_environment():
-    ensemble = ActorEnsemble(make_members()).eval()
-    env = TransformedEnv(lw.LanguageWorldEnv("reach", num_envs=2), lw.QAFTransform(ensemble.plans))
-    assert env.rollout(3, ensemble)["action"].shape == (2, 3, 4)
-    env.close()
 
 
 def test_members_that_do_not_belong_together_are_refused():

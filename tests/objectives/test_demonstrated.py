@@ -9,7 +9,6 @@ from torchrl.objectives import SACLoss, SoftUpdate, TD3Loss
 
 import lw_torchrl as lw
 from lw_torchrl.modules import QValue
-from lw_torchrl.objectives.demonstrated import imitation
 
 
 def make(kind, bc_weight=2.0, seed=0, **options):
@@ -114,24 +113,6 @@ def test_keys_are_obeyed(kind):
     assert torch.equal(total(other, batch), expected)
     with pytest.raises(ValueError, match="is_demonstration"):
         loss.set_keys(is_demonstrations="is_demonstration")
-
-
-def test_a_loss_for_each_row_has_the_same_mean():
-    batch = make_batch()
-    loss, _, _ = make(lw.objectives.DemonstratedTD3Loss)
-    each, _, _ = make(lw.objectives.DemonstratedTD3Loss, reduction="none")
-    found = each.actor_loss(batch)[0]
-    assert found.shape == (24,)
-    torch.testing.assert_close(found.mean(), loss.actor_loss(batch)[0])
-
-
-def test_imitation_is_of_demonstrated_rows_alone():
-    generator = torch.Generator().manual_seed(0)
-    action, other = (torch.rand(7, 4, generator=generator) for _ in range(2))
-    rows = torch.tensor([False, True, False, False, True, False, False])
-    found = imitation(action, other, rows)
-    assert (found[~rows] == 0).all()
-    torch.testing.assert_close(found.mean(), (action - other)[rows].square().mean())
 
 
 @pytest.mark.parametrize("kind", [lw.objectives.DemonstratedTD3Loss, lw.objectives.DemonstratedSACLoss])

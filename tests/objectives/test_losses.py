@@ -169,17 +169,6 @@ def test_with_either_distribution_the_loss_is_finite_at_the_bounds(name, distrib
     assert all(p.grad.isfinite().all() for p in trained(loss).values())
 
 
-@pytest.mark.parametrize("name", LOSSES)
-def test_its_state_goes_round(name):
-    loss, actor, value = make_loss(name, "plan")
-    other, _, _ = make_loss(name, "plan", seed=1)
-    batch = ready(name, make_batch(), actor, value)
-    if name != "online DT":  # its alpha is learned apart
-        assert total(other, batch) != total(loss, batch)
-    other.load_state_dict(loss.state_dict())
-    assert torch.equal(total(other, batch), total(loss, batch))
-
-
 ABOUT_ITSELF = pytest.mark.filterwarnings(  # what PyTorch warns of when it compiles
     "ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning",
     "ignore:.*LeafSpec:FutureWarning",
@@ -313,20 +302,3 @@ def test_a_shared_trunk_is_trained_by_both():
     assert len(names) == 1
     found["loss_critic"].backward()
     assert dict(loss.named_parameters())[names[0]].grad.abs().sum() > 0
-
-
-@pytest.mark.parametrize("name", ["SAC", "TD3", "IQL"])
-def test_targets_follow(name):
-    loss, _, _ = make_loss(name, "plan")
-    update = SoftUpdate(loss, eps=0.5)
-    before = loss.target_qvalue_network_params["heads", "0", "0", "weight"].clone()
-    for p in trained(loss).values():
-        p.data.add_(0.1)
-    update.step()
-    assert not torch.equal(loss.target_qvalue_network_params["heads", "0", "0", "weight"], before)
-
-
-def test_a_loss_can_be_copied():
-    loss, _, _ = make_loss("IQL", "plan")
-    other = copy.deepcopy(loss)
-    assert torch.equal(total(other, make_batch()), total(loss, make_batch()))

@@ -6,10 +6,9 @@ import json
 
 import pytest
 import torch
-from small_training import flat
+from small_training import assert_same, flat
 
 import lw_torchrl as lw
-from lw_torchrl._tensor_files import read_tensors, write_tensors
 from lw_torchrl.evaluation import score_evaluator
 
 PLANS = lw.load_plans("MT10")
@@ -44,13 +43,6 @@ def make_trainer(replay, path=None, *, config=SMALL, **options):
 
 def everything(trainer):
     return flat({"weights": dict(trainer.evaluator.state_dict()), "optimizer": trainer.optimizer.state_dict()})
-
-
-def assert_same(found, expected):
-    assert found.keys() == expected.keys()
-    for key, value in expected.items():
-        assert torch.equal(found[key], value) if isinstance(value, torch.Tensor) else found[key] == value, key
-        assert type(found[key]) is type(value), key
 
 
 # ---- what is trained, and what is not
@@ -188,20 +180,6 @@ def test_what_is_no_evaluators_file_is_refused(tmp_path):
 
     with pytest.raises(TypeError, match="evaluator must be a QueryEvaluator"):
         lw.training.save_evaluator(torch.nn.Linear(1, 1), path)
-
-
-@pytest.mark.parametrize(
-    ("part", "value"),
-    [("width", 8), ("depth", 3), ("predicates", ["near"]), ("own", 1)],
-)
-def test_options_that_the_weights_do_not_have_are_refused(tmp_path, part, value):
-    path = tmp_path / "e.safetensors"
-    lw.training.save_evaluator(make(), path)
-    description, tensors = read_tensors(path)
-    description["evaluator"]["options"][part] = value
-    write_tensors(path, description, tensors)
-    with pytest.raises(ValueError, match=r"evaluator: the evaluator of .* cannot be made"):
-        lw.training.load_evaluator(path, PLANS)
 
 
 # ---- refusals

@@ -16,8 +16,8 @@ from torchrl.objectives import BCLoss, CQLLoss, IQLLoss, REDQLoss, SACLoss, Soft
 from torchrl.record.loggers import Logger
 
 import lw_torchrl as lw
-from lw_torchrl.data.replay_checks import check_minibatches
 from lw_torchrl.training import OfflineConfig, OfflineTrainer, fit_normalization
+from lw_torchrl.training.minibatches import check_minibatches
 
 CONFIG = OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
 CRITIC = dict(width=16, depth=1)
@@ -211,16 +211,6 @@ def test_the_first_steps_of_cqls_actor_stand_for_its_loss_and_not_beside_it(demo
     }  # fmt: skip
 
 
-def test_an_actor_learns_from_its_own_loss_and_a_critic_from_its_own(demos):
-    trainer = make_trainer(demos, "td3-bc", config=replace(CONFIG, critic_learning_rate=0.0, weight_decay=0.0))
-    before = {name: p.detach().clone() for name, p in trainer.loss.named_parameters()}
-    trainer.train()
-    after = dict(trainer.loss.named_parameters())
-    moved = {name for name in before if not torch.equal(before[name], after[name])}
-    assert moved
-    assert all(name.startswith("actor_network_params") for name in moved)
-
-
 @pytest.mark.parametrize("name", ["value", "td3-bc"])
 def test_statistics_of_the_rows_reach_networks_and_their_targets(demos, name):
     trainer = make_trainer(demos, name)
@@ -337,26 +327,6 @@ def test_a_checkpoint_of_another_training_is_refused(demos, checkpoint, change, 
         OfflineTrainer(
             loss, make_replay(demos, **options), change.get("config", CONFIG), checkpoint=checkpoint, progress=False
         )
-
-
-def test_a_checkpoint_of_other_plans_is_refused(demos, checkpoint):
-    others = lw.Plans([lw.ConditionalPlan(plan.task, plan.steps[::-1]) for plan in PLANS.values()])
-    loss = lw.objectives.ExpectileValueLoss(lw.PlanConditionedValue(others, ensemble=2, **CRITIC))
-    loss.make_value_estimator(gamma=GAMMA)
-    with pytest.raises(ValueError, match=r"its loss differs in fixed|replay differs"):
-        OfflineTrainer(loss, make_replay(demos, others), CONFIG, checkpoint=checkpoint, progress=False)
-
-
-def test_a_file_of_another_kind_is_refused(demos, checkpoint, tmp_path):
-    path = tmp_path / "checkpoint.safetensors"
-    lw.save_actor(Networks(0.0, "cpu").actor(), path)
-    with pytest.raises(ValueError, match=r"must be a training state of version 2, got format 'lw_torchrl\.actor'"):
-        make_trainer(demos, "value", path)
-    whole = checkpoint.read_bytes()
-    for content in (b"", b"words", whole[: len(whole) // 2]):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match=r"is damaged or not a \.safetensors file"):
-            make_trainer(demos, "value", path)
 
 
 def test_a_buffer_of_other_plans_is_refused(demos):

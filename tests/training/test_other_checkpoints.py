@@ -144,14 +144,6 @@ def test_a_foreign_file_is_refused(demos, tmp_path, content):
     refused(state, "cannot be read: it is damaged or not a .safetensors file", lambda: make_trainer(demos, path))
 
 
-@pytest.mark.parametrize("share", [0.1, 0.99])
-def test_a_truncated_training_state_is_refused(demos, checkpoint, tmp_path, share):
-    path = tmp_path / "checkpoint.safetensors"
-    content = training_file(checkpoint).read_bytes()
-    training_file(path).write_bytes(content[: int(share * len(content))])
-    refused(training_file(path), "cannot be read: it is damaged", lambda: make_trainer(demos, path))
-
-
 def test_a_training_state_without_its_state_is_refused(demos, checkpoint, tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     description, tensors = read_tensors(training_file(checkpoint))
