@@ -106,7 +106,7 @@ def wrong_answers(evaluator: ImageQueryEvaluator, data: LabelledQueries, most: i
                 probability, holds = float(believed[row, column]), bool(truth[row, column])
                 if (probability > 0.5) == holds:
                     continue
-                pixels, off = asked.seen("pixels")[row], {}
+                pixels, off = asked.view("pixels")[row], {}
                 if evaluator.names:
                     places, _ = evaluator.network.places(pixels[None], evaluator.network.names.weight)
                     true = asked.task.positions(asked.observation[row])

@@ -18,7 +18,7 @@ from lw_torchrl.suites.fetch import load_plans
 from lw_torchrl.transforms import SuiteTransform
 
 gymnasium.register_envs(gymnasium_robotics)
-PLANS = lw.canonical_plans([load_plans()["fetch/reach"]])
+PLANS = lw.canonical_plans(lw.Plans([load_plans()["fetch/reach"]]))
 
 
 def observe(state: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:

@@ -23,7 +23,7 @@ parser.add_argument("--episodes", type=int, default=50, help="evaluated of each 
 parser.add_argument("--out", type=Path, default=Path("runs/fetch-few-shot"))
 options = parser.parse_args()
 
-plans = lw.canonical_plans([load_suite("fetch").plans[task] for task in TASKS])
+plans = lw.canonical_plans(lw.Plans([load_suite("fetch").plans[task] for task in TASKS]))
 for seed in options.seeds:
     folder = options.out / f"seed{seed}"
     lw.collect_demonstrations(

@@ -20,7 +20,7 @@ Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
 
 def pick(table: Tensor, rows: Tensor) -> Tensor:
     """Return ``table[rows]``, also for one row inside of ``vmap``: (T, ...) and (B...) int64 to (B..., ...)."""
-    return table.index_select(0, rows.reshape(-1)).reshape(*rows.shape, *table.shape[1:])
+    return table.index_select(0, rows.reshape(-1)).reshape((*rows.shape, *table.shape[1:]))
 
 
 class TaskIndex:

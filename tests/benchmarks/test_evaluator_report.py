@@ -6,6 +6,7 @@ import json
 
 import pytest
 import torch
+from tensordict.nn import TensorDictSequential
 
 import lw_torchrl as lw
 from benchmarks.evaluator_report import (
@@ -54,7 +55,7 @@ def test_a_report_has_the_calibration_of_every_answer(replay, tmp_path):
 
 def test_drift_compares_answers_with_the_exact_ones(replay):
     rows = replay[:]
-    drifts = condition_drift(lw.ScriptedSkillActor(PLANS, evaluator=Never(PLANS)), rows)
+    drifts = condition_drift(TensorDictSequential(Never(PLANS), lw.ScriptedSkillActor(PLANS)), rows)
     assert len(drifts) == len(PLANS["push"].steps) + len(PLANS["reach"].steps)
     assert [drift.agreement for drift in drifts] == sorted(drift.agreement for drift in drifts)
     truth = lw.QAFTransform(PLANS)(rows.clone())["qaf"]
