@@ -36,4 +36,4 @@ def sentence_vectors(texts: Sequence[str]) -> NDArray[np.float32]:
         what = f"the text {texts[0]!r} is not among the shipped ones, and encoding it needs the text model"
         raise ImportError(f"{what}: pip install 'lw_torchrl[text]'") from error
     vectors = model.encode(list(texts), convert_to_numpy=True, normalize_embeddings=True)  # type: ignore[attr-defined]
-    return vectors.astype("float32")  # type: ignore[no-any-return]
+    return vectors.astype("float32")
