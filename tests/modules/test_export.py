@@ -15,7 +15,8 @@ import lw_torchrl as lw
 pytestmark = pytest.mark.filterwarnings("ignore:.*Function.* should not be instantiated")  # by TorchRL's tanh
 SHARED = [name for name in ACTORS if name not in ("one-hot", "fallback")]
 NAMES = [name if name in ("plan", "scripted") else pytest.param(name, marks=pytest.mark.slow) for name in SHARED]
-OURS = [name for name in SHARED if name not in ("mixed actions", "evaluator")]  # not TorchRL's own sequences
+SEQUENCES = ("mixed actions", "evaluator")  # TorchRL's own
+OURS = [each for name, each in zip(SHARED, NAMES, strict=True) if name not in SEQUENCES]
 
 
 class Deployed(nn.Module):
