@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterable, Sequence
 from hashlib import sha256
@@ -16,38 +15,20 @@ from torch.utils.data import get_worker_info
 from torchrl.data import ImmutableDatasetWriter
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers.samplers import Sampler
-from torchrl.envs import Compose, MultiStepTransform, Reward2GoTransform, Transform
+from torchrl.envs import Transform
 
 from lw_torchrl._checks import Count, Natural, checked
 from lw_torchrl._files import AnyPath, reading
 from lw_torchrl._tensor_files import pop_state, read_tensors, write_tensors
-from lw_torchrl.data.dataset import DATA, Demonstrations, read_metadata
+from lw_torchrl.data.dataset import DATA, read_metadata
 from lw_torchrl.data.loading import load
 from lw_torchrl.data.memory_map import verify
 from lw_torchrl.data.rewards import RewardName
 from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, JoinedDemonstrations, Label
-from lw_torchrl.data.storage import DatasetStorage
+from lw_torchrl.data.storage import DatasetStorage, check_transform, rows_fingerprint
 from lw_torchrl.language.value_checks import finite
 
 _FILE = "buffer.safetensors"
-
-
-def _fingerprint(parts: Sequence[Demonstrations], *cuts: Any) -> str:
-    """A digest of the rows of these episodes, cut short as ``cuts`` say."""
-    listed = [[[e.task, e.episode, e.start, e.length, e.checksum] for e in part.episodes] for part in parts]
-    return sha256(json.dumps([listed, *cuts]).encode()).hexdigest()
-
-
-def _check_transform(transform: Any) -> None:
-    """Raise for TorchRL's transforms that act only on written rows: they would do nothing to samples."""
-    if isinstance(transform, Compose):
-        for part in transform:
-            _check_transform(part)
-    elif isinstance(transform, (MultiStepTransform, Reward2GoTransform)):
-        instead = "compute it once with add_column"
-        if isinstance(transform, MultiStepTransform):
-            instead = f"use n_steps={transform.n_steps}, gamma={transform.gamma}"
-        raise ValueError(f"transform: {type(transform).__name__} does nothing to samples; {instead}")
 
 
 class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
@@ -109,7 +90,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         check: bool = True,
         **kwargs: Any,
     ) -> None:
-        _check_transform(transform)
+        check_transform(transform)
         if (prefetch := kwargs.get("prefetch") or 0) > 1:
             raise ValueError(f"prefetch must be None, 0 or 1, got {prefetch}: several threads draw in no fixed order")
         several = not isinstance(root, (str, os.PathLike))
@@ -126,7 +107,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         self.label, self.reward, self.terminate_on_success = label, reward, terminate_on_success
         self.n_steps, self.gamma, self.columns = n_steps, gamma, dict[str, str]()
         self._plain = keys is not None
-        storage = DatasetStorage(loaded.rows, _fingerprint(loaded.parts, after_success, terminate_on_success))
+        storage = DatasetStorage(loaded.rows, rows_fingerprint(loaded.parts, after_success, terminate_on_success))
         kwargs |= {"sampler": sampler, "batch_size": batch_size, "transform": transform}
         super().__init__(storage=storage, writer=ImmutableDatasetWriter(), **kwargs)
 

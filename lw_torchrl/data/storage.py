@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
+from hashlib import sha256
 from typing import Any, NoReturn
 
 import torch
@@ -9,8 +12,10 @@ from tensordict import NestedKey, TensorDict
 from torch import Tensor
 from torchrl.data import TensorStorage
 from torchrl.data.replay_buffers.storages import Storage
+from torchrl.envs import Compose, MultiStepTransform, Reward2GoTransform
 
 from lw_torchrl._devices import CPU
+from lw_torchrl.data.dataset import Demonstrations
 
 TRAJECTORY, REWARD, DONE = ("collector", "traj_ids"), ("next", "reward"), ("next", "done")
 STEPS = "steps_to_next_obs"  # TorchRL's name of the column with the steps from an observation to its "next"
@@ -72,3 +77,21 @@ class DatasetStorage(TensorStorage):
         """Check that a state belongs to these rows."""
         if state_dict.get("rows") != self.fingerprint:
             raise ValueError("state_dict must be of the rows that this buffer shows, got one of other rows")
+
+
+def rows_fingerprint(parts: Sequence[Demonstrations], *cuts: Any) -> str:
+    """A digest of the rows of these episodes, cut short as ``cuts`` say."""
+    listed = [[[e.task, e.episode, e.start, e.length, e.checksum] for e in part.episodes] for part in parts]
+    return sha256(json.dumps([listed, *cuts]).encode()).hexdigest()
+
+
+def check_transform(transform: Any) -> None:
+    """Raise for TorchRL's transforms that act only on written rows: they would do nothing to samples."""
+    if isinstance(transform, Compose):
+        for part in transform:
+            check_transform(part)
+    elif isinstance(transform, (MultiStepTransform, Reward2GoTransform)):
+        instead = "compute it once with add_column"
+        if isinstance(transform, MultiStepTransform):
+            instead = f"use n_steps={transform.n_steps}, gamma={transform.gamma}"
+        raise ValueError(f"transform: {type(transform).__name__} does nothing to samples; {instead}")
