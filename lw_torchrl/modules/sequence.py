@@ -13,6 +13,9 @@ from torchrl.data import Bounded, Composite
 
 from lw_torchrl._keys import any_arguments, as_keys, check_apart
 
+if TYPE_CHECKING:
+    from lw_torchrl.language.layout import Layout
+
 
 class Part(TensorDictModuleBase):
     """Base of the parts of a policy. ``reads`` and ``writes`` are the default names of its keys."""
@@ -35,10 +38,6 @@ class Part(TensorDictModuleBase):
         """The keyword arguments that rebuild it."""
         options = {name: getattr(self, name) for name in self._options}
         return {**options, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
-
-
-if TYPE_CHECKING:
-    from lw_torchrl.language.layout import Layout
 
 
 class RenamedInputs(TensorDictModuleBase):
