@@ -115,11 +115,13 @@ class StackedBehavioralCloning(Training):
 
     def step(self) -> Tensor:
         """Train every actor on one minibatch and return their losses, (M,) float32, on the device."""
+        first, *others = self.minibatches
         batches = []
-        for minibatches in self.minibatches:
+        for minibatches in others:
             with minibatches.drawing(self.device):
                 batches.append(minibatches.draw(self.device).exclude("next"))
-        with self.minibatches[0].drawing(self.device):  # the features' noise
+        with first.drawing(self.device):  # also the noise of all actors' features
+            batches.insert(0, first.draw(self.device).exclude("next"))
             return self.train_on(torch.stack(batches))
 
     def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:
