@@ -18,6 +18,11 @@ _KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
 Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
 
 
+def one_per_row(task_id: Tensor, values: Tensor) -> Tensor:
+    """Return task ids (...) int64 for rows of ``values`` (..., N), also if they are (..., 1)."""
+    return task_id.squeeze(-1) if task_id.dim() == values.dim() and task_id.shape[-1] == 1 else task_id
+
+
 def pick(table: Tensor, rows: Tensor) -> Tensor:
     """Return ``table[rows]``, also for one row inside of ``vmap``: (T, ...) and (B...) int64 to (B..., ...)."""
     return table.index_select(0, rows.reshape(-1)).reshape((*rows.shape, *table.shape[1:]))

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import check_scale, checked
 from lw_torchrl._keys import dispatched, read, write
-from lw_torchrl.modules.networks import MLP, materialize
-from lw_torchrl.modules.sequence import Part, encoding_width
+from lw_torchrl.modules.networks import MLP, evaluating, materialize
+from lw_torchrl.modules.sequence import Part, encoding_width, trunk_attributes
 
 LEAST_STD = 1e-3
 
@@ -124,14 +124,30 @@ class Decode(Part):
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         decoded = self.network(torch.cat(read(tensordict, self.in_keys), -1))
-        return write(tensordict, self, decoded if isinstance(decoded, tuple) else (decoded,))
+        outputs = decoded if isinstance(decoded, tuple) else (decoded,)
+        if len(outputs) != len(self.out_keys_source):
+            names = ", ".join(map(str, self.out_keys_source))
+            raise ValueError(f"decoder must return a tensor for each of {names}, it returned {len(outputs)}")
+        return write(tensordict, self, outputs)
 
 
-def as_decoder(decoder: nn.Module, trunk: TensorDictSequential, out_keys: Sequence[NestedKey]) -> TensorDictModuleBase:
+def as_decoder(
+    decoder: nn.Module, trunk: TensorDictSequential, out_keys: Sequence[NestedKey] | None = None
+) -> TensorDictModuleBase:
     """Return a decoder behind a trunk: a plain module reads the trunk's latent and features and writes ``out_keys``."""
     own = isinstance(decoder, Decode) or not isinstance(decoder, TensorDictModuleBase)
-    if own and (width := encoding_width(trunk)) is not None:
+    width = encoding_width(trunk)
+    if own and width is not None:
         materialize(getattr(decoder, "network", decoder), torch.zeros(1, width))
     if isinstance(decoder, TensorDictModuleBase):
+        if out_keys is not None and list(out_keys) != list(decoder.out_keys_source):
+            raise ValueError(f"out_keys: a TensorDict module has its own, {decoder.out_keys_source}; got {out_keys}")
         return decoder
-    return Decode(decoder, in_keys=trunk.out_keys_source[-2:], out_keys=out_keys)
+    decode = Decode(decoder, in_keys=trunk.out_keys_source[-2:], out_keys=("action",) if out_keys is None else out_keys)
+    if width is not None and len(decode.out_keys) == 1:
+        with torch.no_grad(), evaluating(decoder), torch.random.fork_rng(devices=[]):
+            device = next((p.device for p in decoder.parameters()), None)
+            found, size = decoder(torch.zeros(1, width, device=device)), trunk_attributes(trunk)["layout"].action_size
+        if found.shape[-1:] != (size,):
+            raise ValueError(f"decoder must return actions (B, {size}) from (B, {width}), got {tuple(found.shape)}")
+    return decode

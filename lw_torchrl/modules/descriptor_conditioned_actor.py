@@ -125,7 +125,7 @@ class DescriptorConditionedActor(ConditionedActor):
         decoder: nn.Module | None = None,
         text_encoder: TextEncoder | None = None,
         in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] = ("action",),
+        out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         known = named_tasks(tasks)
         features = as_features(features, one_layout(known.values()), noise=0.05)

@@ -17,6 +17,7 @@ from lw_torchrl._checks import check_choice, check_scale, checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
 from lw_torchrl.language.task_index import as_plans
 from lw_torchrl.language.value_checks import check_finite
+from lw_torchrl.modules.networks import evaluating
 
 if TYPE_CHECKING:
     from lw_torchrl.language.layout import Layout
@@ -216,13 +217,18 @@ class Concat(TensorDictModuleBase):
         return write(tensordict, self, [torch.cat(seen, -1)])
 
 
+@torch.no_grad()
 def as_features(features: nn.Module | None, layout: Layout, noise: float = 0.0) -> TensorDictModuleBase:
     """Return features as a TensorDict module: a plain one reads ``observation``, None stands for the differences."""
     if features is None:
         return ObservationFeatures(noise=noise, layout=layout)
     if isinstance(features, TensorDictModuleBase):
         return features
-    return TensorDictModule(features, in_keys=["observation"], out_keys=["features"])
+    module: Any = TensorDictModule(features, in_keys=["observation"], out_keys=["features"])
+    with evaluating(features), torch.random.fork_rng(devices=[]):
+        device = next((p.device for p in features.parameters()), None)
+        module.width = features(torch.zeros(1, layout.size, device=device)).shape[-1]
+    return module
 
 
 def check_observation(observation: Tensor, layout: Layout) -> None:

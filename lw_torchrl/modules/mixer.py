@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import check_int, checked
 from lw_torchrl._keys import dispatched, read, write
-from lw_torchrl.language.task_index import PlanTables, as_plans, pick
+from lw_torchrl.language.task_index import PlanTables, as_plans, one_per_row, pick
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.networks import MLP, evaluating, materialize
 from lw_torchrl.modules.sequence import Part
@@ -84,7 +84,8 @@ class _Mixer(Part):
     def per_skill(self, weights: Tensor, task_id: Tensor, latents: Tensor) -> Tensor:
         """Sum attention over steps (..., S) to attention over the K different skills, (..., K)."""
         zeros = weights.new_zeros((*weights.shape[:-1], len(latents)))
-        return zeros.scatter_add(-1, pick(self.index, self.tables.rows(task_id)), weights).to(latents.dtype)
+        rows = self.tables.rows(one_per_row(task_id, weights))
+        return zeros.scatter_add(-1, pick(self.index, rows), weights).to(latents.dtype)
 
 
 class SkillMixer(_Mixer):

@@ -35,7 +35,8 @@ def plan_trunk(
     """Return attention, mixer and features: what a plan says to do now, and what is seen of the state.
 
     Reads ``qaf`` (B, S) bool, ``task_id`` (B,) int64 and ``observation`` (B, 39) float32; writes ``skill_weights``
-    (B, S), ``skill_latent`` (B, D) and ``features`` (B, F) float32. The arguments are :class:`PlanConditionedActor`'s.
+    (B, S), ``skill_latent`` (B, D) and ``features`` (B, F) float32. The arguments are :class:`PlanConditionedActor`'s,
+    but the default features have no noise.
     """
     attention, mixer = PlanAttention(plans), SkillMixer(plans, skill_encoder, text_encoder=text_encoder)
     seen = as_features(features, mixer.plans.layout)
@@ -53,7 +54,7 @@ class ConditionedActor(NamedParts):
         decoder: any module from latent and features, (B, D + F) float32, to the action (B, A), or a TensorDict module;
             None for :class:`MLPDecoder`.
         in_keys: other names for what the policy reads, in the order of ``in_keys``; nested keys are allowed.
-        out_keys: the names of what the decoder returns.
+        out_keys: the names of what a plain decoder returns; None for ``action``.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -69,7 +70,7 @@ class ConditionedActor(NamedParts):
         decoder: nn.Module | None = None,
         *,
         in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] = ("action",),
+        out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         plans, tasks, layout = trunk_attributes(trunk).values()
         decoder = MLPDecoder(actions=layout.action_size) if decoder is None else decoder
@@ -80,7 +81,8 @@ class ConditionedActor(NamedParts):
 
     def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
         if name == "decoder":
-            return as_decoder(module, self.trunk, self.decoder.out_keys_source)
+            own = isinstance(module, TensorDictModuleBase)
+            return as_decoder(module, self.trunk, None if own else self.decoder.out_keys_source)
         return super().as_part(name, module)
 
     @classmethod
@@ -103,7 +105,8 @@ class ConditionedActor(NamedParts):
     @property
     def spec(self) -> Composite:
         """The specification of the action, (A,) float32 in [-1, 1], which TorchRL's losses read."""
-        return action_spec(self.decoder.out_keys_source[0], self.layout)
+        written = self.decoder.out_keys_source
+        return action_spec(written[0] if len(written) == 1 else "action", self.layout)
 
     def with_plans(self, plans: AnyPlans) -> Self:
         """Return an actor with the same networks that follows other plans: training either trains both."""
@@ -121,8 +124,9 @@ class ConditionedActor(NamedParts):
 class PlanConditionedActor(ConditionedActor):
     """Plan Conditioned Behavioral Cloning's policy.
 
-    The policy attends to the skills whose conditions are true, mixes their latents, and decodes the mixture and the
-    observation's features into an action:
+    The policy attends to the skills whose conditions are true (to all alike if none is), mixes their latents, and
+    decodes the mixture and the observation's features into an action. With B rows, S steps of the longest plan and
+    latents of size D:
 
     ====================  ============================================  =================================
     part                  reads                                         writes
@@ -133,6 +137,9 @@ class PlanConditionedActor(ConditionedActor):
     ``decoder``           ``skill_latent``, ``features``                ``action`` (B, 4) float32
     ====================  ============================================  =================================
 
+    Each part is an attribute and can be replaced: ``actor.decoder = network``. Features draw noise only in training;
+    a trainer, or :func:`~lw_torchrl.training.fit_normalization`, fits their statistics.
+
     Args:
         plans: a plan for each task that the policy will see.
         skill_encoder: any module from skill vectors (K, E) to latents (K, D); None for :class:`SkillEncoder`.
@@ -140,8 +147,9 @@ class PlanConditionedActor(ConditionedActor):
             :class:`ObservationFeatures` with noise 0.05. Several are joined by :class:`Concat`.
         decoder: any module from (B, D + F) to the action (B, A), or a TensorDict module; None for :class:`MLPDecoder`.
         text_encoder: a function from n texts to vectors (n, E) float32; None for the shipped sentence encoder.
-        in_keys: other names for ``qaf``, ``task_id`` and ``observation``; nested keys are allowed.
-        out_keys: the names of what the decoder returns.
+        in_keys: other names for ``qaf``, ``task_id`` and ``observation``; nested keys are allowed. With fallback steps,
+            see :func:`~lw_torchrl.canonical_plans`, ``turn`` stands before ``observation``.
+        out_keys: the names of what a plain decoder returns; None for ``action``.
 
     Raises:
         ValueError: at call time, a task without a plan, or ``qaf`` of other plans.
@@ -169,7 +177,7 @@ class PlanConditionedActor(ConditionedActor):
         decoder: nn.Module | None = None,
         text_encoder: TextEncoder | None = None,
         in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] = ("action",),
+        out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         features = as_features(features, as_plans(plans).layout, noise=0.05)
         trunk = plan_trunk(plans, skill_encoder=skill_encoder, features=features, text_encoder=text_encoder)

@@ -17,7 +17,7 @@ from lw_torchrl.language.layout import places
 from lw_torchrl.language.named_objects import GOAL, GRIPPER, NamedObject, coordinate_indices
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, as_plans
 from lw_torchrl.language.roles import VECTORS, StepRole
-from lw_torchrl.language.task_index import PlanTables, pick
+from lw_torchrl.language.task_index import PlanTables, one_per_row, pick
 from lw_torchrl.language.task_objects import role_object
 from lw_torchrl.modules.attention import PlanAttention
 from lw_torchrl.modules.features import Features, squash
@@ -105,7 +105,8 @@ class _RelativePositions(Features):
     def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         observation, weights, task_id = read(tensordict, self.in_keys)
         yaw = tensordict.get(yaw_key(self.in_keys[0]), None)
-        return observation.to(self.offset.dtype), weights.to(self.offset.dtype), self.tables.rows(task_id), yaw
+        rows = self.tables.rows(one_per_row(task_id, observation))
+        return observation.to(self.offset.dtype), weights.to(self.offset.dtype), rows, yaw
 
     def compute(self, tensordict: TensorDictBase) -> Tensor:
         position = self.positions(*self._inputs(tensordict)).flatten(-2)

@@ -56,6 +56,7 @@ class RenamedInputs(TensorDictModuleBase):
         before = self.__dict__.get("_in_keys")
         if before is not None:  # not the constructor
             keys = as_keys("in_keys", keys, list(map(str, before)))
+            check_apart(keys, self.out_keys_source)
             renamed = dict(zip(before, keys, strict=True))
             self.__dict__.update(_parts_reading(self, renamed, {}))
         self._in_keys = list(keys)
@@ -100,6 +101,9 @@ class NamedParts(RenamedInputs, TensorDictSequential):
     def __setattr__(self, name: str, value: Any) -> None:
         parts = self.__dict__.get("_modules", {}).get("module") or {}
         if name not in parts:
+            if parts and isinstance(value, nn.Module) and type(self).__module__.startswith("lw_torchrl."):
+                own = f"{type(self).__name__} has the parts {', '.join(parts)}"
+                raise AttributeError(f"{own}, and no {name}; what a part is made of belongs to it: actor.mixer.encoder")
             super().__setattr__(name, value)
             return
         if not isinstance(value, nn.Module):

@@ -105,7 +105,7 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
         options = {**old.config, "squash": distribution == "normal" and old.squash, "init_std": init_std}
         with torch.random.fork_rng(devices=[]):
             decoder = GaussianDecoder(**options)
-            materialize(decoder, torch.zeros(1, old[0].in_features))
+            materialize(decoder, torch.zeros(1, old[0].weight.shape[-1]))
         decoder.to(next(old.parameters())).copy_from(old)
         trunk = copy.deepcopy(actor.trunk)
         for part in trunk.modules():

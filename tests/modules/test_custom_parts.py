@@ -12,11 +12,14 @@ import pytest
 import torch
 from my_parts import Closest, Gated, Pictures, Projection
 from small_actors import action_of, letters, make_actor, make_rows
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import lw_torchrl as lw
 from lw_torchrl.modules import Concat, MLPDecoder, ObservationFeatures, SkillEncoder
+
+PLANS = lw.load_plans("MT10")
 
 KINDS = {
     "decoder": lambda: {"decoder": Gated(6)},
@@ -149,3 +152,36 @@ def test_a_class_of_a_script_is_passed_by_hand(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"'__main__:Gated' is not known here: pass the class, parts=\[Gated\]"):
         lw.load_actor(path)
     assert type(lw.load_actor(path, parts=[Gated]).decoder.network) is Gated
+
+
+def test_plain_features_state_their_width_so_the_actor_is_saved_and_made_stochastic(tmp_path):
+    actor = lw.PlanConditionedActor(PLANS, features=nn.Linear(39, 10))
+    assert actor.features.width == 10
+    lw.save_actor(actor, tmp_path / "policy.safetensors")
+    assert lw.load_actor(tmp_path / "policy.safetensors").stochastic().out_keys[-1] == "action_log_prob"
+
+
+def test_what_cannot_be_a_part_is_refused_when_it_is_given():
+    actor = lw.PlanConditionedActor(PLANS)
+    with pytest.raises(AttributeError, match="has the parts attention, mixer, features, decoder, and no skill_encoder"):
+        actor.skill_encoder = nn.Linear(384, 16)
+    with pytest.raises(ValueError, match=r"decoder must return actions \(B, 4\) from \(B, 120\), got \(1, 1\)"):
+        lw.PlanConditionedActor(PLANS, decoder=nn.LazyLinear(1))
+    with pytest.raises(ValueError, match="out_keys: a TensorDict module has its own"):
+        decoder = TensorDictModule(nn.Linear(64, 4), ["skill_latent"], ["action"])
+        lw.PlanConditionedActor(PLANS, decoder=decoder, out_keys=["move"])
+    with pytest.raises(ValueError, match="out_keys must not be among in_keys"):
+        actor.in_keys = ["truth", "task_id", "action"]
+
+
+def test_a_decoder_that_returns_too_few_tensors_is_named():
+    actor = lw.PlanConditionedActor(PLANS, decoder=nn.LazyLinear(4), out_keys=["loc", "scale"])
+    assert list(actor.spec.keys()) == ["action"]
+    with pytest.raises(ValueError, match="decoder must return a tensor for each of loc, scale, it returned 1"):
+        actor(qaf=torch.zeros(1, 6), task_id=torch.tensor([lw.task_id("reach")]), observation=torch.rand(1, 39))
+
+
+def test_task_ids_may_be_a_column():
+    actor, ids = lw.PlanConditionedActor(PLANS).eval(), torch.full((2,), lw.task_id("reach"))
+    inputs = {"qaf": torch.zeros(2, 6), "observation": torch.rand(2, 39)}
+    assert torch.equal(actor(**inputs, task_id=ids)[-1], actor(**inputs, task_id=ids.unsqueeze(-1))[-1])
