@@ -167,8 +167,8 @@ def test_what_cannot_be_a_part_is_refused_when_it_is_given():
         actor.skill_encoder = nn.Linear(384, 16)
     with pytest.raises(ValueError, match=r"decoder must return actions \(B, 4\) from \(B, 120\), got \(1, 1\)"):
         lw.PlanConditionedActor(PLANS, decoder=nn.LazyLinear(1))
+    decoder = TensorDictModule(nn.Linear(64, 4), ["skill_latent"], ["action"])
     with pytest.raises(ValueError, match="out_keys: a TensorDict module has its own"):
-        decoder = TensorDictModule(nn.Linear(64, 4), ["skill_latent"], ["action"])
         lw.PlanConditionedActor(PLANS, decoder=decoder, out_keys=["move"])
     with pytest.raises(ValueError, match="out_keys must not be among in_keys"):
         actor.in_keys = ["truth", "task_id", "action"]
