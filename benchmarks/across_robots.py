@@ -59,6 +59,7 @@ class Adapted(TensorDictModuleBase):
         super().__init__()
         self.in_keys, self.out_keys = ["observation", "task_id"], ["action"]
         self.actor, self.turned = actor, turned
+        self.tasks, self.layout = tuple(TASKS), load_suite("fetch").layout
         self.task_ids = {lw.task_id(there): lw.task_id(here) for there, here in TASKS.items()}
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

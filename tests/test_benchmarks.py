@@ -11,8 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from lw_torchrl.language.canonical_steps import read_canonical
-from lw_torchrl.modules.relative_positions import PlanRoles
+from tensordict import TensorDict
 
 import lw_torchrl as lw
 from benchmarks import __main__ as cli
@@ -20,7 +19,7 @@ from benchmarks import ablations, faults, truth
 from benchmarks.finding_points import PADS, find_points
 from benchmarks.report import Row, Skipped, compare, part_of, times_as_long, under
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
-from lw_torchrl.language.task_index import PlanTables
+from lw_torchrl.modules import RoleFeatures
 
 ROOT = Path(__file__).parent.parent
 
@@ -111,22 +110,21 @@ def test_each_ablation_changes_one_ingredient_and_has_a_folder_of_its_own(settin
 
 
 def test_patches_leave_out_what_they_say_and_are_undone():
-    plans = lw.load_plans("MT50", skills="MT10")
-    canonical = {task: read_canonical(plan) for task, plan in plans.items()}
-    tables = PlanTables(lw.Plans([found.plan for found in canonical.values()]))
-    rows = torch.tensor([tables.index.row(task) for task in ("door-open", "drawer-open", "push", "window-open")])
-    seen = torch.rand(4, 39), torch.ones(4, tables.mask.shape[-1]), rows
-    usual = PlanRoles(canonical, tables)
+    plans = lw.canonical_plans(lw.load_plans("MT50", skills="MT10"))
+    usual, tasks = RoleFeatures(plans), ("door-open", "drawer-open", "push", "window-open")
+    at = torch.tensor([usual.tables.index.row(task) for task in tasks])
     with ablations.PATCHES["objects' own places instead of named points"]():
-        assert not PlanRoles(canonical, tables).offset[rows].any()
-    assert torch.equal(PlanRoles(canonical, tables).offset, usual.offset)
+        assert not RoleFeatures(plans).offset[at].any()
+    assert torch.equal(RoleFeatures(plans).offset, usual.offset)
     assert usual.offset.any()
+    task_id = torch.tensor([lw.task_id(task) for task in tasks]).repeat(100)
+    rows = TensorDict(observation=0.1 * torch.rand(400, 39), task_id=task_id, batch_size=[400])
     with ablations.PATCHES["no contacts"]():
-        usual.fit(*seen)
+        usual.fit(rows)
         assert usual.fitted
-        assert usual.demonstrated.nonzero().flatten().tolist() == sorted(rows.tolist()), "nothing is lifted there"
+        assert usual.demonstrated.nonzero().flatten().tolist() == sorted(at.tolist()), "nothing is lifted there"
     assert not usual.contact.any()
-    usual.fit(*seen)
+    usual.fit(rows)
     assert usual.contact.any()
 
 
