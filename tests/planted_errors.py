@@ -28,7 +28,7 @@ def collect(root: Path, episodes: int) -> lw.LanguageWorldExperienceReplay:
 def train(replay: lw.LanguageWorldExperienceReplay, steps: int) -> lw.PlanConditionedActor:
     """A policy that has imitated the demonstrations."""
     actor = lw.PlanConditionedActor(lw.load_plans("MT10"))
-    actor.fit_normalization(replay[:]["observation"])
+    lw.training.fit_normalization(actor, replay)
     optimizer = torch.optim.AdamW(actor.parameters(), lr=1e-3)
     for _ in range(steps):
         batch = replay.sample()
@@ -51,7 +51,7 @@ def main() -> None:
     actor = train(collect(out / "demos", 2), 100)
     result = lw.evaluate(actor, tasks=TASKS, episodes_per_task="ten", seed=1_000)  # planted
     print(f"{result.mean_sucess:.2f}", ask("reach", "the gripper is open"))  # planted
-    env = TransformedEnv(lw.LanguageWorldEnv(TASKS, seed=1), actor.transform())
+    env = TransformedEnv(lw.LanguageWorldEnv(TASKS, seed=1), lw.modules.transform_of(actor))
     print(env.rollout(20, actor.eval())["skill_weights"].shape)
     lw.save_actor(actor, out / "actor.safetensors")
 

@@ -20,7 +20,9 @@ from lw_torchrl.language.tasks import Task
 class Acting:
     """Options of a policy that acts: its plans, its evaluator, noise and seed."""
 
-    plans: Annotated[options.PlanSources, arg(help=f"plans to carry out instead of the policy's: {options.PLANS}")] = ()
+    plans: Annotated[
+        options.PlanSources, options.OPTIONAL, arg(help=f"plans to carry out instead of the policy's: {options.PLANS}")
+    ] = ()
     suite: options.SuiteName = None
     speed: float = 1.0  # scale factor on the hand's displacement, for a policy trained on another robot
     select: Literal["first", "random", "mix"] = "first"  # with scripted: which of several true steps acts
@@ -34,7 +36,9 @@ class Acting:
     stop_at_success: bool = False  # end episodes at their first success; the success rate stays the same
     attribute: bool = False  # re-run failed episodes to say why they failed: a query, the plan, a skill or time
     reference: Annotated[
-        tuple[str, ...], arg(metavar="SOURCES", help="with --attribute, trusted plans for the re-run, as for --plans")
+        tuple[str, ...],
+        options.OPTIONAL,
+        arg(metavar="SOURCES", help="with --attribute, trusted plans for the re-run, as for --plans"),
     ] = ()
     device: options.Device = "cpu"
 

@@ -93,7 +93,8 @@ class Show:
     Example: lw-torchrl data show demos/mt10 demos/spoilt --check
     """
 
-    folders: Positional[Annotated[tuple[Path, ...], arg(metavar="FOLDERS")]]  # datasets of `lw-torchrl collect`
+    folders: Positional[Annotated[tuple[Path, ...], options.REQUIRED, arg(metavar="FOLDERS")]]
+    """datasets of `lw-torchrl collect`"""
     check: bool = False  # also compare all rows with their checksums
     json: options.Json = False
 
@@ -198,7 +199,8 @@ class Export:
     folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]  # dataset of `lw-torchrl collect`
     to: str  # format: lerobot (version 3) or minari
     out: Path  # folder to write, new or empty
-    plans: tuple[str, ...] = ()  # plans whose conditions are stored with each row, if not the suite's
+    plans: Annotated[tuple[str, ...], options.OPTIONAL] = ()
+    """plans whose conditions are stored with each row, if not the suite's"""
     suite: options.SuiteName = None
     json: options.Json = False
 

@@ -31,7 +31,7 @@ class Evaluate:
     """
 
     policy: Positional[Annotated[str, arg(metavar="POLICY", help=f"who acts: {options.WHO}")]]
-    tasks: Annotated[tuple[str, ...], arg(help=_TASKS)] = ()
+    tasks: Annotated[tuple[str, ...], options.OPTIONAL, arg(help=_TASKS)] = ()
     episodes: int = 20  # episodes of each task
     num_envs: int | None = None  # environments stepped together; does not change the result
     out: Path | None = None  # folder for results.json, success.png, rollout.rrd, failures.png and plan_use.json

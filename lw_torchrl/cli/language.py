@@ -24,7 +24,7 @@ class Tasks:
     Example: lw-torchrl tasks drawer-open
     """
 
-    names: Positional[Annotated[tuple[str, ...], arg(metavar="[NAMES]")]] = ()
+    names: Positional[Annotated[tuple[str, ...], options.OPTIONAL, arg(metavar="[NAMES]")]] = ()
     """MT10, MT50, a suite, or names of tasks (without any, all 50)"""
     plans: options.PlanSources = ("MT50",)
     skill_file: options.SkillFile = None

@@ -31,13 +31,16 @@ WHO = (
 _DEVICE = "device of the networks: cpu, cuda, cuda:1, mps, or auto for a GPU if there is one (the simulation uses CPUs)"
 _SUITE = "suite of the tasks, for example fetch, or your own, as my_module:suite"
 _ENCODER = "your own text encoder, as my_module:function: from a list of N texts to an N x D tensor"
+_TASKS = "MT10, MT50, a suite, or names of tasks"
 _EVALUATOR = (
     "answer conditions by a network instead of exactly: a file of `lw-torchrl train-evaluator`, the name of an "
     "evaluator class, or an evaluator in Python, as my_module:evaluator"
 )
 
+# tyro would print "(default: )" for tuples
+OPTIONAL, REQUIRED = arg(help_behavior_hint="(optional)"), arg(help_behavior_hint="(required)")
 TaskName = Positional[Annotated[str, arg(metavar="TASK", help="name of a task")]]
-TaskNames = Positional[Annotated[tuple[str, ...], arg(metavar="TASKS", help="MT10, MT50, a suite, or names of tasks")]]
+TaskNames = Positional[Annotated[tuple[str, ...], REQUIRED, arg(metavar="TASKS", help=_TASKS)]]
 Who = Annotated[str, arg(help=f"who acts: {WHO}")]
 Json = Annotated[bool, arg(help="print one JSON document instead of text")]
 TaskFile = Annotated[Path | None, arg(metavar="FILE", help="a .toml file of your tasks, added to the shipped ones")]

@@ -189,7 +189,7 @@ class Read:
     Example: lw-torchrl plan read runs/plans/llama3.1/chain_py/*.py --out my-plans
     """
 
-    sources: Positional[Annotated[tuple[str, ...], arg(metavar="SOURCES", help=_SOURCES)]]
+    sources: Positional[Annotated[tuple[str, ...], options.REQUIRED, arg(metavar="SOURCES", help=_SOURCES)]]
     task: str | None = None  # show only this task; None reads an answer's task from its file name
     format: str | None = None  # plan format of an answer; None reads it from the folder name
     out: Path | None = None  # folder for .plan files: for each task the plan with the highest confidence

@@ -94,7 +94,8 @@ class View:
     Example: lw-torchrl view runs/small/logs/policy.rrd runs/large/logs/policy.rrd
     """
 
-    recordings: Positional[Annotated[tuple[Path, ...], arg(metavar="FILES")]]  # .rrd files, or folders with one
+    recordings: Positional[Annotated[tuple[Path, ...], options.REQUIRED, arg(metavar="FILES")]]
+    """.rrd files, or folders with one"""
     episode: str | None = None  # title of the tab to open
     step: int | None = None  # step to open at; None for the one that decides the episode, or the last of a training
     screenshot: Path | None = None  # write a .png without a window; requires a Vulkan driver (mesa-vulkan-drivers)

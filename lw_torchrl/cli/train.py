@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
+from lw_torchrl._checks import counted
 from lw_torchrl.cli import options
 from lw_torchrl.cli.acting import read_evaluator
 from lw_torchrl.cli.output import Output
@@ -38,7 +39,7 @@ class Train:
 
     data: Positional[Annotated[Path, arg(metavar="DATA")]]  # dataset of `lw-torchrl collect`
     out: Path  # policy file to write
-    tasks: tuple[str, ...] = ()  # train on the demonstrations of these tasks, if not on all
+    tasks: Annotated[tuple[str, ...], options.OPTIONAL] = ()  # train on the demonstrations of these tasks only
     plans: options.PlanSources = ("MT10",)
     task_file: options.TaskFile = None
     text_encoder: options.Encoder = None
@@ -57,7 +58,7 @@ class Train:
     """how the evaluator answers: by probabilities, or by 0 and 1; None for soft, or with --begin for hard"""
     qaf_anchor: float = 0.0  # weight of the cross entropy with the exact answers; use 1 for a new evaluator
     steps: int | None = None  # number of minibatches; None for 8000, with another loss than bc 4000
-    batch_size: int | None = None  # rows of a minibatch, equally many of each task; None for 500 (250)
+    batch_size: int | None = None  # equally many rows of each task; None for 500, with another loss than bc 250
     learning_rate: float = 1e-3  # at the start; a cosine brings it to 0
     seed: int = 0  # random seed of initial weights and minibatches
     evaluate_every: int | None = None  # evaluate every N steps and at the end, and log the success rate
@@ -88,13 +89,16 @@ class Train:
         torch.manual_seed(self.seed)
         actor = self._new_actor(plans, tuple(sorted(tasks))) if self.begin is None else self._begun_actor(plans)
         logger = None if self.logger is None else make_logger(self.logger, self.out)
-        run: dict[str, Any] = {"checkpoint": self.out, "logger": logger}
+        run: dict[str, Any] = {"checkpoint": self.out, "logger": logger, "evaluate_every": self.evaluate_every}
+        trainer: Any
+        if self.evaluate_every is not None:
+            run["evaluate"] = lambda: self._success_rates(trainer.steps, actor, tasks)
         if self.loss == "bc":
-            trainer = self._clone(actor, rows, run | self._evaluation(actor, tasks))
+            trainer = self._clone(actor, rows, run)
         else:
             if (distribution := DISTRIBUTIONS[self.loss]) is not None:
                 actor = actor.stochastic(distribution)
-            trainer = self._learn(actor, plans, rows, run | self._evaluation(actor, tasks))
+            trainer = self._learn(actor, plans, rows, run)
         loss, steps = trainer.train(), trainer.config.steps
         output = Output(self.json).show("policy", self.out).show("steps", steps)
         trained = "" if loss != loss else f", loss {loss:.4f}"  # nan: nothing was left to train
@@ -153,22 +157,16 @@ class Train:
         config = lw.OfflineConfig(**self._numbers, normalize=False)
         return lw.OfflineTrainer(loss, data, config, actor=actor, **run)
 
-    def _evaluation(self, actor: Any, tasks: list[str]) -> dict[str, Any]:
-        """Return the trainer's options that log the success rates on held-out seeds."""
-
-        def evaluate() -> dict[str, float]:
-            result = lw.evaluate(
-                actor, tasks=tasks, episodes_per_task=self.evaluate_episodes, seed=self.evaluate_seed,
-                stop_at_success=True, suite=options.read_suite(None, tasks), progress=False,
-            )  # fmt: skip
-            rates = {
-                "success": result.mean_success,
-                **{f"success/{task}": r for task, r in result.success_once.items()},
-            }
-            print(f"success {result.mean_success:.3f} on seed {self.evaluate_seed}", file=sys.stderr)
-            return {name: float(rate) for name, rate in rates.items() if rate is not None}
-
-        return {} if self.evaluate_every is None else {"evaluate": evaluate, "evaluate_every": self.evaluate_every}
+    def _success_rates(self, step: int, actor: Any, tasks: list[str]) -> dict[str, float]:
+        """Print and return the success rates on held-out seeds, after ``step`` steps of the training."""
+        result = lw.evaluate(
+            actor, tasks=tasks, episodes_per_task=self.evaluate_episodes, seed=self.evaluate_seed,
+            stop_at_success=True, suite=options.read_suite(None, tasks), progress=False,
+        )  # fmt: skip
+        episodes = f"{counted(self.evaluate_episodes, 'episode')} of each task, seed {self.evaluate_seed}"
+        print(f"step {step}: success {result.mean_success:.3f} ({episodes})", file=sys.stderr)
+        rates = {"success": result.mean_success, **{f"success/{task}": r for task, r in result.success_once.items()}}
+        return {name: float(rate) for name, rate in rates.items() if rate is not None}
 
     def _new_actor(self, plans: lw.Plans, tasks: tuple[str, ...]) -> Any:
         import torch
@@ -260,15 +258,17 @@ class TrainEvaluator:
 
     tasks: options.TaskNames
     out: Path  # folder for evaluator.safetensors, report.json and the collected episodes
-    data: tuple[Path, ...] = ()  # datasets of `lw-torchrl collect` to use instead of collecting episodes
+    data: Annotated[tuple[Path, ...], options.OPTIONAL] = ()
+    """datasets of `lw-torchrl collect` to use instead of collecting episodes"""
     behaviours: tuple[str, ...] = ("expert", "scripted", "spoilt-30", "random")  # who acts, as for `collect --policy`
     episodes: int = 5  # episodes collected of each task and behaviour
     max_steps: int = 500  # steps of an episode
     noise: tuple[float, ...] = (0.0, 0.1, 0.2)  # standard deviations of the expert's execution noise, used in turn
-    cameras: Annotated[tuple[str, ...], arg(help=_CAMERAS)] = ()
+    cameras: Annotated[tuple[str, ...], options.OPTIONAL, arg(help=_CAMERAS)] = ()
     picture: int = 64  # with --cameras, height and width of a picture in pixels
     every: int | None = None  # use every N-th state of an episode; None for 1, with --cameras 5
-    held_out_tasks: tuple[str, ...] = ()  # tasks whose queries are not trained on, or how many to draw at random
+    held_out_tasks: Annotated[tuple[str, ...], options.OPTIONAL] = ()
+    """tasks whose queries are not trained on, or how many to draw at random"""
     held_out_pairs: float = 0.1  # fraction of object pairs whose queries are excluded from training
     width: int = 128  # units of each hidden layer
     depth: int = 3  # number of hidden layers

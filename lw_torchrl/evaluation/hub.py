@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from huggingface_hub import ModelCard
 
 _SHOWN = {
+    *("loss", "reward"),
     *("episodes_per_task", "seed", "noise_scale", "noise_hold", "redraw_failures", "max_steps", "behaviour"),
     *("steps", "batch_size", "learning_rate", "optimizer", "schedule"),
     *("lw_torchrl", "metaworld", "mujoco", "torch"),
@@ -134,7 +135,9 @@ def _training(description: Mapping[str, Any], demonstrated: set[str]) -> str:
     run, data = description.get("run") or {}, description.get("data") or {}
     training = description.get("training") or run.get("training") or {}
     rows: list[tuple[str, Mapping[str, Any]]] = [("dataset", part) for part in data.get("parts", [data])]
-    rows.append(("training", training | ({"seed": run["seed"]} if "seed" in run else {})))
+    loss = description.get("loss") or {}
+    learned = {"loss": loss["class"], "reward": description["replay"].get("reward")} if loss else {}
+    rows.append(("training", learned | training | ({"seed": run["seed"]} if "seed" in run else {})))
     rows.append(("versions", description["versions"]))
     lines = [f"- tasks: {', '.join(sorted(demonstrated)) or 'not recorded'}"]
     for name, row in rows:

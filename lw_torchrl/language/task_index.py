@@ -132,8 +132,8 @@ class PlanTables:
         own = numbers[rows]
         if not torch.equal(own, number) and (wrong := (own != number) & (number != 0)).any():
             tasks = ", ".join(self.index.tasks[row] for row in rows[wrong].unique().tolist()[:5])
-            same = "give QAFTransform actor.plans, which with roles are canonical ones, or take actor.transform()"
-            raise ValueError(f"qaf answers other plans than the actor's, for {tasks}: {same}")
+            hint = "give QAFTransform the actor's plans: QAFTransform(actor.plans)"
+            raise ValueError(f"qaf answers other plans than the actor's, for {tasks}; {hint}")
 
 
 class TaskTables(nn.Module, Generic[Tables]):

@@ -63,7 +63,7 @@ def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, s
             if own is not None and answered is not None and (different := answered.differences(own)):
                 name = "critic" if isinstance(network, Value) else "actor"
                 plans = f"the {name}'s plans, they differ for {', '.join(different)}"
-                raise ValueError(f"replay's QAFTransform must have {plans}; use {name}.transform()")
+                raise ValueError(f"replay's QAFTransform must have {plans}; use QAFTransform({name}.plans)")
     if replay._prefetch:
         raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
     if replay.batch_size not in (None, size):

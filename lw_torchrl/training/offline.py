@@ -79,7 +79,8 @@ class OfflineTrainer(Training):
     Raises:
         ValueError: the buffer answers the queries of other plans, or draws by priorities; the loss's value estimator
             has another gamma than the buffer's n steps, the loss does not return means, or is CQL's with a Lagrange
-            multiplier; with ``normalize``, a network was trained with other statistics.
+            multiplier, or reads rewards or next observations that the buffer lacks; with ``normalize``, a network was
+            trained with other statistics.
         TypeError: the loss is not a LossModule.
 
     Example:
@@ -102,7 +103,7 @@ class OfflineTrainer(Training):
     @checked
     def __init__(
         self,
-        loss: LossModule,
+        loss: Any,  # a LossModule; check_loss explains what else it may be
         replay: TensorDictReplayBuffer,
         config: OfflineConfig | None = None,
         *,
@@ -161,14 +162,21 @@ def networks_of(loss: LossModule) -> list[nn.Module]:
     return [network for network in networks if isinstance(network, nn.Module)]
 
 
-def check_loss(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
+def check_loss(loss: Any, replay: TensorDictReplayBuffer) -> None:
     """Raise unless a loss can be trained on a buffer. TorchRL's default value estimator is made, if it has none."""
     if not isinstance(loss, LossModule):
-        raise TypeError(f"loss must be a LossModule, got {type(loss).__name__}; compile one by loss.compile()")
+        hint = "compile one by loss.compile()"
+        if loss is None:
+            hint = "make_value_estimator of TorchRL's losses returns None, so call it on a line of its own"
+        raise TypeError(f"loss must be a LossModule, got {type(loss).__name__}; {hint}")
     if getattr(loss, "reduction", "mean") == "none":
         raise ValueError("loss must return the mean of its rows, got reduction='none'")
     if getattr(loss, "with_lagrange", False):
         raise ValueError("loss: with_lagrange=True keeps loss_cql from the critics; use with_lagrange=False")
+    ahead = [key for key in loss.in_keys if isinstance(key, tuple) and key[0] == "next"]
+    if ahead and len(replay) and "next" not in replay.storage[0].keys():
+        needs = f"loss: {type(loss).__name__} needs rewards and next observations, which replay's rows lack"
+        raise ValueError(f"{needs}; open the buffer with label='executed'")
     summed = [part.gamma for part in replay.transform if isinstance(part, MultiStepTransform)]
     shown = next(iter(summed), getattr(replay, "gamma", None))  # None where ``next`` is one step ahead
     if shown is None or loss.default_value_estimator is None:

@@ -42,6 +42,7 @@ def test_each_command_explains_itself_with_an_example(capsys, command):
     printed = capsys.readouterr().out
     assert f"Example: lw-torchrl {command} " in printed
     assert f"usage: lw-torchrl {command} " in printed
+    assert "(default: )" not in printed
 
 
 def test_help_loads_nothing_heavy(python):

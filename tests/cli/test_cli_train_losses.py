@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import re
 
 import pytest
 from commands import fails, run
 
 import lw_torchrl as lw
+from lw_torchrl.cli.main import main
 
 SMALL = ["--steps", 4, "--batch-size", 8, "--width", 8, "--depth", 1]
 
@@ -32,13 +34,18 @@ def test_a_policy_is_learned_offline_and_resumes(capsys, data, tmp_path, loss):
     actor = lw.load_actor(out)
     assert actor.decoder.network.config["width"] == 8
     assert hasattr(actor, "get_dist") is (loss in ("iql", "cql"))
+    card = run(capsys, "info", out)
+    assert re.search(r"- training: loss \w+Loss, reward dense_cost, steps 4,", card)
     assert lw.evaluate(actor, tasks="reach", episodes_per_task=1, seed=1000, max_steps=5, progress=False)
 
 
 def test_success_on_held_out_seeds_is_logged(capsys, data, tmp_path):
     out = tmp_path / "policy.safetensors"
     options = ["--loss", "td3-bc", "--evaluate-every", 2, "--evaluate-episodes", 1, "--logger", "csv"]
-    run(capsys, "train", data, "--out", out, *options, *SMALL)
+    main(list(map(str, ["train", data, "--out", out, *options, *SMALL])))
+    printed = capsys.readouterr().err
+    for step in (2, 4):
+        assert re.search(rf"step {step}: success [01]\.\d{{3}} \(1 episode of each task, seed 1000\)", printed)
     (file,) = (tmp_path / "logs").rglob("evaluation/success.csv")
     rows = list(csv.reader(file.read_text().splitlines()))
     assert [int(step) for step, _ in rows] == [2, 4]

@@ -145,6 +145,16 @@ def test_no_module_is_imported_because_a_file_names_it(tmp_path, monkeypatch):
     assert action_of(lw.load_actor(path, parts=[Gated]), rows).shape == (4, 4)
 
 
+def test_all_unknown_classes_are_named_at_once(tmp_path, monkeypatch):
+    path, names = tmp_path / "policy.safetensors", r"'my_parts:\w+', 'my_parts:\w+'"
+    lw.save_actor(make_actor(features=Pictures(), decoder=Gated(6)), path)
+    monkeypatch.delitem(sys.modules, "my_parts")
+    message = rf"the classes {names} are not known here: import my_parts first.*parts=\[Pictures, Gated\]"
+    with pytest.raises(ValueError, match=message):
+        lw.load_actor(path)
+    assert type(lw.load_actor(path, parts=[Pictures, Gated]).decoder.network) is Gated
+
+
 def test_a_class_of_a_script_is_passed_by_hand(tmp_path, monkeypatch):
     path = tmp_path / "policy.safetensors"
     monkeypatch.setattr(Gated, "__module__", "__main__")

@@ -17,7 +17,7 @@ STEPS = [
     ("the gripper is not above the puck", "place the gripper above the puck"),
     ("the gripper is above the puck", "lower the gripper around the puck"),
 ]
-REFUSED = r"qaf answers other plans than the actor's, for push: give QAFTransform actor.plans"
+REFUSED = r"qaf answers other plans than the actor's, for push; give QAFTransform the actor's plans"
 
 
 def plans_of(pairs, *more):
@@ -73,7 +73,7 @@ def test_each_row_has_its_plans_number():
     assert mixed["qaf_plan"][0] == state(PLANS)["qaf_plan"][0], "whatever stands beside it"
     lw.PlanConditionedActor(both)(mixed)
     other = lw.ConditionalPlan.from_pairs("reach", [("the gripper is closed", "close the gripper")] * 2)
-    with pytest.raises(ValueError, match="for reach: give"):
+    with pytest.raises(ValueError, match="for reach; give"):
         lw.PlanConditionedActor(plans_of(STEPS, other))(mixed)
 
 

@@ -31,7 +31,9 @@ def test_other_plans_of_the_same_length_are_refused(demos):
     other = Plans([*kept, ConditionalPlan.from_pairs("reach", turned)])
     assert other.num_steps == PLANS.num_steps
     replay = LanguageWorldExperienceReplay(demos, sampler=TaskBalancedSampler(), transform=QAFTransform(other))
-    message = r"replay's QAFTransform must have the actor's plans, they differ for reach; use actor.transform\(\)"
+    message = (
+        r"replay's QAFTransform must have the actor's plans, they differ for reach; use QAFTransform\(actor.plans\)"
+    )
     actor = PlanConditionedActor(PLANS)
     with pytest.raises(ValueError, match=message):
         BehavioralCloningTrainer(actor, replay, CONFIG)

@@ -336,6 +336,20 @@ def test_a_buffer_of_other_plans_is_refused(demos):
         OfflineTrainer(loss, make_replay(demos, others), CONFIG, progress=False)
 
 
+@pytest.mark.parametrize("name", ["iql", "td3-bc", "sac", "value"])
+def test_rows_without_rewards_and_next_observations_are_refused(demos, name):
+    replay = lw.LanguageWorldExperienceReplay(demos, transform=lw.QAFTransform(PLANS))  # the label "expert"
+    message = r"loss: \w+Loss needs rewards and next observations, .*; open the buffer with label='executed'"
+    with pytest.raises(ValueError, match=message):
+        OfflineTrainer(make_loss(name), replay, CONFIG, progress=False)
+
+
+def test_a_value_estimator_in_the_place_of_a_loss_is_explained(demos):
+    loss = LOSSES["iql"](Networks(0.0, "cpu")).make_value_estimator(gamma=GAMMA)
+    with pytest.raises(TypeError, match=r"got NoneType; make_value_estimator .* on a line of its own"):
+        OfflineTrainer(loss, make_replay(demos), CONFIG, progress=False)
+
+
 @pytest.mark.parametrize("made", [True, False])
 def test_a_value_of_another_discount_than_the_rows_is_refused(demos, made):
     loss = LOSSES["value"](Networks(0.0, "cpu"))

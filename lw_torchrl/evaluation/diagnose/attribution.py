@@ -16,7 +16,8 @@ from lw_torchrl._devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.diagnose.counterfactuals import Counterfactuals, own_evaluators
 from lw_torchrl.evaluation.diagnose.decision import MARGIN, decide
-from lw_torchrl.evaluation.diagnose.failure import Difference, Failure, Finding
+from lw_torchrl.evaluation.diagnose.failure import Failure
+from lw_torchrl.evaluation.diagnose.findings import Difference, Finding
 from lw_torchrl.evaluation.diagnose.rerun import EpisodeId, Rerun, null_control
 from lw_torchrl.evaluation.diagnose.scripts import Scripts
 from lw_torchrl.evaluation.diagnose.states import EpisodeStates, Explanation, explain, stall_step, states_of

@@ -14,7 +14,8 @@ from lw_torchrl._keys import write
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.diagnose.comparison import ScriptComparison, compare_with_scripts
 from lw_torchrl.evaluation.diagnose.decision import Decision
-from lw_torchrl.evaluation.diagnose.failure import REPLACEMENTS, MendedEpisode
+from lw_torchrl.evaluation.diagnose.failure import MendedEpisode
+from lw_torchrl.evaluation.diagnose.findings import REPLACEMENTS
 from lw_torchrl.evaluation.diagnose.rerun import EpisodeId, NullControl, Perception, Rerun
 from lw_torchrl.evaluation.diagnose.scripts import ScriptedControl, Scripts
 from lw_torchrl.evaluation.diagnose.sentences import replacement_text

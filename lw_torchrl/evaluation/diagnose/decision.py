@@ -3,7 +3,7 @@
 from collections.abc import Collection, Iterable, Mapping
 from typing import NamedTuple
 
-from lw_torchrl.evaluation.diagnose.failure import REPLACEMENTS, Cause
+from lw_torchrl.evaluation.diagnose.findings import REPLACEMENTS, Cause
 
 MARGIN = 0.3  # a clear lead, as a share of the task's failed episodes
 _FACTS = ("perception", "query")  # tried only if an observation or answer was wrong, which is a fact

@@ -6,116 +6,16 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from reprlib import repr as short
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
-from lw_torchrl._checks import Count, Natural, Scale, check_fields
+from lw_torchrl._checks import Count, Natural, check_fields
+from lw_torchrl.evaluation.diagnose.findings import CAUSES, FINDINGS, REPLACEMENTS, Cause, Finding
+from lw_torchrl.evaluation.diagnose.sentences import explain_failure
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
 
     from lw_torchrl.language.plans import ConditionalPlan
-
-Blamed = Literal["not reproducible", "perception", "query", "plan", "skill", "gripper", "actuation", "policy"]
-Cause = Literal[Blamed, "out of time", "undecided"]
-
-CAUSES: dict[str, str] = {
-    "not reproducible": "a plain re-run succeeds",
-    "perception": "the policy was shown a wrong state",
-    "query": "a condition was answered wrongly",
-    "plan": "the plan is wrong",
-    "skill": "the policy executed a skill badly",
-    "gripper": "the gripper opened or closed wrongly",
-    "actuation": "the hand moved wrongly in several steps",
-    "policy": "the policy, unclear which part of it",
-    "out of time": "it succeeds with more time",
-    "undecided": "no replacement helps",
-}
-"""Each cause and its meaning."""
-
-REPLACEMENTS: dict[str, tuple[Cause, ...]] = {
-    "perception": ("perception",),
-    "query": ("query",),
-    "plan": ("plan",),
-    "skill": ("skill",),
-    "gripper": ("gripper",),
-    "actuation": ("actuation",),
-    "policy": ("policy",),
-    "time": ("out of time",),
-    "query + skill": ("query", "skill"),
-    "query + plan": ("query", "plan"),
-    "plan + skill": ("plan", "skill"),
-}
-"""The name of each replacement, and the causes to blame if an episode succeeds with it."""
-
-
-@dataclass(frozen=True)
-class WrongAnswers:
-    """The condition of a step was answered wrongly in ``states`` of ``of`` states, first at ``first``."""
-
-    step: Natural
-    condition: str
-    states: Natural
-    of: Count
-    first: Natural
-
-
-@dataclass(frozen=True)
-class NoCondition:
-    """No condition of the plan held in ``states`` of the last ``of`` states."""
-
-    states: Natural
-    of: Count
-
-
-@dataclass(frozen=True)
-class PlanDeparts:
-    """The plan requested another action than the reference in ``states`` of ``of`` states, the last if ``late``."""
-
-    step: Natural  # of the plan, in most of these states
-    skill: str
-    reference: str  # the skill that the reference requests there
-    states: Natural
-    of: Count
-    late: bool
-    uncovered: bool  # no condition of the plan held in most of them
-
-
-@dataclass(frozen=True)
-class ActiveStep:
-    """A step was active in ``states`` of the last ``of`` states, and at the end ``distance`` metres from its target."""
-
-    step: Natural
-    skill: str
-    states: Natural
-    of: Count
-    distance: Scale | None = None
-
-
-@dataclass(frozen=True)
-class Misled:
-    """The observation that the policy was shown differed from the true one, most in entry ``number``, by ``error``."""
-
-    error: Scale
-    number: Natural
-
-
-@dataclass(frozen=True)
-class Difference:
-    """The first difference between two runs of an episode, with ``at``, the state to look at.
-
-    ``part`` is "length", of ``given`` and ``again`` steps; "actions", which differ there by ``size``; "environment", if
-    the same action leads to another state; "states", in a rollout without actions; or "nothing" that was recorded.
-    """
-
-    part: Literal["length", "actions", "environment", "states", "nothing"]
-    at: Natural
-    given: Natural | None = None
-    again: Natural | None = None
-    size: Scale | None = None
-
-
-Finding = WrongAnswers | NoCondition | PlanDeparts | ActiveStep | Misled | Difference
-FINDINGS: dict[str, type[Any]] = {kind.__name__: kind for kind in get_args(Finding)}
 
 
 class MendedEpisode(NamedTuple):
@@ -175,8 +75,6 @@ class Failure:
     @property
     def why(self) -> str:
         """The failure in a few English sentences."""
-        from lw_torchrl.evaluation.diagnose.sentences import explain_failure
-
         return explain_failure(self)
 
     def to_json(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from torch import nn
 from torchrl.envs import RenameTransform
 
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.diagnose.failure import Difference, Misled
+from lw_torchrl.evaluation.diagnose.findings import Difference, Misled
 from lw_torchrl.evaluation.rollout import rollout
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import Task, task_id

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from lw_torchrl.evaluation.diagnose.failure import (
+from typing import TYPE_CHECKING
+
+from lw_torchrl.evaluation.diagnose.findings import (
     REPLACEMENTS,
     ActiveStep,
     Difference,
-    Failure,
     Finding,
     Misled,
     NoCondition,
     PlanDeparts,
     WrongAnswers,
 )
+
+if TYPE_CHECKING:
+    from lw_torchrl.evaluation.diagnose.failure import Failure
 
 _TEXTS = {
     "perception": ("the true observations", "the observations"),

@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from lw_torchrl.evaluation.diagnose.failure import ActiveStep, Cause, Finding, NoCondition, PlanDeparts, WrongAnswers
+from lw_torchrl.evaluation.diagnose.findings import ActiveStep, Cause, Finding, NoCondition, PlanDeparts, WrongAnswers
 from lw_torchrl.evaluation.diagnose.scripts import Scripts, attended
 from lw_torchrl.evaluation.plan_use import where_stuck
 from lw_torchrl.language.layout import METAWORLD, Layout
