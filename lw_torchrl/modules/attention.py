@@ -14,6 +14,7 @@ from lw_torchrl._checks import checked
 from lw_torchrl._keys import dispatched, key_beside, read, write
 from lw_torchrl.language.task_index import PlanTables, as_plans, one_per_row, pick
 from lw_torchrl.language.value_checks import check_values
+from lw_torchrl.modules.networks import in_mode_of
 from lw_torchrl.modules.sequence import Part
 
 if TYPE_CHECKING:
@@ -105,11 +106,16 @@ class PlanAttention(Part):
         """The keys of the conditions' truth and of the task."""
         return self.in_keys[0], self.in_keys[1]
 
+    @property
+    def turn_key(self) -> NestedKey | None:
+        """The key of the turn; None for plans without fallback steps."""
+        return self.in_keys[2] if self.has_fallback else None
+
     def with_plans(self, plans: AnyPlans) -> PlanAttention:
         """Return the attention over other plans' steps."""
         other = PlanAttention(plans, out_keys=self.out_keys_source)
-        other.in_keys = [*self.in_keys[:2], *other.in_keys[2:]]
-        return other.to(self.mask.device).train(self.training)
+        other.in_keys = [*self.in_keys, *other.in_keys[len(self.in_keys) :]][: len(other.in_keys)]
+        return in_mode_of(self, other.to(self.mask.device))
 
     def weights(self, qaf: Tensor, rows: Tensor, turn: Tensor | None = None) -> Tensor:
         """Return the attention (..., S) float32 for truth (..., S), table rows (...) int64 and turns (...) int64."""

@@ -18,7 +18,7 @@ from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import MLP, materialize
 from lw_torchrl.modules.plan_conditioned_actor import plan_trunk
 from lw_torchrl.modules.policy import layout_of, plans_of
-from lw_torchrl.modules.sequence import RenamedInputs, encoding_width
+from lw_torchrl.modules.sequence import RenamedInputs, encoding_keys, encoding_width
 
 
 class Value(RenamedInputs):
@@ -80,7 +80,7 @@ class Value(RenamedInputs):
 
     def _inputs(self, tensordict: TensorDictBase) -> Tensor:
         seen = self.trunk(tensordict.copy())
-        return torch.cat([seen.get(key) for key in self.trunk.out_keys[-2:]], -1)
+        return torch.cat([seen.get(key) for key in encoding_keys(self.trunk)], -1)
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

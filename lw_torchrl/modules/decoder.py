@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from lw_torchrl._checks import check_scale, checked
 from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.modules.networks import MLP, evaluating, materialize
-from lw_torchrl.modules.sequence import Part, encoding_width, trunk_attributes
+from lw_torchrl.modules.sequence import Part, encoding_keys, encoding_width, trunk_attributes
 
 LEAST_STD = 1e-3
 
@@ -42,7 +42,12 @@ class MLPDecoder(MLP):
     ) -> None:
         super().__init__(actions, width=width, depth=depth)
         self.actions, self.squash = actions, squash
-        self.config: dict[str, Any] = {"width": width, "depth": depth, "actions": actions, "squash": squash}
+        self._sizes: dict[str, Any] = {"width": width, "depth": depth, "actions": actions}
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        return {**self._sizes, "squash": self.squash}
 
     def forward(self, *inputs: Tensor) -> Tensor:
         action = super().forward(*inputs)
@@ -61,7 +66,8 @@ class GaussianDecoder(MLP):
         >>> import lw_torchrl as lw
         >>> from torchrl.modules import ProbabilisticActor, TanhNormal
         >>> decoder = lw.modules.GaussianDecoder(init_std=0.2)
-        >>> trunk = lw.PlanConditionedActor(lw.load_plans("MT10"), decoder=decoder, out_keys=["loc", "scale"])
+        >>> parts = {"features": lw.modules.ObservationFeatures(), "decoder": decoder}  # no noise in the likelihoods
+        >>> trunk = lw.PlanConditionedActor(lw.load_plans("MT10"), **parts, out_keys=["loc", "scale"])
         >>> policy = ProbabilisticActor(trunk, in_keys=["loc", "scale"], distribution_class=TanhNormal)
 
     Source: ``torchrl.modules.NormalParamExtractor``, with softplus.
@@ -81,9 +87,13 @@ class GaussianDecoder(MLP):
             raise ValueError(f"init_std must be above {LEAST_STD}, got {init_std}")
         super().__init__(2 * actions, width=width, depth=depth)
         self.actions, self.squash = actions, squash
-        options = {"width": width, "depth": depth, "actions": actions, "squash": squash}
-        self.config: dict[str, Any] = {**options, "init_std": init_std}
+        self._sizes: dict[str, Any] = {"width": width, "depth": depth, "actions": actions, "init_std": init_std}
         self._offset = math.log(math.expm1(init_std - LEAST_STD)) if init_std < 20 else init_std
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        return {**self._sizes, "squash": self.squash}
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         loc, scale = super().forward(*inputs).chunk(2, -1)
@@ -143,7 +153,7 @@ def as_decoder(
         if out_keys is not None and list(out_keys) != list(decoder.out_keys_source):
             raise ValueError(f"out_keys: a TensorDict module has its own, {decoder.out_keys_source}; got {out_keys}")
         return decoder
-    decode = Decode(decoder, in_keys=trunk.out_keys_source[-2:], out_keys=("action",) if out_keys is None else out_keys)
+    decode = Decode(decoder, in_keys=encoding_keys(trunk), out_keys=("action",) if out_keys is None else out_keys)
     if width is not None and len(decode.out_keys) == 1:
         with torch.no_grad(), evaluating(decoder), torch.random.fork_rng(devices=[]):
             device = next((p.device for p in decoder.parameters()), None)

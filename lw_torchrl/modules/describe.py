@@ -22,11 +22,11 @@ _NETWORKS: dict[type[nn.Module], tuple[str, ...]] = {
     nn.Linear: ("in_features", "out_features"),
     nn.ReLU: (),
     nn.Tanh: (),
-    nn.GELU: (),
+    nn.GELU: ("approximate",),
     nn.SiLU: (),
     nn.ELU: ("alpha",),
     nn.Dropout: ("p",),
-    nn.LayerNorm: ("normalized_shape",),
+    nn.LayerNorm: ("normalized_shape", "eps", "elementwise_affine"),
 }
 """PyTorch's own modules that need no ``config``, and the arguments that rebuild them."""
 _TENSORDICT = {kind.__name__: kind for kind in (TensorDictSequential, TensorDictModule)}
@@ -56,11 +56,15 @@ def _encode_module(module: nn.Module, plans: list[Plans], path: str) -> dict[str
     kind = type(module)
     if kind in (TensorDictSequential, nn.Sequential):
         parts: Any = module.module if kind is TensorDictSequential else module
-        named = isinstance(parts, nn.ModuleDict)
-        children = [(name, _encode_module(part, plans, _join(path, name))) for name, part in parts.named_children()]
+        named = isinstance(parts, nn.ModuleDict) or [*parts._modules] != [str(n) for n in range(len(parts))]
+        children = [(name, _encode_module(part, plans, _join(path, name))) for name, part in parts._modules.items()]
         return {"class": kind.__name__, "parts": dict(children) if named else [node for _, node in children]}
     if kind is TensorDictModule:
         wrapped: Any = module
+        if wrapped._kwargs is not None or wrapped.method or wrapped.method_kwargs:
+            raise TypeError(
+                f"{path or 'the policy'} is a TensorDictModule with method= or keyword arguments; wrap them"
+            )
         inner = _encode_module(wrapped.module, plans, path)
         keys = {"in_keys": list(wrapped.in_keys), "out_keys": list(wrapped.out_keys_source)}
         return {"class": "TensorDictModule", "options": {"module": {"module": inner}, **keys}}
@@ -154,7 +158,8 @@ class _Decoder:
         name, parts = node["class"], node.get("parts")
         if name in ("TensorDictSequential", "Sequential"):
             if isinstance(parts, Mapping):
-                return TensorDictSequential(OrderedDict((key, self.module(part)) for key, part in parts.items()))
+                named = OrderedDict((key, self.module(part)) for key, part in parts.items())
+                return (TensorDictSequential if name in _TENSORDICT else nn.Sequential)(named)
             if not isinstance(parts, list):
                 raise ValueError(f"parts of a {name} must be a list or a table, got {shown(parts)}")
             return (TensorDictSequential if name in _TENSORDICT else nn.Sequential)(*map(self.module, parts))
@@ -165,7 +170,7 @@ class _Decoder:
         for key in {*_KEYS} & {*options}:  # JSON has no tuples
             options[key] = [tuple(each) if isinstance(each, list) else each for each in options[key]]
         rebuild: Callable[..., Any] = getattr(kind, "rebuild", kind)
-        if "text_encoder" in signature(rebuild).parameters:
+        if "text_encoder" in signature(rebuild).parameters and "text_encoder" not in options:
             options["text_encoder"] = self.text_encoder
         several = [value for key, values in options.items() if key.startswith("*") for value in values]
         return rebuild(*several, **{key: value for key, value in options.items() if not key.startswith("*")})

@@ -17,7 +17,8 @@ from lw_torchrl._checks import check_choice, check_scale, checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
 from lw_torchrl.language.task_index import as_plans
 from lw_torchrl.language.value_checks import check_finite
-from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.networks import evaluating, in_mode_of
+from lw_torchrl.modules.sequence import written_key
 
 if TYPE_CHECKING:
     from lw_torchrl.language.layout import Layout
@@ -134,7 +135,7 @@ class ObservationFeatures(Features):
             )
         other = ObservationFeatures(**{**self.config, "layout": layout})
         other.mean, other.std = self.mean, self.std
-        return other.train(self.training)
+        return in_mode_of(self, other)
 
     def _select(self, observation: Tensor) -> Tensor:
         check_observation(observation, self.layout)
@@ -209,11 +210,11 @@ class Concat(TensorDictModuleBase):
     def with_plans(self, plans: AnyPlans) -> Concat:
         """Return the same features for other plans."""
         parts = [part.with_plans(plans) if hasattr(part, "with_plans") else part for part in self.parts]
-        return Concat(*parts, out_keys=self.out_keys_source).train(self.training)
+        return in_mode_of(self, Concat(*parts, out_keys=self.out_keys_source))
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        seen = [part(tensordict.copy()).get(part.out_keys[0]) for part in self.parts]
+        seen = [part(tensordict.copy()).get(written_key(part)) for part in self.parts]
         return write(tensordict, self, [torch.cat(seen, -1)])
 
 

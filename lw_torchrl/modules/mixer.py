@@ -14,7 +14,7 @@ from lw_torchrl._checks import check_int, checked
 from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.task_index import PlanTables, as_plans, one_per_row, pick
 from lw_torchrl.language.text import TextEncoder, encoded
-from lw_torchrl.modules.networks import MLP, evaluating, materialize
+from lw_torchrl.modules.networks import MLP, evaluating, in_mode_of, materialize
 from lw_torchrl.modules.sequence import Part
 
 if TYPE_CHECKING:
@@ -63,6 +63,8 @@ class _Mixer(Part):
         self.register_buffer("vectors", unit_scale(vectors), persistent=False)  # (K, E) float32
         self.encoder = SkillEncoder() if encoder is None else encoder
         materialize(self.encoder, self.vectors)
+        if (weight := next(self.encoder.parameters(), None)) is not None:  # with_plans: an encoder that was moved
+            self.index, self.vectors = self.index.to(weight.device), self.vectors.to(weight)
         with torch.no_grad(), evaluating(self.encoder):
             self.latent_size = self.latents().shape[-1]
 
@@ -74,7 +76,7 @@ class _Mixer(Part):
     def with_plans(self, plans: AnyPlans) -> Self:
         """Return a mixer of other plans' skills with the same networks: training either trains both."""
         other = type(self)(**{**self.config, "plans": plans, "text_encoder": self.text_encoder})
-        return other.to(self.index.device).train(self.training)
+        return in_mode_of(self, other.to(self.index.device))
 
     def latents(self) -> Tensor:
         """Return the latent of each different skill, (K, D)."""

@@ -56,6 +56,12 @@ def evaluating(network: nn.Module) -> Iterator[None]:
             module.training = mode
 
 
+def in_mode_of(own: nn.Module, other: Module) -> Module:
+    """Return the other module in train or eval mode as ``own`` is; the modules that both share keep their modes."""
+    other.training = own.training
+    return other
+
+
 def with_weights_of(own: nn.Module, other: Module) -> Module:
     """Return the other, fresh module on the weights and saved buffers of ``own``: training either trains both."""
     other.load_state_dict(own.state_dict())

@@ -18,7 +18,8 @@ from lw_torchrl.modules.attention import PlanAttention
 from lw_torchrl.modules.decoder import MLPDecoder, as_decoder
 from lw_torchrl.modules.features import as_features
 from lw_torchrl.modules.mixer import SkillMixer
-from lw_torchrl.modules.sequence import NamedParts, action_spec, trunk_attributes
+from lw_torchrl.modules.networks import in_mode_of
+from lw_torchrl.modules.sequence import NamedParts, action_spec, check_same_plans, trunk_attributes
 
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import AnyPlans
@@ -75,6 +76,7 @@ class ConditionedActor(NamedParts):
         plans, tasks, layout = trunk_attributes(trunk).values()
         decoder = MLPDecoder(actions=layout.action_size) if decoder is None else decoder
         super().__init__(OrderedDict(**trunk.module, decoder=as_decoder(decoder, trunk, out_keys)))
+        check_same_plans(dict(self.module.items()))
         self.plans, self.tasks, self.layout = plans, tasks, layout
         if in_keys is not None:
             self.in_keys = in_keys
@@ -112,7 +114,7 @@ class ConditionedActor(NamedParts):
         """Return an actor with the same networks that follows other plans: training either trains both."""
         parts = {n: part.with_plans(plans) if hasattr(part, "with_plans") else part for n, part in self.module.items()}
         decoder = parts.pop("decoder")
-        return self.rebuild(TensorDictSequential(OrderedDict(parts)), decoder).train(self.training)
+        return in_mode_of(self, self.rebuild(TensorDictSequential(OrderedDict(parts)), decoder))
 
     def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> StochasticActor:
         """Return a copy that draws its actions, for RL, see :class:`~lw_torchrl.modules.StochasticActor`."""

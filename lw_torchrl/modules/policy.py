@@ -63,7 +63,7 @@ def with_plans(actor: Any, plans: AnyPlans) -> Any:
     if type(actor) is not TensorDictSequential:
         raise TypeError(f"{type(actor).__name__} cannot follow other plans: give it a method with_plans(plans)")
     named = isinstance(actor.module, nn.ModuleDict)
-    parts = [(n, with_plans(p, plans) if plans_of(p) is not None else p) for n, p in actor.module.named_children()]
+    parts = [(n, with_plans(p, plans) if plans_of(p) is not None else p) for n, p in actor.module._modules.items()]
     made = TensorDictSequential(OrderedDict(parts)) if named else TensorDictSequential(*(part for _, part in parts))
     return made.train(actor.training)
 
@@ -86,8 +86,8 @@ def transform_of(actor: Any, plans: Plans | None = None) -> Transform | None:
     answered = plans or (own if qaf in reads else None)
     if answered is not None:
         parts.insert(0, QAFTransform(answered, in_keys=[observation, task_id], out_keys=[qaf]))
-    if own is not None and "turn" in reads:
-        parts.append(FallbackTurns(own.layout, in_keys=[observation]))
+    if own is not None and (turn := _first(actor, "turn_key")) in reads:
+        parts.append(FallbackTurns(own.layout, in_keys=[observation], out_keys=[turn]))
     if not parts:
         return None
     return parts[0] if len(parts) == 1 else Compose(*parts)

@@ -13,8 +13,9 @@ from torch import Tensor, nn
 from torchrl.envs import Transform
 
 from lw_torchrl._checks import check_choice, checked
-from lw_torchrl._keys import dispatched, read, write
+from lw_torchrl._keys import dispatched, key_beside, read, write
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
+from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import with_weights_of
 
@@ -58,6 +59,7 @@ class QueryEvaluator(TensorDictModuleBase):
         super().__init__()
         self.plans, self.tasks, self.layout = plans, tuple(plans), plans.layout
         self.config, self.answers = {}, answers
+        self.plan_tables = PlanTables(plans)
         self.in_keys: list[NestedKey] = ["observation", "task_id"]
         self.out_keys: list[NestedKey] = ["qaf", "qaf_logits"]
 
@@ -107,6 +109,9 @@ class QueryEvaluator(TensorDictModuleBase):
         qaf = logits.sigmoid()
         if self.answers == "hard":
             qaf = (logits > 0).to(qaf.dtype) + (qaf - qaf.detach())
+        rows = self.plan_tables.rows(tensordict.get("task_id")) if "task_id" in self.in_keys else None
+        if rows is not None:  # an actor of other plans then refuses the answers, as QAFTransform's
+            tensordict.set(key_beside(self.out_keys_source[0], "_plan"), self.plan_tables.number.to(rows.device)[rows])
         return write(tensordict, self, [qaf, logits])
 
     def transform(self) -> Transform | None:

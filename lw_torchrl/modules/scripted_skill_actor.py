@@ -17,6 +17,7 @@ from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.modules.attention import check_truth, read_truth
+from lw_torchrl.modules.networks import in_mode_of
 from lw_torchrl.modules.sequence import Part
 
 
@@ -95,7 +96,7 @@ class ScriptedSkillActor(Part):
     def with_plans(self, plans: AnyPlans) -> ScriptedSkillActor:
         """Return the same skills under other plans."""
         options = {**super().config, "plans": plans, "skills": self._skills}
-        return ScriptedSkillActor(**options).train(self.training)
+        return in_mode_of(self, ScriptedSkillActor(**options))
 
     def skill_weights(self, tensordict: TensorDictBase) -> Tensor:
         """Return the weight of each step, (B, S) float32."""

@@ -74,8 +74,23 @@ def _reading(module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[A
     return copies[module]
 
 
+def _in_sequence(
+    sequence: TensorDictSequential, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any]
+) -> nn.Module:
+    """Return a sequence's parts, which read renamed keys unless an earlier part writes them."""
+    container: Any = copy.copy(sequence.module)
+    container.__dict__["_modules"] = {}
+    for name, part in sequence.module._modules.items():
+        container._modules[name] = _reading(part, renamed, copies)
+        renamed = {key: new for key, new in renamed.items() if key not in part.out_keys}
+    return container
+
+
 def _parts_reading(module: nn.Module, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any]) -> dict[str, Any]:
-    parts = {name: _reading(part, renamed, copies) for name, part in module._modules.items()}
+    if isinstance(module, TensorDictSequential):
+        parts: dict[str, Any] = {"module": _in_sequence(module, renamed, copies)}
+    else:
+        parts = {name: _reading(part, renamed, copies) for name, part in module._modules.items()}
     hidden = {n: part for n, part in vars(module).items() if isinstance(part, TensorDictModuleBase)}  # _det_part
     return {"_modules": parts, **{name: _reading(part, renamed, copies) for name, part in hidden.items()}}
 
@@ -89,9 +104,13 @@ class NamedParts(RenamedInputs, TensorDictSequential):
 
     def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
         """Return a module as the part ``name``: a plain module reads and writes the keys of the part before it."""
-        if isinstance(module, TensorDictModuleBase):
-            return module
         before = self.module[name]
+        if isinstance(module, TensorDictModuleBase):
+            if missing := [key for key in before.out_keys_source if key not in module.out_keys_source]:
+                raise ValueError(
+                    f"{name} must write {before.out_keys_source}, which later parts read; it lacks {missing}"
+                )
+            return module
         return TensorDictModule(module, in_keys=before.in_keys[:1], out_keys=before.out_keys)
 
     def __getattr__(self, name: str) -> Any:
@@ -108,7 +127,11 @@ class NamedParts(RenamedInputs, TensorDictSequential):
             return
         if not isinstance(value, nn.Module):
             raise TypeError(f"{name} must be a module, got {value!r:.80}")
-        parts[name] = self.as_part(name, value)
+        part = self.as_part(name, value)
+        check_same_plans({**parts, name: part})
+        parts[name] = part
+        about = trunk_attributes(self)
+        self.plans, self.tasks, self.layout = about["plans"], about["tasks"], about["layout"]
         self._update_keys()
 
     @property
@@ -137,16 +160,53 @@ def action_spec(key: NestedKey, layout: Layout) -> Composite:
     return spec
 
 
+def _named_parts(trunk: TensorDictSequential) -> list[Any]:
+    if not isinstance(trunk.module, nn.ModuleDict) or len(trunk.module) < 2:
+        raise ValueError(
+            "trunk must have at least two named parts: TensorDictSequential(OrderedDict(attention=..., ...))"
+        )
+    return list(trunk.module.values())
+
+
 def trunk_attributes(trunk: TensorDictSequential) -> dict[str, Any]:
     """Return the ``plans``, ``tasks`` and ``layout`` of a trunk's first part that has them; plans may be None."""
-    part = next((part for part in trunk.module.values() if hasattr(part, "layout")), None)
+    part = next((part for part in _named_parts(trunk) if hasattr(part, "layout")), None)
     if part is None:
         raise ValueError("trunk must have a part with a layout: PlanAttention, SkillMixer, TaskLatent or features")
     return {name: getattr(part, name, None) for name in ("plans", "tasks", "layout")}
 
 
+def check_same_plans(parts: Mapping[str, nn.Module]) -> None:
+    """Raise :class:`ValueError` unless all parts follow the same plans."""
+    known = {name: plans for name, part in parts.items() if (plans := getattr(part, "plans", None)) is not None}
+    for name, part in parts.items():  # parts of parts: features that are concatenated
+        inner = (plans for each in part.modules() if (plans := getattr(each, "plans", None)) is not None)
+        known.setdefault(name, next(inner, None))
+    plans = {name: each for name, each in known.items() if each is not None}
+    first = next(iter(plans), "")
+    for name, each in plans.items():
+        if each is not plans[first] and each != plans[first]:
+            raise ValueError(f"{first} and {name} must follow the same plans; give both the same Plans")
+
+
 def encoding_width(trunk: TensorDictSequential) -> int | None:
     """Return D + F, how many numbers the trunk's latent and features are; None if its parts do not state it."""
-    latent, features = [*trunk.module.values()][-2:]
+    latent, features = _named_parts(trunk)[-2:]
     size, width = getattr(latent, "latent_size", None), getattr(features, "width", None)
     return None if size is None or width is None else size + width
+
+
+def encoding_keys(trunk: TensorDictSequential) -> list[NestedKey]:
+    """Return the keys of the trunk's latent and of its features, one for each of its last two parts."""
+    return [written_key(part) for part in _named_parts(trunk)[-2:]]
+
+
+def written_key(part: TensorDictModuleBase) -> NestedKey:
+    """Return the one key that a part writes, or of several the one that is named ``features``."""
+    keys: list[NestedKey] = list(part.out_keys_source)
+    named = [key for key in keys if (key if isinstance(key, str) else key[-1]) == "features"]
+    if len(keys) > 1 and len(named) != 1:
+        raise ValueError(
+            f"features must write one key, or one of them named 'features'; {type(part).__name__} writes {keys}"
+        )
+    return named[0] if len(keys) > 1 else keys[0]

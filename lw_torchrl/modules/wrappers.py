@@ -17,6 +17,7 @@ from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.descriptor_conditioned_actor import TaskLatent
+from lw_torchrl.modules.networks import in_mode_of
 from lw_torchrl.modules.policy import layout_of, plans_of, tasks_of, with_plans
 from lw_torchrl.modules.sequence import RenamedInputs
 
@@ -74,7 +75,7 @@ class ActorEnsemble(RenamedInputs):
 
     def with_plans(self, plans: AnyPlans) -> ActorEnsemble:
         """Return the ensemble with the same networks that follows other plans."""
-        return ActorEnsemble([with_plans(member, plans) for member in self.members]).train(self.training)
+        return in_mode_of(self, ActorEnsemble([with_plans(member, plans) for member in self.members]))
 
 
 class _Wrapper(RenamedInputs):
@@ -135,7 +136,7 @@ class DecidedGripper(_Wrapper):
     def with_plans(self, plans: AnyPlans) -> DecidedGripper:
         """Return the policy with the same networks that follows other plans."""
         actor = with_plans(self.actor, plans)
-        return DecidedGripper(actor, self.closes_above, self.action_layout).train(self.training)
+        return in_mode_of(self, DecidedGripper(actor, self.closes_above, self.action_layout))
 
 
 def decided(action: Tensor, layout: Layout, closes_above: float | None = None) -> Tensor:
@@ -210,7 +211,7 @@ class DemonstratedActor(RenamedInputs):
         others: TensorDictModuleBase = with_plans(self.others, plans)
         if layout_of(others) != self.layout:  # no task of which was demonstrated
             return others
-        return DemonstratedActor(self.demonstrated, others).train(self.training)
+        return in_mode_of(self, DemonstratedActor(self.demonstrated, others))
 
 
 class TransferredActor(_Wrapper):
@@ -276,7 +277,7 @@ class TransferredActor(_Wrapper):
     def with_plans(self, plans: AnyPlans) -> TransferredActor:
         """Return the policy with the same networks that follows other plans."""
         actor = with_plans(self.actor, plans)
-        return TransferredActor(actor, plans, speed=self.speed, trained=self.trained).train(self.training)
+        return in_mode_of(self, TransferredActor(actor, plans, speed=self.speed, trained=self.trained))
 
 
 def _action(actor: TensorDictModuleBase) -> NestedKey:

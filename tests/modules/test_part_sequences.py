@@ -1,0 +1,124 @@
+"""Sequences of parts: renamed keys, the plans of all parts, and modules that are shared."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+
+import lw_torchrl as lw
+from lw_torchrl.modules import (
+    ActorEnsemble,
+    Concat,
+    FocusFeatures,
+    PlanAttention,
+    SkillMixer,
+    Value,
+    describe,
+    from_description,
+    plan_trunk,
+    transform_of,
+)
+
+PLANS = lw.load_plans("MT10")
+REVERSED = lw.Plans(
+    [lw.ConditionalPlan(plan.task, tuple(reversed(plan.steps)), plan.definition) for plan in PLANS.values()]
+)
+IDS = torch.tensor([lw.task_id("push"), lw.task_id("reach")])
+
+
+def inputs(qaf=None):
+    truth = torch.zeros(2, PLANS.num_steps) if qaf is None else qaf
+    return {"qaf": truth, "task_id": IDS, "observation": torch.linspace(0, 1, 78).reshape(2, 39)}
+
+
+def two_keys():
+    scaled = TensorDictModule(nn.LayerNorm(39), ["observation"], ["scaled"])
+    return TensorDictSequential(scaled, TensorDictModule(nn.Linear(39, 16), ["scaled"], ["features"]))
+
+
+def test_features_that_write_more_than_one_key_leave_the_latent_in_its_place():
+    actor = lw.PlanConditionedActor(PLANS, features=two_keys())
+    assert actor.decoder.in_keys == ["skill_latent", "features"]
+    true = torch.zeros(2, PLANS.num_steps)
+    true[:, 1] = 1.0
+    assert not torch.equal(actor(**inputs())[-1], actor(**inputs(true))[-1])
+    value = Value(plan_trunk(PLANS, features=two_keys()))
+    assert not torch.equal(value(**inputs()), value(**inputs(true)))
+    assert Concat(two_keys()).eval()(observation=torch.zeros(2, 39)).shape == (2, 16)
+
+
+def test_parts_of_other_plans_are_refused():
+    with pytest.raises(ValueError, match="attention and features must follow the same plans"):
+        lw.PlanConditionedActor(PLANS, features=FocusFeatures(REVERSED))
+    actor = lw.PlanConditionedActor(PLANS)
+    with pytest.raises(ValueError, match="attention and mixer must follow the same plans"):
+        actor.mixer = SkillMixer(REVERSED)
+    policy = TensorDictSequential(lw.StateQueryEvaluator(REVERSED), lw.PlanConditionedActor(PLANS))
+    with pytest.raises(ValueError, match="qaf answers other plans"):
+        policy(observation=torch.zeros(2, 39), task_id=IDS)
+
+
+def test_an_evaluator_answers_instead_of_the_environment_of_other_plans():
+    canonical = lw.canonical_plans(PLANS)
+    policy = TensorDictSequential(lw.StateQueryEvaluator(canonical), lw.PlanConditionedActor(canonical))
+    rows = lw.QAFTransform(PLANS)(lw.LanguageWorldEnv(["push", "reach"]).reset())
+    assert policy(rows)["action"].shape == (2, 4)
+
+
+def test_a_renamed_turn_is_followed():
+    plans = lw.canonical_plans(PLANS, fallback=True)
+    actor = lw.PlanConditionedActor(plans, in_keys=["qaf", "task_id", "my_turn", "observation"])
+    assert "my_turn" in transform_of(actor)[1].out_keys
+    assert actor.with_plans(plans).in_keys == actor.in_keys
+
+
+def test_renaming_an_ensembles_keys_leaves_what_a_member_writes_itself():
+    member = TensorDictSequential(lw.StateQueryEvaluator(PLANS), lw.PlanConditionedActor(PLANS))
+    ensemble = ActorEnsemble([member, lw.PlanConditionedActor(PLANS)])
+    names = {"qaf": "truth"}
+    ensemble.in_keys = [names.get(key, key) for key in ensemble.in_keys]
+    assert ensemble.members[0][1].in_keys[0] == "qaf"
+    assert ensemble.members[1].in_keys[0] == "truth"
+
+
+def test_with_plans_follows_a_moved_actor_and_leaves_the_modes_of_shared_modules():
+    actor = lw.PlanConditionedActor(PLANS).double().train()
+    actor.decoder.eval()
+    other = actor.with_plans(REVERSED)
+    assert other.training
+    assert not actor.decoder.training
+    observation = torch.zeros(2, 39, dtype=torch.float64)
+    assert other(**{**inputs(), "observation": observation})[-1].dtype == torch.float64
+
+
+def test_a_part_must_write_what_the_next_ones_read():
+    actor = lw.PlanConditionedActor(PLANS)
+    with pytest.raises(ValueError, match=r"features must write .*, which later parts read"):
+        actor.features = TensorDictModule(nn.Linear(39, 56), ["observation"], ["seen"])
+    with pytest.raises(ValueError, match="trunk must have at least two named parts"):
+        Value(TensorDictSequential(PlanAttention(PLANS), SkillMixer(PLANS)))
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        nn.Sequential(nn.Linear(120, 8), nn.LayerNorm(8, eps=0.1), nn.GELU(approximate="tanh"), nn.Linear(8, 4)),
+        nn.Sequential(nn.Linear(120, 8), nn.LayerNorm(8, elementwise_affine=False), nn.Linear(8, 4)),
+        nn.Sequential(OrderedDict(a=nn.Linear(120, 4), b=(tanh := nn.Tanh()), c=nn.Linear(4, 4), d=tanh)),
+    ],
+)
+def test_a_network_of_pytorchs_modules_is_described_with_what_it_computes(network):
+    actor = lw.PlanConditionedActor(PLANS, decoder=network).eval()
+    again = from_description(describe(actor))
+    again.load_state_dict(actor.state_dict())
+    assert torch.equal(again.eval()(**inputs())[-1], actor(**inputs())[-1])
+
+
+def test_a_setting_that_was_changed_later_is_described():
+    actor = lw.PlanConditionedActor(PLANS)
+    actor.decoder.network.squash = False
+    assert from_description(describe(actor)).decoder.network.squash is False
