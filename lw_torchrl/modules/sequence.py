@@ -162,9 +162,7 @@ def action_spec(key: NestedKey, layout: Layout) -> Composite:
 
 def _named_parts(trunk: TensorDictSequential) -> list[Any]:
     if not isinstance(trunk.module, nn.ModuleDict) or len(trunk.module) < 2:
-        raise ValueError(
-            "trunk must have at least two named parts: TensorDictSequential(OrderedDict(attention=..., ...))"
-        )
+        raise ValueError("trunk must have at least two named parts: TensorDictSequential(OrderedDict(mixer=..., ...))")
     return list(trunk.module.values())
 
 
