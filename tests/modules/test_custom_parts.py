@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from my_parts import Closest, Gated, Pictures, Projection
+from users_parts import Closest, Gated, Pictures, Projection
 from small_actors import action_of, letters, make_actor, make_rows
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -47,7 +47,7 @@ PROGRAM = """
 import sys
 import torch
 import lw_torchrl as lw
-from my_parts import Closest, Gated, Pictures, Projection
+from users_parts import Closest, Gated, Pictures, Projection
 from small_actors import letters
 from tensordict import load_memmap
 
@@ -127,7 +127,7 @@ def test_an_assigned_part_is_saved_or_refused(tmp_path):
     lw.save_actor(actor, path)
     assert torch.equal(action_of(lw.load_actor(path), rows), action_of(actor, rows))
     actor.decoder = MLPDecoder(width=4)
-    actor.decoder.network.config["width"] = 5  # a config that is not the network's
+    actor.decoder.network._sizes["width"] = 5  # a config that is not the network's
     with pytest.raises(ValueError, match="its description does not rebuild it"):
         lw.save_actor(actor, path)
 
@@ -135,21 +135,21 @@ def test_an_assigned_part_is_saved_or_refused(tmp_path):
 def test_no_module_is_imported_because_a_file_names_it(tmp_path, monkeypatch):
     path = tmp_path / "policy.safetensors"
     lw.save_actor(make("decoder"), path)
-    monkeypatch.delitem(sys.modules, "my_parts")
-    message = r"the class 'my_parts:Gated' is not known here: import my_parts first.*--import my_parts.*parts=\[Gated\]"
+    monkeypatch.delitem(sys.modules, "users_parts")
+    message = r"the class 'users_parts:Gated' is not known here: import users_parts first.*--import users_parts.*parts=\[Gated\]"
     with pytest.raises(ValueError, match=message):
         lw.load_actor(path)
-    assert "my_parts" not in sys.modules
+    assert "users_parts" not in sys.modules
     rows = make_rows(4)
     assert type(lw.load_actor(path, parts=[Gated]).decoder.network) is Gated
     assert action_of(lw.load_actor(path, parts=[Gated]), rows).shape == (4, 4)
 
 
 def test_all_unknown_classes_are_named_at_once(tmp_path, monkeypatch):
-    path, names = tmp_path / "policy.safetensors", r"'my_parts:\w+', 'my_parts:\w+'"
+    path, names = tmp_path / "policy.safetensors", r"'users_parts:\w+', 'users_parts:\w+'"
     lw.save_actor(make_actor(features=Pictures(), decoder=Gated(6)), path)
-    monkeypatch.delitem(sys.modules, "my_parts")
-    message = rf"the classes {names} are not known here: import my_parts first.*parts=\[Pictures, Gated\]"
+    monkeypatch.delitem(sys.modules, "users_parts")
+    message = rf"the classes {names} are not known here: import users_parts first.*parts=\[Pictures, Gated\]"
     with pytest.raises(ValueError, match=message):
         lw.load_actor(path)
     assert type(lw.load_actor(path, parts=[Pictures, Gated]).decoder.network) is Gated
