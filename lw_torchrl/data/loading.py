@@ -248,7 +248,8 @@ def load_demonstrations(
             ``LanguageWorldEnv(terminate_on_success=True)`` does; with label="executed".
         n_steps, gamma: look N steps ahead with this discount, as :func:`n_step_returns`; with label="executed".
         keys: the columns to load; "rollout" for those that rollouts of :class:`LanguageWorldEnv` have too, so that
-            TorchRL's ``OfflineToOnlineReplayBuffer`` can join both; None for all.
+            TorchRL's ``OfflineToOnlineReplayBuffer`` can join them with ``rollout.select(*sample.keys(True, True))``;
+            None for all.
         device: memory to copy the rows to: "cuda", "mps" or "auto"; None to leave them where they are.
         check: compare the episodes with their checksums, once in a process while the files stay the same. It takes one
             to three seconds a gigabyte.

@@ -301,7 +301,8 @@ class TaskBalancedSampler(GroupSampler):
     It works in any :class:`torchrl.data.ReplayBuffer`. The buffer may grow: a new row takes a random place in the rest
     of its task's pass, and an overwritten one leaves it. When a task comes or goes, all passes begin again. The sampler
     draws from the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches; its state is
-    saved with the buffer's. An epoch is a pass over the largest task.
+    saved with the buffer's. An epoch is a pass over the largest task. TorchRL does not report ``replay[i] = rows`` to
+    samplers: add rows of other tasks by ``extend``.
 
     Args:
         task_key: the entry of the storage that holds the task: one number a row, of any shape.

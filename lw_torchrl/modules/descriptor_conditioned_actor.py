@@ -87,8 +87,16 @@ class TaskLatent(Part):
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         (given,) = read(tensordict, self.in_keys)
-        rows = self.index.rows(given, "tasks this actor was not made for")
+        rows = self.index.rows(_one_per_row(given, tensordict), "tasks this actor was not made for")
         return write(tensordict, self, [pick(self.encoder(self.vectors)[: len(self.tasks)], rows)])
+
+
+def _one_per_row(task_id: Tensor, tensordict: TensorDictBase) -> Tensor:
+    """Return task ids (...) also if they are (..., 1): the batch's dimensions, or those of all entries, tell which."""
+    if task_id.shape[-1:] != (1,) or task_id.dim() <= tensordict.batch_dims:
+        return task_id
+    shapes = [value.shape[: task_id.dim()] for value in tensordict.values(True, True)]
+    return task_id if all(shape == task_id.shape for shape in shapes) else task_id.squeeze(-1)
 
 
 class DescriptorConditionedActor(ConditionedActor):

@@ -147,11 +147,13 @@ class ObservationFeatures(Features):
         """Take mean and standard deviation from the rows; a feature that hardly varies keeps its scale."""
         (observation,) = read(rows, self.in_keys)
         found = self._select(observation.reshape(-1, self.layout.size))
+        check_rows(found)
         if not found.shape[-1]:
             return  # PyTorch warns of the deviation of nothing
         if weights is None:
             mean, std = found.mean(0), found.std(0, unbiased=False)
         else:
+            weights = weights.to(found)
             mean = weights @ found
             std = (weights @ (found - mean).square()).sqrt()
         self.mean.copy_(mean)
@@ -237,6 +239,12 @@ def check_observation(observation: Tensor, layout: Layout) -> None:
     if observation.shape[-1:] != (layout.size,) or not observation.is_floating_point():
         got = f"{observation.dtype} of shape {tuple(observation.shape)}"
         raise ValueError(f"observation must be float32 of shape (..., {layout.size}), got {got}")
+
+
+def check_rows(rows: Tensor) -> None:
+    """Raise :class:`ValueError` unless there are rows to take statistics from."""
+    if not len(rows):
+        raise ValueError("rows to fit features to must be at least one, got 0")
 
 
 def relative(observation: Tensor, layout: Layout) -> Tensor:

@@ -19,8 +19,9 @@ from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, as_plans
 from lw_torchrl.language.roles import VECTORS, StepRole
 from lw_torchrl.language.task_index import PlanTables, one_per_row, pick
 from lw_torchrl.language.task_objects import role_object
+from lw_torchrl.language.value_checks import check_finite
 from lw_torchrl.modules.attention import PlanAttention
-from lw_torchrl.modules.features import Features, squash
+from lw_torchrl.modules.features import Features, check_observation, check_rows, squash
 from lw_torchrl.transforms.qaf import plan_program
 from lw_torchrl.transforms.random_yaw import tilt_key, turn_observation, turn_vectors, yaw_key
 
@@ -104,6 +105,8 @@ class _RelativePositions(Features):
 
     def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         observation, weights, task_id = read(tensordict, self.in_keys)
+        check_observation(observation, self.layout)
+        check_finite("observation", observation)
         yaw = tensordict.get(yaw_key(self.in_keys[0]), None)
         rows = self.tables.rows(one_per_row(task_id, observation))
         return observation.to(self.offset.dtype), weights.to(self.offset.dtype), rows, yaw
@@ -252,6 +255,16 @@ class RoleFeatures(_RelativePositions):
         other._copy(self)
         return other
 
+    def share(self) -> None:
+        """Give the contacts to the features that :meth:`with_plans` made, after the buffers were changed."""
+        for other in self._sharing:
+            if other is not self:
+                other._copy(self)
+
+    def _load_from_state_dict(self, *args: Any) -> None:
+        super()._load_from_state_dict(*args)
+        self.share()
+
     @torch.no_grad()
     def fit(self, rows: TensorDictBase, weights: Tensor | None = None) -> None:
         """Take the contacts from demonstrations, in place.
@@ -261,6 +274,7 @@ class RoleFeatures(_RelativePositions):
         """
         observation, task_id = read(rows, [self.in_keys[0], self.in_keys[2]])
         observation, task_id = observation.reshape(-1, self.layout.size), task_id.reshape(-1)
+        check_rows(observation)
         truth = plan_program(self.plans)(observation, task_id)
         at = self.tables.rows(task_id)
         observation, truth, at = (tensor.to(self.contact.device) for tensor in (observation, truth, at))
@@ -271,9 +285,7 @@ class RoleFeatures(_RelativePositions):
             self.contact[row] = away[held & (at == row)].median(0).values
         self.demonstrated[at.unique()] = True
         self.fitted.fill_(True)
-        for other in self._sharing:
-            if other is not self:
-                other._copy(self)
+        self.share()
 
     @torch.no_grad()
     def _copy(self, other: RoleFeatures) -> None:

@@ -165,7 +165,8 @@ class ExpectileValueLoss(LossModule):
             what = f"lack {keys.value!r} or, of an ensemble, {keys.values!r}: name them by loss.set_keys(value=...)"
             raise ValueError(f"the value network writes {network.out_keys}, which {what}")
         with params.to_module(network, preserve_module_state=False):
-            (values,) = read(network(tensordict.select(*network.in_keys, strict=False)), [key])
+            # The whole rows: features also read the angle of RandomYaw, and the attention qaf_plan.
+            (values,) = read(network(tensordict.copy()), [key])
         return values
 
 

@@ -20,6 +20,7 @@ from lw_torchrl.training.checkpoint import check_finite
 from lw_torchrl.training.checkpoint_files import CheckpointFiles, contents_of
 from lw_torchrl.training.interrupts import interrupts_between_steps
 from lw_torchrl.training.minibatches import Minibatches
+from lw_torchrl.training.normalization import share_contacts
 from lw_torchrl.training.optimizer import check_loss, rate_factor, set_learning_rates
 
 READ_EVERY = 100
@@ -234,6 +235,7 @@ class Training:
         for minibatches in self.minibatches:
             getattr(minibatches.source, "verify", lambda: None)()  # a dataset's rows must be those it recorded
         self._files.restore(self.description, self.device, self.contents(), self.load_state_dict)
+        share_contacts(self.module)
         return True
 
     def state_dict(self) -> dict[str, Any]:

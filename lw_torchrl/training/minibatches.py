@@ -11,12 +11,16 @@ from torch import nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
 from torchrl.envs import Compose, Transform
+from torchrl.objectives import BCLoss, LossModule
 
 from lw_torchrl._devices import CPU, seeded
 from lw_torchrl.data.samplers import GroupSampler
 from lw_torchrl.data.storage import DatasetStorage, device_of_rows
 from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.policy import plans_of
+from lw_torchrl.modules.relative_features import FocusFeatures, RoleFeatures
+from lw_torchrl.transforms.augmentation import JitterTarget
+from lw_torchrl.transforms.random_yaw import RandomYaw
 
 _REPLAY_OPTIONS = ("label", "reward", "terminate_on_success", "n_steps", "gamma", "columns")
 
@@ -83,6 +87,26 @@ def check_replay(actor: Any, replay: TensorDictReplayBuffer, size: int) -> None:
     if "action" not in actor.out_keys:
         raise ValueError(f"actor must write 'action', it writes {', '.join(map(str, actor.out_keys))}")
     check_minibatches([actor], replay, size)
+
+
+def check_augmentations(loss: LossModule, networks: Iterable[nn.Module], replay: TensorDictReplayBuffer) -> None:
+    """Raise :class:`ValueError` if features would not see how an augmentation moved a row.
+
+    TorchRL's losses, except BCLoss, pass on only the ``in_keys`` of a network. The angle and the offset that the
+    augmentations write are not among them, because environments do not write these.
+    """
+    selects = (base for base in type(loss).__mro__ if base not in (LossModule, BCLoss))
+    if isinstance(loss, BCLoss) or not any(base.__module__.startswith("torchrl.objectives") for base in selects):
+        return
+    used = [type(part).__name__ for part in replay.transform.modules() if isinstance(part, (RandomYaw, JitterTarget))]
+    parts = (part for network in networks for part in network.modules())
+    features = [type(part).__name__ for part in parts if isinstance(part, (FocusFeatures, RoleFeatures))]
+    if used and features:
+        raise ValueError(
+            f"replay: {features[0]} would not see what {used[0]} writes, because {type(loss).__name__} passes on only "
+            f"the in_keys of a network; leave out {used[0]}, use other features, or train by BCLoss, "
+            "AdvantageWeightedLoss or ExpectileValueLoss"
+        )
 
 
 def describe_data(replay: Any) -> dict[str, Any] | None:

@@ -12,21 +12,22 @@ from torchrl.objectives import LossModule
 
 from lw_torchrl._checks import checked
 from lw_torchrl.modules.features import Features
+from lw_torchrl.modules.relative_features import RoleFeatures
 
 
 @checked
 def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None:
     """Call :meth:`Features.fit` of all features in a module, or in the networks of a loss, with a buffer's rows.
 
-    The statistics reach every copy of a network that the loss holds, and its target networks. Rows are weighted as the
-    sampler draws them: with a :class:`CoLearningSampler` half of the weight is on the target task's few rows.
+    The statistics reach every copy of a network that the loss holds, and its target networks. Rows count alike, with
+    any sampler but :class:`CoLearningSampler`, with which half of the weight is on the target task's few rows.
 
     Args:
         target: an actor, a critic, any module with :class:`~lw_torchrl.modules.Features` in it, or a loss.
         replay: its rows hold what the features read.
 
     Raises:
-        ValueError: the module holds no features, or a row lacks a key or holds NaN or infinity.
+        ValueError: the module holds no features, the buffer is empty, or a row lacks a key or holds NaN or infinity.
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -47,10 +48,15 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
     features = [(path, part) for path, part in _modules(target) if isinstance(part, Features)]
     if not features:
         raise ValueError(f"{type(target).__name__} holds no Features: there is nothing to normalise")
+    if not len(replay):
+        raise ValueError("replay must hold rows to fit the features to, and it is empty")
     row_weights = getattr(replay.sampler, "row_weights", None)
     weights = None if row_weights is None else row_weights(replay.storage)
     keys = {key for _, part in features for key in part.in_keys}
-    rows = replay.storage.get(slice(0, len(replay))).select(*keys, strict=False).cpu()  # the same sums on every device
+    stored = replay.storage.get(slice(0, len(replay)))
+    if isinstance(stored, list):  # of a ListStorage
+        stored = torch.stack([row.select(*keys, strict=False) for row in stored])
+    rows = stored.select(*keys, strict=False).cpu()  # the same sums on every device
     held = statistics_of(target) if isinstance(target, LossModule) else {}
     for path, part in features:
         fitted = copy.deepcopy(part).cpu() if held else part
@@ -59,6 +65,18 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
             for copied in _copies(f"{path}.{name}"):
                 if copied in held:
                     held[copied].copy_(value)
+    share_contacts(target)
+
+
+def share_contacts(module: nn.Module) -> None:
+    """Call :meth:`RoleFeatures.share` of all features in a module, or in a loss, after their buffers were changed.
+
+    A critic of which a loss holds several copies keeps its own buffers, so there is nothing to share.
+    """
+    changed = {buffer.data_ptr() for buffer in statistics_of(module).values()}
+    for _, part in _modules(module):
+        if isinstance(part, RoleFeatures) and part.contact.data_ptr() in changed:
+            part.share()
 
 
 def statistics_of(module: nn.Module) -> dict[str, Tensor]:
@@ -106,6 +124,7 @@ def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
         if not is_fresh and not torch.allclose(held[name].double(), old.double()):
             for restored, value in before.items():
                 held[restored].copy_(value)
+            share_contacts(loss)
             raise ValueError(
                 "normalize: a network of the loss has the statistics of other rows, with which it was trained: give "
                 "normalize=False to keep them, and fresh networks theirs by fit_normalization(network, replay)"

@@ -21,6 +21,7 @@ from lw_torchrl.training.checkpoint import check_can_be_saved
 from lw_torchrl.training.loop import Training, TrainingOptions
 from lw_torchrl.training.minibatches import (
     Minibatches,
+    check_augmentations,
     check_minibatches,
     describe_data,
     describe_replay,
@@ -80,7 +81,8 @@ class OfflineTrainer(Training):
         ValueError: the buffer answers the queries of other plans, or draws by priorities; the loss's value estimator
             has another gamma than the buffer's n steps, the loss does not return means, or is CQL's with a Lagrange
             multiplier, or reads rewards or next observations that the buffer lacks; with ``normalize``, a network was
-            trained with other statistics.
+            trained with other statistics; the buffer has RandomYaw or JitterTarget, and the loss would not pass on what
+            they write to FocusFeatures or RoleFeatures.
         TypeError: the loss is not a LossModule.
 
     Example:
@@ -117,6 +119,7 @@ class OfflineTrainer(Training):
         self.loss, self.module, self.replay, self.networks = loss, loss, replay, networks_of(loss)
         self.device = next(loss.parameters()).device
         check_minibatches(self.networks, replay, config.batch_size)
+        check_augmentations(loss, self.networks, replay)
         getattr(loss, "target_entropy", None)  # SAC's becomes a buffer when it is first read
         self.minibatches = [Minibatches(replay, config.batch_size, config.seed)]
         delayed = any(name.startswith("target_") and name.endswith("_params") for name, _ in loss.named_children())

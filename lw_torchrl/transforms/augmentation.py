@@ -136,6 +136,8 @@ class SwapUnmentioned(PlanAugmentation):
         key, task, qaf = self.in_keys
         observations = {key: read(tensordict, [key])[0]}
         kept = self._kept(tensordict)
+        if not kept.numel():
+            return tensordict  # no row to swap with
         following = tensordict.get("next", None)
         if following is not None and following.get(key, None) is not None:
             observations[unravel_key(("next", key))] = following.get(key)
@@ -188,6 +190,8 @@ class HideOpening(Augmentation):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observation = read(tensordict, self.in_keys)[0].clone()
+        if not observation.numel():
+            return tensordict  # no row to take the opening from
         opening = observation[..., self._opening]
         others = opening.flatten()[torch.randint(opening.numel(), opening.shape, device=opening.device)]
         hidden = torch.rand(opening.shape, device=opening.device) < self.probability
@@ -201,13 +205,13 @@ class JitterTarget(PlanAugmentation):
     :class:`~lw_torchrl.modules.RoleFeatures` adds the offset to the position of the target that it shows. For replay
     buffers, after a :class:`QAFTransform`. Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); writes ``target_offset``
     (B, 3) float32, metres: normal noise of ``std`` in z and half of it in x and y, or 0 in rows without such a step.
-    Draws from PyTorch's global generator.
+    Draws from PyTorch's global generator. TorchRL's losses, except BCLoss, do not pass the offset on to the features,
+    so :class:`~lw_torchrl.OfflineTrainer` refuses them.
 
     Args:
         plans: canonical plans, see :func:`~lw_torchrl.canonical_plans`, whose conditions ``qaf`` answers.
         std: standard deviation of the offset's height, metres.
         in_keys: other names for task_id and qaf, in this order.
-        out_keys: another name for the offset.
 
     Raises:
         ValueError: the plans have no roles; or at call time, as for :class:`SwapUnmentioned`.
@@ -226,18 +230,8 @@ class JitterTarget(PlanAugmentation):
     scale: Tensor
 
     @checked
-    def __init__(
-        self,
-        plans: AnyPlans,
-        std: Scale,
-        *,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
-    ) -> None:
-        super().__init__(
-            in_keys=as_keys("in_keys", in_keys, ("task_id", "qaf")),
-            out_keys=as_keys("out_keys", out_keys, ("target_offset",)),
-        )
+    def __init__(self, plans: AnyPlans, std: Scale, *, in_keys: Sequence[NestedKey] | None = None) -> None:
+        super().__init__(in_keys=as_keys("in_keys", in_keys, ("task_id", "qaf")), out_keys=["target_offset"])
         check_apart(self.in_keys, self.out_keys)
         self.std = std
         plans = self._read_plans(plans)

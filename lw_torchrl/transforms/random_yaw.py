@@ -74,7 +74,9 @@ class RandomYaw(PlanAugmentation):
     (B, 4) and ``("next", "observation")``, all float32. Writes the angle in radians, ``observation_yaw`` (B,) float32,
     and ``("next", "observation_yaw")``; features of fixed places turn these by it. An action's displacement in the
     plane is shortened if turning would lead it out of [-1, 1]. Orientations are not turned: use features without them,
-    "differences" or "relative". Angles are drawn from PyTorch's global generator.
+    "differences" or "relative". Angles are drawn from PyTorch's global generator. Rows that were turned before get the
+    sum of both angles. TorchRL's losses, except BCLoss, do not pass the angle on to features that read it, so
+    :class:`~lw_torchrl.OfflineTrainer` refuses them.
 
     Args:
         scale: standard deviation of the angle, in radians; 10 is any angle.
@@ -163,13 +165,18 @@ class RandomYaw(PlanAugmentation):
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys[:2]))
         angle = self._angle(tensordict, observation)
         tilt = self._tilt(tensordict) if self.tilt else None
-        if tilt is not None:
+        old_yaw, old_tilt = (tensordict.get(key(seen[0]), None) for key in (yaw_key, tilt_key))
+        yaw = angle if old_yaw is None else old_yaw + angle
+        if old_tilt is not None:  # it came before this turn: in the turned axes it is another rotation
+            old_tilt = turn_vectors(turn_vectors(old_tilt.mT, angle.unsqueeze(-1)).mT, angle.unsqueeze(-1))
+            tensordict.set(tilt_key(seen[1]), old_tilt if tilt is None else tilt @ old_tilt)
+        elif tilt is not None:
             tensordict.set(tilt_key(seen[1]), tilt)
         cos, sin, begin = angle.cos(), angle.sin(), self._begin
-        tensordict.set(seen[1], turn_observation(observation, angle, self.layout)).set(yaw_key(seen[1]), angle)
+        tensordict.set(seen[1], turn_observation(observation, angle, self.layout)).set(yaw_key(seen[1]), yaw)
         if (following := tensordict.get(unravel_key(("next", seen[0])), None)) is not None:
             after = unravel_key(("next", seen[1]))
-            tensordict.set(after, turn_observation(following, angle, self.layout)).set(yaw_key(after), angle)
+            tensordict.set(after, turn_observation(following, angle, self.layout)).set(yaw_key(after), yaw)
         for key, turned_key in actions:
             if (action := tensordict.get(key, None)) is None:
                 continue

@@ -74,6 +74,19 @@ def test_the_latent_is_a_part_of_its_own():
     assert TaskLatent([own]).tasks == ("touch",)
 
 
+@pytest.mark.parametrize("rows", [1, 4])
+@pytest.mark.parametrize("batch", [[], None])
+def test_task_ids_in_a_column(rows, batch):
+    actor, was = make_descriptor(), state(rows)
+    wanted = action_of(actor, was)
+    column = was["task_id"].unsqueeze(-1)
+    given = TensorDict(observation=was["observation"], task_id=column, batch_size=[rows] if batch is None else batch)
+    assert torch.equal(action_of(actor, given), wanted)
+    assert torch.equal(actor(observation=was["observation"], task_id=column)[-1], wanted)
+    in_time = TensorDict(observation=was["observation"].unsqueeze(1), task_id=column, batch_size=given.batch_size)
+    assert torch.equal(action_of(actor, in_time), wanted.unsqueeze(1))
+
+
 def test_bc_loss_trains_every_weight():
     actor = make_descriptor()
     with warnings.catch_warnings():

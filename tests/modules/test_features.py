@@ -132,6 +132,12 @@ def test_observations_that_are_not_finite_are_refused(wrong, kind, call):
     assert features.mean.isfinite().all()
 
 
+def test_no_rows_have_no_statistics():
+    for kind in ("differences", "none"):
+        with pytest.raises(ValueError, match="rows to fit features to must be at least one, got 0"):
+            fit(ObservationFeatures(kind), random_observation(0))
+
+
 def test_weights_count_as_copies_of_rows():
     observation = random_observation(6)
     copies = torch.tensor([1, 2, 1, 3, 1, 0])

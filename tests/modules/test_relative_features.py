@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from small_actors import CANONICAL, PLANS, make_actor, make_role_actor, rows_for
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import TD3Loss
 
 import lw_torchrl as lw
 from lw_torchrl.language.plans import ConditionalPlan, Plans
@@ -367,6 +368,31 @@ def test_actors_with_the_same_weights_share_contacts_whichever_is_fitted():
         assert not other.features.fitted
         fit_normalization(other, replay)
         assert torch.equal(other.features.contact, contact)
+
+
+@pytest.mark.filterwarnings("ignore:No target network updater")
+def test_contacts_that_a_loss_or_a_file_brings_are_shared_too():
+    actor, replay, row = make_role_actor(), make_replay(), row_of(ZERO_SHOT, "drawer-open")
+    wider = actor.with_plans(ZERO_SHOT).features
+    critic = lw.PlanConditionedQValue(ZERO_SHOT, features=actor.with_plans(ZERO_SHOT).features, width=8, depth=1)
+    fit_normalization(TD3Loss(actor, critic, bounds=(-1.0, 1.0)), replay)
+    contact = actor.features.contact[row_of(CANONICAL, "drawer-open")]
+    assert contact.any()
+    assert torch.equal(wider.contact[row], contact)
+    other = make_role_actor()
+    wider = other.with_plans(ZERO_SHOT).features
+    other.load_state_dict(actor.state_dict())
+    assert wider.fitted
+    assert torch.equal(wider.contact[row], contact)
+
+
+@pytest.mark.parametrize("features", [FocusFeatures(CANONICAL), RoleFeatures(CANONICAL)])
+def test_wrong_observations_are_refused(features):
+    weights, ids = torch.ones(2, CANONICAL.num_steps), torch.full((2,), lw.task_id("push"))
+    with pytest.raises(ValueError, match=r"observation must be float32 of shape \(..., 39\), got .*\(2, 40\)"):
+        features(torch.zeros(2, 40), weights, ids)
+    with pytest.raises(ValueError, match="observation must hold finite numbers"):
+        features(torch.full((2, 39), torch.nan), weights, ids)
 
 
 def test_training_without_contacts_is_refused():

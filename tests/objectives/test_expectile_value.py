@@ -94,6 +94,15 @@ def test_it_is_what_is_written_by_hand(kind, ensemble, steps):
         assert not batch["td_error"].requires_grad
 
 
+def test_features_see_the_angle_by_which_a_row_was_turned():
+    plans = lw.load_plans("MT10")
+    critic = lw.PlanConditionedValue(plans, features=lw.modules.FocusFeatures(plans), **SMALL)
+    loss = lw.objectives.ExpectileValueLoss(critic, delay_value=False).make_value_estimator(gamma=0.9)
+    turned = lw.RandomYaw(1.0)(make_batch().set("action", torch.zeros(12, 4)))
+    assert loss(turned.copy())["value"] == critic(turned.copy())["state_value"].mean()
+    assert loss(turned.exclude("observation_yaw"))["value"] != loss(turned)["value"]
+
+
 def test_it_is_iqls_expectile_of_td0s_target():
     """One network, no targets apart: TorchRL's own parts, put together."""
     loss, batch = make_loss(ensemble=1, delay_value=False), make_batch()

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage, ListStorage, RandomSampler, TensorDictReplayBuffer
 from torchrl.objectives import CQLLoss, DDPGLoss, IQLLoss, REDQLoss, SACLoss, TD3Loss
 
 import lw_torchrl as lw
@@ -100,6 +100,25 @@ def test_of_modules(replay, expected):
         fit_normalization(actor, other)
     with pytest.raises(ValueError, match="Linear holds no Features: there is nothing to normalise"):
         fit_normalization(nn.Linear(2, 2), replay)
+
+
+def test_rows_in_a_list_and_in_double_precision(replay, expected):
+    rows = TensorDict(observation=replay[:]["observation"].double()).auto_batch_size_(1)
+    rows["task_id"] = torch.tensor([lw.task_id("push")] * 10 + [lw.task_id("reach")] * 40)
+    found = []
+    for storage in (LazyTensorStorage(50), ListStorage(50)):
+        buffer = TensorDictReplayBuffer(storage=storage, sampler=lw.CoLearningSampler("push"), batch_size=8)
+        with pytest.raises(ValueError, match="replay must hold rows to fit the features to, and it is empty"):
+            fit_normalization(make()[0], buffer)
+        buffer.extend(rows)
+        features = ObservationFeatures()
+        fit_normalization(features, buffer)
+        found.append(features.mean.clone())
+        buffer.set_sampler(RandomSampler())
+        fit_normalization(features, buffer)
+        torch.testing.assert_close(features.std, expected["differences"].std)
+    assert torch.equal(*found)
+    assert not torch.allclose(found[0], expected["differences"].mean)
 
 
 def test_role_features_in_a_loss_get_their_contacts():

@@ -16,6 +16,7 @@ from torchrl.objectives import BCLoss, CQLLoss, IQLLoss, REDQLoss, SACLoss, Soft
 from torchrl.record.loggers import Logger
 
 import lw_torchrl as lw
+from lw_torchrl.modules import FocusFeatures, RoleFeatures
 from lw_torchrl.training import OfflineConfig, OfflineTrainer, fit_normalization
 from lw_torchrl.training.minibatches import check_minibatches
 
@@ -334,6 +335,23 @@ def test_a_buffer_of_other_plans_is_refused(demos):
     loss = make_loss("value")
     with pytest.raises(ValueError, match="replay's QAFTransform must have the critic's plans"):
         OfflineTrainer(loss, make_replay(demos, others), CONFIG, progress=False)
+
+
+@pytest.mark.parametrize("name", ["RandomYaw", "JitterTarget"])
+def test_augmentations_that_features_would_not_see_are_refused(demos, name):
+    plans = lw.canonical_plans(PLANS)
+    augmented = {"RandomYaw": lw.RandomYaw(0.3), "JitterTarget": lw.transforms.JitterTarget(plans, 0.03)}[name]
+    critics = [lw.PlanConditionedValue(plans, features=kind(plans), **CRITIC) for kind in (FocusFeatures, RoleFeatures)]
+    actor = lw.PlanConditionedActor(plans, **make_parts()).stochastic("normal")
+    for value in critics:
+        replay = make_replay(demos, plans)
+        replay.append_transform(augmented)
+        iql = IQLLoss(actor, lw.PlanConditionedQValue(plans, **CRITIC), value)
+        iql.make_value_estimator(gamma=GAMMA)
+        with pytest.raises(ValueError, match=rf"Features would not see what {name} writes, because IQLLoss passes on"):
+            OfflineTrainer(iql, replay, CONFIG, progress=False)
+        loss = lw.objectives.ExpectileValueLoss(value).make_value_estimator(gamma=GAMMA)
+        OfflineTrainer(loss, replay, replace(CONFIG, steps=1), progress=False).train()
 
 
 @pytest.mark.parametrize("name", ["iql", "td3-bc", "sac", "value"])

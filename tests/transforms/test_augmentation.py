@@ -197,8 +197,14 @@ def test_keys_have_other_names():
     keys = [("a", "seen"), ("a", "task"), "truth"]
     expected = seeded(lw.transforms.SwapUnmentioned(PUSH, 1.0), was)["observation"]
     assert torch.equal(seeded(lw.transforms.SwapUnmentioned(PUSH, 1.0, in_keys=keys), moved)["a", "seen"], expected)
-    moved = seeded(lw.transforms.JitterTarget(PUSH_ROLES, 0.1, in_keys=keys[1:], out_keys=[("a", "offset")]), moved)
-    assert moved["a", "offset"].shape == (64, 3)
+    moved = seeded(lw.transforms.JitterTarget(PUSH_ROLES, 0.1, in_keys=keys[1:]), moved)
+    assert moved["target_offset"].shape == (64, 3)
+
+
+@pytest.mark.parametrize("name", ["SwapUnmentioned", "HideOpening", "JitterTarget", "RandomYaw"])
+def test_no_rows_stay_no_rows(name):
+    was = rows(plans=CANONICAL).set("action", torch.zeros(8, 4))[:0]
+    assert MAKERS[name]()(was)["observation"].shape == (0, 39)
 
 
 PUSH_ROLES = Plans([ConditionalPlan("push", CANONICAL["push"].steps[:2])])

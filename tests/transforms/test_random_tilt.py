@@ -119,11 +119,14 @@ def test_so_many_rows_are_tilted_as_it_says():
     assert "observation_tilt" not in tilted(was, 0.0)
 
 
-def test_role_features_see_what_the_action_does():
+@pytest.mark.parametrize("times", [1, 2])
+def test_role_features_see_what_the_action_does(times):
     """An action towards the target stays an action towards the target that the features show."""
     was = rows("push", 3, 50)
     was["action"][:, :3] = (was["observation"][:, 36:39] - was["observation"][:, 4:7]) * 0.3
-    now = tilted(was)
+    now = was
+    for _ in range(times):
+        now = lw.RandomYaw(0.5, plans=PLANS, tilt=1.0)(now)
     now["skill_weights"] = torch.nn.functional.one_hot(torch.full((50,), 3), PLANS.num_steps).float()
     features = lw.modules.RoleFeatures(PLANS).eval()
     features.demonstrated.fill_(True)

@@ -131,6 +131,14 @@ def test_the_angle_is_written_and_turns_back():
     assert torch.equal(turn_vectors(vectors, angle_of)[:, 2], vectors[:, 2])
 
 
+def test_rows_that_are_turned_twice_have_the_sum_of_both_angles():
+    was = rows()
+    was["next", "observation"] = was["observation"].clone()
+    now = lw.RandomYaw(0.5)(lw.RandomYaw(0.5)(was.clone()))
+    for seen in (now, now["next"]):
+        torch.testing.assert_close(turn_observation(seen["observation"], -seen["observation_yaw"]), was["observation"])
+
+
 PLANS = lw.Plans(
     [
         lw.ConditionalPlan.from_pairs(
