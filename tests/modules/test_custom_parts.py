@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from users_parts import Closest, Gated, Pictures, Projection
 from small_actors import action_of, letters, make_actor, make_rows
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from users_parts import Closest, Gated, Pictures, Projection
 
 import lw_torchrl as lw
 from lw_torchrl.modules import Concat, MLPDecoder, ObservationFeatures, SkillEncoder
