@@ -61,7 +61,7 @@ def place(module: Any, device: str | torch.device | None) -> torch.device:
 
 @contextmanager
 def seeded(device: torch.device, seed: int) -> Iterator[None]:
-    """Within the block the default generators of the CPU and of a device start at a seed; then they are as before."""
+    """Seed the default generators of the CPU and of a device within the block, and restore them afterwards."""
     others = [] if device.type == "cpu" else [device]
     with torch.random.fork_rng(devices=others, device_type=device.type):
         torch.default_generator.manual_seed(seed)

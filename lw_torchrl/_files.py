@@ -39,7 +39,7 @@ def absent_policy(path: AnyPath, writer: str = "train") -> str:
 
 @contextmanager
 def _naming(target: Path) -> Iterator[None]:
-    """Let errors of the disk name the file: a full disk does not say which it was."""
+    """Add the file to disk errors: the error of a full disk does not name it."""
     try:
         yield
     except OSError as error:

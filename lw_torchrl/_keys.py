@@ -27,7 +27,7 @@ def _key(given: Any) -> NestedKey | None:
 def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[str]) -> list[NestedKey]:
     """Return the keys ``given``, as many as the default ones and in their order; None for the default.
 
-    Another number of keys, the same key twice, and what is not a key are a :class:`ValueError`.
+    Raise :class:`ValueError` for another number of keys, a repeated key, or an object that is not a key.
     """
     if given is None:
         return list(default)
@@ -52,7 +52,7 @@ def check_apart(in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> 
 
 
 def key_beside(key: NestedKey, ending: str) -> NestedKey:
-    """Return the key next to ``key`` whose name has an ending more."""
+    """Return ``key`` with a suffix added to its name."""
     return key + ending if isinstance(key, str) else (*key[:-1], key[-1] + ending)
 
 

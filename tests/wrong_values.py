@@ -154,6 +154,7 @@ OF_ONE_NAME: dict[str, list[Any]] = {
     "ImageQueryEvaluatorTrainer.config": A_CLASS,
     "ImageQueryEvaluator.names": ["gripper", 3, [3]],  # those that a plan speaks of must be there
     "resolve_tasks.tasks": [3, "MT10", ["reach"]],
+    "OfflineTrainer.loss": A_CLASS,
     "evaluate.engine": [3, "mujoco", []],
     "attribute_failures.engine": [3, "mujoco", []],
     "evaluate.evaluator": FUNCTION,

@@ -54,7 +54,7 @@ class Demo:
 
 
 def run_demo(out: Path, config: DemoConfig) -> lw.EvaluationResult:
-    """Run the demo, or the rest of it, write its files to ``out`` and print its results."""
+    """Run or resume the demo, write its files to ``out`` and print its results."""
     from lw_torchrl._files import locked, read_json, write_json
 
     stated, path = json.loads(json.dumps(asdict(config))), out / "config.json"

@@ -21,8 +21,8 @@ _METHOD = (
     "your own method"
 )
 _LOSS = (
-    "bc (imitate the expert); on any data with rewards: advantage (learn a value, then imitate each row as much as its "
-    "advantage says), iql, td3-bc or cql"
+    "bc (imitate the expert); on any data with rewards: advantage (learn a value, then imitate rows, weighted by their "
+    "advantage), iql, td3-bc or cql"
 )
 
 
@@ -32,7 +32,7 @@ class Train:
 
     Example: lw-torchrl train demos/mt10 --out runs/mt10.safetensors --evaluate-every 2000
 
-    Example: lw-torchrl train data/spoilt --out runs/iql.safetensors --loss iql
+    Example: lw-torchrl train data/noisy --out runs/iql.safetensors --loss iql
 
     Example: lw-torchrl train demos/mt10 --out runs/tuned.safetensors --begin runs/mt10.safetensors --steps 2000
     """
@@ -55,14 +55,14 @@ class Train:
     begin: Path | None = None  # fine-tune this policy file, with its plans, network and normalisation
     evaluator: options.Evaluator = None
     answers: Literal["soft", "hard"] | None = None
-    """how the evaluator answers: by probabilities, or by 0 and 1; None for soft, or with --begin for hard"""
+    """the evaluator's answers: soft (probabilities) or hard (0 or 1); None for soft, or for hard with --begin"""
     qaf_anchor: float = 0.0  # weight of the cross entropy with the exact answers; use 1 for a new evaluator
-    steps: int | None = None  # number of minibatches; None for 8000, with another loss than bc 4000
-    batch_size: int | None = None  # equally many rows of each task; None for 500, with another loss than bc 250
+    steps: int | None = None  # number of minibatches; None for 8000 with --loss bc, 4000 otherwise
+    batch_size: int | None = None  # equally many rows of each task; None for 500 with --loss bc, 250 otherwise
     learning_rate: float = 1e-3  # at the start; a cosine brings it to 0
     seed: int = 0  # random seed of initial weights and minibatches
     evaluate_every: int | None = None  # evaluate every N steps and at the end, and log the success rate
-    evaluate_episodes: int = 5  # episodes of each task in such an evaluation
+    evaluate_episodes: int = 5  # episodes of each task in an evaluation
     evaluate_seed: int = 1000  # random seed of these episodes (not one that the demonstrations used)
     logger: Literal["csv", "tensorboard", "wandb", "rerun"] | None = None  # log the training in logs/ beside OUT
     device: options.Device = "cpu"
@@ -268,7 +268,7 @@ class TrainEvaluator:
     picture: int = 64  # with --cameras, height and width of a picture in pixels
     every: int | None = None  # use every N-th state of an episode; None for 1, with --cameras 5
     held_out_tasks: Annotated[tuple[str, ...], options.OPTIONAL] = ()
-    """tasks whose queries are not trained on, or how many to draw at random"""
+    """tasks to hold out from training, or the number of tasks to draw at random and hold out"""
     held_out_pairs: float = 0.1  # fraction of object pairs whose queries are excluded from training
     width: int = 128  # units of each hidden layer
     depth: int = 3  # number of hidden layers

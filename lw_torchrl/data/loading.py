@@ -82,7 +82,7 @@ def n_step_returns(rollout: TensorDictBase, n_steps: int, gamma: float) -> Tenso
 def _read_part(
     whole: Demonstrations, chosen: Demonstrations, label: Label, reward: RewardName, after: int | None, terminate: bool
 ) -> TensorDict:
-    """The rows of a dataset's chosen episodes, memory-mapped as far as they are as in the files."""
+    """Return the rows of a dataset's chosen episodes, memory-mapped where they are the same as in the files."""
     rows = load_rows(whole)
     if label == "executed":
         kind = REWARDS[reward]
@@ -110,7 +110,7 @@ def _read_part(
 
 
 def _choose_keys(rows: TensorDict, keys: Literal["rollout"] | Iterable[NestedKey]) -> TensorDict:
-    """Some columns, with those that begin every step of a rollout, which no file holds."""
+    """Select columns, after adding the flags that precede each step of a rollout (all false), which no file holds."""
     for flag in _FLAGS:
         rows.set(flag, torch.zeros(len(rows), 1, dtype=torch.bool))
     known = list(rows.keys(True, True))
@@ -164,7 +164,7 @@ def load(
     if joined and episodes is not None:
         if not isinstance(episodes, Sequence) or len(episodes) != len(folders):
             raise ValueError(
-                f"episodes must be a list of a choice for each of the {len(folders)} folders, got {episodes!r}"
+                f"episodes must be a list with one choice for each of the {len(folders)} folders, got {episodes!r}"
             )
         choices: list[Any] = list(episodes)
     else:

@@ -183,7 +183,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         super().load_state_dict(dict(state_dict))
 
     def dumps(self, path: AnyPath) -> None:
-        """Save the state to a folder, as one file that is there whole or not at all; the rows stay in the datasets."""
+        """Save the state to a folder, as one file, written atomically; the rows stay in the datasets."""
         write_tensors(Path(path) / _FILE, {}, {}, self.state_dict())
 
     def loads(self, path: AnyPath) -> None:

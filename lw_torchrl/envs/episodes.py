@@ -40,7 +40,7 @@ def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[
 
 
 def read_action(tensordict: TensorDictBase, size: int) -> Tensor:
-    """Return the ``action`` that an actor wrote, (N, size) float32; another is a :class:`ValueError`."""
+    """Return the ``action`` that an actor wrote, (N, size) float32; raise :class:`ValueError` for any other."""
     action, shape = tensordict.get("action", None), (*tensordict.batch_size, size)
     if action is None:
         raise ValueError(f"the actor must write 'action', got {', '.join(map(str, tensordict.keys()))}")

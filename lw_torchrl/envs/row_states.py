@@ -17,7 +17,7 @@ from lw_torchrl.language.tasks import MT50, task_id
 
 
 def _with_ids(method: Callable[..., Any], change: Callable[..., Tensor] = lambda ids, *_args, **_kwargs: ids) -> Any:
-    """Wrap a method of Categorical that makes another spec, so that it keeps the rows' ids, changed alike."""
+    """Wrap a method of Categorical that returns a new spec, so that this keeps the rows' ids, changed likewise."""
 
     def make(self: TaskIds, *args: Any, **kwargs: Any) -> TaskIds:
         made = method(self, *args, **kwargs)

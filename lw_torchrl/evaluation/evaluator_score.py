@@ -88,7 +88,7 @@ class EvaluatorScore:
 
 @checked
 def score_evaluator(evaluator: ClauseEvaluator, data: LabelledQueries) -> EvaluatorScore:
-    """Score an evaluator, whatever its plans, on the held-out parts of the data, which must have some.
+    """Score an evaluator on the held-out parts of the data, of which there must be some. Its plans do not matter.
 
     Example:
         >>> import lw_torchrl as lw, tempfile

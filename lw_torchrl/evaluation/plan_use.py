@@ -20,7 +20,7 @@ from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.suites.metaworld.experts import ExpertActor
 
 _AFTER = 20  # steps after the first success that still count, as in training data
-_A_WHILE = 5  # an episode has reached a step that was active in so many states
+_A_WHILE = 5  # number of states in which a step must be active to count as reached
 _LATE = 50  # the last steps of a failed episode, in which it makes no progress
 
 

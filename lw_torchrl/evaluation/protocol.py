@@ -58,7 +58,7 @@ def evaluate(
         tasks: as for :func:`resolve_tasks`; for an actor that knows its tasks, some of them.
         plans: the plans whose conditions are answered; None for the actor's own.
         episodes_per_task: k.
-        seed: a seed that no demonstration was collected with.
+        seed: random seed (use a different one from that of the demonstrations).
         noise_scale: standard deviation of the action noise.
         num_envs: environments stepped together, at least the number of tasks; by default about 256.
         stop_at_success: end an episode at its first success; success at the end and return are then None.

@@ -128,7 +128,7 @@ class EvaluationResult:
             raise FileNotFoundError(f"path: no result file {str(path)!r}; evaluate(...).save(path) writes it") from None
         except (ValueError, KeyError, TypeError) as error:
             what, why = f"result of {FORMAT} version {FORMAT_VERSION}", f"{type(error).__name__}: {str(error)[:500]}"
-            raise ValueError(f"path: {str(path)!r} is no {what} ({why})") from error
+            raise ValueError(f"path: {str(path)!r} is not a {what} ({why})") from error
 
     def table(self) -> str:
         """Return the rates per task as text in columns."""
@@ -177,7 +177,7 @@ def _check_config(config: dict[str, Any]) -> None:
 
 
 def _read_episodes(stated: Any, config: dict[str, Any]) -> tuple[EpisodeResult, ...]:
-    """Return the episodes of a file, as many of each task as its configuration says, all different."""
+    """Return the episodes of a file; raise unless they are different and as many per task as its config says."""
     count, wanted, max_steps = dict.fromkeys(config["tasks"], 0), config["episodes_per_task"], config["max_steps"]
 
     def faults(one: EpisodeResult) -> Iterator[str]:

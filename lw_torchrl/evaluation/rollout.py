@@ -49,7 +49,7 @@ def rollout(
 ) -> None:
     """Run each listed episode once, in eval mode and without exploration, and pass it to ``on_episode`` as it finishes.
 
-    Arguments without a description are those of :func:`evaluate`, which also says on what an episode depends.
+    Arguments without a description are those of :func:`evaluate`, which also describes what an episode depends on.
 
     Args:
         label: the work, for the progress bar.
@@ -61,7 +61,7 @@ def rollout(
         after_success: end an episode N steps after its first success; None for never.
         place: a key for the place of each row's episode in its task's list.
         first: a transform that runs before all others.
-        wrap: called with the actor, and returns what acts instead of it.
+        wrap: called with the actor; returns the policy that acts instead.
     """
     most = len(tasks) * max(map(len, episodes.values()))  # more rows would have no work
     rows = min(most, len(tasks) * max(1, ROWS // len(tasks))) if num_envs is None else min(num_envs, most)
@@ -96,7 +96,7 @@ def _with_transforms(base: EnvBase, *transforms: Transform | None) -> EnvBase:
 
 
 def _transform_of_evaluator(evaluator: Any) -> Transform | None:
-    """Return what must run behind the exact answers: an evaluator that is a transform, or what a module reads."""
+    """Return the transform to run after the exact answers: the evaluator, or the one that writes what it reads."""
     if isinstance(evaluator, Transform):
         return evaluator.clone()  # a transform belongs to one environment
     return evaluator.transform() if isinstance(evaluator, QueryEvaluator) else None

@@ -181,7 +181,7 @@ def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> t
     steps = []
     for number, (step, each) in enumerate(pairs):
         verb, manner, direction = each.verb, _manner(each), each.direction
-        # The next step, or else the last before, that moves something.
+        # The first step from this one on that moves something, otherwise the last one before it.
         purpose = next((other for other in (*read[number:], *read[:number][::-1]) if other.verb not in BY_HAND), None)
         if verb in BY_HAND:
             verb, manner, direction = _coming(each, purpose if not grasping else None)
@@ -221,7 +221,7 @@ def _manner(each: ParsedStep) -> Manner:
 
 
 def _at_points(condition: Query, task: Task) -> Query:
-    """Return a condition whose clauses about the gripper and the first object are about where that is touched."""
+    """Return a condition whose clauses about the gripper name the point where the first object is touched."""
     first = first_object(task)
 
     def at(name: str) -> str:
@@ -236,7 +236,7 @@ def _at_points(condition: Query, task: Task) -> Query:
 
 
 def _over_walls(steps: Sequence[PlanStep], task: Task) -> list[PlanStep]:
-    """Make "lift the puck over the wall", then "move it to the goal", one way through the air to the goal."""
+    """Send "lift the puck over the wall" to the target of a later "move it to the goal", in one way through the air."""
     direct = list(steps)
     for number, step in enumerate(steps):
         role = _role(step)
@@ -310,7 +310,7 @@ def _touched(task: Task, roles: Sequence[StepRole]) -> str:
 
 
 def _has_sides(roles: Sequence[StepRole]) -> bool:
-    """Return whether a plan pushes an object from several sides, and says for each how to come there."""
+    """Return whether a plan pushes an object from several sides, and describes the approach to each."""
     sides = {role.target for role in roles if role.verb == "push"}
     return len(sides) > 1 and all(any(role.target == side and role.verb in BY_HAND for role in roles) for side in sides)
 

@@ -53,13 +53,13 @@ class Layout:
     opening: int  # index of the gripper's opening, from 0, closed, to 1, open
     things: tuple[Slot, ...]  # in the order in which tasks have them; all but the first may be absent: zeros
     goal: int  # index of the x of the task's target, which has no past
-    past: int | None = None  # numbers of the step before stand at their index + past; after a reset, the present ones
+    past: int | None = None  # the previous step's numbers are at their index + past; after a reset, the current ones
     action_size: int = 4  # A, how many numbers an action has, each in [-1, 1]
     displacement: int | None = 0  # index of the x of the hand's displacement; None if actions are something else
     reach: float = 0.01  # metres that the hand moves in a step at a displacement of 1, once it moves
     gripper: int | None = 3  # index of the gripper's effort
     closes: int = 1  # the effort's sign that closes, 1 or -1
-    binary_gripper: bool = False  # whether it opens or closes fully within a few steps: an effort has to be decided
+    binary_gripper: bool = False  # it opens or closes fully in a few steps, so an effort is mapped to open or closed
     closes_above: float = 0.3  # the effort above which such a gripper closes
     thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)  # metres, by relation, of this suite
 
@@ -70,15 +70,15 @@ class Layout:
             raise ValueError(f"things of {layout} must be at least one Slot, got {self.things!r}")
         used = [*self.present, *self.positions]
         if min(part.start for part in used) < 0 or max(part.stop for part in used) > self.size:
-            raise ValueError(f"{layout} names numbers outside the {self.size} of an observation")
+            raise ValueError(f"{layout} has an index outside the {self.size} numbers of an observation")
         told = [number for part in (*self.present, *self._past(self.present)) for number in places(part)]
         if twice := sorted({number for number in told if told.count(number) > 1}):
-            raise ValueError(f"{layout} says of number {twice[0]} that it is two things")
+            raise ValueError(f"{layout} uses number {twice[0]} of an observation for two purposes")
         for name, index, width in (("displacement", self.displacement, 3), ("gripper", self.gripper, 1)):
             if index is not None and not 0 <= index <= self.action_size - width:
                 raise ValueError(f"{name} of {layout} must be within {self.action_size} numbers, got {index}")
         if self.displacement is not None and self.gripper in range(self.displacement, self.displacement + 3):
-            raise ValueError(f"gripper of {layout} must be no number of the displacement, got {self.gripper}")
+            raise ValueError(f"gripper of {layout} must not be an index of the displacement, got {self.gripper}")
         if self.closes not in (1, -1):
             raise ValueError(f"closes of {layout} must be 1 or -1, got {shown(self.closes)}")
         if self.reach <= 0:
@@ -132,7 +132,7 @@ class Layout:
         return slice(part.start + self.past, part.stop + self.past)
 
     def _past(self, parts: tuple[slice, ...]) -> tuple[slice, ...]:
-        """Return the same parts of the step before, none in a layout without a past."""
+        """Return the same parts of the previous step; empty in a layout without a past."""
         return () if self.past is None else tuple(map(self.a_step_before, parts))
 
     def to_json(self) -> dict[str, Any]:

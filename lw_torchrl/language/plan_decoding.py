@@ -42,7 +42,7 @@ class DecodedPlan:
 
     Attributes:
         plan: its conditions as queries and its skills in the text's words; None if there is none.
-        scripted: the same with the nearest scripted skills, without the steps that are near none; None if none is left.
+        scripted: the same with the nearest scripted skills, without steps that have none; None if no step is left.
     """
 
     plan: ConditionalPlan | None
@@ -64,7 +64,7 @@ _LONGEST = 65_536  # characters of a text that are read
 def decode_plan(
     text: str, task: str | Task, format: str, *, skills: Skills | None = None, tasks: Tasks = TASKS
 ) -> DecodedPlan:
-    """Read a plan from whatever a language model wrote. No text is an error, and none is executed.
+    """Read a plan from whatever a language model wrote. No text raises an error, and none is executed.
 
     Only clauses for ``task`` count: those of functions and headings of its name, and those before any name, which go
     on where the prompt ended. Thoughts, up to ``</think>`` or as other models mark them, are left out. Of several

@@ -41,7 +41,7 @@ def too_many_steps(what: str, number: int) -> str:
 
 def no_task(where: str, name: str, tasks: Tasks) -> str:
     """What is wrong with a name that is none of ``tasks``."""
-    return f"{where}: {shown(name)} is no task{did_you_mean(name, tasks)}"
+    return f"{where}: {shown(name)} is not a task{did_you_mean(name, tasks)}"
 
 
 def read_plan_text(

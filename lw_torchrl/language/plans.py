@@ -76,7 +76,7 @@ class ConditionalPlan:
 
     task: str
     steps: tuple[PlanStep, ...]
-    # The task whose objects the conditions name; None for ours of that name.
+    # The task whose objects the conditions name; None for the shipped task of that name.
     definition: Task = field(default=None, compare=False, repr=False)  # type: ignore[assignment]
     confidence: Probability | None = None
 
@@ -146,7 +146,7 @@ class ConditionalPlan:
 
     @classmethod
     def from_json(cls, name: str, row: Any) -> ConditionalPlan:
-        """The plan of :meth:`to_json` for the task ``name``; any other value is a :class:`PlanError`."""
+        """Rebuild the plan of the task ``name`` from :meth:`to_json`; raise :class:`PlanError` for any other value."""
         where, keys = f"plan of {shown(name)}", ("plan", "task", "roles", "confidence")
         if not isinstance(row, dict) or not isinstance(row.get("plan"), str) or set(row) - {*keys}:
             raise PlanError(f'{where} must be like {{"plan": text, "task": table}}, got {shown(row)}')

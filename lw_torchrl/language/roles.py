@@ -71,7 +71,7 @@ class StepRole:
 
     @classmethod
     def from_json(cls, row: Any) -> StepRole:
-        """The role of :meth:`to_json`; any other value is a :class:`ValueError`."""
+        """Rebuild a role from :meth:`to_json`; raise :class:`ValueError` for any other value."""
         names = [each.name for each in fields(cls)]
         if not isinstance(row, dict) or set(row) - {*names} or not {*names[:4]} <= set(row):
             raise ValueError(f"role must be a table of {', '.join(names)}, got {shown(row)}")

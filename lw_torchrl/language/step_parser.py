@@ -33,7 +33,7 @@ class ParsedStep:
     moved: str | None  # what is to arrive at the target: the robot's gripper, or an object that it holds
     target: str | None  # the object or point to go to; like ``moved``, None if unknown
     direction: Direction | None = None  # where an object is pushed, pulled or moved to; "goal" leads to ``toward``
-    confidence: float = 1.0  # less where it follows from the condition, or from what is usual
+    confidence: float = 1.0  # lower if it is inferred from the condition or from common usage
     toward: str | None = None  # an object; None for the task's goal
 
 
@@ -113,7 +113,7 @@ def _resolve_it(texts: Iterable[str], facts: Iterable[_Facts], task: Task) -> li
 
 
 def _only_sent(step: ParsedStep | None, text: str) -> ParsedStep | None:
-    """In a plan that does nothing else, "move the gripper to the block" is the whole motion."""
+    """Read "move the gripper to the block" as the whole motion of a plan that does nothing else."""
     to_it = step and step.verb == "descend" and re.match(rf"\w+ <{GRIPPER}> (?:to|at|toward|onto) <", text)
     return replace(step, verb="reach") if step and to_it else step
 
@@ -184,7 +184,7 @@ class _StepParser:
         return self._by_hand() if self.by_hand else self._object_moved(noun)
 
     def _closed(self, noun: str) -> ParsedStep:
-        """For a hand that is not there yet "grab the mug" is the way to it; for a hand that holds it, lifting it."""
+        """Read "grab the mug" as approaching it if the hand is not there yet, as lifting it if the hand holds it."""
         if self.facts.not_at and not self.facts.at and not self.facts.closed:
             return ParsedStep("descend", GRIPPER, noun)
         if self.verb == "pick" and self.facts.closed and not self.facts.open:
@@ -192,7 +192,7 @@ class _StepParser:
         return ParsedStep("close", GRIPPER, noun)
 
     def _by_hand(self) -> ParsedStep | None:
-        """The gripper is put somewhere, and what it holds goes with it."""
+        """Parse a step that puts the gripper somewhere; an object that it holds moves with it."""
         target = self.named[-1] if self.named else self.near
         if target is None:
             return None

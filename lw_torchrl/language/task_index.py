@@ -32,7 +32,7 @@ class TaskIndex:
     """The rows that tasks have in a table, in the order of their ids.
 
     Args:
-        task_ids: task name to id, as :attr:`Plans.task_ids`; two tasks of one id are a ValueError.
+        task_ids: task name to id, as :attr:`Plans.task_ids`; ValueError if two tasks have the same id.
     """
 
     def __init__(self, task_ids: Mapping[str, int]) -> None:
@@ -76,7 +76,7 @@ class TaskIndex:
 
 
 def as_plans(plans: AnyPlans) -> Plans:
-    """As :func:`lw_torchrl.language.plans.as_plans`, which is only imported where ``plans`` are not yet Plans."""
+    """Call :func:`lw_torchrl.language.plans.as_plans`, importing it only if ``plans`` are not Plans yet."""
     if isinstance(plans, Mapping) and hasattr(plans, "task_ids"):
         return plans  # type: ignore[return-value]
     from lw_torchrl.language import plans as library
@@ -85,11 +85,11 @@ def as_plans(plans: AnyPlans) -> Plans:
 
 
 class PlanTables:
-    """What transforms, attention and actors read of plans.
+    """Tables of plans that transforms, attention and actors read.
 
     Attributes:
         index: from task ids to rows, T of them.
-        mask: (T, S) bool, the steps that there are.
+        mask: (T, S) bool, true for the steps that exist, false for padding.
         turns: (T, 2, S) bool, the plan's own steps, and its fallback steps (its own, if it has no fallback steps).
         skill_index: (T, S) int64, the number of each step's skill in ``plans.skills``; 0 beyond the last step.
         number: (T,) int64, the number of each plan, as in :attr:`Plans.numbers`.

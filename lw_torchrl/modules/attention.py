@@ -36,7 +36,7 @@ def read_truth(tensordict: TensorDictBase, keys: Sequence[NestedKey], tables: Pl
     plan = tensordict.get(key_beside(keys[0], "_plan"), None)
     tables.refuse_others(plan, rows)
     steps = tables.mask.shape[-1]
-    # Answers for more plans, of which some are longer, have more columns.
+    # If qaf also answers longer plans, it has more columns.
     return (qaf[..., :steps] if plan is not None and qaf.shape[-1] > steps else qaf), rows
 
 

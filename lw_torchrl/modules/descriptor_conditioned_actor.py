@@ -66,7 +66,7 @@ class TaskLatent(Part):
         vectors = encoded([task.description for task in self.definitions.values()], own)
         self.index = TaskIndex(task_ids(self.tasks))
         order = [self.tasks.index(task) for task in self.index.tasks]
-        # Products of different numbers of rows round differently: whatever the tasks, there are at least 50 rows.
+        # Matrix products round differently for different numbers of rows, so there are always at least 50 rows.
         fill = vectors.new_zeros(max(0, len(MT50) - len(order)), vectors.shape[1])
         self.register_buffer("vectors", torch.cat((unit_scale(vectors)[order], fill)), persistent=False)
         self.encoder = SkillEncoder() if encoder is None else encoder

@@ -143,7 +143,7 @@ class SkillMixer(_Mixer):
 class ActionMixer(_Mixer):
     """Decode each skill's latent to an action, and mix the actions by the attention over the plan's steps.
 
-    It takes the place of :class:`SkillMixer` and the decoder. Reads ``skill_weights`` (B, S) float32, ``task_id``
+    It replaces :class:`SkillMixer` and the decoder. Reads ``skill_weights`` (B, S) float32, ``task_id``
     (B,) int64 and ``features`` (B, F) float32; writes ``action`` (B, A) float32.
 
     Args:

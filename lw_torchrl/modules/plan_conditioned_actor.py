@@ -45,7 +45,7 @@ def plan_trunk(
 
 
 class ConditionedActor(NamedParts):
-    """A policy of a trunk, which says what to do and what is seen, and a decoder, which gives the action.
+    """A policy made of a trunk, which writes a latent and features, and a decoder, which maps them to the action.
 
     Reads what the trunk reads; writes what the trunk and the decoder write, ``action`` (B, A) float32 last. Each part
     is an attribute of its name, and can be replaced: ``actor.decoder = network``.

@@ -1,4 +1,4 @@
-"""What other code may ask of any actor: the plans it follows, its tasks, and the transforms that must run before it."""
+"""Functions that return the plans of any actor, its tasks, and the transforms that must run before it."""
 
 from __future__ import annotations
 

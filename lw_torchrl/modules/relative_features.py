@@ -227,7 +227,7 @@ class RoleFeatures(_RelativePositions):
                 touches = role.verb in ("close", "pull") or (role.verb == "push" and role.manner == "push")
                 acts[at] = _is_first(plan, role.moved) or (at_contact[at] and touches)
                 lifts[at] = role.verb == "carry"
-                if role.verb == "move":  # a place beside where it is
+                if role.verb == "move":  # a place next to its current position
                     self.offset[at] += _AWAY * way
                 else:
                     direction[at] = way

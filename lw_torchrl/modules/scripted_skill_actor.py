@@ -30,7 +30,7 @@ class ScriptedSkillActor(Part):
 
     Args:
         plans: a plan for each task; every step's skill is the text of a scripted skill.
-        select: of several true steps, "first" takes the first, "random" any, as in the paper, "mix" all, equally.
+        select: which of several true steps acts: "first", "random" (as in the paper), or "mix" (all, equally).
         skills: the scripted skills by text, as from :func:`load_skills`; None for the shipped ones.
         seed: of the random choice, from -2**63 to 2**64 - 1.
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested keys are allowed.

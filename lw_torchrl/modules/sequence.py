@@ -122,7 +122,7 @@ class NamedParts(RenamedInputs, TensorDictSequential):
         if name not in parts:
             if parts and isinstance(value, nn.Module) and type(self).__module__.startswith("lw_torchrl."):
                 own = f"{type(self).__name__} has the parts {', '.join(parts)}"
-                raise AttributeError(f"{own}, and no {name}; what a part is made of belongs to it: actor.mixer.encoder")
+                raise AttributeError(f"{own}, and no {name}; a part holds its own modules: actor.mixer.encoder")
             super().__setattr__(name, value)
             return
         if not isinstance(value, nn.Module):

@@ -150,7 +150,7 @@ def decided(action: Tensor, layout: Layout, closes_above: float | None = None) -
 class DemonstratedActor(RenamedInputs):
     """Two policies: one without plans for the tasks that were demonstrated, one with plans for all others.
 
-    Where ten demonstrations show all that there is to do, words have nothing to add.
+    A plan adds nothing in a task that ten demonstrations cover.
 
     Reads what the two read; writes ``action`` (B, A) float32, and what else ``others`` writes.
 
@@ -225,7 +225,7 @@ class TransferredActor(_Wrapper):
 
     Args:
         actor: an actor whose features mean the same in both layouts: :class:`RoleFeatures` with the "opening".
-        plans: what it is to do, for the other suite's tasks.
+        plans: plans for the other suite's tasks.
         speed: scale factor of the displacement, for simulators whose steps last longer.
         trained: the layout that the actor was trained with; None for the actor's.
 

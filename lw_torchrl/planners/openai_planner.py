@@ -103,7 +103,7 @@ class OpenAIPlanner:
             raise TypeError(f"options must be fields of a request in JSON, got {shown(options)}") from error
         if own := sorted(_OWN_FIELDS & set(self.options or ())):
             others = ", ".join(sorted(_OWN_FIELDS))
-            raise ValueError(f"options must be other fields than {others}, got {', '.join(own)}")
+            raise ValueError(f"options must not set {', '.join(own)} (reserved: {others})")
         self.name = folder_name(name or (f"{model}-constrained" if constrain else model))
         self.cache = AnswerCache(cache)
         self.concurrency, self.retries, self.timeout = concurrency, retries, timeout
@@ -171,7 +171,7 @@ class OpenAIPlanner:
         out: AnyPath | None = None,
         progress: bool = True,
     ) -> Answers:
-        """Report to the model how its answers fared, and ask for a better answer to each.
+        """Report to the model how its plans performed, and ask for a better answer to each.
 
         Args:
             answers: answers in one format.

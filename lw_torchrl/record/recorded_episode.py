@@ -36,7 +36,7 @@ class PlanLike(Protocol):
 
 
 class TargetPose(NamedTuple):
-    """What a scripted skill moves, and its target, T×3, metres; equal on an axis that the skill does not control."""
+    """Positions of a skill's moved object and target, T×3, metres; equal on an axis that the skill does not control."""
 
     position: NDArray[np.float32]
     moved: NDArray[np.float32]

@@ -29,7 +29,7 @@ _TABLE, _FLOATING = 0.02, 0.03  # metres: what "touching the table" allows; wher
 
 @dataclass(frozen=True)
 class Finding:
-    """A measurement: what was looked at in a task, what was measured, what the layout wants, and whether they agree."""
+    """A measurement in a task: its subject, its result, the layout's value, and whether they agree."""
 
     task: str
     what: str

@@ -45,7 +45,7 @@ class CheckpointFiles:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Within the block, no other training writes these files."""
+        """Lock these files against other trainings within the block."""
         if self.checkpoint is None:
             yield
             return
@@ -78,7 +78,7 @@ class CheckpointFiles:
             write_file(self.checkpoint, self.part, description, contents_of(part))
 
     def exist(self) -> bool:
-        """Return whether there is a state; raise :class:`ValueError` if there is only a policy, which would be lost."""
+        """Return whether there is a state; ValueError if there is only a policy, which would be overwritten."""
         if self.state is not None and self.state.exists():
             return True
         if self.checkpoint is not None and self.checkpoint.exists():

@@ -53,7 +53,7 @@ class Training:
 
     Attributes:
         module, optimizer: hold everything that is trained.
-        networks, device: are in train mode while training runs and in eval mode afterwards; and their device.
+        networks, device: the networks, in train mode while training runs and in eval mode afterwards; their device.
         minibatches: one for each buffer.
         description: describes the training as JSON; it only resumes from a training state of the same description.
         part: what ``checkpoint`` is, "actor" or "evaluator"; None if it is the training state itself.
@@ -162,7 +162,7 @@ class Training:
         with self._files.locked(), interrupts_between_steps() as interrupt:
             with Progress(self.title, total, "step", initial=self.steps, show=self.progress) as bar:
                 if self.steps >= last:
-                    self.save()  # a kill may have come after the training state was written, before the policy
+                    self.save()  # the process may have been killed after writing the training state, before the policy
                 while self.steps < last and not interrupt.requested:
                     self.step()
                     bar.update()

@@ -1,4 +1,4 @@
-"""Minibatches of a buffer, what a buffer must be for a training, and its description in checkpoints."""
+"""Minibatches of a buffer, checks of the buffer before training, and its description in checkpoints."""
 
 from __future__ import annotations
 

@@ -19,8 +19,8 @@ from lw_torchrl.modules.relative_features import RoleFeatures
 def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None:
     """Call :meth:`Features.fit` of all features in a module, or in the networks of a loss, with a buffer's rows.
 
-    The statistics reach every copy of a network that the loss holds, and its target networks. Rows count alike, with
-    any sampler but :class:`CoLearningSampler`, with which half of the weight is on the target task's few rows.
+    The statistics reach every copy of a network that the loss holds, and its target networks. Rows have equal
+    weights, except with :class:`CoLearningSampler`, which puts half of the weight on the target task's few rows.
 
     Args:
         target: an actor, a critic, any module with :class:`~lw_torchrl.modules.Features` in it, or a loss.

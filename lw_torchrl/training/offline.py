@@ -40,7 +40,7 @@ class OfflineConfig:
     Attributes:
         learning_rate: of the actor, at the start.
         critic_learning_rate: of everything else that the loss trains.
-        target_eps: the share of a target network that stays in a step, where the loss has target networks.
+        target_eps: the fraction of a target network that is kept in each step, if the loss has target networks.
         normalize: before the first step, fit the statistics of the features to the buffer's rows; False for networks
             that were trained on other rows.
         max_grad_norm: the actor's gradients, and those of everything else, are clipped to this norm.

@@ -33,7 +33,7 @@ class CorruptQAF(EpisodeTransform):
 
     The draws depend only on (task, seed, episode, step) and the answer's place in its plan; a larger probability
     inverts all that a smaller one inverts. In :func:`lw_torchrl.evaluate` it can be the ``evaluator``. To corrupt a
-    learned evaluator's answers, run that by a transform before this one, which calls it in ``_reset`` and ``_call``.
+    learned evaluator's answers, put a transform before this one that calls the evaluator in ``_reset`` and ``_call``.
 
     Args:
         plans: the plans whose conditions ``qaf`` answers.

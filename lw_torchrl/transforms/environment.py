@@ -79,7 +79,7 @@ class EpisodeTransform(Transform):
 
 
 class KeepsEnvState(EpisodeTransform):
-    """A transform whose ``state_dict`` holds that of the environment under it, which TorchRL does not ask for it."""
+    """A transform whose ``state_dict`` also holds the environment's, which TorchRL does not save."""
 
     def get_extra_state(self) -> Tensor:
         """Return the environment's ``state_dict``, as bytes (n,) uint8; empty on a replay buffer."""

@@ -189,7 +189,7 @@ def test_wrong_choices_are_named(base, choice, message):
 
 def test_choices_for_several_folders_are_a_list(base, target):
     for episodes in ([None], {"push": 1}, 1):
-        with pytest.raises(ValueError, match="episodes must be a list of a choice for each of the 2 folders"):
+        with pytest.raises(ValueError, match="episodes must be a list with one choice for each of the 2 folders"):
             LanguageWorldExperienceReplay([base.root, target.root], episodes=episodes)
     with pytest.raises(ValueError, match=r"episodes\[1\]: task must be one of 'reach', got 'push'"):
         LanguageWorldExperienceReplay([base.root, target.root], episodes=[None, {"push": 1}])

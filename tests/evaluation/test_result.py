@@ -164,7 +164,7 @@ def test_a_wrong_file_is_refused_and_left_alone(tmp_path, name):
     DAMAGE[name](found)
     path.write_text(json.dumps(found))
     before = path.read_bytes()
-    with pytest.raises(ValueError, match=r"results.json' is no result of lw_torchrl.evaluation version 1"):
+    with pytest.raises(ValueError, match=r"results.json' is not a result of lw_torchrl.evaluation version 1"):
         EvaluationResult.load(path)
     assert path.read_bytes() == before
 
@@ -222,7 +222,7 @@ CONTENTS |= {"nested": NESTED, "twice": TWICE, "digits": b"1" * 5_000}
 @pytest.mark.parametrize("name", CONTENTS)
 def test_a_file_that_is_not_a_result_is_refused(tmp_path, name):
     (tmp_path / "results.json").write_bytes(CONTENTS[name])
-    with pytest.raises(ValueError, match="is no result of"):
+    with pytest.raises(ValueError, match="is not a result of"):
         EvaluationResult.load(tmp_path / "results.json")
 
 

@@ -68,7 +68,7 @@ def test_any_condition_becomes_the_nearest_query(tmp_path_factory, condition, sk
         ("[" * 100_000, "nested too deeply"),
         ([], "task names with lists of pairs: it must be an object, got list"),
         ({"plans": 3}, "expected task names with lists"),
-        ({"pusch": []}, "'pusch' is no task; did you mean 'push'"),
+        ({"pusch": []}, "'pusch' is not a task; did you mean 'push'"),
         ({"push": {}}, "push: expected a list of"),
         ({"push": [["gripper is open"]]}, "push, step 1: expected a condition and a skill, two strings"),
         ({"push": [["gripper is open", 3]]}, "push, step 1: expected a condition and a skill, two strings"),

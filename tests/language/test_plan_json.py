@@ -109,7 +109,7 @@ GOOD = Plans([ConditionalPlan.from_pairs(moved(0.1), PUSH)]).to_json()
         ({"pusch": {"plan": "def pusch(robot):"}}, "did you mean 'push'"),
         ({"../push": {"plan": "", "task": GOOD["push"]["task"]}}, "lower-case words"),
         ({"push": {"plan": "def push(robot):\n  import os"}}, "line 2"),
-        ({"push": {"plan": str(MT10_PLANS["reach"])}}, "'reach' is no task"),
+        ({"push": {"plan": str(MT10_PLANS["reach"])}}, "'reach' is not a task"),
         ({"push": {"plan": "def push(robot):\n  if check('\ud800'):"}}, "line 2"),
         ({"push": {"plan": "x" * 10**5}}, "line 1"),
         ({"push": {"plan": "x" * 10**6}}, "at most 262144 characters, got 1000000"),

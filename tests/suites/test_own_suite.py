@@ -334,10 +334,10 @@ def test_the_check_finds_a_gripper_that_does_not_move():
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"opening": 2}, "says of number 2 that it is two things"),
-        ({"things": (Slot(3),)}, "says of number 3 that it is two things"),
-        ({"past": 2, "size": 40}, "that it is two things"),
-        ({"gripper": 2}, "gripper of layout 'toy' must be no number of the displacement, got 2"),
+        ({"opening": 2}, "uses number 2 of an observation for two purposes"),
+        ({"things": (Slot(3),)}, "uses number 3 of an observation for two purposes"),
+        ({"past": 2, "size": 40}, "for two purposes"),
+        ({"gripper": 2}, "gripper of layout 'toy' must not be an index of the displacement, got 2"),
     ],
 )
 def test_a_number_is_one_thing(change, says):

@@ -114,7 +114,7 @@ def import_dataset(
 
     Our exports are restored bit for bit, so the options after ``format`` are for other people's files. These need
     observations and actions of the suite's sizes. docs/data.md lists the column names that are recognised, and the
-    values of missing columns. Use such datasets with ``label="executed"``: they do not say what an expert would do.
+    values of missing columns. Use such datasets with ``label="executed"``: they hold no expert actions.
 
     Args:
         source: the file or folder.

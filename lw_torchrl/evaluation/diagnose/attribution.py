@@ -54,7 +54,7 @@ def attribute_failures(
     **A rule reads the states.** The cause is *query* if the policy acted on wrong answers; else *plan* if, late in the
     episode, the plan requests something else than the reference plan; else *skill*. This is no proof: a plan that
     differs from the reference may succeed. Without a reference the rule recognises only wrong answers, a plan of which
-    no condition holds, and a skill that stays far from its target. Without ``actor`` the rule is all there is.
+    no condition holds, and a skill that stays far from its target. Without ``actor``, only the rule is used.
 
     **A counterfactual decides**, with ``actor``. First the null control: the same episode is re-run, with the same
     noise and nothing replaced. If it succeeds, the failure is *not reproducible*, and the finding says what differs.
@@ -64,7 +64,7 @@ def attribute_failures(
     *gripper* or the hand's motion (*actuation*) only, or in all steps (*policy*); or twice the time (*out of time*). If
     nothing helps, pairs are tried, which give ``cause`` and ``also``. If several replacements help, the one that fixes
     most of the task's failed episodes counts, and of those about as good the smallest; but a skill does not count if
-    other steps have the same fault. A policy without plans gets no step.
+    other steps have the same fault. For a policy without plans, no step is reported.
 
     Args:
         rollouts: episodes as :func:`evaluate` passes them to ``on_episode``, or TensorDicts of batch (T,), each one
@@ -73,7 +73,7 @@ def attribute_failures(
             Optional: the answers that the policy acted on, ``qaf_logits`` (T, S) float32, else ``qaf`` (T, S) bool;
             ``skill_weights`` (T, S) float32, for the active step.
         plans: the plans that were carried out.
-        actor: the policy; the counterfactuals of one that draws its actions mean less.
+        actor: the policy; the counterfactuals of a stochastic policy are less reliable.
         reference: trusted plans for some of the tasks.
         evaluator: as for :func:`evaluate`; an evaluator inside the policy is found there.
         skills: trusted scripted skills by text; None for the suite's, :func:`load_skills` of Meta-World.

@@ -16,7 +16,7 @@ from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.policy import draws, plans_of
 
 _OFTEN, _BRIEF = 0.4, 5  # the smallest share of a step's states that is often; fewer states decide nothing
-_SAME = 0.02  # an action that differs less from the script's is the script's
+_SAME = 0.02  # actions that differ by less count as equal to the script's
 _HALF = 0.5  # the share of the error that a fault may leave unexplained, and that counts in other steps
 
 

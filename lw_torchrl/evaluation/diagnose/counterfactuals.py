@@ -91,7 +91,7 @@ class Counterfactuals:
             warnings.warn(f"reference: the policy cannot carry it out, so no plan is replaced ({why})", stacklevel=4)
 
     def run(self, seen: Sequence[EpisodeStates], same: Collection[EpisodeId] = ()) -> None:
-        """Run them; ``same`` are the episodes in which plan and reference request the same."""
+        """Run the replacements; ``same`` are the episodes in which plan and reference request the same actions."""
         seen = [one for one in seen if not self.null.succeeds(one.which)]
         every = [one.which for one in seen]
         misled = [which for which in every if which in self.null.misled]

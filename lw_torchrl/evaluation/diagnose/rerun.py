@@ -24,7 +24,7 @@ _TRUE = "true_observation"  # the environment's own, before any transform or mod
 
 
 class Perception:
-    """A context that notes what a policy is shown, or corrects it.
+    """A context that records the observations that a policy is shown, or corrects them.
 
     A module that changes the observation for a policy inside it is looked through; a function is not.
     """

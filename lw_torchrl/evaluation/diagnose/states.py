@@ -17,9 +17,9 @@ from lw_torchrl.transforms.qaf import plan_program
 
 _LATE = 100  # the last states, in which a failed episode got nowhere
 _AHEAD, _STILL = 10, 0.01  # the hand stands still if it moves less than a centimetre in 10 states
-_AWAY = 25  # a stay in a step may be interrupted for so many states: two alternating steps are one stay
+_AWAY = 25  # longest interruption of a stay in a step, in states: two alternating steps are one stay
 _WRONG = 0.01  # the smallest share of states with wrong answers that counts
-OTHER = 0.3  # two actions that differ by more, on some axis, pursue different things
+OTHER = 0.3  # actions that differ by more, on some axis, have different purposes
 
 
 class EpisodeStates(NamedTuple):

@@ -35,7 +35,7 @@ PLAN_FORMATS = Registry(
 def encode_plan(plan: ConditionalPlan, format: str) -> str:
     """A plan as text, from which :func:`~lw_torchrl.decode_plan` reads an equal plan.
 
-    Reasons are written where a format explains; a goal other than its skill's usual one only in the goal formats.
+    Only formats that explain hold reasons, and only goal formats hold a goal other than the skill's usual one.
 
     Example:
         >>> plan = ConditionalPlan.from_pairs("reach", [("gripper is open", "move the gripper to the target")])

@@ -30,7 +30,7 @@ class PlanFormat:
     encode: Callable[[ConditionalPlan], str]
     read: Callable[[str], Reading]  # finds the clauses in any text; it never raises
     prompt: Callable[[Sequence[ConditionalPlan], Task, Sequence[str]], str]
-    style: Style = Style()  # what it says of each step, for models that must keep to a schema
+    style: Style = Style()  # what it writes for each step, for models that are constrained to a schema
 
 
 STYLES = {"basic": Style(), "chain": Style(explains=True), "goal": Style(explains=True, goals=True)}

@@ -23,8 +23,8 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
     """Simulates all rows together: physics in threads, by default one a core, everything else in NumPy over all rows.
 
     Its numbers are those of :class:`~lw_torchrl.suites.metaworld.plain_engine.MetaWorldEngine`, bit for bit, whatever
-    the number of threads. The rows of one XML file share a compiled model. Another Meta-World or MuJoCo than the one
-    this engine was compared with is an ImportError.
+    the number of threads. The rows of one XML file share a compiled model. Raises ImportError for
+    versions of Meta-World or MuJoCo that this engine was not compared with.
 
     A row faults when its action is not finite, or when its simulation becomes unstable. It then repeats its last stable
     observation and is not simulated until it is reset; other rows are not affected.
