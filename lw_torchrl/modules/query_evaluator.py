@@ -15,7 +15,7 @@ from torchrl.envs import Transform
 from lw_torchrl._checks import check_choice, checked
 from lw_torchrl._keys import dispatched, key_beside, read, write
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
-from lw_torchrl.language.task_index import PlanTables
+from lw_torchrl.language.task_index import PlanTables, pick
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import with_weights_of
 
@@ -53,6 +53,7 @@ class QueryEvaluator(TensorDictModuleBase):
     """
 
     text_encoder: TextEncoder | None = None
+    plan_number: Tensor
 
     @checked
     def __init__(self, plans: Plans, *, answers: Answers = "soft") -> None:
@@ -60,6 +61,7 @@ class QueryEvaluator(TensorDictModuleBase):
         self.plans, self.tasks, self.layout = plans, tuple(plans), plans.layout
         self.config, self.answers = {}, answers
         self.plan_tables = PlanTables(plans)
+        self.register_buffer("plan_number", self.plan_tables.number, persistent=False)
         self.in_keys: list[NestedKey] = ["observation", "task_id"]
         self.out_keys: list[NestedKey] = ["qaf", "qaf_logits"]
 
@@ -111,7 +113,7 @@ class QueryEvaluator(TensorDictModuleBase):
             qaf = (logits > 0).to(qaf.dtype) + (qaf - qaf.detach())
         rows = self.plan_tables.rows(tensordict.get("task_id")) if "task_id" in self.in_keys else None
         if rows is not None:  # an actor of other plans then refuses the answers, as QAFTransform's
-            tensordict.set(key_beside(self.out_keys_source[0], "_plan"), self.plan_tables.number.to(rows.device)[rows])
+            tensordict.set(key_beside(self.out_keys_source[0], "_plan"), pick(self.plan_number, rows))
         return write(tensordict, self, [qaf, logits])
 
     def transform(self) -> Transform | None:

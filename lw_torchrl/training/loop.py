@@ -235,7 +235,8 @@ class Training:
         for minibatches in self.minibatches:
             getattr(minibatches.source, "verify", lambda: None)()  # a dataset's rows must be those it recorded
         self._files.restore(self.description, self.device, self.contents(), self.load_state_dict)
-        share_contacts(self.module)
+        for network in self.networks:
+            share_contacts(network)
         return True
 
     def state_dict(self) -> dict[str, Any]:

@@ -54,9 +54,7 @@ def test_exported_it_gives_the_same_bits_at_every_number_of_rows(name):
         run(observation, torch.full_like(ids, lw.task_id("soccer")))
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in ("plan", "scripted") else pytest.param(name, marks=pytest.mark.slow) for name in OURS]
-)
+@pytest.mark.parametrize("name", OURS)
 def test_the_bare_actor_is_exported(name):
     """By name, and by position, which TorchRL's own TensorDictSequential does not support."""
     actor = ACTORS[name]().eval()
