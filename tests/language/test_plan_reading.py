@@ -82,7 +82,7 @@ def test_articles_go_before_the_nouns_that_lack_one(task, written, skill):
         ('if check("the gripper is open"):\n    robot.push("puck")\n', 1, "def task_name(robot):"),
         ("Sure, here is a plan:\n" + HEAD, 1, "def task_name(robot):"),
         (HEAD.replace("push(robot)", "pusch(robot)"), 1, "did you mean 'push'?"),
-        (HEAD.replace("push(robot)", "zzzzzzzz(robot)"), 1, "no task"),
+        (HEAD.replace("push(robot)", "zzzzzzzz(robot)"), 1, "not a task"),
         (HEAD.replace("push(robot)", "push()"), 1, "def task_name(robot):"),
         (HEAD + HEAD, 4, "second plan"),
         (HEAD + "    robot.push('puck')\n", 4, "the skill has no condition"),

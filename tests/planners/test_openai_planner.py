@@ -292,7 +292,7 @@ def test_your_own_task(ask, tmp_path):
     [
         ({"base_url": "127.0.0.1:8000"}, ValueError, "base_url must be an address"),
         ({"free_skills": True}, ValueError, "free_skills needs constrain"),
-        ({"options": {"model": "x"}}, ValueError, "got model"),
+        ({"options": {"model": "x"}}, ValueError, "must not set model"),
         ({"options": {"x": {1}}}, TypeError, "options"),
     ],
 )
