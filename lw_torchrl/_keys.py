@@ -56,6 +56,11 @@ def key_beside(key: NestedKey, ending: str) -> NestedKey:
     return key + ending if isinstance(key, str) else (*key[:-1], key[-1] + ending)
 
 
+def last_name(key: NestedKey) -> str:
+    """Return the last name of a key, which may be nested."""
+    return key if isinstance(key, str) else key[-1]
+
+
 def read(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> list[Tensor]:
     """Return the tensors of ``keys``; a :class:`ValueError` names those that are missing."""
     found = [tensordict.get(key, None) for key in keys]

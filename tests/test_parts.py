@@ -1,4 +1,4 @@
-"""examples/parts: each part of the library alone, in a short program without any other part of ours."""
+"""examples/parts: short programs, each of which uses one part of the library alone."""
 
 from __future__ import annotations
 

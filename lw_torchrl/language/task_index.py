@@ -136,6 +136,18 @@ class PlanTables:
             raise ValueError(f"qaf answers other plans than the actor's, for {tasks}; {hint}")
 
 
+def answers_of(qaf: Tensor, task_id: Tensor, number: Tensor | None, tables: PlanTables) -> tuple[Tensor, Tensor]:
+    """Return ``qaf`` (..., S) and each row's place (...) int64 in the tables of plans that have S steps.
+
+    Answers for more plans, of which some are longer, are cut to S if ``number``, their ``qaf_plan``, shows that the
+    rows' plans are equal. A task without a plan, and the answers of other plans, are a :class:`ValueError`.
+    """
+    rows = tables.rows(one_per_row(task_id, qaf))
+    tables.refuse_others(number, rows)
+    steps = tables.mask.shape[-1]
+    return (qaf[..., :steps] if number is not None and qaf.shape[-1] > steps else qaf), rows
+
+
 class TaskTables(nn.Module, Generic[Tables]):
     """Tables, a named tuple of tensors (T, ...) with a row for each task, and their rows for a batch.
 

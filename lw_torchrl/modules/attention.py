@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lw_torchrl._checks import checked
 from lw_torchrl._keys import dispatched, key_beside, read, write
-from lw_torchrl.language.task_index import PlanTables, as_plans, one_per_row, pick
+from lw_torchrl.language.task_index import PlanTables, answers_of, as_plans, pick
 from lw_torchrl.language.value_checks import check_values
 from lw_torchrl.modules.networks import in_mode_of
 from lw_torchrl.modules.sequence import Part
@@ -32,12 +32,7 @@ def attend(logits: Tensor, mask: Tensor) -> Tensor:
 def read_truth(tensordict: TensorDictBase, keys: Sequence[NestedKey], tables: PlanTables) -> tuple[Tensor, Tensor]:
     """Return the truth (..., S) of a plan's conditions and the rows (...) of its tables; raise for other plans."""
     qaf, task_id = read(tensordict, keys)
-    rows = tables.rows(one_per_row(task_id, qaf))
-    plan = tensordict.get(key_beside(keys[0], "_plan"), None)
-    tables.refuse_others(plan, rows)
-    steps = tables.mask.shape[-1]
-    # If qaf also answers longer plans, it has more columns.
-    return (qaf[..., :steps] if plan is not None and qaf.shape[-1] > steps else qaf), rows
+    return answers_of(qaf, task_id, tensordict.get(key_beside(keys[0], "_plan"), None), tables)
 
 
 def check_truth(qaf: Tensor, shape: torch.Size) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from lw_torchrl._checks import check_scale, checked
 from lw_torchrl._keys import dispatched, read, write
-from lw_torchrl.modules.networks import MLP, evaluating, materialize
+from lw_torchrl.modules.networks import MLP, materialize, probe
 from lw_torchrl.modules.sequence import Part, encoding_keys, encoding_width, trunk_attributes
 
 LEAST_STD = 1e-3
@@ -155,9 +155,7 @@ def as_decoder(
         return decoder
     decode = Decode(decoder, in_keys=encoding_keys(trunk), out_keys=("action",) if out_keys is None else out_keys)
     if width is not None and len(decode.out_keys) == 1:
-        with torch.no_grad(), evaluating(decoder), torch.random.fork_rng(devices=[]):
-            device = next((p.device for p in decoder.parameters()), None)
-            found, size = decoder(torch.zeros(1, width, device=device)), trunk_attributes(trunk)["layout"].action_size
+        found, size = probe(decoder, torch.zeros(1, width)), trunk_attributes(trunk)["layout"].action_size
         if found.shape[-1:] != (size,):
             raise ValueError(f"decoder must return actions (B, {size}) from (B, {width}), got {tuple(found.shape)}")
     return decode

@@ -19,7 +19,7 @@ from lw_torchrl.language.tasks import MT50, Task, named_tasks, one_layout, task_
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.features import as_features
 from lw_torchrl.modules.mixer import SkillEncoder, unit_scale
-from lw_torchrl.modules.networks import evaluating, materialize
+from lw_torchrl.modules.networks import materialize, probe
 from lw_torchrl.modules.plan_conditioned_actor import ConditionedActor
 from lw_torchrl.modules.sequence import Part
 
@@ -71,8 +71,7 @@ class TaskLatent(Part):
         self.register_buffer("vectors", torch.cat((unit_scale(vectors)[order], fill)), persistent=False)
         self.encoder = SkillEncoder() if encoder is None else encoder
         materialize(self.encoder, self.vectors)
-        with torch.no_grad(), evaluating(self.encoder):
-            self.latent_size = self.encoder(self.vectors[:1]).shape[-1]
+        self.latent_size = probe(self.encoder, self.vectors[:1]).shape[-1]
 
     @property
     def text_vectors(self) -> Tensor:

@@ -17,8 +17,8 @@ from lw_torchrl._checks import check_choice, check_scale, checked
 from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
 from lw_torchrl.language.task_index import as_plans
 from lw_torchrl.language.value_checks import check_finite
-from lw_torchrl.modules.networks import evaluating, in_mode_of
-from lw_torchrl.modules.sequence import written_key
+from lw_torchrl.modules.networks import in_mode_of, probe
+from lw_torchrl.modules.sequence import follow, written_key
 
 if TYPE_CHECKING:
     from lw_torchrl.language.layout import Layout
@@ -170,7 +170,7 @@ class Concat(TensorDictModuleBase):
     Reads what the modules read; writes ``features`` (B, F), those of the first module first.
 
     Args:
-        parts: :class:`Features`, or any TensorDict modules; the first key that each one writes is taken.
+        parts: :class:`Features`, or any TensorDict modules that write one key, or one that is named ``features``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -211,7 +211,7 @@ class Concat(TensorDictModuleBase):
 
     def with_plans(self, plans: AnyPlans) -> Concat:
         """Return the same features for other plans."""
-        parts = [part.with_plans(plans) if hasattr(part, "with_plans") else part for part in self.parts]
+        parts = [follow(part, plans) for part in self.parts]
         return in_mode_of(self, Concat(*parts, out_keys=self.out_keys_source))
 
     @dispatched
@@ -220,7 +220,6 @@ class Concat(TensorDictModuleBase):
         return write(tensordict, self, [torch.cat(seen, -1)])
 
 
-@torch.no_grad()
 def as_features(features: nn.Module | None, layout: Layout, noise: float = 0.0) -> TensorDictModuleBase:
     """Return features as a TensorDict module: a plain one reads ``observation``, None stands for the differences."""
     if features is None:
@@ -228,9 +227,7 @@ def as_features(features: nn.Module | None, layout: Layout, noise: float = 0.0) 
     if isinstance(features, TensorDictModuleBase):
         return features
     module: Any = TensorDictModule(features, in_keys=["observation"], out_keys=["features"])
-    with evaluating(features), torch.random.fork_rng(devices=[]):
-        device = next((p.device for p in features.parameters()), None)
-        module.width = features(torch.zeros(1, layout.size, device=device)).shape[-1]
+    module.width = probe(features, torch.zeros(1, layout.size)).shape[-1]
     return module
 
 

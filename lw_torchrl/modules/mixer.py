@@ -14,7 +14,7 @@ from lw_torchrl._checks import check_int, checked
 from lw_torchrl._keys import dispatched, read, write
 from lw_torchrl.language.task_index import PlanTables, as_plans, one_per_row, pick
 from lw_torchrl.language.text import TextEncoder, encoded
-from lw_torchrl.modules.networks import MLP, evaluating, in_mode_of, materialize
+from lw_torchrl.modules.networks import MLP, in_mode_of, materialize, probe
 from lw_torchrl.modules.sequence import Part
 
 if TYPE_CHECKING:
@@ -65,8 +65,7 @@ class _Mixer(Part):
         materialize(self.encoder, self.vectors)
         if (weight := next(self.encoder.parameters(), None)) is not None:  # with_plans: an encoder that was moved
             self.index, self.vectors = self.index.to(weight.device), self.vectors.to(weight)
-        with torch.no_grad(), evaluating(self.encoder):
-            self.latent_size = self.latents().shape[-1]
+        self.latent_size = probe(self.encoder, self.vectors).shape[-1]
 
     @property
     def text_vectors(self) -> Tensor | None:

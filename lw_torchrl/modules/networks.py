@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -42,6 +42,14 @@ def materialize(module: nn.Module, *inputs: Tensor) -> None:
     if any(isinstance(parameter, nn.parameter.UninitializedParameter) for parameter in module.parameters()):
         with evaluating(module):
             module(*inputs)
+
+
+@torch.no_grad()
+def probe(module: nn.Module, example: Tensor) -> Any:
+    """Return what a module gives for an example, moved to its device, without drawing from the global generator."""
+    weight = next(module.parameters(), None)
+    with evaluating(module), torch.random.fork_rng(devices=[]):
+        return module(example if weight is None else example.to(weight.device))
 
 
 @contextmanager

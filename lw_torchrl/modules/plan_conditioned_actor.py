@@ -19,7 +19,7 @@ from lw_torchrl.modules.decoder import MLPDecoder, as_decoder
 from lw_torchrl.modules.features import as_features
 from lw_torchrl.modules.mixer import SkillMixer
 from lw_torchrl.modules.networks import in_mode_of
-from lw_torchrl.modules.sequence import NamedParts, action_spec, check_same_plans, trunk_attributes
+from lw_torchrl.modules.sequence import NamedParts, action_spec, check_same_plans, follow, trunk_attributes
 
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import AnyPlans
@@ -112,7 +112,7 @@ class ConditionedActor(NamedParts):
 
     def with_plans(self, plans: AnyPlans) -> Self:
         """Return an actor with the same networks that follows other plans: training either trains both."""
-        parts = {n: part.with_plans(plans) if hasattr(part, "with_plans") else part for n, part in self.module.items()}
+        parts = {name: follow(part, plans) for name, part in self.module.items()}
         decoder = parts.pop("decoder")
         return in_mode_of(self, self.rebuild(TensorDictSequential(OrderedDict(parts)), decoder))
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Iterator
 from typing import Any
 
-from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.envs import Compose, Transform
 
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
+from lw_torchrl.modules.sequence import follow
 from lw_torchrl.transforms.fallback_turns import FallbackTurns
 from lw_torchrl.transforms.qaf import QAFTransform
 
@@ -58,14 +57,7 @@ def with_plans(actor: Any, plans: AnyPlans) -> Any:
     plans = as_plans(plans)
     if plans_of(actor) is None:
         raise TypeError(f"with_plans needs an actor that follows plans, and this {type(actor).__name__} does not")
-    if hasattr(actor, "with_plans"):
-        return actor.with_plans(plans)
-    if type(actor) is not TensorDictSequential:
-        raise TypeError(f"{type(actor).__name__} cannot follow other plans: give it a method with_plans(plans)")
-    named = isinstance(actor.module, nn.ModuleDict)
-    parts = [(n, with_plans(p, plans) if plans_of(p) is not None else p) for n, p in actor.module._modules.items()]
-    made = TensorDictSequential(OrderedDict(parts)) if named else TensorDictSequential(*(part for _, part in parts))
-    return made.train(actor.training)
+    return follow(actor, plans)
 
 
 def transform_of(actor: Any, plans: Plans | None = None) -> Transform | None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
@@ -11,10 +12,12 @@ from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.data import Bounded, Composite
 
-from lw_torchrl._keys import any_arguments, as_keys, check_apart
+from lw_torchrl._keys import any_arguments, as_keys, check_apart, last_name
+from lw_torchrl.modules.networks import in_mode_of
 
 if TYPE_CHECKING:
     from lw_torchrl.language.layout import Layout
+    from lw_torchrl.language.plans import AnyPlans
 
 
 class Part(TensorDictModuleBase):
@@ -176,15 +179,37 @@ def trunk_attributes(trunk: TensorDictSequential) -> dict[str, Any]:
 
 def check_same_plans(parts: Mapping[str, nn.Module]) -> None:
     """Raise :class:`ValueError` unless all parts follow the same plans."""
-    known = {name: plans for name, part in parts.items() if (plans := getattr(part, "plans", None)) is not None}
-    for name, part in parts.items():  # parts of parts: features that are concatenated
-        inner = (plans for each in part.modules() if (plans := getattr(each, "plans", None)) is not None)
-        known.setdefault(name, next(inner, None))
-    plans = {name: each for name, each in known.items() if each is not None}
-    first = next(iter(plans), "")
-    for name, each in plans.items():
-        if each is not plans[first] and each != plans[first]:
-            raise ValueError(f"{first} and {name} must follow the same plans; give both the same Plans")
+    first: tuple[str, Any] | None = None
+    for name, part in parts.items():
+        plans = next(_plans_inside(part), None)
+        if plans is None:
+            continue
+        first = first or (name, plans)
+        if plans is not first[1] and plans != first[1]:
+            raise ValueError(f"{first[0]} and {name} must follow the same plans; give both the same Plans")
+
+
+def _plans_inside(part: nn.Module) -> Iterator[Any]:
+    """The plans of a part and of its own parts, such as features that are concatenated."""
+    return (plans for each in part.modules() if (plans := getattr(each, "plans", None)) is not None)
+
+
+def follow(part: Any, plans: AnyPlans) -> Any:
+    """Return a part that follows other plans, with the same networks; a part without plans is returned itself.
+
+    Raises:
+        TypeError: the part follows plans, and has no method ``with_plans``.
+    """
+    if hasattr(part, "with_plans"):
+        return part.with_plans(plans)
+    if isinstance(part, nn.Module) and next(_plans_inside(part), None) is None:
+        return part
+    if type(part) is not TensorDictSequential:
+        raise TypeError(f"{type(part).__name__} cannot follow other plans: give it a method with_plans(plans)")
+    parts = {name: follow(each, plans) for name, each in part.module._modules.items()}
+    named = isinstance(part.module, nn.ModuleDict)
+    other = TensorDictSequential(OrderedDict(parts)) if named else TensorDictSequential(*parts.values())
+    return in_mode_of(part, other)
 
 
 def encoding_width(trunk: TensorDictSequential) -> int | None:
@@ -202,7 +227,7 @@ def encoding_keys(trunk: TensorDictSequential) -> list[NestedKey]:
 def written_key(part: TensorDictModuleBase) -> NestedKey:
     """Return the one key that a part writes, or of several the one that is named ``features``."""
     keys: list[NestedKey] = list(part.out_keys_source)
-    named = [key for key in keys if (key if isinstance(key, str) else key[-1]) == "features"]
+    named = [key for key in keys if last_name(key) == "features"]
     if len(keys) > 1 and len(named) != 1:
         raise ValueError(
             f"features must write one key, or one of them named 'features'; {type(part).__name__} writes {keys}"

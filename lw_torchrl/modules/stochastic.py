@@ -23,7 +23,7 @@ from lw_torchrl._keys import any_arguments, key_beside
 from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
 from lw_torchrl.modules.features import Features
 from lw_torchrl.modules.networks import in_mode_of, materialize
-from lw_torchrl.modules.sequence import NamedParts, action_spec, encoding_width, trunk_attributes
+from lw_torchrl.modules.sequence import NamedParts, action_spec, encoding_width, follow, trunk_attributes
 
 DistributionName = Literal["tanh_normal", "normal"]
 DISTRIBUTIONS: dict[str, Any] = {"tanh_normal": TanhNormal, "normal": IndependentNormal}
@@ -137,6 +137,5 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
 
     def with_plans(self, plans: Any) -> StochasticActor:
         """Return a policy with the same networks that follows other plans: training either trains both."""
-        parts = {n: p.with_plans(plans) if hasattr(p, "with_plans") else p for n, p in self.trunk.module.items()}
-        options: dict[str, Any] = {**self.config, "trunk": TensorDictSequential(OrderedDict(parts))}
+        options: dict[str, Any] = {**self.config, "trunk": follow(self.trunk, plans)}
         return in_mode_of(self, StochasticActor(**options))

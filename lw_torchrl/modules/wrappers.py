@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from lw_torchrl._checks import checked, shown
-from lw_torchrl._keys import dispatched, read, write
+from lw_torchrl._keys import dispatched, last_name, read, write
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.tasks import task_id
@@ -58,8 +58,8 @@ class ActorEnsemble(RenamedInputs):
         self.members: Any = nn.ModuleList(members)
         self.plans, self.tasks, self.layout = plans_of(first), tasks_of(first), layout_of(first)
         self.in_keys = list(dict.fromkeys(key for member in members for key in member.in_keys))
-        written = [key for key in first.out_keys if _last(key) in ("action", "skill_weights")]
-        self._written: list[NestedKey] = sorted(written, key=_last)
+        written = [key for key in first.out_keys if last_name(key) in ("action", "skill_weights")]
+        self._written: list[NestedKey] = sorted(written, key=last_name)
         self.out_keys = list(self._written)
 
     @property
@@ -281,13 +281,11 @@ class TransferredActor(_Wrapper):
 
 
 def _action(actor: TensorDictModuleBase) -> NestedKey:
-    return next(key for key in actor.out_keys if _last(key) == "action")
+    return next(key for key in actor.out_keys if last_name(key) == "action")
 
 
 def _task_key(actor: TensorDictModuleBase) -> NestedKey:
     latents = (part for part in actor.modules() if isinstance(part, TaskLatent))
-    return next((part.in_keys[0] for part in latents), None) or next(k for k in actor.in_keys if _last(k) == "task_id")
-
-
-def _last(key: NestedKey) -> str:
-    return key if isinstance(key, str) else key[-1]
+    return next((part.in_keys[0] for part in latents), None) or next(
+        k for k in actor.in_keys if last_name(k) == "task_id"
+    )

@@ -1,4 +1,4 @@
-"""OfflineTrainer: train any of TorchRL's losses, or of ours, on a replay buffer."""
+"""OfflineTrainer: train any TorchRL loss, or one of this library, on a replay buffer."""
 
 from __future__ import annotations
 

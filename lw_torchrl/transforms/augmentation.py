@@ -17,10 +17,10 @@ from lw_torchrl._keys import as_keys, check_apart, read
 from lw_torchrl.language.layout import METAWORLD, Layout, places
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.roles import StepRole
-from lw_torchrl.language.task_index import PlanTables
+from lw_torchrl.language.task_index import PlanTables, answers_of
 from lw_torchrl.language.task_objects import role_object
 from lw_torchrl.language.value_checks import plain
-from lw_torchrl.transforms.qaf import answers_of, plan_number_key
+from lw_torchrl.transforms.qaf import plan_number_key
 
 ACTIVE = 0.01  # attention of an active step: a step whose condition is false beside a true one has 1e-4
 
@@ -73,6 +73,8 @@ class PlanAugmentation(Augmentation):
         """Return qaf (B, S), the rows' place in the tables (B,) int64, and the steps of the row's turn (B, S) bool."""
         qaf, task_id = read(tensordict, keys)
         qaf, rows = answers_of(qaf, task_id, tensordict.get(plan_number_key(keys[0]), None), self._tables)
+        if qaf.shape != (wanted := (*rows.shape, self._tables.mask.shape[-1])):
+            raise ValueError(f"qaf must have shape {wanted}, one column for each step of plans, got {tuple(qaf.shape)}")
         turn = tensordict.get("turn", None)
         return qaf, rows, self.table("steps", rows.device)[rows, torch.zeros_like(rows) if turn is None else turn % 2]
 

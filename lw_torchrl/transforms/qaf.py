@@ -17,7 +17,7 @@ from lw_torchrl._checks import checked, missing_keys
 from lw_torchrl._keys import as_keys, check_apart, key_beside
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
-from lw_torchrl.language.task_index import PlanTables, TaskTables
+from lw_torchrl.language.task_index import PlanTables, TaskTables, one_per_row
 from lw_torchrl.transforms.environment import KeepsEnvState, base_env, refuse_changed, reset_rows
 
 _HALF = (torch.float16, torch.bfloat16)  # in which metres are not told apart as conditions do
@@ -35,27 +35,6 @@ def plan_program(plans: Plans) -> QueryProgram:
 def plan_number_key(qaf: NestedKey) -> NestedKey:
     """Where :class:`QAFTransform` writes the plan's number: beside ``qaf``, ``qaf_plan``."""
     return key_beside(qaf, "_plan")
-
-
-def answers_of(qaf: Tensor, task_id: Tensor, number: Tensor | None, tables: PlanTables) -> tuple[Tensor, Tensor]:
-    """Return ``qaf`` (B, S) and each row's place (B,) int64 in the tables of plans that have S steps.
-
-    Answers for more plans, of which some are longer, are cut to S if ``number``, their ``qaf_plan``, shows that the
-    rows' plans are equal. A task without a plan, and the answers of other plans, are a :class:`ValueError`.
-    """
-    rows = tables.rows(one_per_row(task_id, qaf.shape[:-1]))
-    tables.refuse_others(number, rows)
-    wanted = (*rows.shape, tables.mask.shape[-1])
-    if number is not None and qaf.shape[:-1] == rows.shape and qaf.shape[-1] > wanted[-1]:
-        qaf = qaf[..., : wanted[-1]]
-    if qaf.shape != wanted:
-        raise ValueError(f"qaf must have shape {wanted}, one column for each step of plans, got {tuple(qaf.shape)}")
-    return qaf, rows
-
-
-def one_per_row(values: Tensor, rows: torch.Size) -> Tensor:
-    """Return values (B,), or (B, 1) as ``UnsqueezeTransform`` makes them, with the shape of the rows, (B,)."""
-    return values.squeeze(-1) if values.shape == (*rows, 1) else values
 
 
 class QAFTransform(KeepsEnvState):
@@ -119,7 +98,7 @@ class QAFTransform(KeepsEnvState):
         if observation.dtype in _HALF:
             got = f"got {observation.dtype}: put QAFTransform before what casts it"
             raise ValueError(f"observation must be float32 or float64, {got}")
-        task_id = one_per_row(task_id, observation.shape[:-1])
+        task_id = one_per_row(task_id, observation)
         tensordict.set(self.out_keys[0], self.program(observation, task_id))
         number = self._number.select(task_id.reshape(-1), observation).plan
         tensordict.set(self.out_keys[1], number.reshape(task_id.shape).clone())  # a collector zeroes what it is given

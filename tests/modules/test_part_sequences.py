@@ -122,3 +122,13 @@ def test_a_setting_that_was_changed_later_is_described():
     actor = lw.PlanConditionedActor(PLANS)
     actor.decoder.network.squash = False
     assert from_description(describe(actor)).decoder.network.squash is False
+
+
+def test_features_in_a_sequence_follow_other_plans():
+    features = TensorDictSequential(FocusFeatures(PLANS))
+    other = lw.PlanConditionedActor(PLANS, features=features).with_plans(REVERSED)
+    assert other.features[0].plans == REVERSED
+    lost = TensorDictModule(nn.Linear(39, 16), ["observation"], ["features"])
+    lost.plans = PLANS
+    with pytest.raises(TypeError, match="TensorDictModule cannot follow other plans"):
+        lw.PlanConditionedActor(PLANS, features=lost).with_plans(REVERSED)
