@@ -1,16 +1,17 @@
 """What a user adds to the tables, typed, with three mistakes: mypy --strict finds them (test_packaging.py)."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
 import lw_torchrl as lw
 from lw_torchrl.language.relations import RELATIONS, Comparison
-from lw_torchrl.modules import ENCODERS, EVALUATORS, METHODS, POLICIES, Encoder, Encoding, Method
+from lw_torchrl.modules import METHODS, Features, SkillEncoder
 
 
-class Blind(lw.Policy):
-    def act(self, observation: Tensor) -> tuple[Tensor, ...]:
-        return (observation[:, :4],)
+def small(plans: lw.Plans) -> lw.PlanConditionedActor:
+    return lw.PlanConditionedActor(plans, skill_encoder=SkillEncoder(64))
 
 
 class Flat(lw.QueryEvaluator):
@@ -18,22 +19,26 @@ class Flat(lw.QueryEvaluator):
         return torch.zeros(*task_id.shape, self.plans.num_steps)
 
 
-class Numbers(Encoder):
-    def encode(self, rows: Tensor, seen: Tensor) -> Encoding:
-        return Encoding(latent=rows, features=seen)
+class Hand(Features):
+    width = 3
+
+    def compute(self, tensordict: Any) -> Tensor:
+        hand: Tensor = tensordict["observation"][..., :3]
+        return hand
 
 
-class Words(Encoder):
-    def encode(self, rows: Tensor, seen: Tensor) -> Tensor:  # planted
-        return rows
+class Texts(Features):
+    def compute(self, tensordict: Any) -> list[str]:  # planted
+        return ["near"]
 
 
-POLICIES["Blind"] = Blind
-EVALUATORS["Flat"] = Flat
-ENCODERS["Numbers"] = "my_module:Numbers"
-METHODS["mine"] = Method("Blind")
+METHODS["small"] = small
+METHODS["words"] = "my_module:words"
+METHODS["linear"] = 64  # planted
 RELATIONS["far from"] = (Comparison("xyz", ">", 0.3),)
-POLICIES["Linear"] = nn.Linear  # planted
 RELATIONS["near to"] = Comparison("xyz", "<", 0.3)  # planted
 plans = lw.load_plans("MT10")
-actor = lw.PlanConditionedActor(plans, width=64, evaluator=Flat(plans))
+actor = lw.PlanConditionedActor(
+    plans, skill_encoder=SkillEncoder(64), features=Hand(0.05, ["observation"]), decoder=nn.Identity()
+)
+evaluator = Flat(plans)

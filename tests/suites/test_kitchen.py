@@ -178,14 +178,14 @@ def replay(demos):
 @pytest.mark.slow
 def test_a_policy_learns_from_demonstrations_and_acts(demos, replay):
     assert demos.success_rate == {CABINET.name: 1.0}
+    torch.manual_seed(0)
     for actor in actors("both"):
-        torch.manual_seed(0)
         config = lw.BehavioralCloningConfig(steps=600, batch_size=64, learning_rate=1e-3)
         trainer = lw.BehavioralCloningTrainer(actor, replay, config, progress=False)
         before, after = trainer.train(100), trainer.train()
         assert after < 0.25 * before
-        run = {"tasks": "slide-cabinet", "suite": SUITE, "episodes_per_task": 2, "seed": 1_000, "noise_scale": 0.0}
-        assert lw.evaluate(actor, **run, progress=False).mean_success == 1.0
+        run = {"tasks": "slide-cabinet", "suite": SUITE, "episodes_per_task": 10, "seed": 1_000, "noise_scale": 0.0}
+        assert lw.evaluate(actor, **run, progress=False).mean_success >= 0.9
 
 
 @pytest.mark.slow
