@@ -21,10 +21,9 @@ from benchmarks.paper.imitation import ImitationRun
 from benchmarks.paper.recipes import EXECUTIONS, PRESETS, SETTINGS, Member, Preset
 from benchmarks.paper.runs import execute_run
 from benchmarks.statistics import count_solved
-from lw_torchrl._files import write_text
-from lw_torchrl.language.named_objects import NamedObject
-from lw_torchrl.language.task_objects import role_object
-from lw_torchrl.language.tasks import Task
+from lw_torchrl._util.files import write_text
+from lw_torchrl.language.objects import NamedObject
+from lw_torchrl.language.tasks import Task, role_object
 from lw_torchrl.modules import RoleFeatures
 
 Setting = Literal["few-shot", "zero-shot"]

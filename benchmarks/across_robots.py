@@ -14,7 +14,7 @@ from torch import Tensor
 
 import lw_torchrl as lw
 from benchmarks.figures import markdown_table
-from lw_torchrl._files import write_json, write_text
+from lw_torchrl._util.files import write_json, write_text
 from lw_torchrl.language.canonical import canonical_like
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.modules import TransferredActor, plans_of

@@ -19,7 +19,7 @@ import lw_torchrl as lw
 from benchmarks.figures import markdown_table
 from benchmarks.finding_points import find_points
 from benchmarks.statistics import mean_difference, mean_rate
-from lw_torchrl._files import read_json, write_json, write_text
+from lw_torchrl._util.files import read_json, write_json, write_text
 from lw_torchrl.evaluation.result import wilson_interval
 from lw_torchrl.language.canonical import canonical_like, explain_canonical, fallback_plan, most_confident
 from lw_torchrl.language.plans import ConditionalPlan, Plans

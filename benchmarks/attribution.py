@@ -12,7 +12,7 @@ import tyro
 
 import lw_torchrl as lw
 from benchmarks.any_plans import TEST
-from lw_torchrl._checks import check_choice
+from lw_torchrl._util.checks import check_choice
 from lw_torchrl.evaluation import plot_failures
 
 

@@ -16,7 +16,7 @@ from benchmarks.paper.imitation import ImitationRun
 from benchmarks.paper.recipes import PRESETS, SETTINGS
 from benchmarks.paper.runs import execute_run
 from benchmarks.statistics import mean_rate
-from lw_torchrl._files import write_json, write_text
+from lw_torchrl._util.files import write_json, write_text
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.evaluation.figures import COLORS, new_figure, saved, trim
 

@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictSequential
 import lw_torchrl as lw
 from benchmarks.evaluator_report import condition_drift, drift_table, write_report
 from benchmarks.figures import markdown_table
-from lw_torchrl._files import write_text
+from lw_torchrl._util.files import write_text
 from lw_torchrl.cli.demo import DemoConfig
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.modules import transform_of

@@ -18,7 +18,7 @@ import lw_torchrl as lw
 from benchmarks import planted
 from benchmarks.figures import markdown_table
 from benchmarks.planted import Altered, Done, InStep, Liar, Sensor, Shown
-from lw_torchrl._files import write_json, write_text
+from lw_torchrl._util.files import write_json, write_text
 from lw_torchrl.data import collect_demonstrations
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation import CAUSES, attribute_failures

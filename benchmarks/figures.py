@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from benchmarks.statistics import Array, Summary, check_rates
-from lw_torchrl._files import AnyPath
+from lw_torchrl._util.files import AnyPath
 from lw_torchrl.evaluation.figures import COLORS, check_image, new_figure, saved, trim
 
 if TYPE_CHECKING:

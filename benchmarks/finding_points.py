@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._checks import Count, checked
+from lw_torchrl._util.checks import Count, checked
 from lw_torchrl.language.layout import places
-from lw_torchrl.language.named_objects import NamedObject, typed
+from lw_torchrl.language.objects import NamedObject, typed
 from lw_torchrl.language.tasks import Task, TaskList
 from lw_torchrl.suites.engine import BodyPoses
 from lw_torchrl.suites.suite import Suite, find_suite

@@ -16,7 +16,7 @@ from benchmarks.evaluator_report import plot_wrong_answers, write_report, wrong_
 from benchmarks.evaluators import WHO, demonstrations, evaluated, in_front
 from benchmarks.figures import markdown_table
 from benchmarks.statistics import Estimate
-from lw_torchrl._files import write_text
+from lw_torchrl._util.files import write_text
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.evaluation.result import wilson_interval
 

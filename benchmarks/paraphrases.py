@@ -9,8 +9,8 @@ from typing import Any
 import tyro
 
 import lw_torchrl as lw
-from lw_torchrl._files import read_json, write_json
-from lw_torchrl._progress import Progress
+from lw_torchrl._util.files import read_json, write_json
+from lw_torchrl._util.progress import Progress
 
 ASKED = "Say the command to a robot in other words. Keep what it means. Answer with one short command and nothing else."
 SHOWN = (

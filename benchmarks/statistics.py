@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lw_torchrl._checks import checked, counted, shown
+from lw_torchrl._util.checks import checked, counted, shown
 from lw_torchrl.evaluation import EvaluationResult
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ import tyro
 import lw_torchrl as lw
 from benchmarks.figures import markdown_table
 from benchmarks.statistics import Estimate, count_solved
-from lw_torchrl._files import write_text
+from lw_torchrl._util.files import write_text
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.evaluation.figures import COLORS, check_image, saved
 from lw_torchrl.evaluation.result import wilson_interval

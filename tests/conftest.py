@@ -14,7 +14,7 @@ import pytest
 from forks import Forks
 
 import lw_torchrl as lw
-from lw_torchrl import _files
+from lw_torchrl._util import files as _files
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import lw_torchrl as lw
-from lw_torchrl._checks import Count, Probability, Scale, check_fields, check_scale, checked
+from lw_torchrl._util.checks import Count, Probability, Scale, check_fields, check_scale, checked
 
 
 @checked

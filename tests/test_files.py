@@ -12,8 +12,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from lw_torchrl import _files
-from lw_torchrl._files import (
+from lw_torchrl._util import files as _files
+from lw_torchrl._util.files import (
     locked,
     read_json,
     read_text,

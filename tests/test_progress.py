@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from lw_torchrl import _progress
-from lw_torchrl._progress import Progress
+from lw_torchrl._util import progress as _progress
+from lw_torchrl._util.progress import Progress
 
 
 class Terminal(io.StringIO):

@@ -8,8 +8,8 @@ import sys
 import pytest
 
 import lw_torchrl as lw
-from lw_torchrl import _registry
-from lw_torchrl._registry import Registry, is_function
+from lw_torchrl._util import registry as _registry
+from lw_torchrl._util.registry import Registry, is_function
 from lw_torchrl.language.relations import RELATIONS, STATES, Comparison
 from lw_torchrl.modules import METHODS, make_policy
 from lw_torchrl.suites import SUITES

@@ -17,7 +17,7 @@ from wrong_values import WRONG as OTHERS
 
 import lw_torchrl as lw
 from benchmarks.statistics import summarize
-from lw_torchrl._checks import check_positive, check_probability, check_scale
+from lw_torchrl._util.checks import check_positive, check_probability, check_scale
 
 PUBLIC = {name: import_module(room) for name, room in lw._ROOM_OF.items()}
 MORE = {

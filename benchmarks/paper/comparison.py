@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.figures import markdown_table
 from benchmarks.paper.runs import Run
 from benchmarks.statistics import Estimate, Summary, mean_difference, probability_of_improvement, summarize
-from lw_torchrl._files import write_json, write_text
+from lw_torchrl._util.files import write_json, write_text
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.evaluation.figures import new_figure, saved, trim
 from lw_torchrl.language.tasks import MT10

@@ -14,8 +14,8 @@ from benchmarks.paper.actors import Parts, ensemble, reads_plans
 from benchmarks.paper.recipes import DataSetting, Execution, Member, Preset
 from benchmarks.paper.runs import Dataset, Run, Work, load_result, own_tasks, plain
 from benchmarks.paper.stacked import StackedBehavioralCloning
-from lw_torchrl._checks import check_choice
-from lw_torchrl._progress import Progress
+from lw_torchrl._util.checks import check_choice
+from lw_torchrl._util.progress import Progress
 from lw_torchrl.data import CoLearningSampler, LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.language.plans import Plans

@@ -17,9 +17,9 @@ from benchmarks.paper.comparison import compare, plot_methods, write_summary
 from benchmarks.paper.offline_losses import L1CQLLoss, L1IQLLoss, L1TD3BCLoss
 from benchmarks.paper.recipes import OfflineMethod, OfflineRecipe, OfflineTable, Portion
 from benchmarks.paper.runs import Dataset, Run, Work, kept_policy, own_tasks, plain
-from lw_torchrl._checks import check_choice
-from lw_torchrl._files import locked
-from lw_torchrl._tensor_files import read_tensors, write_tensors
+from lw_torchrl._util.checks import check_choice
+from lw_torchrl._util.files import locked
+from lw_torchrl._util.tensor_files import read_tensors, write_tensors
 from lw_torchrl.data import BEHAVIOURS, LanguageWorldExperienceReplay, TaskBalancedSampler
 from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.language.plans import Plans

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import torch
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._util.checks import check_choice
 from lw_torchrl.evaluation import EvaluationResult
 
 Job = Callable[[], Any]

@@ -13,15 +13,14 @@ from torch.func import functional_call, stack_module_state, vmap
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives.utils import distance_loss
 
-from lw_torchrl._checks import checked, differences, passes_on
-from lw_torchrl._devices import place
+from lw_torchrl._util.checks import checked, differences, passes_on
+from lw_torchrl._util.devices import place
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.training.checkpoint import check_can_be_saved, text_vectors
 from lw_torchrl.training.cloning import BehavioralCloningConfig
-from lw_torchrl.training.loop import Training, TrainingOptions
+from lw_torchrl.training.loop import Training, TrainingOptions, make_optimizer
 from lw_torchrl.training.minibatches import Minibatches, check_replay, describe_data, describe_replay
 from lw_torchrl.training.normalization import check_contacts, fit_normalization, statistics_of
-from lw_torchrl.training.optimizer import make_optimizer
 
 
 def _check_actors(actors: Sequence[TensorDictModuleBase]) -> None:

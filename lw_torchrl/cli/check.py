@@ -10,11 +10,11 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._checks import counted, nearest
-from lw_torchrl._files import read_text, read_toml
+from lw_torchrl._util.checks import counted, nearest
+from lw_torchrl._util.files import read_text, read_toml
 from lw_torchrl.cli import options
 from lw_torchrl.cli.data import Show
-from lw_torchrl.cli.output import Output
+from lw_torchrl.cli.options import Output
 from lw_torchrl.language.nearest import nearest_skill
 from lw_torchrl.language.plan_text import PLAN_LIMIT
 from lw_torchrl.language.plans import check_plan

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._checks import counted
+from lw_torchrl._util.checks import counted
 from lw_torchrl.cli import options
 from lw_torchrl.cli.acting import is_object, policy_name, read_object
-from lw_torchrl.cli.output import Columns, Output, Row
+from lw_torchrl.cli.options import Columns, Output, Row
 from lw_torchrl.language.tasks import TASKS
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ class Collect:
     json: options.Json = False
 
     def run(self) -> Output:
-        from lw_torchrl._devices import place
+        from lw_torchrl._util.devices import place
         from lw_torchrl.data.behaviours import BEHAVIOURS
 
         suite = options.read_suite(self.suite, self.tasks)

@@ -55,7 +55,7 @@ class Demo:
 
 def run_demo(out: Path, config: DemoConfig) -> lw.EvaluationResult:
     """Run or resume the demo, write its files to ``out`` and print its results."""
-    from lw_torchrl._files import locked, read_json, write_json
+    from lw_torchrl._util.files import locked, read_json, write_json
 
     stated, path = json.loads(json.dumps(asdict(config))), out / "config.json"
     with locked(out, "out", folder=True):

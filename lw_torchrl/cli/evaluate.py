@@ -9,11 +9,11 @@ from typing import Annotated, Any
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._checks import counted
-from lw_torchrl._files import locked, write_json
+from lw_torchrl._util.checks import counted
+from lw_torchrl._util.files import locked, write_json
 from lw_torchrl.cli import options
 from lw_torchrl.cli.acting import Acting, is_object, policy_name
-from lw_torchrl.cli.output import Output
+from lw_torchrl.cli.options import Output
 from lw_torchrl.language.plans import Plans
 
 _TASKS = "MT10, MT50, a suite, or names of tasks; by default those of --plans or of the demonstrations"

@@ -9,10 +9,10 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._checks import check_int, counted
+from lw_torchrl._util.checks import check_int, counted
 from lw_torchrl.cli import options
-from lw_torchrl.cli.output import Columns, Output, Row
-from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.cli.options import Columns, Output, Row
+from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.tasks import MT10, Task
 

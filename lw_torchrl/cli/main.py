@@ -12,7 +12,7 @@ from contextlib import nullcontext, redirect_stdout
 from importlib import import_module
 
 from lw_torchrl import __version__
-from lw_torchrl._checks import nearest
+from lw_torchrl._util.checks import nearest
 
 # Name to group, class and summary. Classes are named, not imported, so that `lw-torchrl --help` loads no torch.
 COMMANDS = {

@@ -11,10 +11,10 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._checks import check_choice, counted
-from lw_torchrl._files import read_text
+from lw_torchrl._util.checks import check_choice, counted
+from lw_torchrl._util.files import read_text
 from lw_torchrl.cli import options
-from lw_torchrl.cli.output import Columns, Output, Row
+from lw_torchrl.cli.options import Columns, Output, Row
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import PlanError, Plans
 from lw_torchrl.language.tasks import Task, check_task

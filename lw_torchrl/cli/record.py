@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 import lw_torchrl as lw
 from lw_torchrl.cli import options
 from lw_torchrl.cli.acting import Acting, policy_name
-from lw_torchrl.cli.output import Output
+from lw_torchrl.cli.options import Output
 
 
 @dataclass(kw_only=True)

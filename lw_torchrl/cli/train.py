@@ -11,10 +11,10 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._checks import counted
+from lw_torchrl._util.checks import counted
 from lw_torchrl.cli import options
 from lw_torchrl.cli.acting import read_evaluator
-from lw_torchrl.cli.output import Output
+from lw_torchrl.cli.options import Output
 
 _METHOD = (
     "what the policy is conditioned on: pcbc (plans), dc (task descriptions), one-hot (task numbers), or the name of "
@@ -72,7 +72,7 @@ class Train:
         import torch
 
         from lw_torchrl.data.dataset import read_metadata
-        from lw_torchrl.training.losses import DISTRIBUTIONS
+        from lw_torchrl.training.offline import DISTRIBUTIONS
 
         self._check()
         options.use_one_thread()
@@ -131,9 +131,9 @@ class Train:
 
     def _learn(self, actor: Any, plans: lw.Plans, rows: Mapping[str, Any], run: Mapping[str, Any]) -> Any:
         """Return the trainer of a loss other than bc; for advantages, first train the value that they need."""
-        from lw_torchrl._devices import place
+        from lw_torchrl._util.devices import place
         from lw_torchrl.modules.policy import plans_of
-        from lw_torchrl.training.losses import GAMMA, N_STEPS, learn_advantages, make_loss
+        from lw_torchrl.training.offline import GAMMA, N_STEPS, learn_advantages, make_loss
 
         plans = plans_of(actor) or plans
         config = lw.OfflineConfig(**self._numbers)

@@ -15,8 +15,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from lw_torchrl._checks import check_choice, check_fields, check_int, check_probability, shown
-from lw_torchrl._seeding import episode_generator
+from lw_torchrl._util.checks import check_choice, check_fields, check_int, check_probability, shown
+from lw_torchrl._util.seeding import episode_generator
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import task_id

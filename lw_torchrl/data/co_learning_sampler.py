@@ -11,7 +11,7 @@ from tensordict import NestedKey
 from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
-from lw_torchrl._keys import check_key
+from lw_torchrl._util.keys import check_key
 from lw_torchrl.data.samplers import GroupSampler, column
 from lw_torchrl.data.storage import DATASET, to_device_of
 from lw_torchrl.language.tasks import MT50, Task, task_id

@@ -14,9 +14,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from lw_torchrl._checks import checked, differences
-from lw_torchrl._files import AnyPath, flush, locked, read_json, write_json
-from lw_torchrl._versions import SIMULATORS, package_versions, version_changes
+from lw_torchrl._util.checks import checked, differences
+from lw_torchrl._util.files import AnyPath, flush, locked, read_json, write_json
+from lw_torchrl._util.versions import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import dataset
 from lw_torchrl.data.behaviours import Behaviour, behaviour_of
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations, write_metadata

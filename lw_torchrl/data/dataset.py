@@ -15,8 +15,8 @@ from pathlib import Path
 from reprlib import repr as short
 from typing import Any
 
-from lw_torchrl._checks import check_fields, check_int, check_scale
-from lw_torchrl._files import AnyPath, read_json, write_json
+from lw_torchrl._util.checks import check_fields, check_int, check_scale
+from lw_torchrl._util.files import AnyPath, read_json, write_json
 from lw_torchrl.data.behaviours import EXPERT, NOISY, Behaviour, check_own_label
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.tasks import resolve_tasks

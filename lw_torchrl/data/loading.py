@@ -11,12 +11,11 @@ from typing import Any, Literal
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 
-from lw_torchrl._checks import Natural, check_int, check_path, check_probability, checked, unknown_name
-from lw_torchrl._devices import check_device
-from lw_torchrl._files import AnyPath
+from lw_torchrl._util.checks import Natural, check_int, check_path, check_probability, checked, unknown_name
+from lw_torchrl._util.devices import check_device, finite
+from lw_torchrl._util.files import AnyPath
 from lw_torchrl.data.dataset import DatasetError, Demonstrations, read_metadata
 from lw_torchrl.data.memory_map import load_rows, verify
-from lw_torchrl.data.rewards import REWARDS, RewardName
 from lw_torchrl.data.selection import (
     EpisodeChoice,
     EpisodeFilter,
@@ -27,8 +26,17 @@ from lw_torchrl.data.selection import (
     kept_rows,
     returns_of,
 )
-from lw_torchrl.data.storage import DATASET, DEMONSTRATION, DONE, REWARD, STEPS, TRAJECTORY, column_name
-from lw_torchrl.language.value_checks import finite
+from lw_torchrl.data.storage import (
+    DATASET,
+    DEMONSTRATION,
+    DONE,
+    REWARD,
+    REWARDS,
+    STEPS,
+    TRAJECTORY,
+    RewardName,
+    column_name,
+)
 
 _FLAGS = ("done", "terminated", "truncated")
 ROLLOUT: tuple[NestedKey, ...] = (

@@ -21,8 +21,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._files import flush
-from lw_torchrl._progress import Progress
+from lw_torchrl._util.files import flush
+from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.dataset import DATA, METADATA, Demonstrations, EpisodeInfo, damaged
 from lw_torchrl.language.layout import METAWORLD, Layout
 

@@ -11,8 +11,8 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from lw_torchrl._files import replacing
-from lw_torchrl._progress import Progress
+from lw_torchrl._util.files import replacing
+from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.behaviours import SegmentActor, segment_plans
 from lw_torchrl.data.dataset import CollectConfig, DatasetError
 from lw_torchrl.data.memory_map import COLUMNS

@@ -19,10 +19,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv, step_mdp
 
-from lw_torchrl._checks import check_int, checked
-from lw_torchrl._files import AnyPath, replacing
-from lw_torchrl._progress import Progress
-from lw_torchrl._rendering import check_cameras
+from lw_torchrl._util.checks import check_int, checked
+from lw_torchrl._util.files import AnyPath, replacing
+from lw_torchrl._util.progress import Progress
+from lw_torchrl._util.rendering import check_cameras
 from lw_torchrl.data.dataset import DatasetError, Demonstrations, EpisodeInfo, read_metadata
 from lw_torchrl.data.memory_map import load_rows, verify
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay

@@ -17,16 +17,15 @@ from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import Count, Natural, checked
-from lw_torchrl._files import AnyPath, reading
-from lw_torchrl._tensor_files import pop_state, read_tensors, write_tensors
+from lw_torchrl._util.checks import Count, Natural, checked
+from lw_torchrl._util.devices import finite
+from lw_torchrl._util.files import AnyPath, reading
+from lw_torchrl._util.tensor_files import pop_state, read_tensors, write_tensors
 from lw_torchrl.data.dataset import DATA, read_metadata
 from lw_torchrl.data.loading import load
 from lw_torchrl.data.memory_map import verify
-from lw_torchrl.data.rewards import RewardName
 from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, JoinedDemonstrations, Label
-from lw_torchrl.data.storage import DatasetStorage, check_transform, rows_fingerprint
-from lw_torchrl.language.value_checks import finite
+from lw_torchrl.data.storage import DatasetStorage, RewardName, check_transform, rows_fingerprint
 
 _FILE = "buffer.safetensors"
 

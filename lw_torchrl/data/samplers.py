@@ -16,10 +16,10 @@ from torch.utils.data import get_worker_info
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
-from lw_torchrl._checks import check_int
-from lw_torchrl._files import reading
-from lw_torchrl._keys import check_key
-from lw_torchrl._tensor_files import pop_state, read_tensors, write_tensors
+from lw_torchrl._util.checks import check_int
+from lw_torchrl._util.files import reading
+from lw_torchrl._util.keys import check_key
+from lw_torchrl._util.tensor_files import pop_state, read_tensors, write_tensors
 from lw_torchrl.data.storage import to_device_of
 
 _FILE = "sampler.safetensors"

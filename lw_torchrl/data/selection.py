@@ -9,10 +9,10 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from lw_torchrl._checks import check_fields, check_int, check_probability, check_text, shown, unknown_name
+from lw_torchrl._util.checks import check_fields, check_int, check_probability, check_text, shown, unknown_name
 from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo
 from lw_torchrl.data.memory_map import load_rows
-from lw_torchrl.data.rewards import REWARDS, RewardName
+from lw_torchrl.data.storage import REWARDS, RewardName
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv, step_mdp
 
-from lw_torchrl._devices import CPU, in_blocks, place
+from lw_torchrl._util.devices import CPU, in_blocks, place
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import action_noise
 

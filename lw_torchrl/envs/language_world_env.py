@@ -17,15 +17,15 @@ from torchrl._utils import seed_generator
 from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
-from lw_torchrl._checks import Count, check_int, checked
-from lw_torchrl._devices import check_device
-from lw_torchrl._keys import row_mask
-from lw_torchrl._rendering import check_picture
+from lw_torchrl._util.checks import Count, check_int, checked
+from lw_torchrl._util.devices import check_device
+from lw_torchrl._util.keys import row_mask
+from lw_torchrl._util.rendering import check_picture
 from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, done_spec, observation_spec
 from lw_torchrl.envs.seeding import EpisodeCounter, check_worker
 from lw_torchrl.language.tasks import Task, one_layout
 from lw_torchrl.suites.engine import Engine, EngineStep
-from lw_torchrl.suites.metaworld.engines import make_engine
+from lw_torchrl.suites.metaworld import make_engine
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
 

@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lw_torchrl._checks import check_int, shown
-from lw_torchrl._files import parse_json
-from lw_torchrl._seeding import episode_generator, episode_hash
+from lw_torchrl._util.checks import check_int, shown
+from lw_torchrl._util.files import parse_json
+from lw_torchrl._util.seeding import episode_generator, episode_hash
 from lw_torchrl.language.tasks import Task
 
 

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lw_torchrl._checks import checked
-from lw_torchrl._files import AnyPath, write_json
-from lw_torchrl.modules.clause_evaluator import ClauseEvaluator
+from lw_torchrl._util.checks import checked
+from lw_torchrl._util.files import AnyPath, write_json
 from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.state_query_evaluator import ClauseEvaluator
 from lw_torchrl.training.labelled_queries import LabelledQueries, TaskQueries
 
 PARTS = {

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from lw_torchrl._checks import checked, counted
-from lw_torchrl._files import AnyPath, replacing
+from lw_torchrl._util.checks import checked, counted
+from lw_torchrl._util.files import AnyPath, replacing
 from lw_torchrl.evaluation.diagnose.failure import count_causes
 from lw_torchrl.evaluation.diagnose.findings import CAUSES
 from lw_torchrl.evaluation.result import EvaluationResult, attributed, wilson_interval

@@ -10,8 +10,8 @@ from string import Template
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from lw_torchrl._checks import checked, counted
-from lw_torchrl._files import AnyPath, replacing, shipped_policy, write_text
+from lw_torchrl._util.checks import checked, counted
+from lw_torchrl._util.files import AnyPath, replacing, shipped_policy, write_text
 from lw_torchrl.evaluation.result import EvaluationResult, wilson_interval
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.training.checkpoint import demonstrated_tasks, load_actor, policy_file, read_description

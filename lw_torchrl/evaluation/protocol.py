@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 
-from lw_torchrl._checks import Count, Scale, check_int, checked
-from lw_torchrl._keys import check_key
+from lw_torchrl._util.checks import Count, Scale, check_int, checked
+from lw_torchrl._util.keys import check_key
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.diagnose.attribution import attribute_failures, keys_to_attribute
 from lw_torchrl.evaluation.result import EpisodeResult, EvaluationResult

@@ -14,9 +14,9 @@ from typing import Any
 
 from torch import Tensor
 
-from lw_torchrl._checks import Count, Natural, check_flag, check_int, check_scale
-from lw_torchrl._files import AnyPath, read_json, write_json
-from lw_torchrl._versions import package_versions
+from lw_torchrl._util.checks import Count, Natural, check_flag, check_int, check_scale
+from lw_torchrl._util.files import AnyPath, read_json, write_json
+from lw_torchrl._util.versions import package_versions
 from lw_torchrl.evaluation.diagnose.failure import Failure, failure_table, is_number, read_failures, read_records
 
 FORMAT = "lw_torchrl.evaluation"

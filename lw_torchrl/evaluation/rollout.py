@@ -11,8 +11,8 @@ from torch import nn
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from lw_torchrl._checks import unknown_name
-from lw_torchrl._progress import Progress
+from lw_torchrl._util.checks import unknown_name
+from lw_torchrl._util.progress import Progress
 from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans

@@ -6,15 +6,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from lw_torchrl._checks import checked
+from lw_torchrl._util.checks import checked
 from lw_torchrl.language.coverage import coverage
-from lw_torchrl.language.named_objects import GOAL, GRIPPER
+from lw_torchrl.language.objects import GOAL, GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep, as_plans
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.roles import BY_HAND, VECTORS, Direction, Manner, StepRole, Verb, motion_of
 from lw_torchrl.language.step_parser import ParsedStep, compared_with_gripper, parse_steps
-from lw_torchrl.language.task_objects import (
+from lw_torchrl.language.tasks import (
+    Task,
     first_object,
+    get_task,
     is_goal,
     object_of,
     point_on,
@@ -22,7 +24,6 @@ from lw_torchrl.language.task_objects import (
     same_object,
     whole_objects,
 )
-from lw_torchrl.language.tasks import Task, get_task
 
 MIN_CONFIDENCE = 0.75
 """A plan of at least this confidence keeps its own conditions."""

@@ -8,14 +8,13 @@ from importlib.resources import files
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._files import read_toml
+from lw_torchrl._util.files import read_toml
 from lw_torchrl.language.layout import places
-from lw_torchrl.language.named_objects import Coordinate
+from lw_torchrl.language.objects import Coordinate
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import STATES, comparisons
 from lw_torchrl.language.roles import Verb
-from lw_torchrl.language.task_objects import role_object
-from lw_torchrl.language.tasks import Task
+from lw_torchrl.language.tasks import Task, role_object
 
 Floats = NDArray[np.float32]
 _OBJECTS = ((0.0, 0.6, 0.02), (0.2, 0.7, 0.02), (-0.2, 0.7, 0.02), (0.0, 0.8, 0.02))

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
-from lw_torchrl._checks import check_fields, shown
-from lw_torchrl._registry import ReadOnlyDict
+from lw_torchrl._util.checks import check_fields, shown
+from lw_torchrl._util.registry import ReadOnlyDict
 
 
 @dataclass(frozen=True)

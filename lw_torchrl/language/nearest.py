@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from rapidfuzz import fuzz, process
 
-from lw_torchrl._checks import check_choice, checked, shown
+from lw_torchrl._util.checks import check_choice, checked, shown
 from lw_torchrl.language.embeddings import sentence_vectors
+from lw_torchrl.language.objects import WORDS
 from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, check_length, read_query
 from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.skills import ScriptedSkill, SkillError, Skills, load_skills, skills_for
 from lw_torchrl.language.tasks import Task, get_task
-from lw_torchrl.language.words import WORDS
 
 if TYPE_CHECKING:
     import numpy as np

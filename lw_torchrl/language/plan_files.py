@@ -7,8 +7,8 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Literal
 
-from lw_torchrl._checks import checked, shown
-from lw_torchrl._files import AnyPath, parse_json, read_text, write_text
+from lw_torchrl._util.checks import checked, shown
+from lw_torchrl._util.files import AnyPath, parse_json, read_text, write_text
 from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.plan_text import MOST_STEPS, PLAN_LIMIT, no_task, too_many_steps
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, PlanError, Plans, PlanStep, as_plans, parse_plan

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from lw_torchrl._checks import check_text, did_you_mean, shown
+from lw_torchrl._util.checks import check_text, did_you_mean, shown
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.tasks import Task, Tasks
 

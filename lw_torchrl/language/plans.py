@@ -11,15 +11,14 @@ from hashlib import sha256
 from types import NoneType
 from typing import Any, NoReturn
 
-from lw_torchrl._checks import Probability, check_fields, checked, shown
+from lw_torchrl._util.checks import Probability, check_fields, checked, shown
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plan_text import MOST_STEPS, function_head, one_line, quote, read_plan_text, too_many_steps
 from lw_torchrl.language.queries import Query, check_query, read_query
 from lw_torchrl.language.relations import comparisons
 from lw_torchrl.language.roles import StepRole
 from lw_torchrl.language.skills import canonical_skill, load_skills
-from lw_torchrl.language.task_objects import role_object
-from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task, one_layout, task_ids
+from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task, one_layout, role_object, task_ids
 
 
 class PlanError(ValueError):

@@ -10,9 +10,9 @@ from itertools import permutations
 
 from rapidfuzz import fuzz, process
 
-from lw_torchrl._checks import checked
+from lw_torchrl._util.checks import checked
 from lw_torchrl.language.layout import places
-from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, STATES, TOUCHING, UNARY
 from lw_torchrl.language.tasks import Task, get_task
 

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import check_choice, shown
+from lw_torchrl._util.checks import check_choice, shown
+from lw_torchrl._util.devices import check_finite
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.query_tables import QueryTables, compile_facts, compile_queries
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
 from lw_torchrl.language.tasks import TASKS, Task, one_layout, task_ids
-from lw_torchrl.language.value_checks import check_finite
 
 _LEAST, _MOST = 1e-6, 1e4  # of the size of a logit, and of metres where a length has a gradient
 _COMPILED = {torch.float32: np.float32, torch.float64: np.float64}

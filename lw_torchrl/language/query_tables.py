@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lw_torchrl.language.named_objects import TypedPosition, coordinate_indices, typed
+from lw_torchrl.language.objects import TypedPosition, coordinate_indices, typed
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import STATES, Comparison, comparisons
 from lw_torchrl.language.tasks import MT50, Task, one_layout, task_id

@@ -8,11 +8,11 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Any, Literal
 
-from lw_torchrl._checks import check_choice, shown
-from lw_torchrl._files import read_toml
-from lw_torchrl._registry import Registry
+from lw_torchrl._util.checks import check_choice, shown
+from lw_torchrl._util.files import read_toml
+from lw_torchrl._util.registry import Registry
 from lw_torchrl.language.layout import Layout
-from lw_torchrl.language.named_objects import is_number
+from lw_torchrl.language.objects import is_number
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import check_choice
-from lw_torchrl.language.named_objects import coordinate_indices
+from lw_torchrl._util.checks import check_choice
+from lw_torchrl.language.objects import coordinate_indices
 from lw_torchrl.language.skills import ScriptedSkill, Skills, load_skills
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
 from lw_torchrl.language.tasks import Task, get_task, one_layout, task_ids

@@ -11,12 +11,11 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from lw_torchrl._checks import check_choice, checked, did_you_mean, shown
-from lw_torchrl._files import AnyPath, read_toml
-from lw_torchrl._registry import ReadOnlyDict
-from lw_torchrl.language.named_objects import GRIPPER, is_number, is_triple
+from lw_torchrl._util.checks import check_choice, checked, did_you_mean, shown
+from lw_torchrl._util.files import AnyPath, read_toml
+from lw_torchrl._util.registry import ReadOnlyDict
+from lw_torchrl.language.objects import GRIPPER, WORDS, is_number, is_triple
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task
-from lw_torchrl.language.words import WORDS
 
 Triple = tuple[float, float, float]
 

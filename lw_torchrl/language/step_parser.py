@@ -6,13 +6,10 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from lw_torchrl.language.named_objects import GOAL, GRIPPER
+from lw_torchrl.language.objects import GOAL, GRIPPER, WORDS
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
-from lw_torchrl.language.roles import Direction, Verb
-from lw_torchrl.language.step_text import mark_objects, simplify
-from lw_torchrl.language.task_objects import first_object, is_goal, object_of, same_object, whole_objects
-from lw_torchrl.language.tasks import Task
-from lw_torchrl.language.words import WORDS
+from lw_torchrl.language.roles import Direction, Verb, mark_objects, simplify
+from lw_torchrl.language.tasks import Task, first_object, is_goal, object_of, same_object, whole_objects
 
 _VERBS = {name: frozenset(words) for name, words in WORDS["canonical"]["verbs"].items()}
 _DIRECTIONS: dict[str, Direction] = {

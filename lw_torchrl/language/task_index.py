@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl.language.value_checks import asserted, plain, readable, waits
+from lw_torchrl._util.devices import asserted, plain, readable, waits
 
 if TYPE_CHECKING:
     from lw_torchrl.language.plans import AnyPlans, Plans

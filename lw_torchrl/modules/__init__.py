@@ -1,6 +1,6 @@
 """Policies as TensorDict modules, in parts that can be used alone: attention, mixers, features, decoders, critics."""
 
-import lw_torchrl._torchrl  # noqa: F401
+import lw_torchrl._util.torchrl  # noqa: F401
 from lw_torchrl.modules.attention import PlanAttention, attend
 from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedValue, QValue, Value
 from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
@@ -10,9 +10,8 @@ from lw_torchrl.modules.features import Concat, Features, ObservationFeatures
 from lw_torchrl.modules.image_query_evaluator import IMAGE_ENCODERS, ImageQueryEvaluator
 from lw_torchrl.modules.mixer import ActionMixer, SkillEncoder, SkillMixer
 from lw_torchrl.modules.plan_conditioned_actor import ConditionedActor, PlanConditionedActor, plan_trunk
-from lw_torchrl.modules.policy import layout_of, plans_of, tasks_of, transform_of, with_plans
+from lw_torchrl.modules.policy import METHODS, layout_of, make_policy, plans_of, tasks_of, transform_of, with_plans
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
-from lw_torchrl.modules.registry import METHODS, make_policy
 from lw_torchrl.modules.relative_features import FocusFeatures, RoleFeatures
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator

@@ -10,10 +10,10 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._checks import checked
-from lw_torchrl._keys import dispatched, key_beside, read, write
+from lw_torchrl._util.checks import checked
+from lw_torchrl._util.devices import check_values
+from lw_torchrl._util.keys import dispatched, key_beside, read, write
 from lw_torchrl.language.task_index import PlanTables, answers_of, as_plans, pick
-from lw_torchrl.language.value_checks import check_values
 from lw_torchrl.modules.networks import in_mode_of
 from lw_torchrl.modules.sequence import Part
 

@@ -11,8 +11,8 @@ from tensordict.nn import TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._checks import check_int, checked, passes_on
-from lw_torchrl._keys import as_keys, check_apart, check_key, dispatched, read, write
+from lw_torchrl._util.checks import check_int, checked, passes_on
+from lw_torchrl._util.keys import as_keys, check_apart, check_key, dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.networks import MLP, materialize

@@ -12,8 +12,8 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._checks import check_scale, checked
-from lw_torchrl._keys import dispatched, read, write
+from lw_torchrl._util.checks import check_scale, checked
+from lw_torchrl._util.keys import dispatched, read, write
 from lw_torchrl.modules.networks import MLP, materialize, probe
 from lw_torchrl.modules.sequence import Part, encoding_keys, encoding_width, trunk_attributes
 

@@ -12,7 +12,7 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 
-from lw_torchrl._checks import shown
+from lw_torchrl._util.checks import shown
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import TASKS, Task

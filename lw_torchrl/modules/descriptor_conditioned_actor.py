@@ -12,8 +12,8 @@ from tensordict.nn import TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._checks import checked
-from lw_torchrl._keys import dispatched, read, write
+from lw_torchrl._util.checks import checked
+from lw_torchrl._util.keys import dispatched, read, write
 from lw_torchrl.language.task_index import TaskIndex, pick
 from lw_torchrl.language.tasks import MT50, Task, named_tasks, one_layout, task_ids
 from lw_torchrl.language.text import TextEncoder, encoded

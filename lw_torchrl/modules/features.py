@@ -13,10 +13,10 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import add_random_module
 
-from lw_torchrl._checks import check_choice, check_scale, checked
-from lw_torchrl._keys import as_keys, check_apart, dispatched, read, write
+from lw_torchrl._util.checks import check_choice, check_scale, checked
+from lw_torchrl._util.devices import check_finite
+from lw_torchrl._util.keys import as_keys, check_apart, dispatched, read, write
 from lw_torchrl.language.task_index import as_plans
-from lw_torchrl.language.value_checks import check_finite
 from lw_torchrl.modules.networks import in_mode_of, probe
 from lw_torchrl.modules.sequence import follow, written_key
 

@@ -9,14 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._checks import check_choice, check_int, checked
-from lw_torchrl._registry import Registry, is_function
-from lw_torchrl._rendering import check_cameras
+from lw_torchrl._util.checks import check_choice, check_int, checked
+from lw_torchrl._util.registry import Registry, is_function
+from lw_torchrl._util.rendering import check_cameras
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
 from lw_torchrl.modules.networks import MLP, materialize
 from lw_torchrl.modules.query_evaluator import Answers
-from lw_torchrl.modules.state_query_evaluator import ClauseNetwork
+from lw_torchrl.modules.state_query_evaluator import ClauseEvaluator, ClauseNetwork, Clauses
 from lw_torchrl.transforms.camera import CameraTransform
 
 KEYS = 32  # size of the vector by which an object is found in a picture
@@ -118,7 +117,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
     network. ``transform()`` returns the :class:`CameraTransform` that takes its pictures.
 
     Args:
-        plans, answers, predicates: as for :class:`~lw_torchrl.modules.clause_evaluator.ClauseEvaluator`, with its
+        plans, answers, predicates: as for :class:`~lw_torchrl.modules.state_query_evaluator.ClauseEvaluator`, with its
             errors and source.
         cameras, height, width: as for :class:`CameraTransform`; at most 512 pixels.
         every: steps from one picture to the next when it acts; in between its answers stay.

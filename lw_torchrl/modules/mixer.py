@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._checks import check_int, checked
-from lw_torchrl._keys import dispatched, read, write
+from lw_torchrl._util.checks import check_int, checked
+from lw_torchrl._util.keys import dispatched, read, write
 from lw_torchrl.language.task_index import PlanTables, as_plans, one_per_row, pick
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.networks import MLP, in_mode_of, materialize, probe

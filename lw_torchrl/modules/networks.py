@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP as TorchRLMLP
 
-from lw_torchrl._checks import check_int
+from lw_torchrl._util.checks import check_int
 
 Module = TypeVar("Module", bound=nn.Module)
 

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.data import Composite
 
-from lw_torchrl._checks import checked
+from lw_torchrl._util.checks import checked
 from lw_torchrl.language.task_index import as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.attention import PlanAttention

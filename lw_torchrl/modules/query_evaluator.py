@@ -12,8 +12,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import check_choice, checked
-from lw_torchrl._keys import dispatched, key_beside, read, write
+from lw_torchrl._util.checks import check_choice, checked
+from lw_torchrl._util.keys import dispatched, key_beside, read, write
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.task_index import PlanTables, pick
 from lw_torchrl.language.text import TextEncoder

@@ -11,15 +11,15 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._checks import checked
-from lw_torchrl._keys import as_keys, read
+from lw_torchrl._util.checks import checked
+from lw_torchrl._util.devices import check_finite
+from lw_torchrl._util.keys import as_keys, read
 from lw_torchrl.language.layout import places
-from lw_torchrl.language.named_objects import GOAL, GRIPPER, NamedObject, coordinate_indices
+from lw_torchrl.language.objects import GOAL, GRIPPER, NamedObject, coordinate_indices
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, as_plans
 from lw_torchrl.language.roles import VECTORS, StepRole
 from lw_torchrl.language.task_index import PlanTables, one_per_row, pick
-from lw_torchrl.language.task_objects import role_object
-from lw_torchrl.language.value_checks import check_finite
+from lw_torchrl.language.tasks import role_object
 from lw_torchrl.modules.attention import PlanAttention
 from lw_torchrl.modules.features import Features, check_observation, check_rows, squash
 from lw_torchrl.transforms.qaf import plan_program

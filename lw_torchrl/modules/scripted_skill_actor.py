@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._checks import checked, shown
-from lw_torchrl._keys import dispatched, read, write
+from lw_torchrl._util.checks import checked, shown
+from lw_torchrl._util.keys import dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill

@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.data import Bounded, Composite
 
-from lw_torchrl._keys import any_arguments, as_keys, check_apart, last_name
+from lw_torchrl._util.keys import any_arguments, as_keys, check_apart, last_name
 from lw_torchrl.modules.networks import in_mode_of
 
 if TYPE_CHECKING:

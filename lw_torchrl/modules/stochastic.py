@@ -18,8 +18,8 @@ from torch import nn
 from torchrl.data import Composite
 from torchrl.modules import IndependentNormal, TanhNormal
 
-from lw_torchrl._checks import check_choice, checked
-from lw_torchrl._keys import any_arguments, key_beside
+from lw_torchrl._util.checks import check_choice, checked
+from lw_torchrl._util.keys import any_arguments, key_beside
 from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
 from lw_torchrl.modules.features import Features
 from lw_torchrl.modules.networks import in_mode_of, materialize

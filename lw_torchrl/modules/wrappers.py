@@ -11,8 +11,8 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._checks import checked, shown
-from lw_torchrl._keys import dispatched, last_name, read, write
+from lw_torchrl._util.checks import checked, shown
+from lw_torchrl._util.keys import dispatched, last_name, read, write
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.tasks import task_id

@@ -14,9 +14,9 @@ from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 
-from lw_torchrl._checks import check_positive, check_probability, check_scale, checked
-from lw_torchrl._keys import read
-from lw_torchrl.language.value_checks import check_finite
+from lw_torchrl._util.checks import check_positive, check_probability, check_scale, checked
+from lw_torchrl._util.devices import check_finite
+from lw_torchrl._util.keys import read
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.objectives.reduction import Reduction, clear_references, priority_weight, set_reduction
 

@@ -15,7 +15,7 @@ from torchrl.data import Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss, TD3BCLoss
 
-from lw_torchrl._checks import check_scale, checked, shown
+from lw_torchrl._util.checks import check_scale, checked, shown
 from lw_torchrl.objectives.reduction import Reduction, clear_references, priority_weight
 
 

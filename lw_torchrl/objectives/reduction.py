@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import IQLLoss, LossModule, REDQLoss
 
-from lw_torchrl._checks import checked
+from lw_torchrl._util.checks import checked
 
 Reduction = Literal["none", "mean", "sum"]
 _STEPS = "steps_to_next_obs"

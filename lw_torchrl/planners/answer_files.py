@@ -12,8 +12,8 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from lw_torchrl._checks import check_choice, check_int, checked, counted, differences, shown, unknown_name
-from lw_torchrl._files import AnyPath, read_json, read_text, write_json, write_text
+from lw_torchrl._util.checks import check_choice, check_int, checked, counted, differences, shown, unknown_name
+from lw_torchrl._util.files import AnyPath, read_json, read_text, write_json, write_text
 from lw_torchrl.language.formats import PLAN_FORMATS, encode_plan
 from lw_torchrl.language.formats.structured import read_structured
 from lw_torchrl.language.nearest import StepMapper

@@ -11,8 +11,8 @@ from time import monotonic
 from typing import Any
 from urllib.parse import urlsplit
 
-from lw_torchrl._checks import counted, shown
-from lw_torchrl._files import parse_json
+from lw_torchrl._util.checks import counted, shown
+from lw_torchrl._util.files import parse_json
 
 OPENAI = "https://api.openai.com/v1"
 REPLY_LIMIT = 4 * 2**20  # bytes

@@ -12,9 +12,9 @@ from pathlib import Path
 from threading import Event
 from typing import Any, Literal
 
-from lw_torchrl._checks import Count, Natural, Positive, Scale, check_choice, check_int, checked, counted, shown
-from lw_torchrl._files import AnyPath, read_text
-from lw_torchrl._progress import Progress
+from lw_torchrl._util.checks import Count, Natural, Positive, Scale, check_choice, check_int, checked, counted, shown
+from lw_torchrl._util.files import AnyPath, read_text
+from lw_torchrl._util.progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.skills import Skills

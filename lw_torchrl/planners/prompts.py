@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from rapidfuzz.distance import Levenshtein
 
-from lw_torchrl._checks import check_choice, checked
+from lw_torchrl._util.checks import check_choice, checked
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.structured import write_structured
 from lw_torchrl.language.plan_files import load_plans

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lw_torchrl._checks import check_int
-from lw_torchrl._files import AnyPath
-from lw_torchrl._progress import Progress
+from lw_torchrl._util.checks import check_int
+from lw_torchrl._util.files import AnyPath
+from lw_torchrl._util.progress import Progress
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.plan_use import PlanUse, TaskUse, expert_use
 from lw_torchrl.evaluation.protocol import evaluate
-from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plan_decoding import DecodedPlan, decode_plan
 from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task

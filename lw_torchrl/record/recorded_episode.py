@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 
 from lw_torchrl.language.layout import METAWORLD, Layout
-from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import TOUCHING
 from lw_torchrl.language.skills import load_skills

@@ -22,8 +22,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
-from lw_torchrl._checks import check_choice, checked
-from lw_torchrl._files import AnyPath
+from lw_torchrl._util.checks import check_choice, checked
+from lw_torchrl._util.files import AnyPath
 from lw_torchrl.evaluation.figures import plot_failures
 from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.language.layout import METAWORLD

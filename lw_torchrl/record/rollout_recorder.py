@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
-from lw_torchrl._checks import check_int, checked
+from lw_torchrl._util.checks import check_int, checked
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.record.meshes import Motion

@@ -18,9 +18,9 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._checks import checked, missing_keys, shown
-from lw_torchrl._devices import device_of
-from lw_torchrl._files import AnyPath
+from lw_torchrl._util.checks import checked, missing_keys, shown
+from lw_torchrl._util.devices import device_of
+from lw_torchrl._util.files import AnyPath
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation.diagnose.counterfactuals import own_evaluators
@@ -29,7 +29,7 @@ from lw_torchrl.evaluation.diagnose.sentences import replacement_text
 from lw_torchrl.evaluation.rollout import actor_plans, suite_tasks
 from lw_torchrl.evaluation.rollout import rollout as run_rollout
 from lw_torchrl.language.layout import METAWORLD
-from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
 from lw_torchrl.modules.query_evaluator import QueryEvaluator

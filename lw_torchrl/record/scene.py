@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.record.entities import GOLD, GREEN, STEEL, Color, changes, entity_path, rr, step_color
 from lw_torchrl.record.meshes import GHOST, Known, Motion, log_motion
 from lw_torchrl.record.metrics import send_images

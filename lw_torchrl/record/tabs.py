@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any, NamedTuple
 
-from lw_torchrl._checks import unknown_name
+from lw_torchrl._util.checks import unknown_name
 from lw_torchrl.record.entities import EPISODE_TIMELINE, METRIC_TIMELINE, STEP_TIME, entity_path, rr, rrb
 from lw_torchrl.record.page import Page
 

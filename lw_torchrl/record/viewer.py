@@ -16,8 +16,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from lw_torchrl._checks import checked
-from lw_torchrl._files import AnyPath, replacing
+from lw_torchrl._util.checks import checked
+from lw_torchrl._util.files import AnyPath, replacing
 from lw_torchrl.record.entities import EPISODE_TIMELINE
 from lw_torchrl.record.rerun_logger import is_complete
 from lw_torchrl.record.tabs import Tabs

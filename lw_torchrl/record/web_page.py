@@ -18,9 +18,9 @@ from string import Template
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from lw_torchrl._checks import checked
-from lw_torchrl._files import AnyPath, replacing
-from lw_torchrl._progress import Progress
+from lw_torchrl._util.checks import checked
+from lw_torchrl._util.files import AnyPath, replacing
+from lw_torchrl._util.progress import Progress
 from lw_torchrl.record.entities import EPISODE_TIMELINE
 from lw_torchrl.record.tabs import OVERVIEW
 from lw_torchrl.record.viewer import (

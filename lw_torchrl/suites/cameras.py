@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._rendering import RENDER_LIBRARIES
+from lw_torchrl._util.rendering import RENDER_LIBRARIES
 from lw_torchrl.suites.engine import BodyPoses, RowModel
 
 _FINGER = re.compile("finger|claw|pad")

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._checks import checked
-from lw_torchrl.language.named_objects import typed
+from lw_torchrl._util.checks import checked
+from lw_torchrl.language.objects import typed
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.suites.engine import Engine, EngineStep
 from lw_torchrl.suites.suite import Suite

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from lw_torchrl._checks import check_choice, check_fields, shown, unknown_name
-from lw_torchrl._registry import ReadOnlyDict, Registry
+from lw_torchrl._util.checks import check_choice, check_fields, shown, unknown_name
+from lw_torchrl._util.registry import ReadOnlyDict, Registry
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.relations import PREDICATES

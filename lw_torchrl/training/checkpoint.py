@@ -11,9 +11,9 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from lw_torchrl._checks import checked, differences
-from lw_torchrl._files import AnyPath, absent_policy, shipped_policy
-from lw_torchrl._tensor_files import read_tensors, write_tensors
+from lw_torchrl._util.checks import checked, differences
+from lw_torchrl._util.files import AnyPath, absent_policy, shipped_policy
+from lw_torchrl._util.tensor_files import read_tensors, write_tensors
 from lw_torchrl.language.plans import AnyPlans, PlanError, as_plans
 from lw_torchrl.language.text import TEXT_DIMENSION, TextEncoder
 from lw_torchrl.modules.describe import describe, from_description, same_keys

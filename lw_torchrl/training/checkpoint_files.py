@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._files import AnyPath, locked
-from lw_torchrl._tensor_files import pop_state
-from lw_torchrl._versions import LIBRARIES, warn_of_other_versions
+from lw_torchrl._util.files import AnyPath, locked
+from lw_torchrl._util.tensor_files import pop_state
+from lw_torchrl._util.versions import LIBRARIES, warn_of_other_versions
 from lw_torchrl.training.checkpoint import (
     check_same_description,
     copy_tensors,
@@ -23,6 +26,42 @@ from lw_torchrl.training.checkpoint import (
     training_file,
     write_file,
 )
+
+
+class Interrupt:
+    """Records whether Ctrl-C was pressed once (``requested``) or twice (``insisted``)."""
+
+    requested = insisted = False
+
+
+@contextmanager
+def interrupts_between_steps() -> Iterator[Interrupt]:
+    """Record the first Ctrl-C, and raise :class:`KeyboardInterrupt` at the end of the block.
+
+    A second Ctrl-C raises at once. Nothing changes outside the main thread, or where SIGINT is ignored.
+    """
+    interrupt = Interrupt()
+    previous = signal.getsignal(signal.SIGINT) if threading.current_thread() is threading.main_thread() else None
+    if not callable(previous):
+        yield interrupt
+        return
+
+    def record(number: int, frame: FrameType | None) -> None:
+        interrupt.insisted, interrupt.requested = interrupt.requested, True
+        if interrupt.insisted:
+            previous(number, frame)
+
+    signal.signal(signal.SIGINT, record)
+    try:
+        yield interrupt
+    except Exception as error:
+        if interrupt.insisted:  # losses catch what tensordicts raise, and may turn it into another error
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    if interrupt.requested:
+        raise KeyboardInterrupt
 
 
 def contents_of(module: nn.Module) -> dict[str, Tensor]:

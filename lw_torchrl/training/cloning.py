@@ -14,16 +14,15 @@ from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import BCLoss
 
-from lw_torchrl._checks import Count, Positive, Scale, check_fields, checked, passes_on
-from lw_torchrl._devices import place
+from lw_torchrl._util.checks import Count, Positive, Scale, check_fields, checked, passes_on
+from lw_torchrl._util.devices import place
 from lw_torchrl.language.task_index import PlanTables, TaskTables
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.modules.query_evaluator import evaluators_of
 from lw_torchrl.training.checkpoint import check_can_be_saved
-from lw_torchrl.training.loop import Training, TrainingOptions
+from lw_torchrl.training.loop import Training, TrainingOptions, make_optimizer
 from lw_torchrl.training.minibatches import Minibatches, check_replay, describe_data, describe_replay
 from lw_torchrl.training.normalization import check_contacts, fit_normalization, statistics_of
-from lw_torchrl.training.optimizer import make_optimizer
 from lw_torchrl.transforms.qaf import plan_program
 
 

@@ -11,12 +11,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from lw_torchrl._checks import checked, passes_on
-from lw_torchrl._devices import place
-from lw_torchrl.modules.clause_evaluator import ClauseEvaluator, Clauses
+from lw_torchrl._util.checks import checked, passes_on
+from lw_torchrl._util.devices import place
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
-from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
+from lw_torchrl.modules.state_query_evaluator import ClauseEvaluator, Clauses, StateQueryEvaluator
 from lw_torchrl.training.checkpoint import check_can_be_saved
 from lw_torchrl.training.labelled_queries import (
     ImageQueryEvaluatorConfig,
@@ -24,9 +23,8 @@ from lw_torchrl.training.labelled_queries import (
     QueryEvaluatorConfig,
     TaskQueries,
 )
-from lw_torchrl.training.loop import Training, TrainingOptions
+from lw_torchrl.training.loop import Training, TrainingOptions, make_optimizer
 from lw_torchrl.training.minibatches import Minibatches
-from lw_torchrl.training.optimizer import make_optimizer
 
 _MOST_WEIGHT = 20.0  # maximum weight of a rare answer, as a multiple of the median
 

@@ -12,7 +12,16 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
-from lw_torchrl._checks import Count, Probability, Scale, check_choice, check_fields, check_int, check_text, checked
+from lw_torchrl._util.checks import (
+    Count,
+    Probability,
+    Scale,
+    check_choice,
+    check_fields,
+    check_int,
+    check_text,
+    checked,
+)
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.queries import Clause, Query, base_clauses
 from lw_torchrl.language.query_program import QueryProgram

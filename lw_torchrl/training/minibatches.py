@@ -13,7 +13,7 @@ from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampl
 from torchrl.envs import Compose, Transform
 from torchrl.objectives import BCLoss, LossModule
 
-from lw_torchrl._devices import CPU, seeded
+from lw_torchrl._util.devices import CPU, seeded
 from lw_torchrl.data.samplers import GroupSampler
 from lw_torchrl.data.storage import DatasetStorage, device_of_rows
 from lw_torchrl.modules.critics import Value

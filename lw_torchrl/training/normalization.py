@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import LossModule
 
-from lw_torchrl._checks import checked
+from lw_torchrl._util.checks import checked
 from lw_torchrl.modules.features import Features
 from lw_torchrl.modules.relative_features import RoleFeatures
 

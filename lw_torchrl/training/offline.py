@@ -7,18 +7,22 @@ from dataclasses import asdict, dataclass
 from hashlib import sha256
 from typing import Any, Literal, Unpack
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import MultiStepTransform
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives import CQLLoss, IQLLoss, LossModule, SoftUpdate, TD3BCLoss
 
-from lw_torchrl._checks import Count, Positive, Probability, Scale, check_fields, checked, passes_on
+from lw_torchrl._util.checks import Count, Positive, Probability, Scale, check_choice, check_fields, checked, passes_on
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedValue
 from lw_torchrl.modules.describe import describe
+from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
 from lw_torchrl.objectives.reduction import with_n_steps
 from lw_torchrl.training.checkpoint import check_can_be_saved
-from lw_torchrl.training.loop import Training, TrainingOptions
+from lw_torchrl.training.loop import Training, TrainingOptions, make_optimizer
 from lw_torchrl.training.minibatches import (
     Minibatches,
     check_augmentations,
@@ -27,8 +31,57 @@ from lw_torchrl.training.minibatches import (
     describe_replay,
     plain_options,
 )
-from lw_torchrl.training.normalization import fit_untrained, statistics_of
-from lw_torchrl.training.optimizer import make_optimizer
+from lw_torchrl.training.normalization import fit_normalization, fit_untrained, statistics_of
+
+GAMMA, N_STEPS = 0.99, 10
+"""The discount of a step, and the number of steps that a value's target looks ahead."""
+DISTRIBUTIONS = {"advantage": None, "iql": "normal", "td3-bc": None, "cql": "tanh_normal"}
+"""The losses by name, and the distribution of actions that the actor needs."""
+_CHUNK = 20_000  # rows whose advantages are computed together
+
+
+def make_loss(name: str, actor: TensorDictModuleBase, plans: Plans, replay: TensorDictReplayBuffer) -> LossModule:
+    """Return the loss of that name for an actor, with plan-conditioned critics normalised to the buffer's rows.
+
+    The actor has the distribution in :data:`DISTRIBUTIONS`. "advantage" reads the column ``advantage``; for the others
+    the buffer looks :data:`N_STEPS` ahead with the discount :data:`GAMMA`.
+
+    Source: Kostrikov et al., "Implicit Q-Learning"; Fujimoto and Gu, "A Minimalist Approach to Offline Reinforcement
+    Learning"; Kumar et al., "Conservative Q-Learning".
+    """
+    check_choice("loss", name, DISTRIBUTIONS)
+    if name == "advantage":
+        return AdvantageWeightedLoss(actor, beta=2.0, loss_function="l1")
+    qvalue = PlanConditionedQValue(plans)
+    fit_normalization(qvalue, replay)
+    pair: dict[str, Any] = {"num_qvalue_nets": 2, "loss_function": "l2"}
+    if name == "iql":
+        value = PlanConditionedValue(plans)
+        fit_normalization(value, replay)
+        loss: LossModule = IQLLoss(actor, qvalue, value, expectile=0.7, temperature=3.0, **pair)
+    elif name == "td3-bc":
+        loss = TD3BCLoss(actor, qvalue, bounds=(-1.0, 1.0), delay_actor=True, **pair)
+    else:
+        loss = CQLLoss(actor, qvalue, loss_function="l2", num_random=1)
+    loss.make_value_estimator(gamma=GAMMA)
+    return loss
+
+
+def learn_advantages(
+    plans: Plans, replay: TensorDictReplayBuffer, config: OfflineConfig, device: torch.device, **options: Any
+) -> Tensor:
+    """Train a value by expectile regression and return each row's advantage, standardised by task, (R, 1) float32.
+
+    The buffer's rows look :data:`N_STEPS` ahead with the discount :data:`GAMMA`.
+    """
+    value = PlanConditionedValue(plans, ensemble=2).to(device)
+    loss = ExpectileValueLoss(value, expectile=0.7).make_value_estimator(gamma=GAMMA)
+    OfflineTrainer(loss, replay, config, **options).train()
+    starts = range(0, len(replay), _CHUNK)
+    chunks = [replay[start : min(start + _CHUNK, len(replay))].to(device) for start in starts]
+    advantage = torch.cat([loss.advantage(chunk).cpu() for chunk in chunks])
+    return standardize_by_task(advantage, torch.cat([chunk["task_id"].cpu() for chunk in chunks]))
+
 
 _REPLACED = {"loss_actor_bc"}  # CQL's first steps of the actor minimise it instead of another entry
 

@@ -12,14 +12,14 @@ from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase, Transform
 
-from lw_torchrl._checks import Probability, Scale, checked
-from lw_torchrl._keys import as_keys, check_apart, read
+from lw_torchrl._util.checks import Probability, Scale, checked
+from lw_torchrl._util.devices import plain
+from lw_torchrl._util.keys import as_keys, check_apart, read
 from lw_torchrl.language.layout import METAWORLD, Layout, places
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.roles import StepRole
 from lw_torchrl.language.task_index import PlanTables, answers_of
-from lw_torchrl.language.task_objects import role_object
-from lw_torchrl.language.value_checks import plain
+from lw_torchrl.language.tasks import role_object
 from lw_torchrl.transforms.qaf import plan_number_key
 
 ACTIVE = 0.01  # attention of an active step: a step whose condition is false beside a true one has 1e-4

@@ -13,9 +13,9 @@ from torchrl.data import Composite, TensorSpec, UnboundedDiscrete
 from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-from lw_torchrl._checks import check_int, checked
-from lw_torchrl._keys import as_keys
-from lw_torchrl._rendering import check_cameras
+from lw_torchrl._util.checks import check_int, checked
+from lw_torchrl._util.keys import as_keys
+from lw_torchrl._util.rendering import check_cameras
 from lw_torchrl.transforms.environment import KeepsEnvState, base_env, reset_rows
 
 

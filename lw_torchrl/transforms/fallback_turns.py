@@ -10,8 +10,8 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import Count, Scale, checked
-from lw_torchrl._keys import as_keys, check_apart, read
+from lw_torchrl._util.checks import Count, Scale, checked
+from lw_torchrl._util.keys import as_keys, check_apart, read
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.transforms.environment import reset_rows
 

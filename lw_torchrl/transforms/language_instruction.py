@@ -10,8 +10,8 @@ from tensordict.utils import NestedKey
 from torchrl.data import Composite, NonTensor, TensorSpec
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import checked
-from lw_torchrl._keys import as_keys, read
+from lw_torchrl._util.checks import checked
+from lw_torchrl._util.keys import as_keys, read
 from lw_torchrl.language.tasks import TASKS, TaskList, named_tasks, task_id
 from lw_torchrl.transforms.environment import base_env
 

@@ -13,8 +13,8 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-from lw_torchrl._checks import checked, missing_keys
-from lw_torchrl._keys import as_keys, check_apart, key_beside
+from lw_torchrl._util.checks import checked, missing_keys
+from lw_torchrl._util.keys import as_keys, check_apart, key_beside
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.task_index import PlanTables, TaskTables, one_per_row

@@ -9,8 +9,8 @@ from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._checks import check_probability, check_scale, checked, missing_keys
-from lw_torchrl._keys import as_keys, check_apart, key_beside
+from lw_torchrl._util.checks import check_probability, check_scale, checked, missing_keys
+from lw_torchrl._util.keys import as_keys, check_apart, key_beside
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import AnyPlans
 from lw_torchrl.language.roles import StepRole

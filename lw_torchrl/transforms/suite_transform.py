@@ -11,8 +11,8 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from lw_torchrl._checks import checked
-from lw_torchrl._keys import check_key, read
+from lw_torchrl._util.checks import checked
+from lw_torchrl._util.keys import check_key, read
 from lw_torchrl.language.tasks import Task, task_id
 
 

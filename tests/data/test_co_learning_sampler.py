@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
 from lw_torchrl.data import CoLearningSampler
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.language.tasks import MT50, Task, task_id
 
 TARGET = "coffee-push"

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from collecting import collect, tree
 
-from lw_torchrl._files import locked
+from lw_torchrl._util.files import locked
 from lw_torchrl.data import DatasetError
 from lw_torchrl.data.missing_episodes import EpisodeFiles
 

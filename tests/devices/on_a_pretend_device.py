@@ -340,7 +340,7 @@ def test_draws_are_the_trainers_alone(demos):
 
 
 def test_names_of_devices(demos):
-    from lw_torchrl._devices import check_device
+    from lw_torchrl._util.devices import check_device
 
     for name in ("auto", "pretend", "pretend:0", PRETEND):
         assert check_device("device", name) == PRETEND

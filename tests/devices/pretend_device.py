@@ -12,11 +12,11 @@ import torch
 from torch.utils import _pytree as pytree
 from torch.utils.backend_registration import _DummyBackendModule, _setup_privateuseone_for_python_backend
 
-from lw_torchrl.language import value_checks
+from lw_torchrl._util import devices
 
 aten = torch.ops.aten
 READS = {aten._local_scalar_dense, aten.equal, aten.nonzero, aten.masked_select, aten._unique2, aten.bincount}
-PACKAGE = str(Path(value_checks.__file__).parents[1])
+PACKAGE = str(Path(devices.__file__).parents[1])
 
 
 class Module(_DummyBackendModule):
@@ -41,7 +41,7 @@ class Module(_DummyBackendModule):
 
 MODULE = Module()
 _setup_privateuseone_for_python_backend("pretend", MODULE)
-value_checks._ASSERTING.add("pretend")
+devices._ASSERTING.add("pretend")
 PRETEND = torch.device("pretend:0")
 WAITS: list[str] = []  # what made somebody wait, and where
 COPIES: list[torch.Size] = []  # what went over without waiting

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import lw_torchrl as lw
-from lw_torchrl._devices import CPU, check_device, device_of
+from lw_torchrl._util.devices import CPU, check_device, device_of
 from lw_torchrl.cli.main import main
 
 HERE = Path(__file__).parent

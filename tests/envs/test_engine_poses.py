@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lw_torchrl.suites.metaworld.engines import MetaWorldEngine
+from lw_torchrl.suites.metaworld import MetaWorldEngine
 from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
 
 

@@ -11,7 +11,7 @@ import lw_torchrl as lw
 from lw_torchrl.envs.episodes import run_episodes
 from lw_torchrl.envs.seeding import action_noise, episode_seed
 from lw_torchrl.suites.engine import EngineStep
-from lw_torchrl.suites.metaworld.engines import ENGINES, make_engine
+from lw_torchrl.suites.metaworld import ENGINES, make_engine
 
 STACK = lw.Task("stack-cups", "Stack the cups.", (*lw.TASKS["reach"].objects,))
 OWN_ID = lw.task_id("stack-cups")

@@ -17,7 +17,7 @@ from torch import nn
 from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
-from lw_torchrl._devices import in_blocks
+from lw_torchrl._util.devices import in_blocks
 from lw_torchrl.envs.episodes import FinishedEpisode, run_episodes
 from lw_torchrl.envs.seeding import action_noise
 

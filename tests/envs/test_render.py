@@ -15,7 +15,7 @@ from torchrl.record import PixelRenderTransform, VideoRecorder
 from torchrl.record.loggers import CSVLogger
 
 import lw_torchrl as lw
-from lw_torchrl._rendering import CAMERAS
+from lw_torchrl._util.rendering import CAMERAS
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 import lw_torchrl as lw
-from lw_torchrl._files import replacing
+from lw_torchrl._util.files import replacing
 from lw_torchrl.language import text
 
 

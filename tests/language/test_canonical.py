@@ -8,13 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.language import canonical, step_parser, step_text, task_objects
+from lw_torchrl.language import canonical, roles, step_parser
 from lw_torchrl.language.canonical import MIN_CONFIDENCE, canonical_plan, explain_canonical, fallback_plan
-from lw_torchrl.language.named_objects import GOAL, GRIPPER
-from lw_torchrl.language.roles import role_vectors
+from lw_torchrl.language.objects import GOAL, GRIPPER
+from lw_torchrl.language.roles import mark_objects, role_vectors
 from lw_torchrl.language.step_parser import parse_steps
-from lw_torchrl.language.step_text import mark_objects
-from lw_torchrl.language.task_objects import first_object, role_object
+from lw_torchrl.language.tasks import first_object, role_object
 
 OWN, MT10_SKILLS = lw.load_plans("MT50"), lw.load_plans("MT50", skills="MT10")
 G = GRIPPER
@@ -115,7 +114,7 @@ def test_the_canonical_form_of_a_canonical_plan_is_itself(task):
 
 
 def test_nothing_of_a_plan_comes_from_the_shipped_plans_or_skills():
-    for module in (canonical, step_parser, step_text, task_objects):
+    for module in (canonical, step_parser, roles):
         source = inspect.getsource(module)
         assert not any(name in source for name in ("load_plans", "load_skills", "skills_for", "usual_goal"))
 

@@ -7,7 +7,7 @@ import torch
 from relation_truth import relation_holds
 
 import lw_torchrl as lw
-from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, PlanStep, usual_goal
 from lw_torchrl.language.queries import parse_query
 

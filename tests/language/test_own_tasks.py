@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 import lw_torchrl as lw
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject, read_objects, write_objects
+from lw_torchrl.language.objects import GRIPPER, NamedObject, read_objects, write_objects
 from lw_torchrl.language.skills import SkillError
 
 FILE = """

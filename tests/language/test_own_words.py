@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from lw_torchrl.language.canonical import canonical_plan, explain_canonical
-from lw_torchrl.language.named_objects import NamedObject
+from lw_torchrl.language.objects import NamedObject
 from lw_torchrl.language.plans import ConditionalPlan
+from lw_torchrl.language.roles import mark_objects, simplify
 from lw_torchrl.language.step_parser import parse_steps
-from lw_torchrl.language.step_text import mark_objects, simplify
 
 PLANS = lw.load_plans("MT50")
 SAYINGS = json.loads((Path(__file__).parent / "sayings.json").read_text("utf-8"))

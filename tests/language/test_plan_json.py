@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.language.named_objects import NamedObject
+from lw_torchrl.language.objects import NamedObject
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
 from lw_torchrl.language.relations import RELATIONS, Comparison
 from lw_torchrl.language.tasks import TASKS, Task

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from plan_texts import DRAWER, conditional_plans, plan
 
-from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, as_plans, parse_plan
 from lw_torchrl.language.queries import Clause, Query, QueryError, parse_query
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from relation_truth import relation_holds
 from states import random_states
 
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.language.queries import parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.relations import RELATIONS

@@ -9,8 +9,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lw_torchrl.language import queries
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject
 from lw_torchrl.language.nearest import nearest_query
+from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.language.queries import ARTICLES, Clause, Query, QueryError, check_query, parse_query, supported_queries
 from lw_torchrl.language.relations import RELATIONS, TOUCHING
 from lw_torchrl.language.tasks import MT50, TASKS, Task, get_task

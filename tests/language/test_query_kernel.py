@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from states import all_tasks, random_states
 
 from lw_torchrl.language import query_program
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.language.queries import supported_queries
 from lw_torchrl.language.query_program import QueryProgram, find_kernel
 from lw_torchrl.language.query_tables import MOST_FACTS

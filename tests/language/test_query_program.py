@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from states import all_tasks, observation, random_states
 
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.language.queries import Clause, Query, parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id

@@ -5,8 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl.language.named_objects import GRIPPER
 from lw_torchrl.language.nearest import nearest_skill
+from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.skills import SkillError, load_skills, skills_for
 
 

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lw_torchrl.language.layout import Layout, Slot
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject
 from lw_torchrl.language.nearest import nearest_query
+from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.relations import PREDICATES, STATES, Comparison

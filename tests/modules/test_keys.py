@@ -14,7 +14,7 @@ from torchrl.objectives.value import GAE
 
 import lw_torchrl as lw
 from lw_torchrl import modules as m
-from lw_torchrl._keys import as_keys
+from lw_torchrl._util.keys import as_keys
 from lw_torchrl.modules import PlanAttention, QValue, Value, descriptor_trunk, plan_trunk
 
 KINDS = {

@@ -21,7 +21,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import lw_torchrl as lw
 from lw_torchrl.language.layout import METAWORLD, Layout, Slot
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules import (
     ActorEnsemble,

@@ -32,7 +32,7 @@ from torchrl.objectives import (
 from torchrl.objectives.value import GAE
 
 import lw_torchrl as lw
-from lw_torchrl._devices import device_of
+from lw_torchrl._util.devices import device_of
 from lw_torchrl.modules import MLPDecoder, ObservationFeatures, QValue, Value, descriptor_trunk, plan_trunk
 from lw_torchrl.objectives import with_n_steps
 

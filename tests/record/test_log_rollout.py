@@ -21,7 +21,7 @@ from lw_torchrl.evaluation.diagnose.findings import ActiveStep
 from lw_torchrl.record.rollouts import run_recorded
 from lw_torchrl.record.tabs import Tabs
 from lw_torchrl.record.viewer import open_viewer
-from lw_torchrl.suites.metaworld.engines import MetaWorldEngine
+from lw_torchrl.suites.metaworld import MetaWorldEngine
 
 PLANS = lw.load_plans("MT10")
 SEED = 5

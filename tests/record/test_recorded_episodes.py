@@ -10,11 +10,11 @@ import torch
 from PIL import Image
 from recordings import PLAN, STEPS, Recording, make_objects, make_rollout, record
 
-from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import TOUCHING
 from lw_torchrl.record import RerunLogger
-from lw_torchrl.record.lanes import EVENLY, NONE_HOLDS
+from lw_torchrl.record.page import EVENLY, NONE_HOLDS
 from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode, short_condition
 from lw_torchrl.record.scene import ROBOT_EYE, name_offsets
 from lw_torchrl.record.tabs import Tabs

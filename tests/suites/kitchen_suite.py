@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 
 import lw_torchrl as lw
 from lw_torchrl.language.layout import Layout, Slot
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.suites import Suite
 from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step

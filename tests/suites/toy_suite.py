@@ -6,7 +6,7 @@ import numpy as np
 
 import lw_torchrl as lw
 from lw_torchrl.language.layout import Layout, Slot
-from lw_torchrl.language.named_objects import GRIPPER, NamedObject
+from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.suites import Suite
 from lw_torchrl.suites.engine import EngineStep

@@ -8,7 +8,7 @@ from small_training import CONFIG, PLANS, collect_demos, make_actor, make_descri
 from torchrl.data import RandomSampler
 from torchrl.envs import Compose
 
-from lw_torchrl._tensor_files import read_tensors, write_tensors
+from lw_torchrl._util.tensor_files import read_tensors, write_tensors
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.training.checkpoint import training_file

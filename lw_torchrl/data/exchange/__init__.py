@@ -9,9 +9,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from lw_torchrl._checks import Count, checked
-from lw_torchrl._files import AnyPath, read_json, replacing_folder
-from lw_torchrl._progress import Progress
+from lw_torchrl._util.checks import Count, checked
+from lw_torchrl._util.files import AnyPath, read_json, replacing_folder
+from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.dataset import METADATA, Demonstrations, parse_metadata, read_metadata
 from lw_torchrl.data.exchange import incoming
 from lw_torchrl.data.exchange.table import ExchangeError, Table, table_of

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from lw_torchrl._checks import shown, unknown_name
-from lw_torchrl._files import replacing_folder
-from lw_torchrl._progress import Progress
+from lw_torchrl._util.checks import shown, unknown_name
+from lw_torchrl._util.files import replacing_folder
+from lw_torchrl._util.progress import Progress
 from lw_torchrl.data import dataset
 from lw_torchrl.data.behaviours import Behaviour
 from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo

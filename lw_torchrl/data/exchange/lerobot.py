@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from lw_torchrl._checks import shown
-from lw_torchrl._files import read_json
-from lw_torchrl._progress import Progress
+from lw_torchrl._util.checks import shown
+from lw_torchrl._util.files import read_json
+from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.exchange import video
 from lw_torchrl.data.exchange.table import ABOUT, KNOWN, NAMES, Array, ExchangeError, Table
 

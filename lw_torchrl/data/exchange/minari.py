@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from lw_torchrl._files import parse_json
-from lw_torchrl._progress import Progress
+from lw_torchrl._util.files import parse_json
+from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.exchange.table import ABOUT, HOLDS, NAMES, TASK_NAMES, Array, Table
 
 _AFTER = ("success", "reward_sparse")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lw_torchrl._progress import Progress
+from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.dataset import Demonstrations
 from lw_torchrl.data.exchange.table import Array
 from lw_torchrl.data.pictures import Pictures

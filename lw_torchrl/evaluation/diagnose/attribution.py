@@ -11,8 +11,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from lw_torchrl._checks import Count, Scale, checked, missing_keys
-from lw_torchrl._devices import device_of
+from lw_torchrl._util.checks import Count, Scale, checked, missing_keys
+from lw_torchrl._util.devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.diagnose.counterfactuals import Counterfactuals, own_evaluators
 from lw_torchrl.evaluation.diagnose.decision import MARGIN, decide

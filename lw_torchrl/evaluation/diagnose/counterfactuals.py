@@ -10,16 +10,21 @@ from tensordict import TensorDictBase
 from torch import nn
 from torchrl.envs import Transform
 
-from lw_torchrl._keys import write
+from lw_torchrl._util.keys import write
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.diagnose.comparison import ScriptComparison, compare_with_scripts
 from lw_torchrl.evaluation.diagnose.decision import Decision
 from lw_torchrl.evaluation.diagnose.failure import MendedEpisode
 from lw_torchrl.evaluation.diagnose.findings import REPLACEMENTS
 from lw_torchrl.evaluation.diagnose.rerun import EpisodeId, NullControl, Perception, Rerun
 from lw_torchrl.evaluation.diagnose.scripts import ScriptedControl, Scripts
 from lw_torchrl.evaluation.diagnose.sentences import replacement_text
-from lw_torchrl.evaluation.diagnose.states import EpisodeStates, candidates, states_of
+from lw_torchrl.evaluation.diagnose.states import (
+    EpisodeStates,
+    ScriptComparison,
+    candidates,
+    compare_with_scripts,
+    states_of,
+)
 from lw_torchrl.language.canonical import canonical_like
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.policy import plans_of, with_plans

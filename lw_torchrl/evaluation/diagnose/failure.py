@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields
 from reprlib import repr as short
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
-from lw_torchrl._checks import Count, Natural, check_fields
+from lw_torchrl._util.checks import Count, Natural, check_fields
 from lw_torchrl.evaluation.diagnose.findings import CAUSES, FINDINGS, REPLACEMENTS, Cause, Finding
 from lw_torchrl.evaluation.diagnose.sentences import explain_failure
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from lw_torchrl._checks import Count, Natural, Scale
+from lw_torchrl._util.checks import Count, Natural, Scale
 
 Blamed = Literal["not reproducible", "perception", "query", "plan", "skill", "gripper", "actuation", "policy"]
 Cause = Literal[Blamed, "out of time", "undecided"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from lw_torchrl._checks import check_choice, checked, shown
-from lw_torchrl._registry import Registry
+from lw_torchrl._util.checks import check_choice, checked, shown
+from lw_torchrl._util.registry import Registry
 from lw_torchrl.language.formats.base import STYLES, Clause, PlanFormat, Reading
 from lw_torchrl.language.formats.prose import md
 from lw_torchrl.language.formats.python import py, py_md

@@ -4,9 +4,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 
-from lw_torchrl._checks import shown
+from lw_torchrl._util.checks import shown
 from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, item
-from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plan_text import one_line
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.tasks import TASKS, Task

@@ -4,9 +4,9 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from lw_torchrl._checks import shown
+from lw_torchrl._util.checks import shown
 from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, item
-from lw_torchrl.language.named_objects import GRIPPER
+from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.plan_text import function_head, one_line, quote
 from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import Query

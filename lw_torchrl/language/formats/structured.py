@@ -4,7 +4,7 @@ import json
 import re
 from typing import Any
 
-from lw_torchrl._checks import shown
+from lw_torchrl._util.checks import shown
 from lw_torchrl.language.formats.base import Clause, Reading, Style
 from lw_torchrl.language.plan_text import one_line
 from lw_torchrl.language.plans import ConditionalPlan

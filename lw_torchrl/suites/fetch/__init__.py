@@ -5,8 +5,8 @@ what its numbers mean, its words, and what simulates it.
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from lw_torchrl._files import read_toml
-from lw_torchrl._registry import ReadOnlyDict
+from lw_torchrl._util.files import read_toml
+from lw_torchrl._util.registry import ReadOnlyDict
 from lw_torchrl.language import plan_files, skills
 from lw_torchrl.language.layout import Layout, Slot
 from lw_torchrl.language.plans import Plans

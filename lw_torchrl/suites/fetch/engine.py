@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._checks import check_choice
-from lw_torchrl._rendering import naming_absent_renderer
+from lw_torchrl._util.checks import check_choice
+from lw_torchrl._util.rendering import naming_absent_renderer
 from lw_torchrl.suites.engine import BodyPoses, RowModel
 from lw_torchrl.suites.fetch import FETCH
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE

@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
+from lw_torchrl._util.checks import check_choice
+from lw_torchrl._util.registry import Registry, is_function
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import TASKS
 from lw_torchrl.suites.engine import Engine
+from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
+from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
 from lw_torchrl.suites.suite import Suite
 
 if TYPE_CHECKING:
     from lw_torchrl.suites.metaworld.experts import ExpertActor
+
+
+_SHIPPED = {"vectorized": VectorizedEngine, "metaworld": MetaWorldEngine}
+ENGINES = Registry("engine", "lw_torchrl.engines", _SHIPPED, is_function)
+"""Name to ``(row_tasks, *, reward, num_threads) -> Engine``."""
+
+
+def make_engine(engine: str | Callable[..., Engine], row_tasks: Sequence[str], **options: Any) -> Engine:
+    """The engine of that name, or what a callable of one's own gives, for rows of these tasks."""
+    make: Callable[..., Engine] = engine if callable(engine) else ENGINES[check_choice("engine", engine, ENGINES)]
+    return make(list(row_tasks), **options)
 
 
 def make_suite() -> Suite:
@@ -23,7 +38,7 @@ def make_suite() -> Suite:
 
 
 def _make_engine(row_tasks: Sequence[str], **options: object) -> Engine:
-    from lw_torchrl.suites.metaworld.engines import make_engine  # Meta-World takes a second to import
+    from lw_torchrl.suites.metaworld import make_engine  # Meta-World takes a second to import
 
     return make_engine("vectorized", row_tasks, **options)
 

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 
-from lw_torchrl._keys import as_keys, dispatched, read, row_mask, write
+from lw_torchrl._util.keys import as_keys, dispatched, read, row_mask, write
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 from lw_torchrl.suites.metaworld.plain_engine import import_metaworld

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._rendering import naming_absent_renderer
+from lw_torchrl._util.rendering import naming_absent_renderer
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import check_task
 from lw_torchrl.suites.cameras import SeenRows

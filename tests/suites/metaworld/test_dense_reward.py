@@ -12,7 +12,10 @@ from metaworld.policies import ENV_POLICY_MAP
 from metaworld.utils import reward_utils
 
 from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
+from lw_torchrl.suites.metaworld.vectorized import terms
+from lw_torchrl.suites.metaworld.vectorized.dense_reward import DenseReward, EpisodeStarts
 from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
+from lw_torchrl.suites.metaworld.vectorized.formulas import FORMULAS, LIFTS
 from lw_torchrl.suites.metaworld.vectorized.observation import (
     CORNERS,
     HAND,
@@ -30,9 +33,6 @@ from lw_torchrl.suites.metaworld.vectorized.observation import (
     SECOND,
     Observer,
 )
-from lw_torchrl.suites.metaworld.vectorized.rewards import terms
-from lw_torchrl.suites.metaworld.vectorized.rewards.dense_reward import DenseReward, EpisodeStarts
-from lw_torchrl.suites.metaworld.vectorized.rewards.formulas import FORMULAS, LIFTS
 from lw_torchrl.suites.metaworld.vectorized.tables import reward_table, simulation_table
 
 TASKS = list(simulation_table())

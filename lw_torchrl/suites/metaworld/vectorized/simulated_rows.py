@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._checks import check_int
+from lw_torchrl._util.checks import check_int
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows

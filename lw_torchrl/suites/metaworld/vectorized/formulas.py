@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from lw_torchrl.suites.metaworld.vectorized import observation as at
+from lw_torchrl.suites.metaworld.vectorized import terms
 from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask, row_norm
-from lw_torchrl.suites.metaworld.vectorized.rewards import terms
-from lw_torchrl.suites.metaworld.vectorized.rewards.terms import Numbers, hamacher_product, limited, square, tolerance
+from lw_torchrl.suites.metaworld.vectorized.terms import Numbers, hamacher_product, limited, square, tolerance
 
 Cast = Callable[[Any], Any]
 """Brings numbers to the precision that a formula is computed in: single, where a number of a float32 action takes part,

@@ -4,7 +4,7 @@ from hashlib import blake2b
 
 import numpy as np
 
-from lw_torchrl._checks import check_int
+from lw_torchrl._util.checks import check_int
 from lw_torchrl.language.tasks import Task, get_task
 
 

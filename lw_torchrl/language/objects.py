@@ -5,10 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from typing import Any
 
-from lw_torchrl._checks import check_choice, shown
+from lw_torchrl._util.checks import check_choice, shown
+from lw_torchrl._util.files import read_toml
 from lw_torchrl.language.layout import METAWORLD, Layout, places
+
+WORDS: Mapping[str, Any] = read_toml(files("lw_torchrl.language") / "data" / "words.toml", ValueError)
+
 
 GRIPPER = "robot's gripper"
 GOAL = "target location"

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch, skip_existing
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
-from lw_torchrl._checks import missing_keys
+from lw_torchrl._util.checks import missing_keys
 
 
 def _key(given: Any) -> NestedKey | None:

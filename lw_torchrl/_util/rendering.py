@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from lw_torchrl._checks import check_choice, check_int
+from lw_torchrl._util.checks import check_choice, check_int
 
 RENDER_LIBRARIES = {
     "egl": "libEGL (Debian: apt-get install libegl1)",

@@ -6,7 +6,7 @@ from importlib.metadata import version
 from typing import Any
 
 from lw_torchrl import __version__
-from lw_torchrl._checks import shown
+from lw_torchrl._util.checks import shown
 
 SIMULATORS: tuple[str, ...] = ("metaworld", "mujoco")  # what an episode's physics depend on
 LIBRARIES: tuple[str, ...] = ("lw_torchrl", "numpy", "tensordict", "torch", "torchrl")  # and the last bits of results

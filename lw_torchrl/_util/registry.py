@@ -7,7 +7,7 @@ from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from lw_torchrl._checks import unknown_name
+from lw_torchrl._util.checks import unknown_name
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

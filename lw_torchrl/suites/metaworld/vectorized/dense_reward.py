@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._checks import check_choice
+from lw_torchrl._util.checks import check_choice
+from lw_torchrl.suites.metaworld.vectorized import terms
+from lw_torchrl.suites.metaworld.vectorized.formulas import FORMULAS, LIFTS, StepState
 from lw_torchrl.suites.metaworld.vectorized.observation import CURRENT, GRIPPER, OBJECT, Array, Index, Mask
-from lw_torchrl.suites.metaworld.vectorized.rewards import terms
-from lw_torchrl.suites.metaworld.vectorized.rewards.formulas import FORMULAS, LIFTS, StepState
 from lw_torchrl.suites.metaworld.vectorized.tables import FIRST_DISTANCE, TaskReward
 
 FULL_REWARD = 10.0

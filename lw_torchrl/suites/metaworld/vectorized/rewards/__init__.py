@@ -1,1 +1,0 @@
-"""Meta-World's dense reward of many rows at once."""
