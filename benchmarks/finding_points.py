@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lw_torchrl._util.checks import Count, checked
 from lw_torchrl.language.layout import places
-from lw_torchrl.language.objects import NamedObject, typed
+from lw_torchrl.language.objects import NamedObject, typed_position
 from lw_torchrl.language.tasks import Task, TaskList
 from lw_torchrl.suites.engine import BodyPoses
 from lw_torchrl.suites.suite import Suite, find_suite
@@ -92,7 +92,7 @@ def _with_points(task: Task, seen: list[dict[str, tuple[str, Array]]]) -> Task:
     points: list[NamedObject] = []
     for one in task.published.objects[1:]:
         told = [point[one.name] for point in seen if one.name in point]
-        known = any(typed(one.position) == typed(other.position) for other in points)
+        known = any(typed_position(one.position) == typed_position(other.position) for other in points)
         if len(told) == len(seen) and not known:
             x, y, z = np.median([offset for _, offset in told], 0).round(4).tolist()
             points.append(NamedObject(f"{one.name} {told[0][0]}", one.position, (x, y, z), ours=True))

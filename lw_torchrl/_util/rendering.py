@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from lw_torchrl._util.checks import check_choice, check_int
+from lw_torchrl._util.checks import Count, check_choice, check_value
 
 RENDER_LIBRARIES = {
     "egl": "libEGL (Debian: apt-get install libegl1)",
@@ -18,7 +18,7 @@ def check_picture(camera: str, height: int, width: int) -> None:
     """Raise :class:`ValueError` for an unknown camera or a size that no picture has."""
     check_choice("camera", camera, CAMERAS)
     for name, size in (("height", height), ("width", width)):
-        if check_int(name, size, minimum=1) > _LARGEST:
+        if check_value(name, size, Count) > _LARGEST:
             raise ValueError(f"{name} must be at most {_LARGEST} pixels, got {size}")
 
 

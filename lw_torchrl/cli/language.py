@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._util.checks import check_int, counted
+from lw_torchrl._util.checks import Natural, check_value, counted
 from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Columns, Output, Row
 from lw_torchrl.language.objects import GRIPPER
@@ -106,7 +106,7 @@ class Ask:
         task, suite = known[name], find_suite(name)
         texts = lw.supported_queries(task) if self.text is None else [self.text]
         queries = [lw.parse_query(text, task) for text in texts]
-        if check_int("--step", self.step, minimum=0) > suite.max_steps:
+        if check_value("--step", self.step, Natural) > suite.max_steps:
             raise ValueError(f"--step must be at most {suite.max_steps}, the length of an episode, got {self.step}")
         env: EnvBase = lw.LanguageWorldEnv(name, seed=self.seed)
         expert = suite_expert(suite, (name,)) if self.step else None

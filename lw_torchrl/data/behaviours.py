@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import check_choice, check_fields, check_int, check_probability, shown
+from lw_torchrl._util.checks import Count, Probability, check_choice, check_value, shown, typed_fields
 from lw_torchrl._util.seeding import episode_generator
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.skills import Skills
@@ -26,6 +26,7 @@ from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.suites.suite import Suite, load_suite
 
 
+@typed_fields
 @dataclass(frozen=True)
 class Behaviour:
     """The policy that collects an episode, as a dataset's metadata describe it; equal ones act alike.
@@ -54,12 +55,11 @@ class Behaviour:
     fingerprint: str | None = None
 
     def __post_init__(self) -> None:
-        check_fields(self, "behaviour: ")
         if not self.name.strip() or not self.name.isprintable():
             raise ValueError(f"behaviour: name must be a printable label, got {shown(self.name)}")
-        object.__setattr__(self, "right", check_probability("behaviour: right", self.right))
+        object.__setattr__(self, "right", check_value("behaviour: right", self.right, Probability))
         for field in ("shortest", "longest"):
-            object.__setattr__(self, field, check_int(f"behaviour: {field}", getattr(self, field), minimum=1))
+            object.__setattr__(self, field, check_value(f"behaviour: {field}", getattr(self, field), Count))
         if self.shortest > self.longest:
             raise ValueError(f"behaviour: longest must be at least shortest, {self.shortest}, got {self.longest}")
 

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
-from lw_torchrl._util.checks import checked, differences
+from lw_torchrl._util.checks import differences, typed
 from lw_torchrl._util.files import AnyPath, flush, locked, read_json, write_json
 from lw_torchrl._util.versions import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import dataset
@@ -89,7 +89,7 @@ def _finished(root: Path, config: CollectConfig) -> Demonstrations | None:
     return demonstrations
 
 
-@checked
+@typed
 def collect_demonstrations(
     tasks: str | Iterable[str],
     *,

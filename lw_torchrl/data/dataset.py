@@ -15,7 +15,7 @@ from pathlib import Path
 from reprlib import repr as short
 from typing import Any
 
-from lw_torchrl._util.checks import check_fields, check_int, check_scale
+from lw_torchrl._util.checks import Count, Scale, check_value, typed_fields
 from lw_torchrl._util.files import AnyPath, read_json, write_json
 from lw_torchrl.data.behaviours import EXPERT, NOISY, Behaviour, check_own_label
 from lw_torchrl.language.layout import METAWORLD, Layout
@@ -35,6 +35,7 @@ def _own_tasks(tasks: tuple[str, ...], layout: Layout) -> tuple[str, ...]:
     return tuple(sorted(tasks))
 
 
+@typed_fields
 @dataclass(frozen=True)
 class CollectConfig:
     """The arguments of :func:`collect_demonstrations` that decide what it collects: equal ones give equal datasets.
@@ -53,17 +54,16 @@ class CollectConfig:
 
     def __post_init__(self) -> None:
         check_own_label(self.policy)
-        check_fields(self)
         if not self.noise_scale:
             raise ValueError("noise_scale must hold at least one number, got an empty sequence")
         checked = {
             "tasks": resolve_tasks(self.tasks) if self.layout == METAWORLD else _own_tasks(self.tasks, self.layout),
-            "episodes_per_task": check_int("episodes_per_task", self.episodes_per_task, minimum=1),
-            "seed": check_int("seed", self.seed),
-            "noise_scale": tuple(check_scale("noise_scale", scale) for scale in self.noise_scale),
-            "noise_hold": check_int("noise_hold", self.noise_hold, minimum=1),
-            "gripper_noise_factor": check_scale("gripper_noise_factor", self.gripper_noise_factor),
-            "max_steps": check_int("max_steps", self.max_steps, minimum=1),
+            "episodes_per_task": check_value("episodes_per_task", self.episodes_per_task, Count),
+            "seed": check_value("seed", self.seed, int),
+            "noise_scale": tuple(check_value("noise_scale", scale, Scale) for scale in self.noise_scale),
+            "noise_hold": check_value("noise_hold", self.noise_hold, Count),
+            "gripper_noise_factor": check_value("gripper_noise_factor", self.gripper_noise_factor, Scale),
+            "max_steps": check_value("max_steps", self.max_steps, Count),
         }
         for name, value in checked.items():
             object.__setattr__(self, name, value)

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 
-from lw_torchrl._util.checks import Natural, check_int, check_path, check_probability, checked, unknown_name
+from lw_torchrl._util.checks import Count, Natural, Probability, check_value, typed, unknown_name
 from lw_torchrl._util.devices import check_device, finite
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl.data.dataset import DatasetError, Demonstrations, read_metadata
@@ -67,8 +67,8 @@ def n_step_returns(rollout: TensorDictBase, n_steps: int, gamma: float) -> Tenso
         >>> ahead["next", "reward"].flatten().tolist(), ahead["next", "x"].tolist()
         ([1.5, 1.5, 1.0, 1.0], [1, 2, 2, 3])
     """
-    check_int("n_steps", n_steps, minimum=1)
-    if not check_probability("gamma", gamma):
+    check_value("n_steps", n_steps, Count)
+    if not check_value("gamma", gamma, Probability):
         raise ValueError("gamma must be above 0, got 0")
     rows = rollout.reshape(-1)
     end = rows.get(DONE).reshape(-1).clone()
@@ -154,7 +154,7 @@ def load(
     check: bool = True,
 ) -> Loaded:
     """Load rows with their descriptions; see :func:`load_demonstrations`."""
-    if check_int("n_steps", n_steps, minimum=1) > 1 and gamma is None:
+    if check_value("n_steps", n_steps, Count) > 1 and gamma is None:
         raise ValueError(f"n_steps={n_steps} needs gamma, the loss's discount")
     if n_steps == 1 and gamma is not None:
         raise ValueError(f"gamma needs n_steps of 2 or more, got gamma={gamma!r} with n_steps=1")
@@ -165,7 +165,7 @@ def load(
     joined = not isinstance(root, (str, os.PathLike))
     folders: list[Any] = list(root) if joined else [root]  # type: ignore[arg-type]
     for folder in folders:
-        check_path("root", folder)
+        check_value("root", folder, AnyPath)
     twice = episodes is None and len({Path(folder).resolve() for folder in folders}) < len(folders)
     if not folders or twice:
         raise ValueError(f"root must be a folder, or a list that names each folder once, got {root}")
@@ -214,7 +214,7 @@ def load(
     return Loaded(rows, tuple(parts), behaviours, joined or episodes is not None or keep is not None)
 
 
-@checked
+@typed
 def load_demonstrations(
     root: AnyPath | Iterable[AnyPath],
     *,

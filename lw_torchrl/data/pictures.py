@@ -19,7 +19,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv, step_mdp
 
-from lw_torchrl._util.checks import check_int, checked
+from lw_torchrl._util.checks import Count, check_value, typed
 from lw_torchrl._util.files import AnyPath, replacing
 from lw_torchrl._util.progress import Progress
 from lw_torchrl._util.rendering import check_cameras
@@ -41,7 +41,7 @@ class Pictures:
 
     @classmethod
     def of(cls, cameras: str | Sequence[str], height: int, width: int, every: int) -> Pictures:
-        return cls(check_cameras(cameras, height, width), height, width, check_int("every", every, minimum=1))
+        return cls(check_cameras(cameras, height, width), height, width, check_value("every", every, Count))
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -70,7 +70,7 @@ class Pictures:
         return torch.from_numpy(pictures)
 
 
-@checked
+@typed
 def add_pictures(
     root: AnyPath,
     cameras: str | Sequence[str] = "corner",
@@ -157,7 +157,7 @@ def _write(path: Path, pictures: Sequence[np.ndarray[Any, Any]]) -> None:
             archive.writestr(zipfile.ZipInfo(f"{number}.png"), stream.getvalue())  # of no date
 
 
-@checked
+@typed
 def load_pictures(
     replay: LanguageWorldExperienceReplay,
     cameras: str | Sequence[str] = "corner",

@@ -17,7 +17,7 @@ from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.envs import Transform
 
-from lw_torchrl._util.checks import Count, Natural, checked
+from lw_torchrl._util.checks import Count, Natural, typed
 from lw_torchrl._util.devices import finite
 from lw_torchrl._util.files import AnyPath, reading
 from lw_torchrl._util.tensor_files import pop_state, read_tensors, write_tensors
@@ -68,7 +68,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
     Source: the datasets of ``torchrl.data.datasets``.
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         root: AnyPath | Iterable[AnyPath],

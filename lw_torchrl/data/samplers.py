@@ -16,7 +16,7 @@ from torch.utils.data import get_worker_info
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
-from lw_torchrl._util.checks import check_int
+from lw_torchrl._util.checks import Count, check_value
 from lw_torchrl._util.files import reading
 from lw_torchrl._util.keys import check_key
 from lw_torchrl._util.tensor_files import pop_state, read_tensors, write_tensors
@@ -201,7 +201,7 @@ class GroupSampler(Sampler):
         return shares
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
-        batch_size = check_int("batch_size", batch_size, minimum=1)
+        batch_size = check_value("batch_size", batch_size, Count)
         worker = get_worker_info()
         if worker is not None and worker.num_workers > 1 and self._process != os.getpid():
             raise RuntimeError(

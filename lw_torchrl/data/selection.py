@@ -9,12 +9,13 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from lw_torchrl._util.checks import check_fields, check_int, check_probability, check_text, shown, unknown_name
+from lw_torchrl._util.checks import Count, Probability, check_value, shown, typed_fields, unknown_name
 from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo
 from lw_torchrl.data.memory_map import load_rows
 from lw_torchrl.data.storage import REWARDS, RewardName
 
 
+@typed_fields
 @dataclass(frozen=True)
 class EpisodeFilter:
     """Keeps the episodes that meet every given condition.
@@ -41,16 +42,15 @@ class EpisodeFilter:
     else_best: float | None = None
 
     def __post_init__(self) -> None:
-        check_fields(self, "keep: ")
         for name in ("best", "else_best"):
-            if (part := getattr(self, name)) is not None and not check_probability(f"keep: {name}", part):
+            if (part := getattr(self, name)) is not None and not check_value(f"keep: {name}", part, Probability):
                 raise ValueError(f"keep: {name} must be above 0, got 0")
         if self.behaviours is not None:
             if isinstance(self.behaviours, str) or not isinstance(self.behaviours, Iterable):
                 raise TypeError(f"keep: behaviours must be a list of labels, got {self.behaviours!r}")
             object.__setattr__(self, "behaviours", tuple(self.behaviours))
             for label in self.behaviours:
-                check_text("keep: behaviours", label)
+                check_value("keep: behaviours", label, str)
             if not self.behaviours:
                 raise ValueError("keep: behaviours must hold at least one label, got none")
 
@@ -120,7 +120,7 @@ def choose_episodes(dataset: Demonstrations, chosen: EpisodeChoice, argument: st
         place = f"{argument}[{task!r}]"
         if isinstance(choice, Sequence) and not isinstance(choice, str):
             numbers = list(choice)
-        elif check_int(place, choice, minimum=1) > len(existing[task]):
+        elif check_value(place, choice, Count) > len(existing[task]):
             raise ValueError(f"{place}: the dataset has {len(existing[task])} episodes of {task!r}, got {choice}")
         else:
             numbers = existing[task][:choice]

@@ -17,7 +17,7 @@ from torchrl._utils import seed_generator
 from torchrl.data import Unbounded
 from torchrl.envs import EnvBase
 
-from lw_torchrl._util.checks import Count, check_int, checked
+from lw_torchrl._util.checks import Count, Natural, check_value, typed
 from lw_torchrl._util.devices import check_device
 from lw_torchrl._util.keys import row_mask
 from lw_torchrl._util.rendering import check_picture
@@ -98,7 +98,7 @@ class LanguageWorldEnv(EnvBase):
 
     _has_frame_skip = True  # else TorchRL puts a transform of its own around it, which knows nothing of rows that end
 
-    @checked
+    @typed
     def __init__(
         self,
         tasks: str | Task | Iterable[str | Task],
@@ -134,7 +134,7 @@ class LanguageWorldEnv(EnvBase):
         self.row_tasks = tuple(self.tasks[i % n] for i in range(num_envs))
         self.worker = (0, 1) if worker is None else check_worker(worker)
         self._process = os.getpid()
-        self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_int("seed", seed), self.worker)
+        self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_value("seed", seed, int), self.worker)
         super().__init__(device=check_device("device", device), batch_size=(num_envs,) if batch_size is None else ())
         self._rows = RowStates(self.row_tasks, self.layout)
         which = ... if batch_size is None else 0
@@ -285,7 +285,7 @@ class LanguageWorldEnv(EnvBase):
         """
         self._check_process()
         check_picture(camera, height, width)
-        asked = range(len(self.row_tasks)) if rows is None else [check_int("rows", row, minimum=0) for row in rows]
+        asked = range(len(self.row_tasks)) if rows is None else [check_value("rows", row, Natural) for row in rows]
         if asked and max(asked) >= len(self.row_tasks):
             raise ValueError(f"rows must be below {len(self.row_tasks)}, got {max(asked)}")
         if self.is_closed or (self._rows.episode[list(asked)] < 0).any():

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lw_torchrl._util.checks import check_int, shown
+from lw_torchrl._util.checks import Count, Natural, check_value, shown
 from lw_torchrl._util.files import parse_json
 from lw_torchrl._util.seeding import episode_generator, episode_hash
 from lw_torchrl.language.tasks import Task
@@ -45,8 +45,8 @@ def check_worker(worker: Any) -> tuple[int, int]:
     """Return ``worker`` as (rank, of), if 0 <= rank < of."""
     if not isinstance(worker, Sequence) or isinstance(worker, str) or len(worker) != 2:
         raise TypeError(f"worker must be a pair (rank, of), got {worker!r}")
-    of = check_int("worker's of", worker[1], minimum=1)
-    rank = check_int("worker's rank", worker[0], minimum=0)
+    of = check_value("worker's of", worker[1], Count)
+    rank = check_value("worker's rank", worker[0], Natural)
     if rank >= of:
         raise ValueError(f"worker's rank must be under the number of workers, {of}, got {rank}")
     return rank, of
@@ -68,7 +68,7 @@ class EpisodeCounter:
     def start_again(self, seed: int | None) -> None:
         """Begin at the first episode, of another seed if one is given."""
         if seed is not None:
-            self.seed = check_int("seed", seed)
+            self.seed = check_value("seed", seed, int)
         self.resets[:] = 0
 
     def next(self, rows: Rows) -> Episodes:
@@ -81,7 +81,7 @@ class EpisodeCounter:
             if episode.shape not in ((), (n,)) or episode.dtype not in (torch.int64, torch.int32):
                 given = f"{episode.dtype} of shape {tuple(episode.shape)}"
                 raise ValueError(f"episode must be an integer, or int64 of shape ({n},), one for each row, got {given}")
-        elif check_int("episode", episode, minimum=0) >= 2**63:
+        elif check_value("episode", episode, Natural) >= 2**63:
             raise ValueError(f"episode must be below 2**63, got {shown(episode)}")
         found = torch.as_tensor(episode).expand(n).cpu().numpy().astype(np.int64)[rows]
         if (found < 0).any():

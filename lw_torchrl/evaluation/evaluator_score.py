@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lw_torchrl._util.checks import checked
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.files import AnyPath, write_json
 from lw_torchrl.modules.networks import evaluating
 from lw_torchrl.modules.state_query_evaluator import ClauseEvaluator
@@ -86,7 +86,7 @@ class EvaluatorScore:
         write_json(path, {"about": self.about, "parts": {name: part.to_json() for name, part in self.parts.items()}})
 
 
-@checked
+@typed
 def score_evaluator(evaluator: ClauseEvaluator, data: LabelledQueries) -> EvaluatorScore:
     """Score an evaluator on the held-out parts of the data, of which there must be some. Its plans do not matter.
 

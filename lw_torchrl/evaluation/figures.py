@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from lw_torchrl._util.checks import checked, counted
+from lw_torchrl._util.checks import counted, typed
 from lw_torchrl._util.files import AnyPath, replacing
 from lw_torchrl.evaluation.diagnose.failure import count_causes
 from lw_torchrl.evaluation.diagnose.findings import CAUSES
@@ -55,7 +55,7 @@ def trim(axes: Axes, grid: Literal["x", "y"] | None = None) -> None:
         axes.set_axisbelow(True)
 
 
-@checked
+@typed
 def plot_success(result: EvaluationResult, path: AnyPath | None = None, *, title: str = "") -> Figure:
     """Draw the any-step success rate of each task, best first, with 95 % intervals over the episodes.
 
@@ -87,7 +87,7 @@ def plot_success(result: EvaluationResult, path: AnyPath | None = None, *, title
     return saved(figure, path)
 
 
-@checked
+@typed
 def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, title: str = "") -> Figure:
     """Draw the failed episodes of each task by cause, of a result of ``evaluate(..., attribute=True)``, most on top.
 

@@ -10,7 +10,7 @@ from string import Template
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from lw_torchrl._util.checks import checked, counted
+from lw_torchrl._util.checks import counted, typed
 from lw_torchrl._util.files import AnyPath, replacing, shipped_policy, write_text
 from lw_torchrl.evaluation.result import EvaluationResult, wilson_interval
 from lw_torchrl.language.text import TextEncoder
@@ -38,7 +38,7 @@ def hub() -> Any:
     return huggingface_hub
 
 
-@checked
+@typed
 def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo: str = "") -> ModelCard:
     """Make a model card of a policy: training data, success rates, limits, how to load and cite it.
 
@@ -77,7 +77,7 @@ def _measured(policy: AnyPath, result: EvaluationResult | None) -> EvaluationRes
     return EvaluationResult.load(shipped.with_suffix(".json")) if result is None and shipped is not None else result
 
 
-@checked
+@typed
 def describe_policy(policy: AnyPath, result: EvaluationResult | None = None, *, repo: str = "") -> str:
     """Describe a policy in Markdown: training data, success rates, limits, how to load and cite it.
 
@@ -159,7 +159,7 @@ def _success(result: EvaluationResult) -> str:
     )
 
 
-@checked
+@typed
 def save_pretrained(
     policy: AnyPath, folder: AnyPath, result: EvaluationResult | None = None, *, repo: str = ""
 ) -> None:
@@ -180,7 +180,7 @@ def save_pretrained(
     write_text(Path(folder) / CARD, str(card))
 
 
-@checked
+@typed
 def push_to_hub(
     policy: AnyPath,
     repo: str,
@@ -203,7 +203,7 @@ def push_to_hub(
         return str(api.upload_folder(repo_id=repo, folder_path=folder, commit_message="Add a policy of lw_torchrl"))
 
 
-@checked
+@typed
 def from_pretrained(source: AnyPath, *, revision: str | None = None, text_encoder: TextEncoder | None = None) -> Any:
     """Load a policy from a folder or from the Hugging Face Hub, in eval mode. Nothing in the file is executed.
 

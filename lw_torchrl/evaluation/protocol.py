@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 
-from lw_torchrl._util.checks import Count, Scale, check_int, checked
+from lw_torchrl._util.checks import Count, Scale, check_value, typed
 from lw_torchrl._util.keys import check_key
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.diagnose.attribution import attribute_failures, keys_to_attribute
@@ -22,7 +22,7 @@ from lw_torchrl.modules.policy import tasks_of
 from lw_torchrl.suites.suite import Suite
 
 
-@checked
+@typed
 def evaluate(
     actor: TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase],
     *,
@@ -108,7 +108,7 @@ def evaluate(
     for key in (also_record := list(also_record)):
         check_key("also_record", key)
     if num_envs is not None:
-        check_int("num_envs", num_envs)
+        check_value("num_envs", num_envs, int)
     shared: dict[str, Any] = {"seed": seed, "max_steps": max_steps or own_suite.max_steps}
     env_options = shared | {"suite": own_suite, "engine": engine, "num_threads": num_threads}
     how: dict[str, Any] = {"noise_scale": noise_scale, "num_envs": num_envs, "device": device, "progress": progress}

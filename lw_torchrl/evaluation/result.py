@@ -14,7 +14,7 @@ from typing import Any
 
 from torch import Tensor
 
-from lw_torchrl._util.checks import Count, Natural, check_flag, check_int, check_scale
+from lw_torchrl._util.checks import Count, Natural, Scale, check_value, typed_fields
 from lw_torchrl._util.files import AnyPath, read_json, write_json
 from lw_torchrl._util.versions import package_versions
 from lw_torchrl.evaluation.diagnose.failure import Failure, failure_table, is_number, read_failures, read_records
@@ -23,6 +23,7 @@ FORMAT = "lw_torchrl.evaluation"
 FORMAT_VERSION = 1
 
 
+@typed_fields
 @dataclass(frozen=True)
 class EpisodeResult:
     """One evaluated episode; ``episode_seed(task, seed, episode)`` is its seed."""
@@ -170,10 +171,10 @@ def _check_config(config: dict[str, Any]) -> None:
     if not named or not tasks or len(set(tasks)) != len(tasks):
         raise ValueError(f"config: tasks must be different names, got {short(tasks)}")
     for name in ("episodes_per_task", "max_steps"):
-        check_int(f"config: {name}", config[name], minimum=1)
-    check_int("config: seed", config["seed"])
-    check_scale("config: noise_scale", config["noise_scale"])
-    check_flag("config: stop_at_success", config["stop_at_success"])
+        check_value(f"config: {name}", config[name], Count)
+    check_value("config: seed", config["seed"], int)
+    check_value("config: noise_scale", config["noise_scale"], Scale)
+    check_value("config: stop_at_success", config["stop_at_success"], bool)
 
 
 def _read_episodes(stated: Any, config: dict[str, Any]) -> tuple[EpisodeResult, ...]:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from lw_torchrl._util.checks import checked
+from lw_torchrl._util.checks import typed
 from lw_torchrl.language.coverage import coverage
 from lw_torchrl.language.objects import GOAL, GRIPPER
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep, as_plans
@@ -64,7 +64,7 @@ class CanonicalReport:
         return notes + [{"written": skill, **nothing, "confidence": 0.0, "seen": False} for skill in self.left_out]
 
 
-@checked
+@typed
 def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> ConditionalPlan:
     """Read a free-form plan and return it with a role for each step, completed where it says too little.
 
@@ -100,13 +100,13 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
     return replace(plan, steps=(*plan.steps, *steps))
 
 
-@checked
+@typed
 def canonical_plans(plans: AnyPlans, fallback: bool = False) -> Plans:
     """Apply :func:`canonical_plan` to each of ``plans``."""
     return Plans([canonical_plan(plan, fallback) for plan in as_plans(plans).values()])
 
 
-@checked
+@typed
 def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
     """Report how :func:`canonical_plan` reads a plan, step by step.
 

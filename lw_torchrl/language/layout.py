@@ -7,19 +7,17 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
-from lw_torchrl._util.checks import check_fields, shown
+from lw_torchrl._util.checks import shown, typed_fields
 from lw_torchrl._util.registry import ReadOnlyDict
 
 
+@typed_fields
 @dataclass(frozen=True)
 class Slot:
     """The numbers of an observation that describe one object."""
 
     position: int  # index of its x; y and z follow
     quaternion: int | None = None  # index of the first of its four numbers; None without an orientation
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     @property
     def xyz(self) -> slice:
@@ -32,6 +30,7 @@ class Slot:
         return (self.xyz,) if self.quaternion is None else (self.xyz, slice(self.quaternion, self.quaternion + 4))
 
 
+@typed_fields
 @dataclass(frozen=True)
 class Layout:
     """The meaning of the numbers of observations and actions, for all tasks of a suite.
@@ -64,7 +63,6 @@ class Layout:
     thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)  # metres, by relation, of this suite
 
     def __post_init__(self) -> None:
-        check_fields(self)
         layout = f"layout {self.name!r}"
         if not self.things or not all(isinstance(thing, Slot) for thing in self.things):
             raise ValueError(f"things of {layout} must be at least one Slot, got {self.things!r}")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from rapidfuzz import fuzz, process
 
-from lw_torchrl._util.checks import check_choice, checked, shown
+from lw_torchrl._util.checks import check_choice, shown, typed
 from lw_torchrl.language.embeddings import sentence_vectors
 from lw_torchrl.language.objects import WORDS
 from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, check_length, read_query
@@ -53,7 +53,7 @@ class QueryMatch:
     parts: tuple[QueryPart, ...]  # what each clause of the text was taken for
 
 
-@checked
+@typed
 def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] = "edit") -> QueryMatch:
     """The query of a task that is nearest to a text.
 
@@ -131,7 +131,7 @@ def _vectors(texts: tuple[str, ...]) -> NDArray[np.float32]:
     return sentence_vectors(texts)
 
 
-@checked
+@typed
 def nearest_skill(
     text: str, task: str | Task | None = None, skills: Skills | Iterable[str] | None = None
 ) -> tuple[ScriptedSkill, float]:

@@ -35,7 +35,7 @@ def is_triple(value: object) -> bool:
     return isinstance(value, (list, tuple)) and len(value) == 3 and all(map(is_number, value))
 
 
-def typed(position: Sequence[Coordinate]) -> TypedPosition:
+def typed_position(position: Sequence[Coordinate]) -> TypedPosition:
     """A position that tells index 1 from metre 1.0, which are equal numbers."""
     return tuple((isinstance(coordinate, int), coordinate) for coordinate in position)
 
@@ -145,14 +145,14 @@ def read_objects(row: Mapping[str, Any], layout: Layout = METAWORLD) -> tuple[Na
 def write_objects(objects: Sequence[NamedObject]) -> dict[str, dict[str, Any]]:
     """What :func:`read_objects` reads back, if a row can hold it."""
     row: dict[str, dict[str, Any]] = {"objects": {}, "points": {}}
-    published = {typed(named.position): named.name for named in reversed(objects) if not named.ours}
+    published = {typed_position(named.position): named.name for named in reversed(objects) if not named.ours}
     for named in objects[1:]:
         x, *_ = named.position
         at: Any = [f"obs[{c}]" if isinstance(c, int) else c for c in named.position]
         if isinstance(x, int) and named.position == (x, x + 1, x + 2):
             at = f"obs[{x}:{x + 3}]"
         if any(named.offset):
-            at = {"object": published.get(typed(named.position), ""), "offset": list(named.offset)}
+            at = {"object": published.get(typed_position(named.position), ""), "offset": list(named.offset)}
         elif named.opening is not None:
             at = {"position": at, "opening": f"obs[{named.opening}]"}
         row["points" if named.ours else "objects"][named.name] = at

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from lw_torchrl._util.checks import check_choice, checked, counted, shown
+from lw_torchrl._util.checks import check_choice, counted, shown, typed
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.base import Clause, Note, Reading, Section, listed_steps
 from lw_torchrl.language.formats.prose import ProseReading
@@ -60,7 +60,7 @@ class DecodedPlan:
 _LONGEST = 65_536  # characters of a text that are read
 
 
-@checked
+@typed
 def decode_plan(
     text: str, task: str | Task, format: str, *, skills: Skills | None = None, tasks: Tasks = TASKS
 ) -> DecodedPlan:

@@ -7,7 +7,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Literal
 
-from lw_torchrl._util.checks import checked, shown
+from lw_torchrl._util.checks import shown, typed
 from lw_torchrl._util.files import AnyPath, parse_json, read_text, write_text
 from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.plan_text import MOST_STEPS, PLAN_LIMIT, no_task, too_many_steps
@@ -18,7 +18,7 @@ from lw_torchrl.language.tasks import MT10, TASKS, Tasks
 _MOST_PAIRS = 2_000  # of a file, each compared with all queries of its task
 
 
-@checked
+@typed
 def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks: Tasks = TASKS) -> Plans:
     """Load plans.
 
@@ -104,7 +104,7 @@ def _read_pairs(path: Path, tasks: Tasks) -> Plans:
     return Plans(plans)
 
 
-@checked
+@typed
 def save_plans(plans: AnyPlans, folder: AnyPath) -> list[Path]:
     """Write each plan to ``folder``/<task>.plan, "__" for a slash; a file is replaced whole or not at all."""
     texts = {Path(folder) / f"{task.replace('/', '__')}.plan": str(plan) for task, plan in as_plans(plans).items()}

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from lw_torchrl._util.checks import check_text, did_you_mean, shown
+from lw_torchrl._util.checks import check_value, did_you_mean, shown
 from lw_torchrl.language.queries import Query, check_query
 from lw_torchrl.language.tasks import Task, Tasks
 
@@ -48,7 +48,7 @@ def read_plan_text(
     text: str, task: str | None, source: str, tasks: Tasks, report: Callable[[str], Any]
 ) -> tuple[str, list[StepFields]] | None:
     """Report every fault, line by line, and return the task's name and the steps if there is none."""
-    check_text("text", text)
+    check_value("text", text, str)
     if (asked := len(_ASKS.findall(text))) > MOST_STEPS:
         return report(too_many_steps(source, asked))
     if len(text) > PLAN_LIMIT:
@@ -85,7 +85,7 @@ def read_plan_text(
                 fault = fault or str(error)
         elif match := _SKILL.fullmatch(line):
             if not opened:
-                fault = 'the skill has no condition; expected if check("condition"): above it'
+                fault = 'the skill has no condition; expected if check_value("condition"): above it'
             elif condition is not None:
                 goal = _unquote(match, 4)
                 try:
@@ -95,7 +95,7 @@ def read_plan_text(
                     fault = f"goal: {error}"
             opened, condition, reason = False, None, []
         else:
-            fault = f'expected a comment, if check("condition"): or robot.verb("details"), got {shown(line)}'
+            fault = f'expected a comment, if check_value("condition"): or robot.verb("details"), got {shown(line)}'
             if line.startswith("if"):
                 opened, condition = True, None
         if fault:

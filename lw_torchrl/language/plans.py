@@ -11,7 +11,7 @@ from hashlib import sha256
 from types import NoneType
 from typing import Any, NoReturn
 
-from lw_torchrl._util.checks import Probability, check_fields, checked, shown
+from lw_torchrl._util.checks import Probability, shown, typed, typed_fields
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plan_text import MOST_STEPS, function_head, one_line, quote, read_plan_text, too_many_steps
 from lw_torchrl.language.queries import Query, check_query, read_query
@@ -32,6 +32,7 @@ def usual_goal(skill: str, task: Task) -> Query | None:
     return None if found is None else read_query(found.variants.get(task.name, found).goal, task)
 
 
+@typed_fields
 @dataclass(frozen=True)
 class PlanStep:
     """One step: while ``condition`` holds, do ``skill``. Its queries are of the plan's task."""
@@ -41,9 +42,6 @@ class PlanStep:
     reason: str = field(default="", compare=False)  # a comment for the reader; it does not change what the plan does
     goal: Query | None = None  # the state to reach, if not the skill's usual one; :attr:`ConditionalPlan.goals` has all
     role: StepRole | None = None  # what the step does to which object, in plans of :func:`~lw_torchrl.canonical_plan`
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     def mentions(self, task: Task) -> set[str]:
         """The names of the objects that the condition or the skill mentions; "target location" may stand for the goal.
@@ -58,6 +56,7 @@ class PlanStep:
         return names.union(re.findall(rf"(?<![\w-])(?:{'|'.join(map(re.escape, longest))})(?![\w-])", self.skill))
 
 
+@typed_fields
 @dataclass(frozen=True)
 class ConditionalPlan:
     """The steps that carry out one task, as in the paper's section 'Conditional Plan Generation'.
@@ -80,7 +79,6 @@ class ConditionalPlan:
     confidence: Probability | None = None
 
     def __post_init__(self) -> None:
-        check_fields(self)
         if isinstance(self.steps, str) or not isinstance(self.steps, Iterable):
             raise TypeError(f"steps must be a tuple of PlanStep, got {shown(self.steps)}")
         if not isinstance(self.definition, (Task, NoneType)):
@@ -214,7 +212,7 @@ def _read(text: str, task: str | None, source: str, tasks: Tasks, report: Callab
 class Plans(Mapping[str, ConditionalPlan]):
     """An immutable mapping from task names, sorted, to their plans. ``layout`` is that of the tasks."""
 
-    @checked
+    @typed
     def __init__(self, plans: Mapping[str, ConditionalPlan] | Iterable[ConditionalPlan]) -> None:
         listed = list(plans.values() if isinstance(plans, Mapping) else plans)
         for plan in listed:

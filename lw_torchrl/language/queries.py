@@ -10,7 +10,7 @@ from itertools import permutations
 
 from rapidfuzz import fuzz, process
 
-from lw_torchrl._util.checks import checked
+from lw_torchrl._util.checks import typed
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.objects import GRIPPER
 from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, STATES, TOUCHING, UNARY
@@ -78,7 +78,7 @@ def base_clauses(task: Task, said: tuple[str, ...]) -> tuple[Clause, ...]:
     return (*clauses, Clause(GRIPPER, "open"), Clause(GRIPPER, "closed"))
 
 
-@checked
+@typed
 def supported_queries(task: str | Task, published_only: bool = False) -> tuple[str, ...]:
     """The base queries of a task, in canonical spelling.
 
@@ -186,7 +186,7 @@ class _ClauseParser:
         return Clause(subject, predicate, other, negated)
 
 
-@checked
+@typed
 def parse_query(text: str, task: str | Task) -> Query:
     """Read an English condition about a state of ``task``.
 

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lw_torchrl.language.objects import TypedPosition, coordinate_indices, typed
+from lw_torchrl.language.objects import TypedPosition, coordinate_indices, typed_position
 from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import STATES, Comparison, comparisons
 from lw_torchrl.language.tasks import MT50, Task, one_layout, task_id
@@ -51,7 +51,7 @@ class Atom(NamedTuple):
         return self.part.sense == "<="  # the atom holds where its value is not below the threshold
 
 
-_ORIGIN = typed((0.0, 0.0, 0.0))
+_ORIGIN = typed_position((0.0, 0.0, 0.0))
 _NO_SHIFT = (0.0, 0.0, 0.0)
 # Of the origin and itself, the padding of the tables: far from changing its truth at any temperature.
 _ALWAYS = Atom(_ORIGIN, _ORIGIN, _NO_SHIFT, Comparison("xyz", "<", 1e4, temperature=1e-6))
@@ -62,13 +62,13 @@ def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
     """The atoms that must all hold for a clause without its "not"."""
     second, shift = _ORIGIN, _NO_SHIFT
     if clause.predicate in STATES:
-        first = typed((0.0, 0.0, task.openings[clause.subject]))
+        first = typed_position((0.0, 0.0, task.openings[clause.subject]))
     else:
         subject = task.object(clause.subject)
-        first, shift = typed(subject.position), subject.offset
+        first, shift = typed_position(subject.position), subject.offset
         if clause.object is not None:
             other = task.object(clause.object)
-            second = typed(other.position)
+            second = typed_position(other.position)
             x, y, z = (a - b for a, b in zip(shift, other.offset, strict=True))
             shift = (x, y, z)
     return [Atom(first, second, shift, part) for part in comparisons(clause.predicate, task.layout)]

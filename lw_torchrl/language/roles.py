@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from functools import lru_cache
 from typing import Any, Literal, get_args
 
-from lw_torchrl._util.checks import Probability, check_fields, shown
+from lw_torchrl._util.checks import Probability, shown, typed_fields
 from lw_torchrl.language.objects import GOAL, GRIPPER, WORDS
 from lw_torchrl.language.tasks import Task, whole_objects
 
@@ -98,6 +98,7 @@ _VERBS = [verb for verb in get_args(Verb) if verb not in _SAME_MOTION]
 _SKILLS, _WAYS = WORDS["roles"]["skills"], WORDS["roles"]["ways"]
 
 
+@typed_fields
 @dataclass(frozen=True)
 class StepRole:
     """What one step of a plan does, as :func:`~lw_torchrl.canonical_plan` reads it.
@@ -114,9 +115,6 @@ class StepRole:
     written: str = ""  # the skill in the plan's own words; "" for a step that the plan lacked
     confidence: Probability = 1.0  # from 0, a guess, to 1, stated in the plan's words
     fallback: bool = False  # whether the step is of the fallback plan, which is tried when the plan makes no progress
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     @property
     def skill(self) -> str:

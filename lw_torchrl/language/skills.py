@@ -11,7 +11,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
-from lw_torchrl._util.checks import check_choice, checked, did_you_mean, shown
+from lw_torchrl._util.checks import check_choice, did_you_mean, shown, typed
 from lw_torchrl._util.files import AnyPath, read_toml
 from lw_torchrl._util.registry import ReadOnlyDict
 from lw_torchrl.language.objects import GRIPPER, WORDS, is_number, is_triple
@@ -119,7 +119,7 @@ def _read(file: Path | Traversable, tasks: Tasks) -> dict[str, ScriptedSkill]:
     return found
 
 
-@checked
+@typed
 def load_skills(path: AnyPath | None = None, *, tasks: Tasks = TASKS) -> Skills:
     """Return the scripted skills by their text.
 

@@ -12,11 +12,19 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lw_torchrl._util.checks import check_choice, check_fields, checked, did_you_mean, shown, unknown_name
+from lw_torchrl._util.checks import check_choice, did_you_mean, shown, typed, typed_fields, unknown_name
 from lw_torchrl._util.files import AnyPath, read_toml
 from lw_torchrl._util.registry import ReadOnlyDict
 from lw_torchrl.language.layout import METAWORLD, Layout, places
-from lw_torchrl.language.objects import GOAL, GRIPPER, NamedObject, check_inside, read_objects, typed, write_objects
+from lw_torchrl.language.objects import (
+    GOAL,
+    GRIPPER,
+    NamedObject,
+    check_inside,
+    read_objects,
+    typed_position,
+    write_objects,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -32,7 +40,7 @@ def role_object(task: Task, name: str) -> NamedObject:
 
 def same_object(task: Task, first: str, second: str) -> bool:
     """Return whether two names are of one object, or of points on it."""
-    return typed(role_object(task, first).position) == typed(role_object(task, second).position)
+    return typed_position(role_object(task, first).position) == typed_position(role_object(task, second).position)
 
 
 def is_goal(task: Task, name: str) -> bool:
@@ -47,8 +55,8 @@ def whole_objects(task: Task) -> tuple[str, ...]:
 
 def first_object(task: Task) -> str | None:
     """Return the object that a task is about, the first of its layout; None for a task with only a goal, like reach."""
-    first = typed(places(task.layout.positions[1]))
-    return next((name for name in whole_objects(task) if typed(task.object(name).position) == first), None)
+    first = typed_position(places(task.layout.positions[1]))
+    return next((name for name in whole_objects(task) if typed_position(task.object(name).position) == first), None)
 
 
 def object_of(task: Task, name: str) -> str:
@@ -73,6 +81,7 @@ class TaskError(ValueError):
     """A task that cannot be read or written, or a file of such tasks."""
 
 
+@typed_fields
 @dataclass(frozen=True)
 class Task:
     """One manipulation task in words.
@@ -87,7 +96,6 @@ class Task:
     layout: Layout = METAWORLD
 
     def __post_init__(self) -> None:
-        check_fields(self)
         if not isinstance(self.objects, tuple) or not all(isinstance(one, NamedObject) for one in self.objects):
             raise TypeError(f"objects of task {self.name!r} must be a tuple of NamedObject, got {shown(self.objects)}")
         _check_name(self.name)
@@ -210,7 +218,7 @@ def _unknown_task(argument: str, name: str, tasks: Tasks) -> ValueError:
     return ValueError(f"{said} A task of your own is a Task with an engine=, see docs/training.md#a-task-of-your-own")
 
 
-@checked
+@typed
 def task_id(name: str) -> int:
     """Return the integer of a task: of the 50, the rank among the sorted names, from 0; of any other, a number from
     50 to 2³¹ - 1 that depends only on the name. A misspelt name has an id too.
@@ -290,7 +298,7 @@ def one_layout(tasks: Iterable[Task]) -> Layout:
     return next(iter(found))
 
 
-@checked
+@typed
 def load_tasks(path: AnyPath) -> Tasks:
     """Return all 50 tasks and those of your file, by name: some of the 50 with other objects or words, or new tasks.
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from functools import lru_cache
 from importlib.resources import as_file, files
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ TEXT_DIMENSION = 384
 TABLE = "embeddings.npz"
 
 
+@runtime_checkable
 class TextEncoder(Protocol):
     """Any function of n texts to (n, D) float32; modules take one as ``text_encoder``."""
 

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._util.checks import checked
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.devices import check_values
 from lw_torchrl._util.keys import dispatched, key_beside, read, write
 from lw_torchrl.language.task_index import PlanTables, answers_of, as_plans, pick
@@ -79,7 +79,7 @@ class PlanAttention(Part):
     _options = ("plans",)
     mask: Tensor
 
-    @checked
+    @typed
     def __init__(
         self,
         plans: AnyPlans,

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import check_int, checked, passes_on
+from lw_torchrl._util.checks import Count, check_value, typed
 from lw_torchrl._util.keys import as_keys, check_apart, check_key, dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans
 from lw_torchrl.language.text import TextEncoder
@@ -49,7 +49,7 @@ class Value(RenamedInputs):
     _numbers = 1  # of a value
     _also_read: Sequence[NestedKey] = ()
 
-    @checked
+    @typed
     def __init__(
         self,
         trunk: TensorDictSequential,
@@ -67,7 +67,7 @@ class Value(RenamedInputs):
         check_apart(self.in_keys, self.out_keys)
         self.heads = nn.ModuleList(
             MLP(self._numbers, width=width, depth=depth, layer_norm=True)
-            for _ in range(check_int("ensemble", ensemble, minimum=1))
+            for _ in range(check_value("ensemble", ensemble, Count))
         )
         if (size := encoding_width(trunk)) is not None:
             for head in self.heads:
@@ -108,8 +108,7 @@ class QValue(Value):
 
     _written = ("state_action_value", "state_action_values")
 
-    @passes_on(Value.__init__)
-    @checked
+    @typed
     def __init__(
         self,
         trunk: TensorDictSequential,
@@ -119,7 +118,7 @@ class QValue(Value):
         quantiles: int = 1,
         **options: Any,
     ) -> None:
-        self._numbers = check_int("quantiles", quantiles, minimum=1)
+        self._numbers = check_value("quantiles", quantiles, Count)
         if quantiles > 1 and ensemble != 1:
             raise ValueError(f"ensemble must be 1 with quantiles, got {ensemble}: TQCLoss makes several critics itself")
         check_key("action_key", action_key)
@@ -151,8 +150,7 @@ class PlanConditionedValue(Value):
         ['state_value']
     """
 
-    @passes_on(Value.__init__)
-    @checked
+    @typed
     def __init__(
         self,
         plans: AnyPlans,
@@ -182,8 +180,7 @@ class PlanConditionedQValue(QValue):
         >>> loss = TD3BCLoss(lw.PlanConditionedActor(plans), lw.PlanConditionedQValue(plans), bounds=(-1.0, 1.0))
     """
 
-    @passes_on(QValue.__init__)
-    @checked
+    @typed
     def __init__(
         self,
         plans: AnyPlans,

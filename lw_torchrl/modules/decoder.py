@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import check_scale, checked
+from lw_torchrl._util.checks import Scale, check_value, typed
 from lw_torchrl._util.keys import dispatched, read, write
 from lw_torchrl.modules.networks import MLP, materialize, probe
 from lw_torchrl.modules.sequence import Part, encoding_keys, encoding_width, trunk_attributes
@@ -36,7 +36,7 @@ class MLPDecoder(MLP):
     Source: paper section 'Plan Conditioning'.
     """
 
-    @checked
+    @typed
     def __init__(
         self, *, width: int | Sequence[int] = 256, depth: int = 3, actions: int = 4, squash: bool = True
     ) -> None:
@@ -73,7 +73,7 @@ class GaussianDecoder(MLP):
     Source: ``torchrl.modules.NormalParamExtractor``, with softplus.
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         *,
@@ -83,7 +83,7 @@ class GaussianDecoder(MLP):
         squash: bool = False,
         init_std: float = 0.3,
     ) -> None:
-        if check_scale("init_std", init_std) <= LEAST_STD:
+        if check_value("init_std", init_std, Scale) <= LEAST_STD:
             raise ValueError(f"init_std must be above {LEAST_STD}, got {init_std}")
         super().__init__(2 * actions, width=width, depth=depth)
         self.actions, self.squash = actions, squash

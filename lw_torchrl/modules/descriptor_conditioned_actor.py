@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictSequential
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import checked
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.keys import dispatched, read, write
 from lw_torchrl.language.task_index import TaskIndex, pick
 from lw_torchrl.language.tasks import MT50, Task, named_tasks, one_layout, task_ids
@@ -47,7 +47,7 @@ class TaskLatent(Part):
     _options = ("condition", "encoder")
     vectors: Tensor
 
-    @checked
+    @typed
     def __init__(
         self,
         tasks: str | Iterable[str | Task],
@@ -121,7 +121,7 @@ class DescriptorConditionedActor(ConditionedActor):
     Source: paper section 'Conditional Plan Experiments'.
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         tasks: str | Iterable[str | Task],

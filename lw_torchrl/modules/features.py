@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import add_random_module
 
-from lw_torchrl._util.checks import check_choice, check_scale, checked
+from lw_torchrl._util.checks import Scale, check_choice, check_value, typed
 from lw_torchrl._util.devices import check_finite
 from lw_torchrl._util.keys import as_keys, check_apart, dispatched, read, write
 from lw_torchrl.language.task_index import as_plans
@@ -46,7 +46,7 @@ class Features(TensorDictModuleBase):
 
     def __init__(self, noise: float, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey] | None = None) -> None:
         super().__init__()
-        self.noise = check_scale("noise", noise)
+        self.noise = check_value("noise", noise, Scale)
         self.in_keys, self.out_keys = list(in_keys), as_keys("out_keys", out_keys, ("features",))
         check_apart(self.in_keys, self.out_keys)
 
@@ -96,7 +96,7 @@ class ObservationFeatures(Features):
     mean: Tensor
     std: Tensor
 
-    @checked
+    @typed
     def __init__(
         self,
         kind: Kind = "differences",

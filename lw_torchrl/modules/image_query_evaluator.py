@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import check_choice, check_int, checked
+from lw_torchrl._util.checks import Count, check_choice, check_value, typed
 from lw_torchrl._util.registry import Registry, is_function
 from lw_torchrl._util.rendering import check_cameras
 from lw_torchrl.language.plans import Plans
@@ -137,7 +137,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
     rows_at_once = 4
     """Number of rows that are evaluated together when it acts, so that results do not depend on other rows."""
 
-    @checked
+    @typed
     def __init__(
         self,
         plans: Plans,
@@ -156,7 +156,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
         if names is None:
             names = sorted({name for plan in plans.values() for name in plan.definition.object_names})
         super().__init__(plans, answers=answers, predicates=predicates, names=names)
-        self.cameras, self.every = check_cameras(cameras, height, width), check_int("every", every, minimum=1)
+        self.cameras, self.every = check_cameras(cameras, height, width), check_value("every", every, Count)
         if max(height, width) > _LARGEST:
             raise ValueError(f"height and width must be at most {_LARGEST} pixels, got {height} and {width}")
         self.height, self.width = height, width

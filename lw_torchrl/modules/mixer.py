@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import check_int, checked
+from lw_torchrl._util.checks import Count, check_value, typed
 from lw_torchrl._util.keys import dispatched, read, write
 from lw_torchrl.language.task_index import PlanTables, as_plans, one_per_row, pick
 from lw_torchrl.language.text import TextEncoder, encoded
@@ -41,7 +41,7 @@ class SkillEncoder(MLP):
     """
 
     def __init__(self, latent_size: int = 64, *, width: int | Sequence[int] = 128, depth: int = 1) -> None:
-        super().__init__(check_int("latent_size", latent_size, minimum=1), width=width, depth=depth)
+        super().__init__(check_value("latent_size", latent_size, Count), width=width, depth=depth)
         self.config = {"latent_size": latent_size, "width": width, "depth": depth}
 
 
@@ -118,7 +118,7 @@ class SkillMixer(_Mixer):
 
     _options = ("plans", "encoder")
 
-    @checked
+    @typed
     def __init__(
         self,
         plans: AnyPlans,
@@ -163,7 +163,7 @@ class ActionMixer(_Mixer):
 
     _options = ("plans", "decoder", "encoder")
 
-    @checked
+    @typed
     def __init__(
         self,
         plans: AnyPlans,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP as TorchRLMLP
 
-from lw_torchrl._util.checks import check_int
+from lw_torchrl._util.checks import Count, Natural, check_value
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -24,9 +24,9 @@ class MLP(TorchRLMLP):
     def __init__(
         self, out_features: int, *, width: int | Sequence[int] = 256, depth: int = 3, layer_norm: bool = False
     ) -> None:
-        widths = [width] * check_int("depth", depth, minimum=0) if isinstance(width, int) else list(width)
+        widths = [width] * check_value("depth", depth, Natural) if isinstance(width, int) else list(width)
         for cells in [width] if isinstance(width, int) else widths:
-            check_int("width", cells, minimum=1)
+            check_value("width", cells, Count)
         super().__init__(
             out_features=out_features,
             num_cells=widths,

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.data import Composite
 
-from lw_torchrl._util.checks import checked
+from lw_torchrl._util.checks import typed
 from lw_torchrl.language.task_index import as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.attention import PlanAttention
@@ -64,7 +64,7 @@ class ConditionedActor(NamedParts):
         ['skill_weights', 'skill_latent', 'features', 'action']
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         trunk: TensorDictSequential,
@@ -169,7 +169,7 @@ class PlanConditionedActor(ConditionedActor):
     Source: paper section 'Plan Conditioning' and its figure of the architecture.
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         plans: AnyPlans,

@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import Compose, Transform
 
-from lw_torchrl._util.checks import check_choice, checked
+from lw_torchrl._util.checks import check_choice, typed
 from lw_torchrl._util.registry import Registry
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
@@ -52,7 +52,7 @@ def one_hot_actor(plans: AnyPlans, **options: Any) -> TensorDictModuleBase:
     return descriptor_actor(plans, condition="one-hot", **options)
 
 
-@checked
+@typed
 def make_policy(method: str, plans: AnyPlans, **options: Any) -> TensorDictModuleBase:
     """Return a policy of a method for the tasks of some plans.
 

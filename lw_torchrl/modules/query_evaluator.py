@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import Transform
 
-from lw_torchrl._util.checks import check_choice, checked
+from lw_torchrl._util.checks import check_choice, typed
 from lw_torchrl._util.keys import dispatched, key_beside, read, write
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.task_index import PlanTables, pick
@@ -55,7 +55,7 @@ class QueryEvaluator(TensorDictModuleBase):
     text_encoder: TextEncoder | None = None
     plan_number: Tensor
 
-    @checked
+    @typed
     def __init__(self, plans: Plans, *, answers: Answers = "soft") -> None:
         super().__init__()
         self.plans, self.tasks, self.layout = plans, tuple(plans), plans.layout

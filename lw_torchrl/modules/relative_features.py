@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._util.checks import checked
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.devices import check_finite
 from lw_torchrl._util.keys import as_keys, read
 from lw_torchrl.language.layout import places
@@ -144,7 +144,7 @@ class FocusFeatures(_RelativePositions):
         >>> actor = lw.PlanConditionedActor(plans, features=lw.modules.FocusFeatures(plans))
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         plans: AnyPlans,
@@ -202,7 +202,7 @@ class RoleFeatures(_RelativePositions):
     direction: Tensor
     ahead_begin: Tensor
 
-    @checked
+    @typed
     def __init__(
         self,
         plans: AnyPlans,

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._util.checks import checked, shown
+from lw_torchrl._util.checks import shown, typed
 from lw_torchrl._util.keys import dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
@@ -50,7 +50,7 @@ class ScriptedSkillActor(Part):
 
     _options = ("plans", "select", "seed")
 
-    @checked
+    @typed
     def __init__(
         self,
         plans: AnyPlans,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from lw_torchrl._util.checks import check_int, checked, shown, unknown_name
+from lw_torchrl._util.checks import Count, check_value, shown, typed, unknown_name
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.queries import Clause
 from lw_torchrl.language.relations import PREDICATES, STATES
@@ -195,8 +195,8 @@ class ClauseNetwork(nn.Module):
 
     def __init__(self, width: int, depth: int, *, predicates: int) -> None:
         super().__init__()
-        check_int("width", width, minimum=1)
-        check_int("depth", depth, minimum=1)
+        check_value("width", width, Count)
+        check_value("depth", depth, Count)
         self.width = width
         self.trunk = MLP(
             in_features=self.numbers * len(_SCALES),
@@ -245,7 +245,7 @@ class StateQueryEvaluator(ClauseEvaluator):
 
     network: ClauseNetwork
 
-    @checked
+    @typed
     def __init__(
         self,
         plans: Plans,

@@ -18,7 +18,7 @@ from torch import nn
 from torchrl.data import Composite
 from torchrl.modules import IndependentNormal, TanhNormal
 
-from lw_torchrl._util.checks import check_choice, checked
+from lw_torchrl._util.checks import check_choice, typed
 from lw_torchrl._util.keys import any_arguments, key_beside
 from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
 from lw_torchrl.modules.features import Features
@@ -51,7 +51,7 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
     Source: ``torchrl.modules.ProbabilisticActor``.
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         trunk: TensorDictSequential,

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import checked, shown
+from lw_torchrl._util.checks import shown, typed
 from lw_torchrl._util.keys import dispatched, last_name, read, write
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import AnyPlans, as_plans
@@ -46,7 +46,7 @@ class ActorEnsemble(RenamedInputs):
     Source: the mean of ``torchrl.modules.EnsembleModule``.
     """
 
-    @checked
+    @typed
     def __init__(self, members: Sequence[TensorDictModuleBase]) -> None:
         super().__init__()
         if not members:
@@ -117,7 +117,7 @@ class DecidedGripper(_Wrapper):
         1.0
     """
 
-    @checked
+    @typed
     def __init__(
         self, actor: TensorDictModuleBase, closes_above: float | None = None, layout: Layout | None = None
     ) -> None:
@@ -173,7 +173,7 @@ class DemonstratedActor(RenamedInputs):
     Source: ours.
     """
 
-    @checked
+    @typed
     def __init__(self, demonstrated: TensorDictModuleBase, others: TensorDictModuleBase) -> None:
         super().__init__()
         known = tasks_of(demonstrated)
@@ -245,7 +245,7 @@ class TransferredActor(_Wrapper):
     Source: ours; a plan says what matters, so the motion relative to it is the same with another robot.
     """
 
-    @checked
+    @typed
     def __init__(
         self, actor: TensorDictModuleBase, plans: AnyPlans, *, speed: float = 1.0, trained: Layout | None = None
     ) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 
-from lw_torchrl._util.checks import check_positive, check_probability, check_scale, checked
+from lw_torchrl._util.checks import Positive, Probability, Scale, check_value, typed
 from lw_torchrl._util.devices import check_finite
 from lw_torchrl._util.keys import read
 from lw_torchrl.modules.networks import evaluating
@@ -85,7 +85,7 @@ class ExpectileValueLoss(LossModule):
     value_network_params: TensorDictParams
     target_value_network_params: TensorDictParams
 
-    @checked
+    @typed
     def __init__(
         self,
         value_network: TensorDictModuleBase,
@@ -96,7 +96,7 @@ class ExpectileValueLoss(LossModule):
     ) -> None:
         super().__init__()
         set_reduction(self, reduction)
-        self.expectile = check_probability("expectile", expectile)
+        self.expectile = check_value("expectile", expectile, Probability)
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
 
     @property
@@ -219,7 +219,7 @@ class AdvantageWeightedLoss(LossModule):
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
 
-    @checked
+    @typed
     def __init__(
         self,
         actor_network: TensorDictModuleBase,
@@ -231,8 +231,8 @@ class AdvantageWeightedLoss(LossModule):
     ) -> None:
         super().__init__()
         set_reduction(self, reduction)
-        self.beta = check_scale("beta", beta)
-        self.max_weight = check_positive("max_weight", max_weight)
+        self.beta = check_value("beta", beta, Scale)
+        self.max_weight = check_value("max_weight", max_weight, Positive)
         self.loss_function = loss_function
         self.convert_to_functional(actor_network, "actor_network")
 
@@ -271,7 +271,7 @@ class AdvantageWeightedLoss(LossModule):
         return distance_loss(predicted, action, self.loss_function).mean(-1)
 
 
-@checked
+@typed
 def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
     """Standardise advantages to mean 0 and standard deviation 1 over the rows of each task.
 

@@ -15,7 +15,7 @@ from torchrl.data import Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss, TD3BCLoss
 
-from lw_torchrl._util.checks import check_scale, checked, shown
+from lw_torchrl._util.checks import Scale, check_value, shown, typed
 from lw_torchrl.objectives.reduction import Reduction, clear_references, priority_weight
 
 
@@ -37,7 +37,7 @@ class _ImitatesDemonstrations(_Loss):
     _fixed: Mapping[str, Any] = {}  # options that users cannot set
     in_keys: list[NestedKey]
 
-    @checked
+    @typed
     def __init__(
         self,
         actor_network: TensorDictModuleBase,
@@ -57,7 +57,7 @@ class _ImitatesDemonstrations(_Loss):
         if not critics or not all(isinstance(critic, TensorDictModuleBase) for critic in critics):
             raise TypeError(f"qvalue_network must be a TensorDictModule, or a list, got {shown(qvalue_network)}")
         super().__init__(actor_network, qvalue_network, reduction=reduction, **self._fixed, **options)
-        self.bc_weight = check_scale("bc_weight", bc_weight)
+        self.bc_weight = check_value("bc_weight", bc_weight, Scale)
         self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
 
     def set_keys(self, **keys: NestedKey) -> None:

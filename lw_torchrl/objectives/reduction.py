@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import IQLLoss, LossModule, REDQLoss
 
-from lw_torchrl._util.checks import checked
+from lw_torchrl._util.checks import typed
 
 Reduction = Literal["none", "mean", "sum"]
 _STEPS = "steps_to_next_obs"
@@ -33,7 +33,7 @@ def clear_references(*tensordicts: TensorDictBase) -> None:
             tensordict.clear_refs_for_compile_()
 
 
-@checked
+@typed
 def with_n_steps(loss: LossModule, batch: TensorDictBase) -> TensorDictBase:
     """Make a loss's value estimator read n-step rows: ``loss(with_n_steps(loss, batch))``.
 

@@ -12,7 +12,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from lw_torchrl._util.checks import check_choice, check_int, checked, counted, differences, shown, unknown_name
+from lw_torchrl._util.checks import Count, check_choice, check_value, counted, differences, shown, typed, unknown_name
 from lw_torchrl._util.files import AnyPath, read_json, read_text, write_json, write_text
 from lw_torchrl.language.formats import PLAN_FORMATS, encode_plan
 from lw_torchrl.language.formats.structured import read_structured
@@ -94,19 +94,19 @@ def storable(text: str) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n").lstrip("\ufeff")
 
 
-@checked
+@typed
 def folder_name(model: str) -> str:
     """Turn a model's name into a folder's: "meta-llama_Llama-3.1-8B"."""
     return re.sub(r"[^\w .+-]+", "_", model).strip(" ._")[:100].rstrip(" .") or "model"
 
 
-@checked
+@typed
 def answer_path(folder: AnyPath, model: str, format: str, task: str, attempt: int) -> Path:
     """Return the path of a model's answer."""
     return Path(folder) / folder_name(model) / format / f"{task}-{attempt}.{PLAN_FORMATS[format].extension}"
 
 
-@checked
+@typed
 def write_answer(folder: AnyPath, model: str, answer: Answer) -> Path:
     """Write an answer to its path; if the server sent JSON, also write that, as .json."""
     path = answer_path(folder, model, answer.format, answer.task, answer.attempt)
@@ -248,7 +248,7 @@ class FilePlanner:
         'push'
     """
 
-    @checked
+    @typed
     def __init__(self, source: AnyPath, model: str | None = None) -> None:
         answers = recorded_answers(source)
         if model is None and len(answers) > 1:
@@ -267,7 +267,7 @@ class FilePlanner:
     ) -> Answers:
         """Return the recorded answers; see :meth:`Planner.plans`."""
         check_choice("format", format, PLAN_FORMATS)
-        count = check_int("attempts", attempts, minimum=1)
+        count = check_value("attempts", attempts, Count)
         answers = []
         for name, task in named_tasks(tasks).items():
             for attempt in range(count):

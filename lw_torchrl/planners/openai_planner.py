@@ -12,7 +12,7 @@ from pathlib import Path
 from threading import Event
 from typing import Any, Literal
 
-from lw_torchrl._util.checks import Count, Natural, Positive, Scale, check_choice, check_int, checked, counted, shown
+from lw_torchrl._util.checks import Count, Natural, Positive, Scale, check_choice, check_value, counted, shown, typed
 from lw_torchrl._util.files import AnyPath, read_text
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
@@ -67,7 +67,7 @@ class OpenAIPlanner:
     Source: paper section 'LLM Experiments'.
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         model: str,
@@ -156,7 +156,7 @@ class OpenAIPlanner:
             ValueError: no scripted skill suits a task, or the folder has answers of other settings.
         """
         check_choice("format", format, PLAN_FORMATS)
-        count = check_int("attempts", attempts, minimum=1)
+        count = check_value("attempts", attempts, Count)
         each = [(task, attempt) for task in named_tasks(tasks).values() for attempt in range(count)]
         questions = [Question(task, attempt, self.request(task, format, attempt)) for task, attempt in each]
         return self._answers(questions, format, self.name, out, progress, "read" if recorded else "replace")
@@ -193,7 +193,7 @@ class OpenAIPlanner:
             request = self.request(task, format, answer.attempt)
             request["messages"] += [{"role": "assistant", "content": answer.raw}, {"role": "user", "content": report}]
             questions.append(Question(task, answer.attempt, request))
-        name = f"{self.name}-round{check_int('round', round, minimum=1)}"
+        name = f"{self.name}-round{check_value('round', round, Count)}"
         return self._answers(questions, format, name, out, progress, "refuse")
 
     def _answers(

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from rapidfuzz.distance import Levenshtein
 
-from lw_torchrl._util.checks import check_choice, checked
+from lw_torchrl._util.checks import check_choice, typed
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.formats.structured import write_structured
 from lw_torchrl.language.plan_files import load_plans
@@ -24,7 +24,7 @@ _ALWAYS = "pick-place"  # it has skills that many tasks need
 _EXAMPLES = 3
 
 
-@checked
+@typed
 def prompt_examples(task: str | Task, plans: AnyPlans | None = None) -> tuple[ConditionalPlan, ...]:
     """Return the plans that a prompt shows: pick-place's, and those of the tasks with the most similar descriptions.
 
@@ -61,7 +61,7 @@ def example_plans(plans: AnyPlans | None) -> Plans:
     return _shipped() if plans is None else as_plans(plans)
 
 
-@checked
+@typed
 def plan_prompt(
     task: str | Task, format: str, *, plans: AnyPlans | None = None, vocabulary: bool = False, tasks: Tasks = TASKS
 ) -> str:
@@ -123,7 +123,7 @@ _SKILL = "^[a-z]+( [a-z'-]+){1,12}$"
 _BECAUSE = "^[A-Za-z0-9,.:;'-]+( [A-Za-z0-9,.:;'-]+){1,29}$"
 
 
-@checked
+@typed
 def plan_schema(
     task: str | Task, format: str = "basic_py", *, skills: Skills | None = None, free_skills: bool = False
 ) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lw_torchrl._util.checks import check_int
+from lw_torchrl._util.checks import Count, check_value
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.envs.episodes import FinishedEpisode
@@ -206,7 +206,7 @@ def repair_plans(
         episodes, seed: the episodes in which scripted skills carry out each plan. Compare plans with another seed.
         tasks, out, progress: see :meth:`OpenAIPlanner.revise`.
     """
-    check_int("rounds", rounds, minimum=1)
+    check_value("rounds", rounds, Count)
 
     def run(answers: Sequence[Answer]) -> list[PlanCheck]:
         checks = []

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ APART = 0.01  # two episodes have parted when something is more than this apart,
 NOBODY = -1  # instead of a step's number: no single step is active
 
 
+@runtime_checkable
 class PlanLike(Protocol):
     """Anything with ``steps`` that have a ``condition``, shown as ``str`` gives it, and a ``skill``, a string."""
 

@@ -22,7 +22,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
-from lw_torchrl._util.checks import check_choice, checked
+from lw_torchrl._util.checks import check_choice, typed
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl.evaluation.figures import plot_failures
 from lw_torchrl.evaluation.result import EvaluationResult
@@ -75,7 +75,7 @@ class RerunLogger(Logger):
     experiment: rr.RecordingStream
     _service_shutdown: bool = False
 
-    @checked
+    @typed
     def __init__(self, path: AnyPath | None = None, *, connect: str | None = None, exp_name: str | None = None) -> None:
         if path is None and connect is None:
             raise ValueError("give path, a file to write, or connect, a viewer to show it in, or both; got neither")

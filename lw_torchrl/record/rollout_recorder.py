@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
-from lw_torchrl._util.checks import check_int, checked
+from lw_torchrl._util.checks import Count, Natural, check_value, typed
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.record.meshes import Motion
@@ -57,7 +57,7 @@ class RolloutRecorder(Transform):
         >>> logger.shutdown()
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         logger: RerunLogger,
@@ -71,9 +71,9 @@ class RolloutRecorder(Transform):
     ) -> None:
         super().__init__(in_keys=[], out_keys=[])
         self.logger = logger
-        self.rows = tuple(dict.fromkeys(check_int("rows", row, minimum=0) for row in rows))
+        self.rows = tuple(dict.fromkeys(check_value("rows", row, Natural) for row in rows))
         self.plans = None if plans is None else as_plans(plans)
-        self.every = check_int("every", every, minimum=1)
+        self.every = check_value("every", every, Count)
         self.policy, self.objects, self.task = policy, objects, task
         self._running: dict[int, _Row] = {}
 

@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._util.checks import checked, missing_keys, shown
+from lw_torchrl._util.checks import missing_keys, shown, typed
 from lw_torchrl._util.devices import device_of
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl.envs.episodes import FinishedEpisode
@@ -45,7 +45,7 @@ _KEYS: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next"
 _PLAN_KEYS = ("qaf", "qaf_logits", "skill_weights", "action_corrected")
 
 
-@checked
+@typed
 def log_rollout(
     logger: RerunLogger,
     rollout: TensorDictBase,

@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-from lw_torchrl._util.checks import checked
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.files import AnyPath, replacing
 from lw_torchrl.record.entities import EPISODE_TIMELINE
 from lw_torchrl.record.rerun_logger import is_complete
@@ -34,7 +34,7 @@ REASONS = {
 """Patterns in the output of a failed viewer, and the reason and remedy to report."""
 
 
-@checked
+@typed
 def open_viewer(
     path: AnyPath | Sequence[AnyPath],
     screenshot: AnyPath | None = None,

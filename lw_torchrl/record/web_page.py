@@ -18,7 +18,7 @@ from string import Template
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from lw_torchrl._util.checks import checked
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.files import AnyPath, replacing
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.record.entities import EPISODE_TIMELINE
@@ -37,7 +37,7 @@ from lw_torchrl.record.viewer import (
 LARGE = 30 * 10**6
 
 
-@checked
+@typed
 def write_html(path: AnyPath, page: AnyPath, *, episode: str | None = None, step: int | None = None) -> Path:
     """Write a recording as one HTML file that opens from disk, without a network.
 
@@ -87,7 +87,7 @@ class WebPage(AbstractContextManager["WebPage"]):
         ...     page.serve()
     """
 
-    @checked
+    @typed
     def __init__(self, path: AnyPath, *, episode: str | None = None, step: int | None = None, port: int = 0) -> None:
         text, parts = _page(find_recordings(path)[-1], episode, step)
         script, wasm = _viewer_files()

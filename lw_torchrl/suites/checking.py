@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._util.checks import checked
-from lw_torchrl.language.objects import typed
+from lw_torchrl._util.checks import typed
+from lw_torchrl.language.objects import typed_position
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.suites.engine import Engine, EngineStep
 from lw_torchrl.suites.suite import Suite
@@ -38,7 +38,7 @@ class Finding:
     right: bool
 
 
-@checked
+@typed
 def check_suite(suite: Suite, *, seed: int = 0) -> list[Finding]:
     """Run a few steps of each task and compare what happens with the suite's layout; success is never looked at.
 
@@ -131,7 +131,7 @@ class _Bench:
             yield "numbers of the step before", "those" if kept else "others", "those; after a reset, the present", kept
         gripper = self.task.objects[0].position
         place = tuple(range(self.hand.start, self.hand.stop))
-        right = typed(gripper) == typed(place)
+        right = typed_position(gripper) == typed_position(place)
         yield "the gripper's position", f"obs{list(gripper)}", f"obs{list(place)}, the layout's hand", right
 
     def _axes(self) -> Iterator[_Row]:

@@ -7,7 +7,7 @@ observations); the environment converts them, counts steps and truncates.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ class EngineStep(NamedTuple):
     fault: NDArray[np.bool_]  # (N,) unstable: such a row repeats its last stable observation until it is reset
 
 
+@runtime_checkable
 class Engine(Protocol):
     """Simulates N rows of tasks. With the ``render`` of :class:`~lw_torchrl.suites.cameras.SeenRows` it also gives
     pictures, with its ``model`` and ``poses`` recordings of the scene."""

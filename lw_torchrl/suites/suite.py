@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from lw_torchrl._util.checks import check_choice, check_fields, shown, unknown_name
+from lw_torchrl._util.checks import check_choice, shown, typed_fields, unknown_name
 from lw_torchrl._util.registry import ReadOnlyDict, Registry
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import Plans
@@ -16,6 +16,7 @@ from lw_torchrl.language.tasks import TASKS, Task, TaskList, Tasks, named_tasks
 from lw_torchrl.suites.engine import Engine
 
 
+@typed_fields
 @dataclass(frozen=True)
 class Suite:
     """Tasks of one simulator and robot, for everything that takes ``suite=``.
@@ -48,7 +49,6 @@ class Suite:
     step_time: float = 0.0125
 
     def __post_init__(self) -> None:
-        check_fields(self)
         for relation in self.layout.thresholds:
             check_choice(f"thresholds of layout {self.layout.name!r}", relation, PREDICATES)
         for name, task in self.tasks.items():

@@ -11,7 +11,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import checked, differences
+from lw_torchrl._util.checks import differences, typed
 from lw_torchrl._util.files import AnyPath, absent_policy, shipped_policy
 from lw_torchrl._util.tensor_files import read_tensors, write_tensors
 from lw_torchrl.language.plans import AnyPlans, PlanError, as_plans
@@ -26,7 +26,7 @@ _TEXTS = "texts/"  # begins the names of text vectors, which show whether anothe
 _TEXT_TOLERANCE = 0.01  # machines differ by less, encoders by more
 
 
-@checked
+@typed
 def save_actor(actor: TensorDictModuleBase, path: AnyPath, **about: Any) -> None:
     """Write a policy for :func:`load_actor`. An earlier file is replaced whole.
 
@@ -53,7 +53,7 @@ def save_actor(actor: TensorDictModuleBase, path: AnyPath, **about: Any) -> None
     _save(path, "actor", actor, about)
 
 
-@checked
+@typed
 def load_actor(path: AnyPath, *, text_encoder: TextEncoder | None = None, parts: Sequence[type[nn.Module]] = ()) -> Any:
     """Load a policy with its plans and weights, in eval mode.
 
@@ -76,7 +76,7 @@ def load_actor(path: AnyPath, *, text_encoder: TextEncoder | None = None, parts:
     return _load(policy_file(path), "actor", lambda found: from_description(found, text_encoder, parts))
 
 
-@checked
+@typed
 def save_evaluator(evaluator: QueryEvaluator, path: AnyPath, **about: Any) -> None:
     """Write an evaluator's network for :func:`load_evaluator`. An earlier file is replaced whole.
 
@@ -95,7 +95,7 @@ def save_evaluator(evaluator: QueryEvaluator, path: AnyPath, **about: Any) -> No
     _save(path, "evaluator", evaluator, about)
 
 
-@checked
+@typed
 def load_evaluator(
     path: AnyPath,
     plans: AnyPlans,

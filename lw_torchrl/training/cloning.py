@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import BCLoss
 
-from lw_torchrl._util.checks import Count, Positive, Scale, check_fields, checked, passes_on
+from lw_torchrl._util.checks import Count, Positive, Scale, typed, typed_fields
 from lw_torchrl._util.devices import place
 from lw_torchrl.language.task_index import PlanTables, TaskTables
 from lw_torchrl.modules.describe import describe
@@ -26,6 +26,7 @@ from lw_torchrl.training.normalization import check_contacts, fit_normalization,
 from lw_torchrl.transforms.qaf import plan_program
 
 
+@typed_fields
 @dataclass(frozen=True)
 class BehavioralCloningConfig:
     """Hyperparameters of behavioral cloning.
@@ -60,9 +61,6 @@ class BehavioralCloningConfig:
     seed: int = 0
     checkpoint_every: Count = 500
     qaf_anchor: Scale = 0.0
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
     def describe(self) -> dict[str, Any]:
         """Return the options, as JSON."""
@@ -138,8 +136,7 @@ class BehavioralCloningTrainer(Training):
 
     part = "actor"
 
-    @passes_on(Training.__init__)
-    @checked
+    @typed
     def __init__(
         self,
         actor: TensorDictModuleBase,

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import checked, passes_on
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.devices import place
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
@@ -161,8 +161,7 @@ class QueryEvaluatorTrainer(Training):
     evaluator_class: ClassVar[type[ClauseEvaluator]] = StateQueryEvaluator
     queries_class: ClassVar[Any] = _StateQueries
 
-    @passes_on(Training.__init__)
-    @checked
+    @typed
     def __init__(
         self,
         evaluator: ClauseEvaluator,

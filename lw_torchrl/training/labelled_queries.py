@@ -12,16 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
-from lw_torchrl._util.checks import (
-    Count,
-    Probability,
-    Scale,
-    check_choice,
-    check_fields,
-    check_int,
-    check_text,
-    checked,
-)
+from lw_torchrl._util.checks import Count, Natural, Probability, Scale, check_choice, check_value, typed, typed_fields
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.queries import Clause, Query, base_clauses
 from lw_torchrl.language.query_program import QueryProgram
@@ -32,6 +23,7 @@ from lw_torchrl.suites.suite import find_suite
 _MOVED = 0.02  # metres; a hand that moves further between two pictures must look different
 
 
+@typed_fields
 @dataclass(frozen=True)
 class QueryEvaluatorConfig:
     """Hyperparameters of a query evaluator's training by AdamW, and what is held out.
@@ -61,17 +53,16 @@ class QueryEvaluatorConfig:
     checkpoint_every: Count = 500
 
     def __post_init__(self) -> None:
-        check_fields(self)
         for name in ("held_out_states", "held_out_pairs"):
             if getattr(self, name) > 0.9:
                 raise ValueError(f"{name} must leave a tenth to train on, got {getattr(self, name)}")
         given = self.held_out_tasks
         if isinstance(given, str) or not isinstance(given, Iterable):
-            check_int("held_out_tasks", given, minimum=0)
+            check_value("held_out_tasks", given, Natural)
             return
         object.__setattr__(self, "held_out_tasks", tuple(given))
         for task in self.held_out_tasks:  # type: ignore[union-attr]
-            check_text("held_out_tasks", task)
+            check_value("held_out_tasks", task, str)
 
 
 @dataclass(frozen=True)
@@ -138,7 +129,7 @@ class LabelledQueries:
             while the hand moves.
     """
 
-    @checked
+    @typed
     def __init__(
         self, replay: TensorDictReplayBuffer, config: QueryEvaluatorConfig, tasks: Iterable[Task] | None = None
     ) -> None:

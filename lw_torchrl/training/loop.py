@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 from torchrl.record.loggers import Logger
 
-from lw_torchrl._util.checks import Count, check_int, checked
+from lw_torchrl._util.checks import Count, check_value, typed
 from lw_torchrl._util.devices import CPU
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl._util.progress import Progress
@@ -121,7 +121,7 @@ class Training:
     optimizer: torch.optim.Optimizer
     device = CPU
 
-    @checked
+    @typed
     def __init__(
         self,
         config: Any,
@@ -202,7 +202,7 @@ class Training:
     def run(self, until: int | None = None) -> Tensor:
         """Train as :meth:`train` does, and return the latest 100 losses, (n,) or (n, M) float32 on the CPU."""
         total = self.config.steps
-        if until is not None and check_int("until", until, minimum=1) > total:
+        if until is not None and check_value("until", until, Count) > total:
             raise ValueError(f"until must be at most the configuration's steps, {total}, got {until}")
         self._values.clear()
         self._set_training(True)

@@ -10,12 +10,12 @@ from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives import LossModule
 
-from lw_torchrl._util.checks import checked
+from lw_torchrl._util.checks import typed
 from lw_torchrl.modules.features import Features
 from lw_torchrl.modules.relative_features import RoleFeatures
 
 
-@checked
+@typed
 def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None:
     """Call :meth:`Features.fit` of all features in a module, or in the networks of a loss, with a buffer's rows.
 

@@ -15,7 +15,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.envs import MultiStepTransform
 from torchrl.objectives import CQLLoss, IQLLoss, LossModule, SoftUpdate, TD3BCLoss
 
-from lw_torchrl._util.checks import Count, Positive, Probability, Scale, check_choice, check_fields, checked, passes_on
+from lw_torchrl._util.checks import Count, Positive, Probability, Scale, check_choice, typed, typed_fields
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedValue
 from lw_torchrl.modules.describe import describe
@@ -86,6 +86,7 @@ def learn_advantages(
 _REPLACED = {"loss_actor_bc"}  # CQL's first steps of the actor minimise it instead of another entry
 
 
+@typed_fields
 @dataclass(frozen=True)
 class OfflineConfig:
     """Hyperparameters of training with any loss, by AdamW. Others are those of :class:`BehavioralCloningConfig`.
@@ -110,9 +111,6 @@ class OfflineConfig:
     max_grad_norm: Positive = 1.0
     seed: int = 0
     checkpoint_every: Count = 1000
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
 
 class OfflineTrainer(Training):
@@ -154,8 +152,7 @@ class OfflineTrainer(Training):
     Source: ``torchrl.trainers.Trainer``, without an environment.
     """
 
-    @passes_on(Training.__init__)
-    @checked
+    @typed
     def __init__(
         self,
         loss: Any,  # a LossModule; check_loss explains what else it may be

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase, Transform
 
-from lw_torchrl._util.checks import Probability, Scale, checked
+from lw_torchrl._util.checks import Probability, Scale, typed
 from lw_torchrl._util.devices import plain
 from lw_torchrl._util.keys import as_keys, check_apart, read
 from lw_torchrl.language.layout import METAWORLD, Layout, places
@@ -117,7 +117,7 @@ class SwapUnmentioned(PlanAugmentation):
 
     mentioned: Tensor
 
-    @checked
+    @typed
     def __init__(
         self, plans: AnyPlans, probability: Probability, *, in_keys: Sequence[NestedKey] | None = None
     ) -> None:
@@ -182,7 +182,7 @@ class HideOpening(Augmentation):
         torch.Size([8, 39])
     """
 
-    @checked
+    @typed
     def __init__(
         self, probability: Probability, *, layout: Layout = METAWORLD, in_keys: Sequence[NestedKey] | None = None
     ) -> None:
@@ -231,7 +231,7 @@ class JitterTarget(PlanAugmentation):
     pushes: Tensor
     scale: Tensor
 
-    @checked
+    @typed
     def __init__(self, plans: AnyPlans, std: Scale, *, in_keys: Sequence[NestedKey] | None = None) -> None:
         super().__init__(in_keys=as_keys("in_keys", in_keys, ("task_id", "qaf")), out_keys=["target_offset"])
         check_apart(self.in_keys, self.out_keys)

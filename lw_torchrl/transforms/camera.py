@@ -13,7 +13,7 @@ from torchrl.data import Composite, TensorSpec, UnboundedDiscrete
 from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-from lw_torchrl._util.checks import check_int, checked
+from lw_torchrl._util.checks import Count, check_value, typed
 from lw_torchrl._util.keys import as_keys
 from lw_torchrl._util.rendering import check_cameras
 from lw_torchrl.transforms.environment import KeepsEnvState, base_env, reset_rows
@@ -47,7 +47,7 @@ class CameraTransform(KeepsEnvState):
     Source: mirrors ``torchrl.record.PixelRenderTransform``, for some rows and some steps.
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         cameras: str | Sequence[str] = "corner",
@@ -58,7 +58,7 @@ class CameraTransform(KeepsEnvState):
         out_keys: Sequence[NestedKey] | None = None,
     ) -> None:
         self.cameras = check_cameras(cameras, height, width)
-        self.height, self.width, self.every = height, width, check_int("every", every, minimum=1)
+        self.height, self.width, self.every = height, width, check_value("every", every, Count)
         super().__init__(in_keys=[], out_keys=as_keys("out_keys", out_keys, ("pixels",)))
         self.shape = self.height, self.width * len(self.cameras), 3  # of a row's pictures
         self._forget_episodes()

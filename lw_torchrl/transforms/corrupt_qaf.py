@@ -10,7 +10,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
 
-from lw_torchrl._util.checks import Count, Natural, Probability, checked, missing_keys
+from lw_torchrl._util.checks import Count, Natural, Probability, missing_keys, typed
 from lw_torchrl._util.keys import as_keys, read
 from lw_torchrl._util.seeding import episode_generator
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
@@ -57,7 +57,7 @@ class CorruptQAF(EpisodeTransform):
     Source: the paper names a visual question answering model as a query answering function; such a model errs.
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         plans: AnyPlans,

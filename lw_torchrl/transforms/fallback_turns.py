@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from lw_torchrl._util.checks import Count, Scale, checked
+from lw_torchrl._util.checks import Count, Scale, typed
 from lw_torchrl._util.keys import as_keys, check_apart, read
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.transforms.environment import reset_rows
@@ -55,7 +55,7 @@ class FallbackTurns(Transform):
     Source: ours; time-outs of a behaviour tree's fallback node.
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         layout: Layout = METAWORLD,

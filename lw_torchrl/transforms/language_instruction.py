@@ -10,7 +10,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import Composite, NonTensor, TensorSpec
 from torchrl.envs import Transform
 
-from lw_torchrl._util.checks import checked
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.keys import as_keys, read
 from lw_torchrl.language.tasks import TASKS, TaskList, named_tasks, task_id
 from lw_torchrl.transforms.environment import base_env
@@ -41,7 +41,7 @@ class LanguageInstruction(Transform):
     Source: ``torchrl.envs.LiberoEnv``.
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         tasks: TaskList | None = None,

@@ -13,7 +13,7 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-from lw_torchrl._util.checks import checked, missing_keys
+from lw_torchrl._util.checks import missing_keys, typed
 from lw_torchrl._util.keys import as_keys, check_apart, key_beside
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
@@ -69,7 +69,7 @@ class QAFTransform(KeepsEnvState):
     Source: paper section 'Query Answering Function'.
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         plans: AnyPlans,

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import check_probability, check_scale, checked, missing_keys
+from lw_torchrl._util.checks import Probability, Scale, check_value, missing_keys, typed
 from lw_torchrl._util.keys import as_keys, check_apart, key_beside
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import AnyPlans
@@ -103,7 +103,7 @@ class RandomYaw(PlanAugmentation):
     Source: data augmentation by a symmetry of the task, images in ``torchvision.transforms.RandomRotation``.
     """
 
-    @checked
+    @typed
     def __init__(
         self,
         scale: float,
@@ -121,7 +121,7 @@ class RandomYaw(PlanAugmentation):
         for own, there in zip(self.in_keys, self.out_keys, strict=True):
             if there != own:
                 check_apart(self.in_keys, [there])
-        self.scale, self.tilt = check_scale("scale", scale), check_probability("tilt", tilt)
+        self.scale, self.tilt = check_value("scale", scale, Scale), check_value("tilt", tilt, Probability)
         self.has_plans = plans is not None
         if plans is not None:
             plans = self._read_plans(plans)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
-from lw_torchrl._util.checks import checked
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.keys import check_key, read
 from lw_torchrl.language.tasks import Task, task_id
 
@@ -47,7 +47,7 @@ class SuiteTransform(Transform):
 
     makes_observation = True
 
-    @checked
+    @typed
     def __init__(
         self,
         task: Task,

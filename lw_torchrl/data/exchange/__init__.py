@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from lw_torchrl._util.checks import Count, checked
+from lw_torchrl._util.checks import Count, typed
 from lw_torchrl._util.files import AnyPath, read_json, replacing_folder
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.dataset import METADATA, Demonstrations, parse_metadata, read_metadata
@@ -50,7 +50,7 @@ def _format(name: str) -> Iterator[Any]:
         raise ImportError(f"format {name!r} needs {error.name}, which is not installed: {install}") from error
 
 
-@checked
+@typed
 def export_dataset(
     root: AnyPath,
     format: ExportFormat,
@@ -98,7 +98,7 @@ def export_dataset(
     return target
 
 
-@checked
+@typed
 def import_dataset(
     source: AnyPath,
     out: AnyPath,

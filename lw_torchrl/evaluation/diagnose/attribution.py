@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from lw_torchrl._util.checks import Count, Scale, checked, missing_keys
+from lw_torchrl._util.checks import Count, Scale, missing_keys, typed
 from lw_torchrl._util.devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.diagnose.counterfactuals import Counterfactuals, own_evaluators
@@ -29,7 +29,7 @@ from lw_torchrl.modules.policy import plans_of
 from lw_torchrl.suites.suite import Suite, find_suite
 
 
-@checked
+@typed
 def attribute_failures(
     rollouts: Iterable[FinishedEpisode | TensorDictBase],
     plans: AnyPlans,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields
 from reprlib import repr as short
 from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
-from lw_torchrl._util.checks import Count, Natural, check_fields
+from lw_torchrl._util.checks import ArgumentError, Count, Natural, typed_fields
 from lw_torchrl.evaluation.diagnose.findings import CAUSES, FINDINGS, REPLACEMENTS, Cause, Finding
 from lw_torchrl.evaluation.diagnose.sentences import explain_failure
 
@@ -30,6 +30,7 @@ class MendedEpisode(NamedTuple):
     steps: TensorDictBase
 
 
+@typed_fields
 @dataclass(frozen=True)
 class Failure:
     """Why one episode failed. Every field is data; :attr:`why` writes it in English.
@@ -111,8 +112,10 @@ def read_records(
         where = f"{argument}[{number}]"
         if not isinstance(entry, dict) or set(entry) != names:
             raise ValueError(f"{where} must be an object of {', '.join(sorted(names))}, got {short(entry)}")
-        records.append(record(**parse(where, entry)))
-        check_fields(records[-1], f"{where}: ")
+        try:
+            records.append(record(**parse(where, entry)))
+        except ArgumentError as error:
+            raise ArgumentError(f"{where}: {error}") from None
         for fault in faults(records[-1]):
             raise ValueError(f"{where}: {fault}, got {short(entry)}")
     return tuple(records)
@@ -126,9 +129,10 @@ def _read_finding(where: str, stated: Any) -> Any:
     if kind is None or set(stated) != {"kind", *(one.name for one in fields(kind))}:
         kinds = ", ".join(FINDINGS)
         raise ValueError(f"{where} must be null, or a kind of {kinds} with its fields, got {short(stated)}")
-    finding = kind(**{name: value for name, value in stated.items() if name != "kind"})
-    check_fields(finding, f"{where}: ")
-    return finding
+    try:
+        return kind(**{name: value for name, value in stated.items() if name != "kind"})
+    except ArgumentError as error:
+        raise ArgumentError(f"{where}: {error}") from None
 
 
 def read_failures(stated: Any, config: Mapping[str, Any], failed: Sequence[tuple[str, int]]) -> tuple[Failure, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
-from lw_torchrl._util.checks import Count, Natural, Scale
+from lw_torchrl._util.checks import Count, Natural, Scale, typed_fields
 
 Blamed = Literal["not reproducible", "perception", "query", "plan", "skill", "gripper", "actuation", "policy"]
 Cause = Literal[Blamed, "out of time", "undecided"]
@@ -40,6 +40,7 @@ REPLACEMENTS: dict[str, tuple[Cause, ...]] = {
 """The name of each replacement, and the causes to blame if an episode succeeds with it."""
 
 
+@typed_fields
 @dataclass(frozen=True)
 class WrongAnswers:
     """The condition of a step was answered wrongly in ``states`` of ``of`` states, first at ``first``."""
@@ -51,6 +52,7 @@ class WrongAnswers:
     first: Natural
 
 
+@typed_fields
 @dataclass(frozen=True)
 class NoCondition:
     """No condition of the plan held in ``states`` of the last ``of`` states."""
@@ -59,6 +61,7 @@ class NoCondition:
     of: Count
 
 
+@typed_fields
 @dataclass(frozen=True)
 class PlanDeparts:
     """The plan requested another action than the reference in ``states`` of ``of`` states, the last if ``late``."""
@@ -72,6 +75,7 @@ class PlanDeparts:
     uncovered: bool  # no condition of the plan held in most of them
 
 
+@typed_fields
 @dataclass(frozen=True)
 class ActiveStep:
     """A step was active in ``states`` of the last ``of`` states, and at the end ``distance`` metres from its target."""
@@ -83,6 +87,7 @@ class ActiveStep:
     distance: Scale | None = None
 
 
+@typed_fields
 @dataclass(frozen=True)
 class Misled:
     """The observation that the policy was shown differed from the true one, most in entry ``number``, by ``error``."""
@@ -91,6 +96,7 @@ class Misled:
     number: Natural
 
 
+@typed_fields
 @dataclass(frozen=True)
 class Difference:
     """The first difference between two runs of an episode, with ``at``, the state to look at.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from lw_torchrl._util.checks import check_choice, checked, shown
+from lw_torchrl._util.checks import check_choice, shown, typed
 from lw_torchrl._util.registry import Registry
 from lw_torchrl.language.formats.base import STYLES, Clause, PlanFormat, Reading
 from lw_torchrl.language.formats.prose import md
@@ -31,7 +31,7 @@ PLAN_FORMATS = Registry(
 """The formats by name: the nine of the paper, and those that you add, ``PLAN_FORMATS["mine"] = PlanFormat(...)``."""
 
 
-@checked
+@typed
 def encode_plan(plan: ConditionalPlan, format: str) -> str:
     """A plan as text, from which :func:`~lw_torchrl.decode_plan` reads an equal plan.
 

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._util.checks import check_int
+from lw_torchrl._util.checks import Count, check_value
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
@@ -169,7 +169,7 @@ class ThreadedEngine(SeenRows):
     _rows: list[Any]  # each with ``seen`` and ``bodies``
 
     def __init__(self, keys: Sequence[str], layout: Layout, num_threads: int | None) -> None:
-        threads = check_int("num_threads", available_cores() if num_threads is None else num_threads, minimum=1)
+        threads = check_value("num_threads", available_cores() if num_threads is None else num_threads, Count)
         self._groups, self._pool = split_into_groups(keys, threads), WorkerPool(threads)
         self._layout = layout
         self._goal = np.zeros((len(keys), 3))
