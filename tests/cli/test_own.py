@@ -108,7 +108,7 @@ def test_a_task_that_the_simulator_lacks_is_named(capsys, tmp_path):
     for name, some in (("alone", plans), ("both", both)):
         lw.save_actor(lw.PlanConditionedActor(some), tmp_path / f"{name}.safetensors")
     error = fails(capsys, "evaluate", tmp_path / "alone.safetensors", "--tasks", "stack-cup")
-    assert "A task of your own is a Task with an engine=, see docs/training.md" in error
+    assert "Other tasks are Task objects with an engine=, see docs/training.md" in error
     assert "no simulator has the policy's tasks, stack-cup" in fails(capsys, "evaluate", tmp_path / "alone.safetensors")
     printed = run(capsys, "evaluate", tmp_path / "both.safetensors", "--episodes", 1, "--max-steps", 5)
     assert printed.startswith("evaluating 1 task of the policy's 2; choose others by --tasks\n")
