@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lw_torchrl._util.checks import checked, counted, shown
+from lw_torchrl._util.checks import counted, shown, typed
 from lw_torchrl.evaluation import EvaluationResult
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ def check_rates(argument: str, given: Any) -> Array:
     return rates
 
 
-@checked
+@typed
 def mean_rate(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
     """Return the mean success rate over seeds and tasks of ``rates`` (seeds, tasks), in [0, 1], with its interval.
 
@@ -73,7 +73,7 @@ def mean_rate(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
     return _seed_interval(np.mean, [check_rates("rates", rates)], confidence, least=0.0)
 
 
-@checked
+@typed
 def interquartile_mean(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
     """Return the mean of the middle half of all ``rates`` (seeds, tasks), in [0, 1]: a quarter is cut at each end.
 
@@ -91,7 +91,7 @@ def interquartile_mean(rates: ArrayLike, *, confidence: float = 0.95) -> Estimat
     return _seed_interval(middle, [check_rates("rates", rates)], confidence, least=0.0)
 
 
-@checked
+@typed
 def mean_difference(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> Estimate:
     """Return the mean over tasks of method X's rate minus Y's on the same task.
 
@@ -104,7 +104,7 @@ def mean_difference(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> 
     return _seed_interval(lambda a, b: a.mean() - b.mean(), _pair(x, y), confidence, least=-1.0)
 
 
-@checked
+@typed
 def probability_of_improvement(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> Estimate:
     """Return the probability that a seed of method X beats one of Y on a random task; a tie counts half.
 
@@ -120,7 +120,7 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, *, confidence: float 
     return _seed_interval(lambda a, b: (0.5 + 0.5 * np.sign(a[:, None] - b)).mean(), beats, confidence, least=0.0)
 
 
-@checked
+@typed
 def count_solved(rates: ArrayLike, threshold: float = 0.8) -> int:
     """Return the number of tasks whose mean over seeds is at least ``threshold``, in (0, 1], up to rounding.
 
@@ -239,7 +239,7 @@ class Summary:
         return "\n".join(lines)
 
 
-@checked
+@typed
 def summarize_rates(
     rates: Mapping[str, Sequence[float]],
     *,
@@ -282,7 +282,7 @@ def summarize_rates(
     )
 
 
-@checked
+@typed
 def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResult], **options: Any) -> Summary:
     """Summarize the any-step success of several training seeds, one evaluation of the same tasks each.
 
