@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import gc
+import inspect
 import json
 import math
+import pkgutil
 import random
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from importlib import import_module
+from types import FunctionType
 from typing import Literal
 
 import numpy as np
@@ -116,3 +121,13 @@ def test_checked_value_is_named_as_the_caller_says():
 def test_misspelt_option_is_named():
     with pytest.raises(TypeError, match="'quantile'"):
         lw.PlanConditionedQValue(lw.load_plans("MT10"), quantile=3)
+
+
+def test_annotations_of_checked_functions_can_be_read():
+    """A name that is imported only for type checkers would be a NameError at the first call."""
+    for module in pkgutil.walk_packages(lw.__path__, "lw_torchrl."):
+        import_module(module.name)
+    checked = [one for one in gc.get_objects() if isinstance(one, FunctionType) and one.__code__ is draw.__code__]
+    assert len(checked) > 100
+    for function in checked:
+        inspect.getclosurevars(function).nonlocals["read_hints"]()

@@ -7,7 +7,7 @@ from functools import cache, wraps
 from math import inf
 from numbers import Integral, Real
 from reprlib import Repr
-from types import UnionType
+from types import SimpleNamespace, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -60,7 +60,12 @@ def typed(function: Function) -> Function:
     NumPy's numbers arrive as Python's. Annotations are read at the first call, so each name in them must be imported
     by then, and not only for type checkers. ``*args`` and ``**kwargs`` are not checked.
     """
-    return _checked(function, lambda: get_type_hints(function, include_extras=True))
+
+    def read_hints() -> dict[str, Any]:  # not the result's, whose type may be in a package that is not installed
+        arguments = {name: hint for name, hint in function.__annotations__.items() if name != "return"}
+        return get_type_hints(SimpleNamespace(__annotations__=arguments), function.__globals__, include_extras=True)
+
+    return _checked(function, read_hints)
 
 
 def typed_fields(kind: Class) -> Class:
