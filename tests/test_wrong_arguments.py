@@ -16,19 +16,7 @@ import lw_torchrl as lw
 from benchmarks.statistics import summarize
 from lw_torchrl._util.checks import checker
 
-ROOMS = [
-    "envs",
-    "transforms",
-    "modules",
-    "objectives",
-    "data",
-    "training",
-    "evaluation",
-    "planners",
-    "record",
-    "suites",
-]
-MODULES = [import_module(f"lw_torchrl.{room}") for room in ROOMS]
+MODULES = [import_module(f"lw_torchrl.{room}") for room in lw._ROOMS if room != "language"]
 PUBLIC: dict[str, Any] = {name: getattr(lw, name) for name in lw._ROOM_OF}
 PUBLIC |= {name: getattr(module, name) for module in MODULES for name in module.__all__}
 PUBLIC |= {one.__name__: one for one in (lw.language.plans.PlanStep, lw.language.tasks.resolve_tasks)}
