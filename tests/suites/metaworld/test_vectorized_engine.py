@@ -13,12 +13,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lw_torchrl.suites.engine import EngineStep
+from lw_torchrl.suites.metaworld.observation import quaternion_of_matrix, row_norm
 from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
-from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
-from lw_torchrl.suites.metaworld.vectorized.observation import quaternion_of_matrix, row_norm
-from lw_torchrl.suites.metaworld.vectorized.simulated_rows import RowGroup, WorkerPool, split_into_groups
-from lw_torchrl.suites.metaworld.vectorized.tables import simulation_table
-from lw_torchrl.suites.metaworld.vectorized.task_programs import borrow_model, model_path, return_models
+from lw_torchrl.suites.metaworld.simulated_rows import RowGroup, WorkerPool, split_into_groups
+from lw_torchrl.suites.metaworld.tables import simulation_table
+from lw_torchrl.suites.metaworld.task_programs import borrow_model, model_path, return_models
+from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 TASKS = list(simulation_table())
 

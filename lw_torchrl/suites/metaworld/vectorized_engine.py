@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from lw_torchrl._util.checks import check_choice
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import check_task
-from lw_torchrl.suites.metaworld.vectorized import observation as at
-from lw_torchrl.suites.metaworld.vectorized import simulated_rows, task_programs
-from lw_torchrl.suites.metaworld.vectorized.dense_reward import DenseReward, EpisodeStarts
-from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask, Observer, SuccessFunction
-from lw_torchrl.suites.metaworld.vectorized.tables import reward_table, simulation_table
+from lw_torchrl.suites.metaworld import observation as at
+from lw_torchrl.suites.metaworld import simulated_rows, task_programs
+from lw_torchrl.suites.metaworld.dense_reward import DenseReward, EpisodeStarts
+from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, Observer, SuccessFunction
+from lw_torchrl.suites.metaworld.tables import reward_table, simulation_table
 
 FINGERS = np.array([1.0, -1.0])  # the two fingers are driven against each other by one number of the action
 
