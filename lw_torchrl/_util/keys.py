@@ -13,6 +13,10 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
 from lw_torchrl._util.checks import checker, missing_keys
+from lw_torchrl._util.rendering import naming_absent_renderer
+
+with naming_absent_renderer():  # rooms that use TorchRL import this module first
+    import torchrl.envs  # noqa: F401
 
 
 def _key(given: Any) -> NestedKey | None:
