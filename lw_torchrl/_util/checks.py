@@ -96,7 +96,7 @@ def _checked(function: Any, read_hints: Callable[[], dict[str, Any]]) -> Any:
 
 def check_value(argument: str, value: Any, hint: Any) -> Any:
     """Return ``value``, a NumPy number as Python's, if it matches a type hint; else raise :class:`ArgumentError`."""
-    if not _checker(hint)(value):
+    if not checker(hint)(value):
         choices = [choice for part in _parts(hint) if get_origin(part) is Literal for choice in get_args(part)]
         close = did_you_mean(value, map(str, choices)) if isinstance(value, str) else ""
         raise ArgumentError(f"{argument} must be {_words(hint)}, got {shown(value)}{close}")
@@ -108,16 +108,16 @@ def _plain(value: Any) -> Any:
 
 
 @cache
-def _checker(hint: Any) -> Callable[[Any], bool]:
+def checker(hint: Any) -> Callable[[Any], bool]:
     """Return a function that tells whether a value matches a type hint: beartype for all but containers, of which
     beartype looks at one random item only: it would miss wrong ones, and advance Python's random generator."""
     kind, parts = get_origin(hint), get_args(hint)
     if kind in (Union, UnionType):
-        checkers = [_checker(part) for part in parts]
-        return lambda value: any(check(value) for check in checkers)
+        alternatives = [checker(part) for part in parts]
+        return lambda value: any(check(value) for check in alternatives)
     if getattr(kind, "__module__", "") not in ("builtins", "collections.abc") or not issubclass(kind, Iterable):
         return lambda value: is_bearable(_plain(value), hint, conf=_CONF)
-    items = [_checker(part) for part in parts if part is not ...]
+    items = [checker(part) for part in parts if part is not ...]
 
     def check(value: Any) -> bool:
         if not isinstance(value, kind) or isinstance(value, (str, bytes)):  # a string is not a list of strings

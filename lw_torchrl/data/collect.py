@@ -16,7 +16,7 @@ from torch import nn
 
 from lw_torchrl._util.checks import differences, typed
 from lw_torchrl._util.files import AnyPath, flush, locked, read_json, write_json
-from lw_torchrl._util.versions import SIMULATORS, package_versions, version_changes
+from lw_torchrl._util.reproducibility import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import dataset
 from lw_torchrl.data.behaviours import Behaviour, behaviour_of
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations, write_metadata

@@ -66,9 +66,10 @@ class LanguageWorldEnv(EnvBase):
         seed: any integer; :meth:`set_seed` starts again at episode 0.
         suite: the :class:`~lw_torchrl.suites.Suite` that has the tasks, or its name; None for the one that their names
             begin with, "fetch/push", and Meta-World for those without.
-        engine: None for the suite's. Of Meta-World that is "vectorized", the fast one; "metaworld" for its own
-            environments in a loop, which gives the same numbers; or a callable ``(row_tasks, *, reward, num_threads) ->
-            Engine``.
+        engine: None for the suite's; "vectorized" for the fast one of Meta-World; "metaworld" for its own environments
+            in a loop, which gives the same numbers; another name of :data:`~lw_torchrl.suites.metaworld.ENGINES`; or a
+            callable ``(row_tasks, *, reward, num_threads) -> Engine``. By default, Meta-World runs on the fast engine,
+            or with a warning on the slow one if the installed version is not one that the fast one reproduces.
         num_threads: of the simulation, by default the cores this process may use. It never changes a result.
         reward: "sparse", the success as 0 and 1, or "dense", Meta-World's own.
         max_steps: steps of the simulation until truncation; None for the suite's, Meta-World's 500.
@@ -83,8 +84,8 @@ class LanguageWorldEnv(EnvBase):
         RuntimeError: a step of a row that has ended; a reset or step in a forked process that did not make it.
         TypeError: it is pickled or copied; pass the function that makes it.
         ValueError: the step of an engine of your own returns no EngineStep.
-        ImportError: a rendering library named by MUJOCO_GL is missing, or the vectorized engine does not know the
-            installed version of Meta-World or MuJoCo.
+        ImportError: a rendering library named by MUJOCO_GL is missing, or ``engine="vectorized"`` does not
+            reproduce the installed version of Meta-World or MuJoCo.
 
     Example:
         >>> env = LanguageWorldEnv(["reach", "push"], num_envs=4, seed=0)
@@ -106,7 +107,7 @@ class LanguageWorldEnv(EnvBase):
         num_envs: Count | None = None,
         seed: int = 0,
         suite: str | Suite | None = None,
-        engine: Literal["vectorized", "metaworld"] | Callable[..., Engine] | None = None,
+        engine: str | Callable[..., Engine] | None = None,
         num_threads: Count | None = None,
         reward: Literal["sparse", "dense"] = "sparse",
         max_steps: Count | None = None,

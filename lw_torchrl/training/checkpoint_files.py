@@ -15,8 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from lw_torchrl._util.files import AnyPath, locked
+from lw_torchrl._util.reproducibility import LIBRARIES, warn_of_other_versions
 from lw_torchrl._util.tensor_files import pop_state
-from lw_torchrl._util.versions import LIBRARIES, warn_of_other_versions
 from lw_torchrl.training.checkpoint import (
     check_same_description,
     copy_tensors,

@@ -65,6 +65,7 @@ class QueryEvaluatorConfig:
             check_value("held_out_tasks", task, str)
 
 
+@typed_fields
 @dataclass(frozen=True)
 class ImageQueryEvaluatorConfig(QueryEvaluatorConfig):
     """Hyperparameters of an :class:`ImageQueryEvaluator`'s training; others are those of :class:`QueryEvaluatorConfig`.

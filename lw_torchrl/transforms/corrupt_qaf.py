@@ -12,7 +12,7 @@ from torchrl.data import Composite, TensorSpec
 
 from lw_torchrl._util.checks import Count, Natural, Probability, missing_keys, typed
 from lw_torchrl._util.keys import as_keys, read
-from lw_torchrl._util.seeding import episode_generator
+from lw_torchrl._util.reproducibility import episode_generator
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.transforms.environment import EpisodeTransform, reset_rows

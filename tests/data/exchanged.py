@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from lw_torchrl._util.versions import package_versions
+from lw_torchrl._util.reproducibility import package_versions
 from lw_torchrl.data.dataset import DATA, CollectConfig, Demonstrations, read_metadata, write_metadata
 from lw_torchrl.data.memory_map import COLUMNS, describe_episode, write_rows
 from lw_torchrl.language.tasks import task_id

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl._util.seeding import episode_generator
+from lw_torchrl._util.reproducibility import episode_generator
 from lw_torchrl.data import BEHAVIOURS, Behaviour, CollectConfig, DatasetError, missing_episodes
 from lw_torchrl.data.behaviours import SegmentActor, segment_plans
 from lw_torchrl.data.dataset import read_metadata
