@@ -50,6 +50,8 @@ WRONG: dict[str, list[Any]] = {
     "str | Iterable[str | Task]": TASKS,
     "str | Iterable[str]": TASKS,
     "Sequence[NestedKey]": KEYS,
+    "Keys": KEYS,
+    "Width": WIDTH,
     "NestedKey": [3, [], {}, 1.5],
     "TextEncoder": FUNCTION,
     "str | torch.device": DEVICE,

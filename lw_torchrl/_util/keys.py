@@ -15,6 +15,8 @@ from torch import Tensor
 
 from lw_torchrl._util.checks import missing_keys
 
+Keys = Sequence[NestedKey]
+
 
 def _key(given: Any) -> NestedKey | None:
     """Return a key; None if it is not one. A list is a nested key too, since JSON has no tuples."""

@@ -159,7 +159,7 @@ def test_a_class_of_a_script_is_passed_by_hand(tmp_path, monkeypatch):
     path = tmp_path / "policy.safetensors"
     monkeypatch.setattr(Gated, "__module__", "__main__")
     lw.save_actor(make("decoder"), path)
-    with pytest.raises(ValueError, match=r"'__main__:Gated' is not known here: pass the class, parts=\[Gated\]"):
+    with pytest.raises(ValueError, match=r"'__main__:Gated' is not known here: pass parts=\[Gated\]"):
         lw.load_actor(path)
     assert type(lw.load_actor(path, parts=[Gated]).decoder.network) is Gated
 
