@@ -26,7 +26,19 @@ from lw_torchrl.modules.parts import (
 LEAST_STD = 1e-3
 
 
-class MLPDecoder(MLP):
+class _ActionMLP(MLP):
+    """Base of the decoders. ``squash`` can be set after construction, so it is no fixed part of the ``config``."""
+
+    _options: dict[str, Any]
+    squash: bool
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        return {**self._options, "squash": self.squash}
+
+
+class MLPDecoder(_ActionMLP):
     """The paper's action decoder, an MLP from a latent and features (..., D + F) to an action (..., A).
 
     Args:
@@ -46,19 +58,14 @@ class MLPDecoder(MLP):
     def __init__(self, *, width: Width = 256, depth: Natural = 3, actions: Count = 4, squash: bool = True) -> None:
         super().__init__(actions, width=width, depth=depth)
         self.actions, self.squash = actions, squash
-        self._sizes: dict[str, Any] = {"width": width, "depth": depth, "actions": actions}
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
-        return {**self._sizes, "squash": self.squash}
+        self._options = {"width": width, "depth": depth, "actions": actions}
 
     def forward(self, *inputs: Tensor) -> Tensor:
         action = super().forward(*inputs)
         return torch.tanh(action) if self.squash else action
 
 
-class GaussianDecoder(MLP):
+class GaussianDecoder(_ActionMLP):
     """An MLP from a latent and features (..., D + F) to mean and standard deviation of a Normal, (..., A) each.
 
     Args:
@@ -91,14 +98,9 @@ class GaussianDecoder(MLP):
             raise ValueError(f"init_std must be above {LEAST_STD}, got {init_std}")
         super().__init__(2 * actions, width=width, depth=depth)
         self.actions, self.squash = actions, squash
-        self._sizes: dict[str, Any] = {"width": width, "depth": depth, "actions": actions, "init_std": init_std}
+        self._options = {"width": width, "depth": depth, "actions": actions, "init_std": init_std}
         # The inverse of softplus, which is the identity for large numbers.
         self._offset = math.log(math.expm1(init_std - LEAST_STD)) if init_std < 20 else init_std
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
-        return {**self._sizes, "squash": self.squash}
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         loc, scale = super().forward(*inputs).chunk(2, -1)

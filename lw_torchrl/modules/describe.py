@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from inspect import signature
 from typing import Any
 
@@ -127,20 +127,7 @@ def from_description(
     if not isinstance(description, Mapping) or not isinstance(description.get("plans"), list):
         raise ValueError(f"a description must have class, options and plans, got {shown(description)}")
     plans = [Plans.from_json(row) for row in description["plans"]]
-    decoder = _Decoder(plans, text_encoder, parts)
-    decoder.check_classes({key: value for key, value in description.items() if key != "plans"})
-    return decoder.module(description)
-
-
-def _class_names(value: Any) -> Iterator[str]:
-    """Yield the name of each class in a part of a description."""
-    if isinstance(value, Mapping):
-        if isinstance(name := value.get("class"), str):
-            yield name
-        for key, each in value.items():
-            yield from _class_names([*each.values()] if key == "dict" and isinstance(each, Mapping) else each)
-    for each in value if isinstance(value, list) else ():
-        yield from _class_names(each)
+    return _Decoder(plans, text_encoder, parts).module(description)
 
 
 class _Decoder:
@@ -163,7 +150,7 @@ class _Decoder:
             if not isinstance(parts, list):
                 raise ValueError(f"parts of a {name} must be a list or a table, got {shown(parts)}")
             return _SEQUENCES[name](*map(self.module, parts))
-        kind: Any = self.find(name)
+        kind = self.find(name)
         if not isinstance(node.get("options"), Mapping):
             raise ValueError(f"options of a {name} must be a table, got {shown(node.get('options'))}")
         options = {key: self.value(value) for key, value in node["options"].items()}
@@ -175,31 +162,15 @@ class _Decoder:
         positional = [value for key, values in options.items() if key.startswith("*") for value in values]
         return rebuild(*positional, **{key: value for key, value in options.items() if not key.startswith("*")})
 
-    def check_classes(self, description: Any) -> None:
-        """Raise :class:`ValueError` that names all classes that are not known here."""
-        names = [name for name in dict.fromkeys(_class_names(description)) if self.find(name) is None]
-        if not names:
-            return
-        custom = [(place, path) for place, _, path in (name.rpartition(":") for name in names) if place]
-        places, paths = list(dict.fromkeys(place for place, _ in custom)), ", ".join(path for _, path in custom)
-        if not custom:
-            hint = ""
-        elif "__main__" in places:
-            hint = f": pass parts=[{paths}]"
-        else:
-            options = " ".join(f"--import {place}" for place in places)
-            hint = f": import {' and '.join(places)} first, on the command line by {options}, or pass parts=[{paths}]"
-        unknown = f"class {shown(names[0])} is" if len(names) == 1 else f"classes {', '.join(map(shown, names))} are"
-        raise ValueError(f"the {unknown} not known here{hint}")
-
-    def find(self, name: str) -> type[nn.Module] | None:
-        """Return the class of a name: ours, a custom one, or one of a module that is imported already; else None."""
+    def find(self, name: str) -> Any:
+        """Return the class of a name: ours, a custom one, or one of a module that is imported already."""
         from lw_torchrl import modules
 
         place, _, path = name.rpartition(":")
         kind: Any
-        if name in _SEQUENCES or name == "TensorDictModule":
-            kind = _SEQUENCES.get(name, TensorDictModule)
+        hint = ""
+        if name == "TensorDictModule":
+            kind = TensorDictModule
         elif not place:
             kind = getattr(modules, path, None) if path.isidentifier() else None
         elif place == "torch.nn":
@@ -208,7 +179,11 @@ class _Decoder:
             kind = self.custom.get(name) or sys.modules.get(place)
             for step in path.split(".") if not isinstance(kind, type) else ():
                 kind = getattr(kind, step, None)
-        return kind if isinstance(kind, type) and issubclass(kind, nn.Module) else None
+            by_import = f"import {place} first, on the command line by --import {place}, or " * (place != "__main__")
+            hint = f": {by_import}pass parts=[{path}]"
+        if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
+            raise ValueError(f"the class {shown(name)} is not known here{hint}")
+        return kind
 
     def value(self, value: Any) -> Any:
         if isinstance(value, list):

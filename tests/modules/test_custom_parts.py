@@ -127,7 +127,7 @@ def test_an_assigned_part_is_saved_or_refused(tmp_path):
     lw.save_actor(actor, path)
     assert torch.equal(action_of(lw.load_actor(path), rows), action_of(actor, rows))
     actor.decoder = MLPDecoder(width=4)
-    actor.decoder.network._sizes["width"] = 5  # a config that is not the network's
+    actor.decoder.network._options["width"] = 5  # a config that is not the network's
     with pytest.raises(ValueError, match="its description does not rebuild it"):
         lw.save_actor(actor, path)
 
