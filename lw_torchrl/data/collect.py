@@ -23,7 +23,7 @@ from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations,
 from lw_torchrl.data.memory_map import describe_episode, verify, write_rows
 from lw_torchrl.data.missing_episodes import EpisodeFiles, run_missing_episodes
 from lw_torchrl.language.tasks import task_id
-from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.parts import evaluating
 from lw_torchrl.modules.policy import tasks_of
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 

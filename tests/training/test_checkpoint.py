@@ -193,7 +193,7 @@ def pruned(actor):
 
 
 def reconfigured(actor):
-    actor.decoder.network._sizes["width"] = 32
+    actor.decoder.network._options["width"] = 32
     return actor
 
 
