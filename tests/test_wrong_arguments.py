@@ -32,8 +32,8 @@ MORE = {
     ),
     "record": ("RolloutRecorder",),
     "training": (
-        "ImageQueryEvaluatorConfig", "ImageQueryEvaluatorTrainer", "LabelledQueries", "QueryEvaluatorConfig",
-        "QueryEvaluatorTrainer", "load_evaluator", "save_evaluator",
+        "ImageQueryEvaluatorConfig", "LabelledQueries", "QueryEvaluatorConfig", "QueryEvaluatorTrainer",
+        "load_evaluator", "save_evaluator",
     ),
     "transforms": ("CameraTransform", "EnvState", "HideOpening", "JitterTarget", "SwapUnmentioned"),
 }  # fmt: skip

@@ -150,8 +150,6 @@ for name in [
 ]:
     WRONG[name] = A_CLASS
 OF_ONE_NAME: dict[str, list[Any]] = {
-    "ImageQueryEvaluatorTrainer.evaluator": A_CLASS,
-    "ImageQueryEvaluatorTrainer.config": A_CLASS,
     "ImageQueryEvaluator.names": ["gripper", 3, [3]],  # those that a plan speaks of must be there
     "resolve_tasks.tasks": [3, "MT10", ["reach"]],
     "OfflineTrainer.loss": A_CLASS,
@@ -181,7 +179,6 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
     actor = lw.PlanConditionedActor(plans)
     expert = lw.ExpertActor("reach")
     evaluator = lw.StateQueryEvaluator(plans, width=8)
-    images = lw.modules.ImageQueryEvaluator(plans, width=8)
     config = lw.training.QueryEvaluatorConfig(steps=1, batch_size=2, held_out_states=0.0, held_out_pairs=0.0)
     data = lw.training.LabelledQueries(replay, config)
     value = lw.PlanConditionedValue(plans, width=8)
@@ -213,11 +210,6 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "HideOpening": {"probability": 0.5},
         "ImageQueryEvaluator": {"plans": plans, "width": 8},
         "ImageQueryEvaluatorConfig": {},
-        "ImageQueryEvaluatorTrainer": {
-            "evaluator": images,
-            "data": data,
-            "config": lw.training.ImageQueryEvaluatorConfig(),
-        },
         "JitterTarget": {"plans": lw.canonical_plans(plans), "std": 0.03},
         "LabelledQueries": {"replay": replay, "config": config},
         "LanguageWorldEnv": {"tasks": "reach"},
