@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, Literal
 
-from lw_torchrl._util.checks import Count, Natural, Positive, check_value, shown, typed_fields
+from lw_torchrl._util.checks import Count, Natural, Positive, shown, typed_fields
 from lw_torchrl._util.registry import ReadOnlyDict
 
 
@@ -77,8 +77,6 @@ class Layout:
                 raise ValueError(f"{name} of {layout} must be within {self.action_size} numbers, got {index}")
         if self.displacement is not None and self.gripper in range(self.displacement, self.displacement + 3):
             raise ValueError(f"gripper of {layout} must not be an index of the displacement, got {self.gripper}")
-        for relation, threshold in self.thresholds.items():
-            check_value(f"thresholds of {layout}: {relation!r}", threshold, float)
         object.__setattr__(self, "thresholds", ReadOnlyDict(dict(self.thresholds)))
         for name in ("present", "positions", "all_positions", "parts"):
             getattr(self, name)  # computed here: torch.compile cannot trace the lock of a cached_property

@@ -7,12 +7,11 @@ import pytest
 from fake_server import PLANS, FakeServer, completion, error, shipped
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from lw_torchrl.planners.answer_files import Reply
 
 import lw_torchrl as lw
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.planners import plan_schema
-from lw_torchrl.planners.answer_files import read_reply
+from lw_torchrl.planners.answer_files import Reply, read_reply
 from lw_torchrl.planners.prompts import passes, read_structured, write_structured
 
 OTHER_WORDS = lw.load_plans("MT50", skills="MT10")

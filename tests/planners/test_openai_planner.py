@@ -11,7 +11,8 @@ import pytest
 from fake_server import PLANS, Failure, FakeServer, asked_for, completion, error, shipped
 
 import lw_torchrl as lw
-from lw_torchrl.planners import PlannerError, Tokens, openai_planner
+from lw_torchrl.planners import PlannerError, Tokens
+from lw_torchrl.planners.openai_planner import REPLY_LIMIT
 
 KEY = "sk-a-secret-of-the-tests"
 
@@ -105,7 +106,7 @@ FAILURES = {
         "answer within 0.4 s, asked 1 time",
         "longer",
     ),
-    "a large reply": (Failure(200, completion("x" * openai_planner.REPLY_LIMIT)), "larger than 4 MiB", "fewer max_tokens"),
+    "a large reply": (Failure(200, completion("x" * REPLY_LIMIT)), "larger than 4 MiB", "fewer max_tokens"),
 }
 
 
