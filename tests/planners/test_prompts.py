@@ -13,7 +13,7 @@ PLANS = {skills: lw.load_plans("MT50", skills=skills) for skills in ("own", "MT1
 
 
 @pytest.mark.parametrize("format", lw.PLAN_FORMATS)
-def test_no_prompt_holds_the_plan_it_asks_for_or_is_too_long(format):
+def test_a_prompt_is_short_and_lacks_the_task_s_own_plan(format):
     for number, task in enumerate(lw.MT50):
         vocabulary = number % 2 == 0
         prompt = lw.plan_prompt(task, format, vocabulary=vocabulary)
@@ -26,14 +26,14 @@ def test_no_prompt_holds_the_plan_it_asks_for_or_is_too_long(format):
 
 
 @pytest.mark.parametrize("format", lw.PLAN_FORMATS)
-def test_a_prompt_holds_the_plans_of_its_examples(format):
+def test_a_prompt_contains_the_plans_of_its_examples(format):
     for task in ("pick-place", "stick-pull", "handle-press-side"):
         for example in prompt_examples(task):
             assert lw.decode_plan(lw.plan_prompt(task, format), example.task, format).plan == example
 
 
 @pytest.mark.parametrize("format", lw.PLAN_FORMATS)
-def test_what_follows_a_prompt_is_an_answer(format):
+def test_a_continuation_of_a_prompt_is_an_answer(format):
     """A model that completes texts answers with the rest of the plan, without its first lines."""
     plan = PLANS["own"]["drawer-open"]
     whole = lw.encode_plan(plan, format)
@@ -67,7 +67,7 @@ def test_the_task_comes_last_in_the_format():
     assert last == "The task `drawer-open`: Take hold of the drawer handle and pull the drawer open."
 
 
-def test_plans_and_tasks_of_ones_own(tmp_path):
+def test_custom_plans_and_tasks(tmp_path):
     (tmp_path / "tasks.toml").write_text('[stack]\ndescription = "Stack it."\nobjects.brick = "obs[4:7]"\n')
     tasks = lw.load_tasks(tmp_path / "tasks.toml")
     mine = lw.Plans([PLANS["own"]["hammer"]])
@@ -75,5 +75,5 @@ def test_plans_and_tasks_of_ones_own(tmp_path):
     assert "def hammer(robot):" in prompt
     assert "# The things in stack are: the robot's gripper, the brick." in prompt
     assert prompt.endswith("# stack: Stack it.\ndef stack(robot):\n")
-    with pytest.raises(ValueError, match="plans must hold one of another task than 'hammer'"):
+    with pytest.raises(ValueError, match=r"plans .*'hammer'"):
         lw.plan_prompt("hammer", "basic_py", plans=mine)

@@ -113,7 +113,7 @@ def test_rounds_limit_the_requests(planner):
     assert "no plan was found" in server.requests[-1]["messages"][-1]["content"]
 
 
-def test_the_model_is_told_that_its_json_was_cut_off(planner):
+def test_the_report_says_that_the_json_was_cut_off(planner):
     whole = write_structured(PLANS["push"], PLAN_FORMATS["chain_py"].style)
     server = FakeServer(lambda body: completion(whole[: whole.index('"skill"', 900)], "length"))
     with serving(server) as address:
@@ -130,7 +130,7 @@ def test_answers_and_facts_must_agree(planner):
     with serving(FakeServer()) as address:
         model = planner(address)
         answers = [*model.plans("push", progress=False), *model.plans("push", format="basic_py", progress=False)]
-        with pytest.raises(ValueError, match="of one format, each with its facts, got 2 answers of basic_py, chain_py"):
+        with pytest.raises(ValueError, match=r"answers .*basic_py, chain_py"):
             model.revise(answers, ["a", "b"])
-        with pytest.raises(ValueError, match="got 1 answer of chain_py and 2 facts"):
+        with pytest.raises(ValueError, match=r"answers .*2 facts"):
             model.revise(answers[:1], ["a", "b"])

@@ -111,23 +111,10 @@ class PythonReading(Reading):
         self.blocks: list[_Block] = []
         self.reason: list[str] = []
         self.listing = False
-        self.ignored: tuple[int, int, str] | None = None  # lines outside a plan: first and last number, first line
+        self.is_outside = False  # whether the last line was not part of a plan
         for number, line in _statements(text):
             if not self.read(number, line):
                 break
-        self.flush()
-
-    def note(self, line: int, text: str) -> None:
-        self.flush()
-        super().note(line, text)
-
-    def flush(self) -> None:
-        """Add a note on the lines that were skipped."""
-        if self.ignored is not None:
-            first, last, line = self.ignored
-            self.ignored = None
-            which = "is" if first == last else f"to line {last} are"
-            super().note(first, f"{which} not part of a plan: {shown(line.strip())}")
 
     def read(self, number: int, line: str) -> bool:
         """Read a line; return False if the answer ends with it."""
@@ -138,7 +125,6 @@ class PythonReading(Reading):
         if code.startswith("#"):
             self.comment(number, line)
         elif code.startswith(("```", "~~~")):
-            self.flush()
             self.blocks.clear()
         elif code:
             self.listing = False
@@ -178,16 +164,17 @@ class PythonReading(Reading):
         if definition := _DEF.match(code):
             self.open(_task_name(definition[1]), number)
         elif branch:
-            self.flush()
             self.branch(number, indent, code, branch)
         elif call:
-            self.flush()
             self.call(number, indent, code, call)
         elif code.startswith("robot."):
             self.note(number, f"is cut off: {shown(code)}")
         else:
-            first = self.ignored or (number, number, line)
-            self.ignored = (first[0], number, first[2])
+            if not self.is_outside:  # one note for several such lines
+                self.note(number, f"is not part of a plan: {shown(code)}")
+            self.is_outside = True
+            return
+        self.is_outside = False
 
     def branch(self, number: int, indent: int, code: str, branch: re.Match[str]) -> None:
         condition, rest = (None, code[branch.end() :]) if branch[2] else self.condition(number, code, branch.end())
