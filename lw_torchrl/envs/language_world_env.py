@@ -280,7 +280,7 @@ class LanguageWorldEnv(EnvBase):
             rows: which to draw, by their numbers; None for all.
 
         Raises:
-            RuntimeError: a row was not reset, or the process was forked from one that took pictures.
+            RuntimeError: a row was not reset, or the process was forked from one that rendered.
             ImportError: there is no OpenGL; it names what to install.
             NotImplementedError: your own engine has no ``render``.
         """
