@@ -80,7 +80,7 @@ def test_plugins_are_listed_without_import_and_loaded_by_name(plugin):
     ("name", "message"),
     [
         ("broken", r"method 'broken', no_such_module:broken of the package my-plugin,.*ModuleNotFoundError"),
-        ("uncallable", r"method 'uncallable', my_plugin:FAR of the package my-plugin,.*must be a function of plans"),
+        ("uncallable", r"method 'uncallable', my_plugin:FAR of the package my-plugin,.*must be a function"),
     ],
 )
 def test_broken_plugin_is_named_and_others_work(plugin, name, message):
@@ -126,5 +126,5 @@ def test_string_is_imported_at_its_first_use():
 
 
 def test_methods_must_be_functions():
-    with pytest.raises(TypeError, match="method 'mine' must be a function of plans, got 'PlanConditionedActor'"):
+    with pytest.raises(TypeError, match="'mine' must be a function, got 'PlanConditionedActor'"):
         METHODS["mine"] = "PlanConditionedActor"

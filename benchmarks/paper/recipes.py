@@ -13,8 +13,8 @@ from benchmarks.paper.actors import Parts, reads_plans
 from lw_torchrl._util.checks import Count, Probability, Scale, typed_fields
 from lw_torchrl._util.files import read_toml
 from lw_torchrl.data import BEHAVIOURS, EpisodeFilter
+from lw_torchrl.data.rewards import RewardName
 from lw_torchrl.data.selection import Label
-from lw_torchrl.data.storage import RewardName
 from lw_torchrl.language.tasks import MT10
 from lw_torchrl.training.cloning import BehavioralCloningConfig
 

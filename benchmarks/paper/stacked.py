@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Unpack
 
 import torch
@@ -82,7 +83,7 @@ class StackedBehavioralCloning(Training):
             check_can_be_saved(actors[0])
             self.description = {
                 "actor": describe(actors[0]) | {"number": len(actors)},
-                "training": config.describe(),
+                "training": asdict(config),
                 "data": {str(number): describe_data(replay) for number, replay in enumerate(replays)},
                 "replay": {str(number): describe_replay(replay) for number, replay in enumerate(replays)},
             }

@@ -18,6 +18,8 @@ from lw_torchrl._util.rendering import naming_absent_renderer
 with naming_absent_renderer():  # rooms that use TorchRL import this module first
     import torchrl.envs  # noqa: F401
 
+Keys = Sequence[NestedKey]
+
 
 def _key(given: Any) -> NestedKey | None:
     """Return a key; None if it is not one. A list is a nested key too, since JSON has no tuples."""

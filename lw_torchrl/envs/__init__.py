@@ -1,4 +1,4 @@
-"""The environment, the engines behind it, and the scripted experts."""
+"""The batched environment, its simulation engines, and the scripted experts."""
 
 import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
