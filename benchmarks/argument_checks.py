@@ -16,8 +16,8 @@ PACKAGE = Path(__file__).resolve().parents[1] / "lw_torchrl"
 
 @dataclass(frozen=True)
 class Arguments:
-    """Count lines that check arguments or word errors: ``raise``, ``if`` blocks that only raise, functions and statements
-    named check..., decorators that check annotations, and the whole of checks.py."""
+    """Count lines that check arguments or word errors: ``raise``, ``if`` blocks that only raise, functions and
+    statements named check..., decorators that check annotations, and the whole of checks.py."""
 
     package: Path = PACKAGE
     """Folder of a package."""
