@@ -89,8 +89,8 @@ def _changes(function: ast.FunctionDef, lines: list[str]) -> Iterator[tuple[int,
         if (operands := _operands(node)) is not None:
             operator, left, right = operands
             between = line[left.end_col_offset : right.col_offset]
-            if type(operator) in OPERATORS and left.end_lineno == right.lineno == node.end_lineno:  # type:
-                ignore[attr-defined] changed = between.replace(between.strip(" ()"), OPERATORS[type(operator)])
+            if type(operator) in OPERATORS and left.end_lineno == right.lineno == node.end_lineno:  # type: ignore[attr-defined]
+                changed = between.replace(between.strip(" ()"), OPERATORS[type(operator)])
                 yield number, line[: left.end_col_offset] + changed + line[right.col_offset :]
         elif isinstance(node, ast.Constant) and isinstance(node.value, int):
             changed = str(not node.value) if isinstance(node.value, bool) else str(node.value + 1)
