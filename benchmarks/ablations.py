@@ -105,9 +105,9 @@ PATCHES: Mapping[str, Callable[[], AbstractContextManager[Any]]] = MappingProxyT
 
 @dataclass(frozen=True)
 class Arguments:
-    """Train PCBC with one ingredient of the recipe changed at a time. If the command is stopped, run it again to
-    resume.
-        A seed of one change takes 3 to 8 minutes few-shot, 3 zero-shot.
+    """Train PCBC with one ingredient of the recipe changed at a time.
+
+    If the command is stopped, run it again to resume. A seed of one change takes 3 to 8 minutes few-shot, 3 zero-shot.
     """
 
     setting: Setting = "few-shot"
