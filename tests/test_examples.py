@@ -190,7 +190,7 @@ def test_the_tour_is_kept_with_what_it_shows():
     kinds, text = shown(TOUR)
     assert kinds.count("image/png") == 4
     assert "error" not in kinds
-    assert "WebPage" in text
+    assert "lw-torchrl view" in text
     assert "stderr" not in text
     assert TOUR.stat().st_size < 300_000
 

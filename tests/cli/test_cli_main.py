@@ -54,7 +54,7 @@ for command in ([], ["train"], ["evaluate"]):
         main([*command, "--help"])
     except SystemExit:
         pass
-print([name for name in ("torch", "numpy", "torchrl", "mujoco", "rich") if name in sys.modules])
+print([name for name in ("torch", "torchrl", "mujoco", "rich") if name in sys.modules])
 """
     assert python(program).stdout.splitlines()[-1] == "[]"
 
@@ -68,7 +68,7 @@ print([name for name in ("torch", "numpy", "torchrl", "mujoco", "rich") if name 
         (["tasks", "raech"], "did you mean 'reach'"),
         (["tasks", "--import", "no_such_module"], "No module named 'no_such_module'"),
         (["evaluate", "nowhere.safetensors"], "no file 'nowhere.safetensors'"),
-        (["collect", "reach", "--out", "OUT", "--episodes", "0"], "must be at least 1, got 0"),
+        (["collect", "reach", "--out", "OUT", "--episodes", "0"], "--episodes must be at least 1, got 0"),
         (["train", "nowhere", "--out", "OUT"], "nowhere"),
         (["view", "nowhere.rrd"], "nowhere.rrd"),
         (["check", "nowhere.plan"], "no file, folder or suite 'nowhere.plan'"),

@@ -173,7 +173,7 @@ def test_repair_begins_with_the_answers_that_generate_wrote_and_replaces_none(ca
         assert len(server.requests) == 2
         assert [message["content"] for message in server.requests[1]["messages"]][2] == text
         assert first.read_text() == text
-        assert "1 first answer, 0 asked now" in printed
+        assert "1 first answer, 0 requested now" in printed
         assert printed.endswith(f"written to {tmp_path / 'plans/m'}, {tmp_path / 'plans/m-round1'}\n")
         more = ("plan", "repair", "reach", "--base-url", address, "--attempts", 2, *options)
         assert "seed (7, now None)" in fails(capsys, *more)
