@@ -75,7 +75,7 @@ class Rollout:
         return policy, plans, evaluator
 
     def _policy(self, name: str, tasks: list[str]) -> tuple[Any, Plans | None]:
-        from lw_torchrl.data.behaviours import BEHAVIOURS
+        from lw_torchrl.data.collection_policy import BEHAVIOURS
         from lw_torchrl.modules.wrappers import TransferredActor
         from lw_torchrl.training.checkpoint import demonstration_seeds
 
@@ -99,8 +99,8 @@ class Rollout:
 
     def _behaviour(self, name: str, tasks: list[str]) -> tuple[Any, Plans | None]:
         """Return a scripted policy and the plans to show."""
-        from lw_torchrl.data.behaviours import SegmentActor, behaviour_of
-        from lw_torchrl.data.missing_episodes import suite_expert
+        from lw_torchrl.data.collect import suite_expert
+        from lw_torchrl.data.collection_policy import SegmentActor, behaviour_of
         from lw_torchrl.suites.suite import find_suite
 
         suite = self.chosen_suite or find_suite(tasks)
@@ -148,7 +148,7 @@ class Evaluate:
     rollout: OmitArgPrefixes[Rollout] = field(default_factory=Rollout)
 
     def run(self) -> Output:
-        from lw_torchrl.data.behaviours import BEHAVIOURS
+        from lw_torchrl.data.collection_policy import BEHAVIOURS
         from lw_torchrl.training.checkpoint import demonstrated_tasks
 
         rollout = self.rollout

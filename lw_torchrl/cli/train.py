@@ -306,9 +306,9 @@ class TrainEvaluator:
         labelled = lw.training.LabelledQueries(replay, config)
         if not any(queries for name, queries in labelled.parts.items() if name != "training"):
             raise ValueError("nothing is held out to score the evaluator on; collect at least --episodes 2")
-        make = lw.training.ImageQueryEvaluatorTrainer if self.cameras else lw.training.QueryEvaluatorTrainer
         file = self.out / "evaluator.safetensors"
-        loss = make(evaluator, labelled, config, checkpoint=file, device=self.device).train()
+        trainer = lw.training.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=file, device=self.device)
+        loss = trainer.train()
         evaluator.cpu()
         output = Output(self.json).show("evaluator", file).show("steps", config.steps)
         output.show("loss", loss, _trained(config.steps, loss))
