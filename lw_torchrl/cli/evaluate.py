@@ -76,25 +76,26 @@ class Rollout:
 
     def _policy(self, name: str, tasks: list[str]) -> tuple[Any, Plans | None]:
         from lw_torchrl.data.collection_policy import BEHAVIOURS
+        from lw_torchrl.language.canonical import canonical_like
         from lw_torchrl.modules.wrappers import TransferredActor
         from lw_torchrl.training.checkpoint import demonstration_seeds
 
-        suite, plans = self.chosen_suite, self.own_plans
         if name in BEHAVIOURS:
             return self._behaviour(name, tasks)
+        suite, plans = self.chosen_suite, self.own_plans
         if options.is_object(name):
             policy = options.read_object(name)
-            policy = policy if plans is None else _with_plans(policy, plans)
-            return policy, lw.modules.plans_of(policy)
-        if self.seed in demonstration_seeds(name):
+        elif self.seed in demonstration_seeds(name):
             raise ValueError(f"--seed {self.seed} is the seed of the demonstrations; evaluate on a different one")
-        policy = lw.load_actor(name, text_encoder=options.read_encoder(self.text_encoder))
-        if suite is not None and lw.modules.layout_of(policy) != suite.layout:
-            if (plans := plans or suite.plans) is None:
-                raise ValueError(f"suite {suite.name!r} has no plans; give some by --plans")
-            policy = TransferredActor(policy, _like(plans, policy), speed=self.speed)
-        elif plans is not None:
-            policy = _with_plans(policy, plans)
+        else:
+            policy = lw.load_actor(name, text_encoder=options.read_encoder(self.text_encoder))
+            if suite is not None and lw.modules.layout_of(policy) != suite.layout:  # a policy of another robot
+                if (plans := plans or suite.plans) is None:
+                    raise ValueError(f"suite {suite.name!r} has no plans; give some by --plans")
+                plans = canonical_like(plans, lw.modules.plans_of(policy))
+                policy, plans = TransferredActor(policy, plans, speed=self.speed), None
+        if plans is not None:
+            policy = lw.modules.with_plans(policy, canonical_like(plans, lw.modules.plans_of(policy)))
         return policy, lw.modules.plans_of(policy)
 
     def _behaviour(self, name: str, tasks: list[str]) -> tuple[Any, Plans | None]:
@@ -116,17 +117,6 @@ class Rollout:
             return lw.ScriptedSkillActor(plans, skills=skills), plans
         behaviour = behaviour_of(name, tasks, suite=suite)
         return SegmentActor(behaviour, plans, self.seed, self.max_steps or suite.max_steps, skills=skills), plans
-
-
-def _with_plans(policy: Any, plans: Plans) -> Any:
-    return lw.modules.with_plans(policy, _like(plans, policy))
-
-
-def _like(plans: Plans, policy: Any) -> Plans:
-    """Return plans in the form of the plans that a policy was trained with."""
-    from lw_torchrl.language.canonical import canonical_like
-
-    return canonical_like(plans, lw.modules.plans_of(policy))
 
 
 @dataclass(kw_only=True)

@@ -45,16 +45,14 @@ class Train:
     loss: Annotated[Literal["bc", "advantage", "iql", "td3-bc", "cql"], arg(help=_LOSS)] = "bc"
     method: Annotated[str, arg(help=_METHOD)] = "pcbc"
     features: Maybe[Literal["raw", "differences", "relative", "both"]] = None
-    """features of the state: raw (the observation), differences (between hand, objects and goal; the default), relative
-    (differences without the hand's height and the gripper's opening), or both (raw and differences)"""
+    """features of the state: raw (the observation), differences (between hand, objects and goal; the default), both, or
+    relative (differences without the hand's height and the gripper's opening)"""
     width: Maybe[Count] = None  # units of each hidden layer (default: 256)
     depth: Maybe[Natural] = None  # number of hidden layers (default: 3)
     after_success: Natural = 20  # with --loss bc, drop steps more than N steps after the first success
     reward: Literal["sparse", "dense", "cost", "dense_cost"] = "dense_cost"  # reward of the losses other than bc
     begin: Maybe[Path] = None  # fine-tune this policy file, with its plans, network and normalisation
     evaluator: options.Evaluator = None
-    answers: Maybe[Literal["soft", "hard"]] = None
-    """answers of --evaluator: soft (probabilities) or hard (0 or 1); by default soft, or hard with --begin"""
     qaf_anchor: Scale = 0.0  # weight of the cross entropy with the exact answers; use 1 for a new evaluator
     steps: Maybe[Count] = None  # number of minibatches (default: 8000 with --loss bc, else 4000)
     batch_size: Maybe[Count] = None  # rows in a minibatch, equally many of each task (default: 500 with bc, else 250)
@@ -107,8 +105,6 @@ class Train:
             raise ValueError("--out must be a different file from --begin")
         if self.loss != "bc" and (self.evaluator is not None or self.qaf_anchor):
             raise ValueError("--evaluator and --qaf-anchor only apply to --loss bc")
-        if self.answers is not None and self.evaluator is None:
-            raise ValueError("--answers requires --evaluator")
 
     @property
     def _numbers(self) -> dict[str, Any]:
@@ -186,7 +182,7 @@ class Train:
             actor = make_policy(self.method, lw.Plans({task: plans[task] for task in tasks}), **parts)
         if self.evaluator is None:
             return actor
-        return TensorDictSequential(self._read_evaluator(plans, self.answers or "soft"), actor)
+        return TensorDictSequential(self._read_evaluator(plans, "soft"), actor)
 
     def _begun_actor(self) -> Any:
         """Load the policy of --begin, with its evaluator in front."""
@@ -202,7 +198,7 @@ class Train:
             return actor
         if "qaf" not in actor.in_keys or (own := plans_of(actor)) is None:
             raise ValueError(f"--evaluator requires a policy that reads qaf, --begin is a {type(actor).__name__}")
-        return TensorDictSequential(self._read_evaluator(own, self.answers or "hard"), actor)
+        return TensorDictSequential(self._read_evaluator(own, "hard"), actor)
 
     def _read_evaluator(self, plans: lw.Plans, answers: Literal["soft", "hard"]) -> lw.QueryEvaluator:
         assert self.evaluator is not None

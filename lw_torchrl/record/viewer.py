@@ -68,6 +68,8 @@ def open_viewer(
     Example:
         >>> open_viewer("runs/demo", screenshot="rollout.png", episode="drawer-open", step=75)  # doctest: +SKIP
     """
+    from rerun.chunk import RrdReader
+
     paths = [path] if isinstance(path, (str, os.PathLike)) else path
     recordings = [file for place in paths for file in find_recordings(place)]
     if screenshot is not None and Path(screenshot).suffix != ".png":
@@ -81,14 +83,15 @@ def open_viewer(
         openings: dict[str, Opening] = {}
         unknown: list[ValueError] = []
         for file in files:
-            reader, known, tabs = read_recording(file)
-            front = episode
-            try:
-                openings[known.recording_id] = _opening(tabs, front, step)
-            except ValueError as error:
-                unknown.append(error)
-                front = None
-                openings[known.recording_id] = _opening(tabs, front, None)
+            reader = RrdReader(file)
+            known, tabs, front, at = reader.recordings()[0], Tabs.read(reader), episode, step
+            if tabs is not None and episode is not None:
+                try:
+                    tabs.index(episode)
+                except ValueError as error:
+                    unknown.append(error)
+                    front = at = None
+            openings[known.recording_id] = Opening.of(tabs, front, at)
             # A recording that was never closed has no layout; a web viewer's front tab is set by its layout.
             if tabs is not None and (not reader.blueprints() or (web_port is not None and front is not None)):
                 layouts.append(folder / f"{known.recording_id}.rbl")
@@ -154,14 +157,6 @@ def readable(recording: Path) -> Iterator[Path]:
         yield copy
 
 
-def read_recording(file: Path) -> tuple[Any, Any, Tabs | None]:
-    """Return a reader of a recording, its ids and its tabs; None for another program's, which has its own layout."""
-    from rerun.chunk import RrdReader
-
-    reader = RrdReader(file)
-    return reader, reader.recordings()[0], Tabs.read(reader)
-
-
 class Opening(NamedTuple):
     """Where to open a recording: the index of a tab, a timeline and a step; None leaves the viewer's choice."""
 
@@ -169,12 +164,13 @@ class Opening(NamedTuple):
     timeline: str | None
     step: int | None
 
-
-def _opening(tabs: Tabs | None, episode: str | None, step: int | None) -> Opening:
-    if tabs is None:
-        return Opening(None, None, step)
-    number = None if episode is None else tabs.index(episode)
-    return Opening(number, tabs.tab(episode).timeline, tabs.opening_step(episode) if step is None else step)
+    @classmethod
+    def of(cls, tabs: Tabs | None, episode: str | None, step: int | None) -> Opening:
+        """Return where to open a tab; another program's recording, without our tabs, has its own layout."""
+        if tabs is None:
+            return cls(None, None, step)
+        number = None if episode is None else tabs.index(episode)
+        return cls(number, tabs.tab(episode).timeline, tabs.opening_step(episode) if step is None else step)
 
 
 def _connect(process: subprocess.Popen[bytes], port: str, recordings: int) -> Any:
