@@ -91,3 +91,17 @@ def rows_for(actor, *shape, seed=0):
 
 def action_of(actor, rows):
     return actor(rows.copy())["action"]
+
+
+def assert_a_logit_for_each_step(evaluator, rows):
+    """Check an evaluator's logits for 64 rows, the size of evaluation's blocks, in any order and shape."""
+    logits = evaluator(rows.clone())["qaf_logits"]
+    assert logits.shape == (64, evaluator.plans.num_steps)
+    assert logits.dtype == torch.float32
+    for row, task in enumerate(rows["task_id"].tolist()):
+        steps = len(evaluator.plans[lw.MT50[task]].steps)
+        assert (logits[row, :steps].abs() <= 31).all()
+        assert (logits[row, steps:] == -1e4).all()
+    order = torch.randperm(64, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(evaluator(rows[order])["qaf_logits"], logits[order])
+    assert torch.equal(evaluator(rows.reshape(4, 16))["qaf_logits"].reshape(64, -1), logits)

@@ -32,7 +32,7 @@ def weights(qaf, task_ids):
     return PlanAttention(PLANS)(TensorDict({"qaf": qaf, "task_id": task_ids}, task_ids.shape))["skill_weights"]
 
 
-def test_the_softmax_by_hand():
+def test_weights_are_the_softmax_by_hand():
     found = weights([[True, False, True, False], [False, True, False, False]], [PUSH, REACH])
     high, low = math.exp(5), math.exp(-5)
     push = [high, low, high, low]
@@ -46,7 +46,7 @@ def test_without_a_true_condition_attention_is_uniform():
     torch.testing.assert_close(found, torch.tensor([[0.25] * 4, [0.5, 0.5, 0, 0], [1.0, 0, 0, 0]]))
 
 
-def test_the_gradient_reaches_soft_truth_but_not_padding():
+def test_gradient_reaches_soft_truth_but_not_padding():
     qaf = torch.full((1, 4), 0.5, requires_grad=True)
     weights(qaf, [REACH])[0, 0].backward()
     assert qaf.grad[0, 0] > 0
@@ -74,15 +74,15 @@ def test_a_task_without_a_plan_is_named():
         weights(torch.zeros(3, 4), [task_id("lever-pull"), REACH, task_id("box-close")])
 
 
-@pytest.mark.parametrize("wrong", [-1, 50, 1000])
-def test_a_task_id_that_does_not_exist_is_named(wrong):
-    with pytest.raises(ValueError, match=f"task_id.*{wrong}"):
+@pytest.mark.parametrize("wrong", [-1, 50, 1000, 4.0])
+def test_unknown_task_ids_are_refused(wrong):
+    with pytest.raises(ValueError, match="task_id"):
         weights(torch.zeros(2, 4), [REACH, wrong])
 
 
 @pytest.mark.parametrize("shape", [(2, 3), (2, 5), (2, 1, 4)])
 def test_qaf_of_another_shape_is_refused(shape):
-    with pytest.raises(ValueError, match=r"qaf must have shape \(2, 4\).*QAFTransform the same plans"):
+    with pytest.raises(ValueError, match="qaf"):
         weights(torch.zeros(shape), [REACH, PUSH])
 
 
@@ -94,7 +94,7 @@ def test_a_plain_mapping_is_accepted_as_plans():
 
 @pytest.mark.parametrize("wrong", [math.nan, 100.0, -0.1, math.inf])
 def test_soft_truth_outside_0_to_1_is_refused(wrong):
-    with pytest.raises(ValueError, match="qaf must be bool, or numbers from 0 to 1"):
+    with pytest.raises(ValueError, match="qaf"):
         weights(torch.tensor([[0.5, wrong, 0.0, 0.0]]), [REACH])
     assert weights(torch.tensor([[0.0, 1.0, 0.0, 0.0]]), [REACH]).sum() == 1
 
@@ -121,7 +121,7 @@ def test_a_wider_qaf_is_read_if_qaf_plan_shows_the_same_plan():
     scripted = lw.ScriptedSkillActor(two)
     assert torch.equal(scripted(wide.clone())["action"], scripted(narrow)["action"])
     for module in (attention, scripted):
-        with pytest.raises(ValueError, match="qaf must have shape"):
+        with pytest.raises(ValueError, match="qaf"):
             module(wide.exclude("qaf_plan"))
     assert lw.PlanConditionedQValue(two)(wide.set("action", torch.zeros(5, 4)))["state_action_value"].shape == (5, 1)
 
@@ -141,7 +141,7 @@ def test_fallback_steps_have_their_own_turns(turn):
     assert not found[:, ~active].any()
 
 
-def test_it_follows_other_plans_with_the_same_keys():
+def test_with_plans_keeps_the_keys():
     attention = PlanAttention(PLANS, in_keys=["truth", ("words", "task")], out_keys=["weights"])
     other = attention.with_plans(Plans([make_plan("reach", 3)]))
     assert (other.in_keys, other.out_keys) == (attention.in_keys, ["weights"])
