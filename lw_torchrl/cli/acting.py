@@ -75,8 +75,8 @@ class Acting:
         return policy, plans, evaluator
 
     def _policy(self, who: str, tasks: list[str]) -> tuple[Any, Plans | None]:
-        from lw_torchrl.data.behaviours import BEHAVIOURS, SegmentActor, behaviour_of
-        from lw_torchrl.data.missing_episodes import suite_expert
+        from lw_torchrl.data.collect import suite_expert
+        from lw_torchrl.data.collection_policy import BEHAVIOURS, SegmentActor, behaviour_of
         from lw_torchrl.modules.wrappers import TransferredActor
         from lw_torchrl.suites.suite import find_suite
         from lw_torchrl.training.checkpoint import demonstration_seeds

@@ -56,7 +56,7 @@ class Collect:
 
     def run(self) -> Output:
         from lw_torchrl._util.devices import place
-        from lw_torchrl.data.behaviours import BEHAVIOURS
+        from lw_torchrl.data.collection_policy import BEHAVIOURS
 
         suite = options.read_suite(self.suite, self.tasks)
         tasks = options.select_tasks(self.tasks, options.read_tasks(self.task_file, self.tasks), suite)
@@ -178,7 +178,7 @@ def _summary(label: str, episodes: list[_Episode]) -> dict[str, Any]:
 
 
 def _check(output: Output, parts: list[Demonstrations]) -> None:
-    from lw_torchrl.data.memory_map import whole_episodes
+    from lw_torchrl.data.dataset import whole_episodes
 
     damaged = []
     for part in parts:

@@ -39,7 +39,7 @@ class Evaluate:
     acting: OmitArgPrefixes[Acting] = field(default_factory=Acting)
 
     def run(self) -> Output:
-        from lw_torchrl.data.behaviours import BEHAVIOURS
+        from lw_torchrl.data.collection_policy import BEHAVIOURS
         from lw_torchrl.training.checkpoint import demonstrated_tasks
 
         acting = self.acting

@@ -98,7 +98,7 @@ class Ask:
     def run(self) -> Output:
         from torchrl.envs import EnvBase, TransformedEnv
 
-        from lw_torchrl.data.missing_episodes import suite_expert
+        from lw_torchrl.data.collect import suite_expert
         from lw_torchrl.suites.suite import find_suite
 
         known = options.read_tasks(self.task_file, (self.task,))

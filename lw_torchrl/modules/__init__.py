@@ -1,6 +1,6 @@
 """Policies as TensorDict modules, in parts that can be used alone: attention, mixers, features, decoders, critics."""
 
-import lw_torchrl._util.torchrl  # noqa: F401
+import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.modules.attention import PlanAttention, attend
 from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedValue, QValue, Value
 from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder

@@ -1,6 +1,6 @@
 """TorchRL transforms: query answers, also corrupted ones, pictures and language for environments, and augmentations."""
 
-import lw_torchrl._util.torchrl  # noqa: F401
+import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.transforms.augmentation import HideOpening, JitterTarget, SwapUnmentioned
 from lw_torchrl.transforms.camera import CameraTransform
 from lw_torchrl.transforms.environment import EnvState, LanguageInstruction

@@ -14,7 +14,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 
 from lw_torchrl._util.checks import Count, Natural, Probability, missing_keys, typed
 from lw_torchrl._util.keys import Keys, as_keys, check_apart, key_beside, read
-from lw_torchrl._util.seeding import episode_generator
+from lw_torchrl._util.reproducibility import episode_generator
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.task_index import PlanTables, TaskTables, one_per_row

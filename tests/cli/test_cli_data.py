@@ -14,7 +14,7 @@ from commands import document, fails, run
 import lw_torchrl as lw
 from lw_torchrl.cli.main import main
 from lw_torchrl.data import collect_demonstrations
-from lw_torchrl.data.memory_map import load_rows
+from lw_torchrl.data.dataset import load_rows
 
 
 def collect(root, **options):

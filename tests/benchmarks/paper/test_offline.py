@@ -14,7 +14,7 @@ import lw_torchrl as lw
 from benchmarks.paper.offline import DISTRIBUTIONS, BehaviourDataset, OfflineRun, offline_runs, write_table
 from benchmarks.paper.recipes import MIXTURES, OFFLINE_METHODS, OFFLINE_TABLES, TASK_SETS, OfflineRecipe, Portion
 from benchmarks.paper.runs import EVALUATION_SEED, execute_run
-from lw_torchrl.data.behaviours import BEHAVIOURS
+from lw_torchrl.data.collection_policy import BEHAVIOURS
 from lw_torchrl.data.dataset import read_metadata
 
 PLANS = lw.load_plans("MT10")
