@@ -118,7 +118,11 @@ class ObservationFeatures(Features):
         return {"kind": self.kind, "noise": self.noise, "layout": self.layout, **keys}
 
     def with_plans(self, plans: AnyPlans) -> ObservationFeatures:
-        """Return the features, with the same statistics, for plans of a layout; ValueError if they differ there."""
+        """Return the features, with the same statistics, for the layout of other plans.
+
+        Raises:
+            ValueError: features that mean something else in that layout.
+        """
         layout = as_plans(plans).layout
         if layout == self.layout:
             return self

@@ -23,7 +23,7 @@ Reduction = Literal["none", "mean", "sum"]
 
 
 class ExpectileValueLoss(LossModule):
-    """Learns the value V of a state by expectile regression, without a value of actions.
+    """Loss of a state value V by expectile regression, without a value of actions.
 
     The loss of a row is |τ - 1(u < 0)|·u², where u is the target minus V. The target is the reward plus the discounted
     value, by the target network, of the next state (n steps ahead where the rows have ``steps_to_next_obs``). With an
@@ -173,7 +173,7 @@ class ExpectileValueLoss(LossModule):
 
 
 class AdvantageWeightedLoss(LossModule):
-    """Imitates a batch's actions with weights exp(β·A), at most ``max_weight``, where A is a row's advantage.
+    """Imitation loss with weights exp(β·A), at most ``max_weight``, where A is a row's advantage.
 
     Reads what the actor reads, ``action`` (B, 4) float32, and ``advantage`` (B, 1) float32, which
     :meth:`ExpectileValueLoss.advantage` returns and :func:`standardize_by_task` makes comparable. Returns
@@ -243,7 +243,7 @@ class AdvantageWeightedLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the loss; the input stays as it is."""
+        """Return the loss; the input is not changed."""
         action, advantage = read(tensordict, [self.tensor_keys.action, self.tensor_keys.advantage])
         if advantage.shape != (*tensordict.batch_size, 1) or advantage.dtype != action.dtype:
             got = f"shape {tuple(advantage.shape)} in {advantage.dtype}"
