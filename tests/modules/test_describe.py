@@ -39,9 +39,9 @@ def test_rebuilt_module_has_the_same_names_and_keys(name):
     assert describe(again) == describe(module)
 
 
-@pytest.mark.parametrize("name", ACTORS)
+@pytest.mark.parametrize("name", [*ACTORS, "transferred"])
 def test_saved_and_loaded_actor_gives_the_same_bits(name, tmp_path):
-    actor = ACTORS[name]().eval()
+    actor = MODULES[name]().eval()
     lw.save_actor(actor, tmp_path / "policy.safetensors")
     loaded = lw.load_actor(tmp_path / "policy.safetensors")
     found, expected = (each(rows_for(actor, 6)) for each in (loaded, actor))

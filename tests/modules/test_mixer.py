@@ -38,11 +38,6 @@ torch.manual_seed(0)
 MIXER = SkillMixer(PLANS, SkillEncoder(6, width=12))
 
 
-@pytest.mark.parametrize("shape", [(), (5,), (3, 4)])
-def test_any_leading_shape(shape):
-    assert MIXER(weighted(*shape))["skill_latent"].shape == (*shape, 6)
-
-
 def test_steps_of_one_kind_have_one_latent_in_every_task():
     """Canonical steps are encoded by verb and manner: no text is read."""
 
@@ -85,14 +80,6 @@ def test_text_encoder_is_called_once_for_the_different_skills():
 def test_wrong_number_of_text_vectors_is_refused(shape):
     with pytest.raises(ValueError, match="text_encoder"):
         SkillMixer(PLANS, text_encoder=lambda texts: torch.zeros(shape))
-
-
-def test_with_plans_shares_the_encoder():
-    other = MIXER.with_plans(lw.Plans([PLANS["push"]]))
-    assert other.encoder is MIXER.encoder
-    assert other.state_dict().keys() == MIXER.state_dict().keys(), "no table of the plans is saved"
-    rows = weighted(3, plans=other.plans)
-    assert other(rows)["skill_latent"].shape == (3, 6)
 
 
 def test_mixed_actions_by_hand():

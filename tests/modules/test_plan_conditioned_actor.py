@@ -145,22 +145,6 @@ def other_plans():
     return Plans([ConditionalPlan.from_pairs("reach", pairs), ConditionalPlan.from_pairs("sweep", pairs[:1])])
 
 
-def test_with_plans_shares_the_weights_both_ways():
-    actor = make_actor(text_encoder=letters)
-    other = actor.with_plans(other_plans())
-    ours, theirs = dict(actor.named_parameters()), dict(other.named_parameters())
-    assert ours.keys() == theirs.keys()
-    assert all(ours[name] is theirs[name] for name in ours)
-    rows = {actor: make_rows(4), other: make_rows(4, plans=other_plans())}
-    for trained in (actor, other):
-        before = [action_of(each, rows[each]) for each in (actor, other)]
-        optimizer = torch.optim.SGD(trained.parameters(), 0.1)
-        action_of(trained, rows[trained]).sum().backward()
-        optimizer.step()
-        optimizer.zero_grad()
-        assert not any(torch.allclose(action_of(each, rows[each]), old) for each, old in zip(rows, before, strict=True))
-
-
 @pytest.mark.parametrize("training", [True, False])
 def test_with_plans_keeps_statistics_and_mode(training):
     actor = make_actor(text_encoder=letters).train(training)

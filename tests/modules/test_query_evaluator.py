@@ -217,15 +217,6 @@ def test_soft_answers_give_the_papers_attention():
     assert torch.allclose(found["skill_weights"], logits.softmax(-1), atol=1e-6)
 
 
-def test_saved_and_loaded_policy_with_evaluator_gives_the_same_bits(tmp_path):
-    policy = make_policy(answers="hard")
-    lw.save_actor(policy, tmp_path / "policy.safetensors")
-    loaded = lw.load_actor(tmp_path / "policy.safetensors", text_encoder=letters)
-    assert loaded[0].answers == "hard"
-    for key in policy.out_keys:
-        assert torch.equal(loaded(states())[key], policy(states())[key]), key
-
-
 def test_scripted_skills_act_on_an_evaluators_answers(tmp_path):
     evaluator = make()
     policy = TensorDictSequential(evaluator, lw.ScriptedSkillActor(PLANS))

@@ -6,8 +6,6 @@ import pytest
 import torch
 from small_actors import (
     CANONICAL,
-    PLANS,
-    letters,
     make_actor,
     make_descriptor,
     make_role_actor,
@@ -101,16 +99,6 @@ def test_feature_noise_is_off_in_likelihoods():
     assert [part.noise for part in before.features.parts] == [0.2, 0.2, 0.2]
 
 
-@by_distribution
-def test_saved_and_loaded_actor_gives_the_same_bits(distribution, tmp_path):
-    actor, rows = make(distribution=distribution, init_std=0.7), make_rows(5)
-    lw.save_actor(actor, tmp_path / "policy.safetensors")
-    loaded = lw.load_actor(tmp_path / "policy.safetensors")
-    out, expected = loaded(rows.clone()), actor.eval()(rows.clone())
-    assert all(torch.equal(out[key], expected[key]) for key in actor.out_keys)
-    assert loaded.distribution == distribution
-
-
 def test_nested_action_key(tmp_path):
     actor = make(out_keys=[("agent", "action")])
     keys = [("agent", name) for name in ("loc", "scale", "action", "action_log_prob")]
@@ -118,13 +106,6 @@ def test_nested_action_key(tmp_path):
     assert actor.spec["agent", "action"].shape == (4,)
     lw.save_actor(actor, tmp_path / "policy.safetensors")
     assert lw.load_actor(tmp_path / "policy.safetensors").out_keys == actor.out_keys
-
-
-def test_with_plans_shares_the_weights():
-    actor = make(text_encoder=letters)
-    other = actor.with_plans({"push": PLANS["push"]})
-    assert {id(one) for one in other.parameters()} == {id(one) for one in actor.parameters()}
-    assert other(make_rows(3, plans=other.plans))["action"].shape == (3, 4)
 
 
 def test_actors_without_a_gaussian_copy_are_refused():

@@ -11,11 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from test_losses import COMPILING, PLANS, SMALL
+from test_losses import COMPILING, PLANS
 from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
-from lw_torchrl.modules import Value, descriptor_trunk
 
 DISTANCES = ("l2", "l1", "smooth_l1")
 FLOATS = st.floats(-100, 100, width=32)
@@ -189,18 +188,6 @@ def test_equal_advantages_of_a_task_become_zero(same):
     assert (lw.objectives.standardize_by_task(advantage, torch.zeros(7, dtype=torch.int64)) == 0).all()
     assert (lw.objectives.standardize_by_task(advantage, torch.arange(7)) == 0).all()
     assert lw.objectives.standardize_by_task(torch.zeros(0, 1), torch.zeros(0, dtype=torch.int64)).shape == (0, 1)
-
-
-def test_value_advantage_and_weights_together():
-    batch = make_batch(40)
-    ended = torch.ones(40, 1, dtype=torch.bool)
-    following = batch.select("observation", "task_id").set("done", ended).set("terminated", ended)
-    batch["next"] = following.set("reward", torch.rand(40, 1))
-    value = lw.objectives.ExpectileValueLoss(Value(descriptor_trunk("MT10"), ensemble=2, **SMALL), delay_value=False)
-    batch["advantage"] = lw.objectives.standardize_by_task(value.advantage(batch), batch["task_id"])
-    found = lw.objectives.AdvantageWeightedLoss(make_actor("description"), beta=3.0)(batch)
-    assert found["loss_actor"].isfinite()
-    assert found["ESS"] < 0.9
 
 
 ACTOR = make_actor()

@@ -54,9 +54,7 @@ def test_td3_actor_loss_by_hand(shape):
     actor.zero_grad()
     expected.backward()
     torch.testing.assert_close(actor.decoder.network[0].weight.grad, mine)
-    assert all(p.grad is None for p in loss.qvalue_network_params.parameters()), (
-        "critics are not trained"
-    )
+    assert all(p.grad is None for p in loss.qvalue_network_params.parameters()), "critics are not trained"
 
 
 def test_td3_critic_loss_is_torchrls():

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
 from test_losses import COMPILING, PLANS, SMALL
-from torch import nn
 from torchrl.objectives import IQLLoss, SoftUpdate, ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
@@ -110,26 +108,6 @@ def test_loss_is_iqls_expectile_of_the_td0_target():
     torch.testing.assert_close(loss(batch)["loss_value"], IQLLoss.loss_value_diff(diff, 0.7).mean())
 
 
-def test_training_finds_the_expectile_of_the_rewards():
-    """V of one state with many rewards converges to where the definition of the expectile holds."""
-    rewards = torch.rand(200, 1, generator=torch.Generator().manual_seed(0))
-    ended = torch.ones(200, 1, dtype=torch.bool)
-    batch = TensorDict(
-        one=torch.ones(200, 1), next=TensorDict(one=torch.ones(200, 1), reward=rewards, done=ended, terminated=ended)
-    ).auto_batch_size_(1)
-    network = TensorDictModule(nn.Linear(1, 1, bias=False), in_keys=["one"], out_keys=["state_value"])
-    loss = lw.objectives.ExpectileValueLoss(network, expectile=0.9, delay_value=False).make_value_estimator(gamma=0.9)
-    optimizer = torch.optim.SGD(loss.parameters(), lr=0.5)
-    for _ in range(300):
-        optimizer.zero_grad()
-        loss(batch)["loss_value"].backward()
-        optimizer.step()
-    value = loss(batch)["value"]
-    above, below = (rewards - value).clamp(min=0).sum(), (value - rewards).clamp(min=0).sum()
-    torch.testing.assert_close(0.9 * above, 0.1 * below, rtol=1e-3, atol=1e-3)
-    assert value > rewards.mean() + 0.1
-
-
 @pytest.mark.parametrize("kind", CRITICS)
 def test_gradients_reach_every_parameter_but_no_target(kind):
     loss, batch = make_loss(kind), make_batch()
@@ -198,13 +176,6 @@ def test_call_with_tensors_of_in_keys():
     expected = loss(batch)
     assert torch.equal(value, expected["loss_value"])
     assert torch.equal(mean, expected["value"])
-
-
-def test_priority_weights():
-    loss, batch = make_loss(), make_batch()
-    weights = torch.rand(12, generator=torch.Generator().manual_seed(1))
-    expected = sum(w * loss(batch[i : i + 1])["loss_value"] for i, w in enumerate(weights)) / weights.sum()
-    torch.testing.assert_close(loss(batch.clone().set("priority_weight", weights))["loss_value"], expected)
 
 
 def test_feature_noise_is_in_the_loss_but_not_in_advantages():

@@ -12,7 +12,6 @@ from random_states import CONDITIONS, PLANS, RandomStates
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
-from torchrl.collectors import Collector
 from torchrl.data import Bounded, Composite, LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, EnvBase, SerialEnv, TransformedEnv, check_env_specs
 from torchrl.envs.transforms import ModuleTransform
@@ -193,16 +192,6 @@ def test_rows_of_a_worker_that_end_at_different_steps(place):
                 wanted = expected(list(one["exact"][: step + 1]), task, number, **options)
                 assert torch.equal(one["qaf"][step], wanted)
     env.close()
-
-
-def test_collector_gives_the_same_errors():
-    env = both(RandomStates(ROWS, 7), flip=0.3)
-    frames = {"frames_per_batch": ROWS * 10, "total_frames": ROWS * 20}
-    collector = Collector(env, None, **frames, auto_register_policy_transforms=False)
-    found = torch.cat([batch.clone() for batch in collector], -1)
-    collector.shutdown()
-    straight = both(RandomStates(ROWS, 7), flip=0.3).rollout(20, break_when_any_done=False)
-    assert torch.equal(found["qaf"], straight["qaf"])
 
 
 def test_resumed_environment_continues_with_the_same_errors():
