@@ -15,7 +15,7 @@ FALLBACK = lw.canonical_plans(PLANS, fallback=True)
 
 
 def letters(texts):
-    """A text encoder that counts vowels."""
+    """Return text vectors that count vowels."""
     return torch.tensor([[float(text.count(letter)) for letter in "aeiou"] for text in texts])
 
 
@@ -66,7 +66,7 @@ ACTORS = {
 
 
 def make_rows(*shape, plans=PLANS, seed=0, answered=True):
-    """Random states of the plans' tasks; ``qaf`` is random too, but none is true beyond a plan's last step."""
+    """Return random states of the plans' tasks, with random ``qaf``, which is false beyond a plan's last step."""
     generator = torch.Generator().manual_seed(seed)
     names = list(plans)
     chosen = torch.randint(len(names), tuple(shape), generator=generator)
@@ -83,7 +83,7 @@ def make_rows(*shape, plans=PLANS, seed=0, answered=True):
 
 
 def rows_for(actor, *shape, seed=0):
-    """States with exact answers, as ``actor`` reads them."""
+    """Return states with exact answers, as ``actor`` reads them."""
     rows = make_rows(*shape, plans=m.plans_of(actor) or PLANS, seed=seed, answered=False)
     transform = m.transform_of(actor)
     return rows if transform is None else transform(rows)

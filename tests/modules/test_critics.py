@@ -23,11 +23,11 @@ def rows_of(*shape):
 @pytest.mark.parametrize("make", [Value, QValue])
 def test_ensemble_value_is_its_minimum(make, kind, shape):
     critic, rows = make(TRUNKS[kind](), ensemble=3, **SMALL).eval(), rows_of(*shape)
-    found = critic(rows.clone())
-    value, values = (found[key] for key in critic.out_keys)
+    output = critic(rows.clone())
+    value, values = (output[key] for key in critic.out_keys)
     assert (value.shape, values.shape) == ((*shape, 1), (*shape, 3))
     assert torch.equal(value, values.amin(-1, keepdim=True))
-    assert set(found.keys()) == {*rows.keys(), *critic.out_keys}, "what the trunk writes stays inside"
+    assert set(output.keys()) == {*rows.keys(), *critic.out_keys}, "what the trunk writes stays inside"
     assert (
         critic.out_keys
         == {

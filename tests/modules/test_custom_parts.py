@@ -77,8 +77,8 @@ def test_custom_part_is_trained_saved_and_loaded_in_a_new_process(kind, tmp_path
         command, capture_output=True, text=True, timeout=240, env={**os.environ, "PYTHONPATH": search}
     )
     assert done.returncode == 0, done.stderr
-    found = torch.tensor(json.loads(done.stdout)).reshape(len(batch), 4)
-    torch.testing.assert_close(found, action_of(actor.eval(), rows.clone()))
+    output = torch.tensor(json.loads(done.stdout)).reshape(len(batch), 4)
+    torch.testing.assert_close(output, action_of(actor.eval(), rows.clone()))
 
 
 class Plain(nn.Module):

@@ -44,9 +44,9 @@ def test_saved_and_loaded_actor_gives_the_same_bits(name, tmp_path):
     actor = MODULES[name]().eval()
     lw.save_actor(actor, tmp_path / "policy.safetensors")
     loaded = lw.load_actor(tmp_path / "policy.safetensors")
-    found, expected = (each(rows_for(actor, 6)) for each in (loaded, actor))
+    output, expected = (each(rows_for(actor, 6)) for each in (loaded, actor))
     assert (type(loaded), loaded.training) == (type(actor), False)
-    assert all(torch.equal(found[key], expected[key]) for key in actor.out_keys)
+    assert all(torch.equal(output[key], expected[key]) for key in actor.out_keys)
 
 
 def test_description_holds_classes_options_and_plans():

@@ -35,10 +35,10 @@ def test_action_for_any_leading_shape(kind, shape):
 @pytest.mark.parametrize("encoder", [None, letters])
 def test_action_by_hand(encoder):
     actor, rows = make_descriptor(text_encoder=encoder), state(8)
-    found = action_of(actor, rows)
+    output = action_of(actor, rows)
     for row in range(8):
         vector = (encoder or encode_texts)([TASKS[MT50[rows["task_id"][row]]].description])[0]
-        torch.testing.assert_close(found[row], decoded(actor, vector, rows["observation"][row]))
+        torch.testing.assert_close(output[row], decoded(actor, vector, rows["observation"][row]))
 
 
 @pytest.mark.parametrize("condition", ["description", "one-hot"])

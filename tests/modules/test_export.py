@@ -20,7 +20,7 @@ OURS = [each for name, each in zip(SHARED, NAMES, strict=True) if name not in SE
 
 
 class Deployed(nn.Module):
-    """Observation and task to the action."""
+    """A policy with its queries, from observation and task to the action."""
 
     def __init__(self, actor):
         super().__init__()
@@ -66,10 +66,10 @@ def test_bare_actor_is_exported_by_name_and_by_position(name):
     any_rows = (tuple({0: torch.export.Dim("rows")} for _ in tensors),)
     by_place = torch.export.export(actor, tensors, dynamic_shapes=any_rows).module()
     fewer = by_place(*(tensor[:3] for tensor in tensors))
-    for found, rows in ((by_name, 7), (by_place(*tensors), 7), (fewer, 3)):
-        found = found if isinstance(found, tuple) else (found,)
+    for output, rows in ((by_name, 7), (by_place(*tensors), 7), (fewer, 3)):
+        output = output if isinstance(output, tuple) else (output,)
         expected = actor(read[:rows].clone()) if rows < 7 else written
-        assert all(torch.equal(one, expected[key]) for one, key in zip(found, actor.out_keys, strict=True))
+        assert all(torch.equal(one, expected[key]) for one, key in zip(output, actor.out_keys, strict=True))
 
 
 @pytest.mark.parametrize("name", NAMES)

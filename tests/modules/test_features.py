@@ -29,20 +29,20 @@ def random_observation(*shape, seed=0):
 def test_differences_by_hand():
     observation = random_observation()
     hand, one, two, goal = (observation[i : i + 3] for i in (0, 4, 11, 36))
-    found = differences(observation)
+    output = differences(observation)
     plain = torch.cat([one - hand, two - hand, goal - hand, two - one, goal - one, goal - two])
-    torch.testing.assert_close(found[:18], plain)
-    torch.testing.assert_close(found[18:36], torch.tanh(plain / 0.02))
-    torch.testing.assert_close(found[36:54], torch.tanh(plain / 0.1))
-    assert torch.equal(found[54:], observation[2:4])
+    torch.testing.assert_close(output[:18], plain)
+    torch.testing.assert_close(output[18:36], torch.tanh(plain / 0.02))
+    torch.testing.assert_close(output[36:54], torch.tanh(plain / 0.1))
+    assert torch.equal(output[54:], observation[2:4])
 
 
 def test_differences_to_an_absent_object_are_zero():
     observation = random_observation(2)
     observation[0, 11:14] = 0
-    found = differences(observation)[:, :18].reshape(2, 6, 3)
-    assert found[0].abs().sum(-1).eq(0).tolist() == [False, True, False, True, False, True]
-    assert not found[1].abs().sum(-1).eq(0).any()
+    output = differences(observation)[:, :18].reshape(2, 6, 3)
+    assert output[0].abs().sum(-1).eq(0).tolist() == [False, True, False, True, False, True]
+    assert not output[1].abs().sum(-1).eq(0).any()
 
 
 @pytest.mark.parametrize(
@@ -51,10 +51,10 @@ def test_differences_to_an_absent_object_are_zero():
 @pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
 def test_width_of_every_kind_for_any_leading_shape(kind, width, shape):
     features = ObservationFeatures(kind)
-    found = features(random_observation(*shape))
+    output = features(random_observation(*shape))
     assert features.width == width
-    assert found.shape == (*shape, width)
-    assert found.dtype == torch.float32
+    assert output.shape == (*shape, width)
+    assert output.dtype == torch.float32
 
 
 @pytest.mark.parametrize(("kind", "same"), [("raw", False), ("differences", False), ("relative", True)])
@@ -72,9 +72,9 @@ def test_fitted_rows_have_mean_zero_and_deviation_one(kind):
     features = ObservationFeatures(kind)
     observation = random_observation(40, 25)
     fit(features, observation)
-    found = features(observation).reshape(-1, features.width)
-    torch.testing.assert_close(found.mean(0), torch.zeros(features.width), atol=1e-4, rtol=0)
-    torch.testing.assert_close(found.std(0, unbiased=False), torch.ones(features.width), atol=1e-3, rtol=0)
+    output = features(observation).reshape(-1, features.width)
+    torch.testing.assert_close(output.mean(0), torch.zeros(features.width), atol=1e-4, rtol=0)
+    torch.testing.assert_close(output.std(0, unbiased=False), torch.ones(features.width), atol=1e-3, rtol=0)
 
 
 def test_a_constant_feature_is_centred_and_not_amplified():
@@ -170,11 +170,11 @@ def test_concatenated_features_keep_their_noise():
         batch_size=[4],
     )
     assert (module.in_keys, module.width) == (["observation", "skill_weights", "task_id"], 39 + 18)
-    found = module.eval()(rows.copy())
-    assert set(found.keys()) == {*rows.keys(), "features"}
+    output = module.eval()(rows.copy())
+    assert set(output.keys()) == {*rows.keys(), "features"}
     for part, columns in zip(parts, (slice(39), slice(39, None)), strict=True):
-        assert torch.equal(found["features"][:, columns], part(rows.copy())["features"])
-    noisy = module.train()(rows.copy())["features"] - found["features"]
+        assert torch.equal(output["features"][:, columns], part(rows.copy())["features"])
+    noisy = module.train()(rows.copy())["features"] - output["features"]
     assert noisy[:, :39].all()
     assert not noisy[:, 39:].any()
 

@@ -44,24 +44,24 @@ def test_logits_of_each_step_for_rows_in_any_order_and_shape():
 
 
 def test_logits_depend_on_every_picture_and_not_on_the_observation():
-    evaluator, found = make(), states()
-    logits = evaluator(found.clone())["qaf_logits"]
-    other = found.clone().set("observation", torch.zeros(10, 39))
+    evaluator, output = make(), states()
+    logits = evaluator(output.clone())["qaf_logits"]
+    other = output.clone().set("observation", torch.zeros(10, 39))
     assert torch.equal(evaluator(other)["qaf_logits"], logits)
     for part in (slice(0, 24), slice(24, 48)):
-        other = found.clone()
+        other = output.clone()
         other["pixels"][:, :, part] = 0
         assert not torch.equal(evaluator(other)["qaf_logits"], logits)
 
 
 def test_attention_is_a_distribution_over_each_picture():
-    evaluator, found = make(), states()
+    evaluator, output = make(), states()
     with torch.no_grad():
-        places, seen = evaluator.network.places(found["pixels"], evaluator.network.names.weight)
+        places, seen = evaluator.network.places(output["pixels"], evaluator.network.names.weight)
     assert places.shape == (10, len(evaluator.names), 4)
     assert seen.shape == (10, 2, len(evaluator.names), 8, 12)
     assert torch.allclose(seen.sum((-1, -2)), torch.ones(()))
-    swapped = found["pixels"].unflatten(-2, (2, 24)).flip(-3).flatten(-3, -2)
+    swapped = output["pixels"].unflatten(-2, (2, 24)).flip(-3).flatten(-3, -2)
     with torch.no_grad():
         _, other = evaluator.network.places(swapped, evaluator.network.names.weight)
     assert torch.allclose(other, seen.flip(1), atol=1e-6)
@@ -134,8 +134,8 @@ class TestActing:
     @pytest.mark.slow
     def test_results_do_not_depend_on_num_envs(self):
         actor = TensorDictSequential(make(), lw.PlanConditionedActor(PLANS))
-        found = [self.evaluated(actor, num_envs=n, num_threads=t) for n, t in ((2, 1), (4, 2))]
-        for one, other in zip(*found, strict=True):
+        output = [self.evaluated(actor, num_envs=n, num_threads=t) for n, t in ((2, 1), (4, 2))]
+        for one, other in zip(*output, strict=True):
             assert torch.equal(one, other)
 
     def test_evaluator_in_a_sequence_equals_evaluator_as_an_argument(self):

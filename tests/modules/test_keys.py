@@ -50,9 +50,9 @@ def test_renamed_keys_are_read_and_written(kind):
     assigned.in_keys = read
     for other, names in ((make(kind, in_keys=read, out_keys=written), written), (assigned, last)):
         assert (other.in_keys, other.out_keys[-len(last) :]) == (read, names)
-        found = other(moved.clone())
-        assert set(found.keys(True, True)) == {*read, *other.out_keys}
-        assert all(torch.equal(found[there], expected[here]) for here, there in zip(last, names, strict=True))
+        output = other(moved.clone())
+        assert set(output.keys(True, True)) == {*read, *other.out_keys}
+        assert all(torch.equal(output[there], expected[here]) for here, there in zip(last, names, strict=True))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -86,7 +86,7 @@ def test_writing_over_an_input_is_refused(make_one):
         make_one()
 
 
-# --- what TorchRL does with modules --------------------------------------------------------------------------------
+# --- how TorchRL uses modules --------------------------------------------------------------------------------------
 
 
 SMALL = dict(width=8, depth=1)
@@ -105,7 +105,7 @@ each_module = pytest.mark.parametrize("name", MODULES)
 
 
 def made(name):
-    """A module, what it reads of some rows, and what it writes."""
+    """Return a module, its inputs for some rows, and its outputs."""
     torch.manual_seed(0)
     module = MODULES[name]().eval()
     rows = rows_for(module, 3).update({"action": torch.rand(3, 4), "skill_weights": torch.rand(3, PLANS.num_steps)})
@@ -114,8 +114,8 @@ def made(name):
     return module, read, module(read.copy()).select(*module.out_keys)
 
 
-def as_tuple(found):
-    return found if isinstance(found, tuple) else (found,)
+def as_tuple(output):
+    return output if isinstance(output, tuple) else (output,)
 
 
 @each_module
@@ -126,9 +126,9 @@ def test_select_out_keys(name):
         assert module.select_out_keys(*chosen) is module
         assert (module.out_keys, module.out_keys_source) == (chosen, names)
         for one in (module, copy.deepcopy(module)):
-            found = one(read.copy())
-            assert set(found.keys(True, True)) == {*module.in_keys, *chosen}
-            assert all(torch.equal(found[key], written[key]) for key in chosen)
+            output = one(read.copy())
+            assert set(output.keys(True, True)) == {*module.in_keys, *chosen}
+            assert all(torch.equal(output[key], written[key]) for key in chosen)
         by_name = as_tuple(module(**read.to_dict()))
         assert all(torch.equal(one, written[key]) for one, key in zip(by_name, chosen, strict=True))
         module.reset_out_keys()
@@ -138,16 +138,16 @@ def test_select_out_keys(name):
 @each_module
 def test_selected_out_keys_of_a_sequence(name):
     module, read, written = made(name)
-    found = TensorDictSequential(module, selected_out_keys=[module.out_keys[-1]])(read.copy())
-    assert set(found.keys(True, True)) == {*module.in_keys, module.out_keys[-1]}
-    assert torch.equal(found[module.out_keys[-1]], written[module.out_keys[-1]])
+    output = TensorDictSequential(module, selected_out_keys=[module.out_keys[-1]])(read.copy())
+    assert set(output.keys(True, True)) == {*module.in_keys, module.out_keys[-1]}
+    assert torch.equal(output[module.out_keys[-1]], written[module.out_keys[-1]])
 
 
 @each_module
 def test_call_with_tensors_by_position_and_by_name(name):
     module, read, written = made(name)
-    for found in (module(**read.to_dict()), module(*(read[key] for key in module.in_keys))):
-        assert all(torch.equal(one, written[key]) for one, key in zip(as_tuple(found), module.out_keys, strict=True))
+    for output in (module(**read.to_dict()), module(*(read[key] for key in module.in_keys))):
+        assert all(torch.equal(one, written[key]) for one, key in zip(as_tuple(output), module.out_keys, strict=True))
     with pytest.raises((TypeError, RuntimeError), match="observatoin"):
         module(observatoin=read[module.in_keys[0]])
 
@@ -157,8 +157,8 @@ def test_assigned_out_keys(name):
     module, read, written = made(name)
     names = list(module.out_keys)
     module.out_keys = [("other", key) for key in names]
-    found = module(read.copy())
-    assert all(torch.equal(found["other", key], written[key]) for key in names)
+    output = module(read.copy())
+    assert all(torch.equal(output["other", key], written[key]) for key in names)
 
 
 @each_module
@@ -175,9 +175,9 @@ def test_skip_existing(name):
 @pytest.mark.parametrize("rows", [(0,), (2, 0)])
 def test_call_with_no_rows(name, rows):
     module, read, written = made(name)
-    found = module(TensorDict({key: value.new_zeros(*rows, *value.shape[1:]) for key, value in read.items()}, rows))
+    output = module(TensorDict({key: value.new_zeros(*rows, *value.shape[1:]) for key, value in read.items()}, rows))
     for key in module.out_keys:
-        assert (found[key].shape, found[key].dtype) == ((*rows, *written[key].shape[1:]), written[key].dtype)
+        assert (output[key].shape, output[key].dtype) == ((*rows, *written[key].shape[1:]), written[key].dtype)
 
 
 def test_value_estimators_skip_existing_values():
@@ -185,8 +185,8 @@ def test_value_estimators_skip_existing_values():
     flag = torch.zeros(1, 3, 1, dtype=torch.bool)
     rows["state_value"] = torch.ones(1, 3, 1)
     rows["next"] = rows.copy().update({"reward": torch.ones(1, 3, 1), "done": flag, "terminated": flag})
-    found = GAE(gamma=0.5, lmbda=0.0, value_network=value, skip_existing=True)(rows)
-    assert torch.equal(found["advantage"], torch.full((1, 3, 1), 0.5)), "1 + 0.5 - 1"
+    output = GAE(gamma=0.5, lmbda=0.0, value_network=value, skip_existing=True)(rows)
+    assert torch.equal(output["advantage"], torch.full((1, 3, 1), 0.5)), "1 + 0.5 - 1"
 
 
 @pytest.mark.parametrize("name", ["ensemble", "decided", "scripted"])

@@ -26,12 +26,12 @@ def weighted(*shape, plans=PLANS, seed=0):
 @given(st.integers(0, 2**31))
 def test_mixed_latents_by_hand(seed):
     rows = weighted(3, seed=seed)
-    found = MIXER(rows.clone())["skill_latent"]
+    output = MIXER(rows.clone())["skill_latent"]
     for row in range(3):
         steps = PLANS[lw.MT50[rows["task_id"][row]]].steps
         vectors = encode_texts([step.skill for step in steps])
         latents = MIXER.encoder(vectors / vectors.square().mean(-1, keepdim=True).sqrt())  # root mean square 1
-        torch.testing.assert_close(found[row], rows["skill_weights"][row, : len(steps)] @ latents)
+        torch.testing.assert_close(output[row], rows["skill_weights"][row, : len(steps)] @ latents)
 
 
 torch.manual_seed(0)
@@ -86,12 +86,12 @@ def test_mixed_actions_by_hand():
     torch.manual_seed(0)
     mixer = ActionMixer(PLANS, small_decoder(), SkillEncoder(3))
     rows = weighted(5).set("features", torch.rand(5, 4))
-    found = mixer(rows.clone())["action"]
+    output = mixer(rows.clone())["action"]
     latents = mixer.latents()
     for row in range(5):
         at = mixer.tables.index.row(lw.MT50[rows["task_id"][row]])
         each = torch.cat((latents[mixer.index[at]], rows["features"][row].expand(PLANS.num_steps, -1)), -1)
-        torch.testing.assert_close(found[row], rows["skill_weights"][row] @ mixer.decoder(each))
+        torch.testing.assert_close(output[row], rows["skill_weights"][row] @ mixer.decoder(each))
 
 
 @pytest.mark.parametrize("plans", [PLANS, CANONICAL], ids=["text", "roles"])

@@ -60,11 +60,11 @@ def test_with_plans_shares_every_weight(name):
     assert (plans_of(other), other.training) == (lw.Plans(own), False)
     assert {id(one) for one in other.parameters()} == {id(one) for one in actor.parameters()}
     rows = make_rows(4, plans=lw.Plans(own), answered=False)
-    found = []
+    output = []
     for each in (actor, other):
         transform = transform_of(each)
-        found.append(each(rows.copy() if transform is None else transform(rows.copy()))["action"])
-    torch.testing.assert_close(*found)
+        output.append(each(rows.copy() if transform is None else transform(rows.copy()))["action"])
+    torch.testing.assert_close(*output)
 
 
 def test_actors_that_cannot_follow_other_plans_are_refused():
@@ -99,12 +99,12 @@ def test_policy_without_progress_reaches_its_fallback_steps():
 
 @pytest.mark.parametrize("turn", [0, 1])
 def test_each_turn_acts_as_an_actor_of_only_that_plan(turn):
-    """The plan's own steps in even turns, the fallback plan's in odd ones."""
+    """Even turns use the plan's own steps, odd turns the fallback plan's."""
     from lw_torchrl.language.canonical import fallback_plan
 
     actor = make_role_actor(FALLBACK)
     alone = lw.Plans([fallback_plan(plan.definition) for plan in PLANS.values()]) if turn else CANONICAL
     other = actor.with_plans(alone)
     rows = make_rows(40, plans=PLANS, answered=False)
-    found = actor(transform_of(actor)(rows.copy()).set("turn", torch.full((40,), turn)))["action"]
-    torch.testing.assert_close(found, other(transform_of(other)(rows.copy()))["action"])
+    output = actor(transform_of(actor)(rows.copy()).set("turn", torch.full((40,), turn)))["action"]
+    torch.testing.assert_close(output, other(transform_of(other)(rows.copy()))["action"])

@@ -26,12 +26,12 @@ def test_other_precisions_give_nearly_the_same_output(name, dtype, rows_too):
     cast = rows.copy()
     if rows_too:
         cast["observation"] = cast["observation"].to(dtype)
-    found = module.to(dtype)(cast)[key]
-    assert found.dtype == dtype
+    output = module.to(dtype)(cast)[key]
+    assert output.dtype == dtype
     if key == "action" and name == "decided":
-        found, expected = found[:, :3], expected[:, :3]
+        output, expected = output[:, :3], expected[:, :3]
     limit = 0.1 if dtype == torch.bfloat16 else 1e-4
-    torch.testing.assert_close(found.float(), expected, atol=limit, rtol=limit)
+    torch.testing.assert_close(output.float(), expected, atol=limit, rtol=limit)
 
 
 @pytest.mark.parametrize("make", [make_actor, make_descriptor])

@@ -23,7 +23,7 @@ S = PLANS.num_steps
 
 
 class Network(lw.QueryEvaluator):
-    """A table for the plans, a network, and a statistic."""
+    """An evaluator with a table for the plans, a network, and a statistic."""
 
     def __init__(self, plans, width=5):
         super().__init__(plans)
@@ -37,7 +37,7 @@ class Network(lw.QueryEvaluator):
 
 
 class Answers(lw.QueryEvaluator):
-    """Returns any logits."""
+    """An evaluator that returns the logits of a function."""
 
     def __init__(self, plans, make, **options):
         super().__init__(plans, **options)
@@ -73,9 +73,9 @@ def test_hard_answers_act_as_exact_truth():
     for answers in ("hard", "soft"):
         policy = TensorDictSequential(Truth(PLANS, answers=answers), actor)
         assert policy.in_keys == ["observation", "task_id"]
-        found = policy(rows.clone())
+        output = policy(rows.clone())
         for key in ("skill_weights", "action"):
-            assert torch.equal(found[key], expected[key]) is (answers == "hard"), key
+            assert torch.equal(output[key], expected[key]) is (answers == "hard"), key
 
 
 def test_constructor_without_answers_is_always_soft():
@@ -162,9 +162,9 @@ def test_logits_of_each_step_for_rows_in_any_order_and_shape():
 
 
 def test_logits_depend_only_on_positions_that_clauses_compare():
-    evaluator, found = make(), states()
-    logits = evaluator(found.clone())["qaf_logits"]
-    moved = found.clone()
+    evaluator, output = make(), states()
+    logits = evaluator(output.clone())["qaf_logits"]
+    moved = output.clone()
     moved["observation"][:, 7:11] += 1.0  # a quaternion, which no relation compares
     assert torch.equal(evaluator(moved)["qaf_logits"], logits)
 
@@ -180,12 +180,12 @@ def test_not_changes_the_sign_of_a_logit():
 
 def test_probability_of_a_conjunction_is_the_product():
     logits = torch.tensor([[0.3, -1.2, 2.0], [29.0, 30.0, -30.0], [4.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    said = torch.tensor([[True, True, True], [True, True, False], [True, False, False], [False, False, False]])
-    found = conjunction(logits, said)
-    p = torch.where(said, logits.double().sigmoid(), 1.0).prod(-1)
-    assert torch.allclose(found[:3].double(), p[:3].logit(), atol=1e-4)
-    assert found[3] > 29
-    assert torch.allclose(conjunction(logits[:, :1], said[:, :1])[:3], logits[:3, 0], atol=1e-5)
+    mask = torch.tensor([[True, True, True], [True, True, False], [True, False, False], [False, False, False]])
+    output = conjunction(logits, mask)
+    p = torch.where(mask, logits.double().sigmoid(), 1.0).prod(-1)
+    assert torch.allclose(output[:3].double(), p[:3].logit(), atol=1e-4)
+    assert output[3] > 29
+    assert torch.allclose(conjunction(logits[:, :1], mask[:, :1])[:3], logits[:3, 0], atol=1e-5)
 
 
 def test_conjunction_has_a_finite_gradient_everywhere():
@@ -201,20 +201,20 @@ def test_gradient_of_imitation_reaches_the_evaluator(answers):
     policy = make_policy(answers=answers).train()
     loss = BCLoss(policy, loss_function="l2")
     loss(states())["loss_bc"].backward()
-    found = dict(policy[0].named_parameters())
-    assert len(found) >= 3
-    for name, parameter in found.items():
+    output = dict(policy[0].named_parameters())
+    assert len(output) >= 3
+    for name, parameter in output.items():
         assert parameter.grad is not None, name
         assert parameter.grad.abs().sum() > 0, name
 
 
 def test_soft_answers_give_the_papers_attention():
     policy, rows = make_policy(), states()
-    found = policy(rows)
+    output = policy(rows)
     steps = [len(PLANS[lw.MT50[task]].steps) for task in rows["task_id"].tolist()]
     mask = torch.arange(PLANS.num_steps) < torch.tensor(steps)[:, None]
-    logits = torch.where(mask, 10 * found["qaf_logits"].sigmoid() - 5, -torch.inf)
-    assert torch.allclose(found["skill_weights"], logits.softmax(-1), atol=1e-6)
+    logits = torch.where(mask, 10 * output["qaf_logits"].sigmoid() - 5, -torch.inf)
+    assert torch.allclose(output["skill_weights"], logits.softmax(-1), atol=1e-6)
 
 
 def test_scripted_skills_act_on_an_evaluators_answers(tmp_path):
@@ -222,14 +222,14 @@ def test_scripted_skills_act_on_an_evaluators_answers(tmp_path):
     policy = TensorDictSequential(evaluator, lw.ScriptedSkillActor(PLANS))
     assert policy.in_keys == ["observation", "task_id"]
     assert transform_of(policy) is None
-    found = policy(states())
+    output = policy(states())
     answers = evaluator(states())["qaf_logits"] > 0
     by_truth = lw.ScriptedSkillActor(PLANS)(states().set("qaf", answers))
     for key in ("action", "skill_weights"):
-        assert torch.equal(found[key], by_truth[key])
-    assert found["skill_weights"][:, 1:].any()
+        assert torch.equal(output[key], by_truth[key])
+    assert output["skill_weights"][:, 1:].any()
     lw.save_actor(policy, tmp_path / "policy.safetensors")
-    assert torch.equal(lw.load_actor(tmp_path / "policy.safetensors")(states())["action"], found["action"])
+    assert torch.equal(lw.load_actor(tmp_path / "policy.safetensors")(states())["action"], output["action"])
     other = with_plans(policy, lw.Plans([PLANS["push"]]))
     assert other[0].network.predicates.weight is evaluator.network.predicates.weight
 

@@ -43,11 +43,11 @@ def focus_of(task, *conditions):
 
 
 def compared(focus, observation, weights=None):
-    """The positions (B, 2, 3), metres, of the first and the last clause."""
+    """Return the positions of the first and the last clause, (B, 2, 3) metres."""
     weights = torch.ones(len(observation), 1) if weights is None else weights
-    found = focus(observation, weights, torch.full((len(observation),), lw.task_id(next(iter(focus.plans)))))
-    assert found.shape == (len(observation), 18)
-    return found[:, :6].reshape(-1, 2, 3) / 10
+    output = focus(observation, weights, torch.full((len(observation),), lw.task_id(next(iter(focus.plans)))))
+    assert output.shape == (len(observation), 18)
+    return output[:, :6].reshape(-1, 2, 3) / 10
 
 
 @pytest.fixture
@@ -57,20 +57,20 @@ def observation():
 
 def test_focus_shows_the_first_and_the_last_clause_with_two_objects(observation):
     condition = "the gripper is above the puck and the gripper is open and the puck is near the target location"
-    found = compared(focus_of("push", condition), observation)
-    torch.testing.assert_close(found[:, 0], observation[:, OBJECT] - observation[:, HAND])
-    torch.testing.assert_close(found[:, 1], observation[:, GOAL] - observation[:, OBJECT])
-    found = compared(focus_of("push", "the gripper is not above the puck"), observation)
-    assert torch.equal(found[:, 0], found[:, 1])
+    output = compared(focus_of("push", condition), observation)
+    torch.testing.assert_close(output[:, 0], observation[:, OBJECT] - observation[:, HAND])
+    torch.testing.assert_close(output[:, 1], observation[:, GOAL] - observation[:, OBJECT])
+    output = compared(focus_of("push", "the gripper is not above the puck"), observation)
+    assert torch.equal(output[:, 0], output[:, 1])
     assert not compared(focus_of("push", "the gripper is open"), observation).any()
 
 
 def test_focus_on_points_with_offsets_and_fixed_places(observation):
-    found = compared(focus_of("hammer", "the hammer head is near the nail"), observation)
+    output = compared(focus_of("hammer", "the hammer head is near the nail"), observation)
     head = observation[:, OBJECT] + torch.tensor([0.16, 0.06, 0.0])
-    torch.testing.assert_close(found[:, 0], observation[:, SECOND] - head)
-    found = compared(focus_of("bin-picking", "the gripper is near the other bin"), observation)
-    torch.testing.assert_close(found[:, 0], torch.tensor([0.12, 0.7, 0.02]) - observation[:, HAND])
+    torch.testing.assert_close(output[:, 0], observation[:, SECOND] - head)
+    output = compared(focus_of("bin-picking", "the gripper is near the other bin"), observation)
+    torch.testing.assert_close(output[:, 0], torch.tensor([0.12, 0.7, 0.02]) - observation[:, HAND])
 
 
 @settings(max_examples=30, deadline=None)
@@ -87,10 +87,10 @@ def test_focus_mixes_steps_by_attention(seed):
 
 def test_focus_squashes_positions_at_two_scales(observation):
     focus = focus_of("push", "the gripper is above the puck")
-    found = focus(observation, torch.ones(5, 1), torch.full((5,), lw.task_id("push")))
-    position = found[:, :6] / 10
-    torch.testing.assert_close(found[:, 6:12], torch.tanh(position / 0.02))
-    torch.testing.assert_close(found[:, 12:], torch.tanh(position / 0.1))
+    output = focus(observation, torch.ones(5, 1), torch.full((5,), lw.task_id("push")))
+    position = output[:, :6] / 10
+    torch.testing.assert_close(output[:, 6:12], torch.tanh(position / 0.02))
+    torch.testing.assert_close(output[:, 12:], torch.tanh(position / 0.1))
 
 
 @pytest.mark.parametrize("kind", [FocusFeatures, RoleFeatures])
@@ -113,8 +113,8 @@ def test_actor_sees_the_positions_of_its_own_plans():
     actor = make_actor(own, features=Concat(ObservationFeatures(), FocusFeatures(own)))
     other = actor.with_plans(PLANS)
     for each in (actor, other):
-        found = each(rows_for(each, 4))
-        assert (found["features"].shape, found["action"].shape) == ((4, 56 + 18), (4, 4))
+        output = each(rows_for(each, 4))
+        assert (output["features"].shape, output["action"].shape) == ((4, 56 + 18), (4, 4))
     assert other.decoder is actor.decoder
     assert other.features.parts[1].plans == PLANS
 
@@ -127,7 +127,7 @@ def roles_of(plans=CANONICAL, **options):
 
 
 def in_step(plans, task, step, number=5, seed=0):
-    """Random observations with all attention on one step of a task's plan, as ``positions`` reads them."""
+    """Return random observations with all attention on one step, as ``positions`` reads them."""
     observation = torch.randn(number, 39, generator=torch.Generator().manual_seed(seed))
     weights = torch.zeros(number, plans.num_steps)
     weights[:, step] = 1.0
@@ -135,7 +135,7 @@ def in_step(plans, task, step, number=5, seed=0):
 
 
 def written(roles, seen, **more):
-    """The features (B, 12) of what :func:`in_step` returned."""
+    """Return the features (B, 12) of inputs from :func:`in_step`."""
     observation, weights, rows = seen
     ids = torch.tensor([lw.task_id(task) for task in roles.tables.index.tasks])[rows]
     rows = TensorDict(observation=observation, skill_weights=weights, task_id=ids, batch_size=[len(ids)])
@@ -223,25 +223,25 @@ def test_position_is_clipped_at_25_cm():
 
 
 def carried(beside, below):
-    """One row in which the puck is carried, at a distance beside its target and below it, metres."""
+    """Return one row in which the puck is carried, some metres beside and below its target."""
     observation, weights, rows = in_step(CANONICAL, "push", 3, number=1)
     observation[:, 4:7] = observation[:, 36:39] - torch.tensor([beside, 0.0, below])
     return observation, weights, rows
 
 
 @pytest.mark.parametrize(
-    ("beside", "below", "wanted"),
+    ("beside", "below", "expected"),
     [
-        (0.2, 0.0, (0.0, 0.0, 0.15)),  # far away: first straight up
+        (0.2, 0.0, (0.0, 0.0, 0.15)),  # far away: straight up first
         (0.2, -0.13, (0.2, 0.0, 0.02)),  # high: to the side
         (0.2, -0.11, (0.1, 0.0, 0.04)),  # in between: both
         (0.02, -0.15, (0.02, 0.0, -0.15)),  # over it: down
         (0.0, 0.0, (0.0, 0.0, 0.0)),
     ],
 )
-def test_without_demonstrations_a_carried_object_is_lifted_first(beside, below, wanted):
+def test_without_demonstrations_a_carried_object_is_lifted_first(beside, below, expected):
     roles, seen = roles_of(), carried(beside, below)
-    torch.testing.assert_close(roles.positions(*seen)[0, 0], torch.tensor(wanted), atol=1e-5, rtol=0)
+    torch.testing.assert_close(roles.positions(*seen)[0, 0], torch.tensor(expected), atol=1e-5, rtol=0)
     roles.fit(rows_of(CANONICAL, in_step(CANONICAL, "push", 0)))
     assert roles.demonstrated.tolist() == [task == "push" for task in roles.tables.index.tasks]
     torch.testing.assert_close(roles.positions(*seen)[0, 0], torch.tensor((beside, 0.0, below)), atol=1e-5, rtol=0)

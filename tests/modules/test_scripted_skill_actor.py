@@ -12,7 +12,7 @@ PUSH = lw.task_id("push")
 
 
 def acting(select, qaf, **options):
-    """The actor's weights and actions in as many random states of push as there are rows of ``qaf``."""
+    """Return the actor's weights and actions, and those of each skill, in a random state of push for each row."""
     n = len(qaf)
     torch.manual_seed(0)
     state = TensorDict(

@@ -23,7 +23,7 @@ from lw_torchrl.modules import Concat, FocusFeatures, ObservationFeatures, RoleF
 
 
 def trained(kind="plan", **options):
-    """A deterministic actor with statistics and noisy features."""
+    """Return a deterministic actor with fitted statistics and noisy features."""
     if kind == "plan":
         actor = make_actor(features=ObservationFeatures(noise=0.3), **options)
     else:

@@ -40,7 +40,7 @@ PLAIN = TensorDictModule(nn.Linear(39, 4), in_keys=["observation"], out_keys=["a
 
 
 def with_effort(actor, effort):
-    """The actor, whose last layer returns an effort whatever it sees."""
+    """Return the actor with a constant effort."""
     *_, last = (part for part in actor.decoder.modules() if isinstance(part, nn.Linear))
     with torch.no_grad():
         last.weight[3] = 0.0
@@ -54,7 +54,7 @@ def with_effort(actor, effort):
 def make_members(kind="plan"):
     if kind == "description":
         return [make_descriptor(seed=seed) for seed in range(3)]
-    features = (ObservationFeatures(kind) for kind in ("differences", "relative", "both"))  # members may see otherwise
+    features = (ObservationFeatures(kind) for kind in ("differences", "relative", "both"))
     return [make_actor(seed=seed, features=each) for seed, each in enumerate(features)]
 
 
@@ -62,14 +62,14 @@ def make_members(kind="plan"):
 def test_ensemble_action_is_the_mean_of_its_members(kind):
     members, rows = make_members(kind), make_rows(7)
     ensemble = ActorEnsemble(members).eval()
-    found = ensemble(rows.copy())
+    output = ensemble(rows.copy())
     actions = [action_of(member, rows) for member in members]
     assert not torch.allclose(actions[0], actions[1], atol=1e-3)
-    torch.testing.assert_close(found["action"], (actions[0] + actions[1] + actions[2]) / 3)
-    assert set(found.keys()) == {*rows.keys(), *ensemble.out_keys}
+    torch.testing.assert_close(output["action"], (actions[0] + actions[1] + actions[2]) / 3)
+    assert set(output.keys()) == {*rows.keys(), *ensemble.out_keys}
     if kind == "plan":
         assert ensemble.out_keys == ["action", "skill_weights"]
-        assert torch.equal(found["skill_weights"], members[0](rows.copy())["skill_weights"])
+        assert torch.equal(output["skill_weights"], members[0](rows.copy())["skill_weights"])
 
 
 def test_any_modules_can_be_members():
@@ -135,7 +135,7 @@ def seven_plans():
 @pytest.mark.parametrize(("effort", "done"), [(0.2, 1.0), (0.4, -1.0), (-0.2, 1.0)])
 @pytest.mark.parametrize("members", [1, 3])
 def test_gripper_of_another_robot_is_decided_by_the_first_robots_effort(effort, done, members):
-    """That robot's effort is at another place and has another sign, and 0.2 does not close with either."""
+    """Its effort has another place and sign; an effort of 0.2 closes neither gripper."""
     one = DecidedGripper(with_effort(make_role_actor(), effort))
     actor = one if members == 1 else DecidedGripper(ActorEnsemble([one] * members), 0.0)
     policy = TransferredActor(actor, seven_plans()).eval()
@@ -175,13 +175,13 @@ def state_of(policy, tasks=("push", "hammer", "reach", "soccer", "push")):
 def test_each_row_acts_by_the_policy_of_its_task():
     policy = make_demonstrated()
     state = state_of(policy)
-    found, seen = policy(state.copy()), torch.tensor([True, False, True, False, True])
-    torch.testing.assert_close(found["action"][seen], action_of(policy.demonstrated, state[seen]))
+    output, seen = policy(state.copy()), torch.tensor([True, False, True, False, True])
+    torch.testing.assert_close(output["action"][seen], action_of(policy.demonstrated, state[seen]))
     others = policy.others(state.copy())
-    assert torch.equal(found["action"][~seen], others["action"][~seen])
-    assert torch.equal(found["skill_weights"], others["skill_weights"])
-    assert set(found.keys()) == {*state.keys(), *policy.out_keys}
-    assert torch.equal(found["task_id"], state["task_id"])
+    assert torch.equal(output["action"][~seen], others["action"][~seen])
+    assert torch.equal(output["skill_weights"], others["skill_weights"])
+    assert set(output.keys()) == {*state.keys(), *policy.out_keys}
+    assert torch.equal(output["task_id"], state["task_id"])
     assert (policy.plans, policy.tasks) == (policy.others.plans, tuple(MT50))
     for tasks, part in ((("push", "reach"), policy.demonstrated), (("hammer", "soccer"), policy.others)):
         state = state_of(policy, tasks)
@@ -253,10 +253,10 @@ def test_displacement_keeps_its_metres():
     rows = torch.rand(20, 4) - 0.5
     for speed in (1.0, 2.0):
         moved = TransferredActor(actor, fetch, speed=speed)
-        found = moved.converted(rows)
+        output = moved.converted(rows)
         ratio = speed * METAWORLD.reach / fetch.layout.reach
         expected = (rows[:, METAWORLD.displaced("test")] * ratio).clamp(-1, 1)
-        torch.testing.assert_close(found[:, fetch.layout.displaced("test")], expected)
+        torch.testing.assert_close(output[:, fetch.layout.displaced("test")], expected)
         assert {id(one) for one in moved.parameters()} == {id(one) for one in actor.parameters()}
     state = TensorDict(
         observation=torch.rand(3, fetch.layout.size),

@@ -37,8 +37,8 @@ def make_batch(rows=12, seed=0, spread=2.0):
     return lw.QAFTransform(PLANS)(batch.auto_batch_size_(1))
 
 
-def distance(given, wanted, name):
-    off = abs(given - wanted)
+def distance(given, expected, name):
+    off = abs(given - expected)
     if name == "l2":
         return off**2
     return off if name == "l1" else (off**2 / 2 if off < 1 else off - 0.5)
@@ -58,12 +58,12 @@ def test_loss_by_hand(kind, name, distribution):
         weights.append(min(exponential, 5.0))
         off = [distance(a, b, name) for a, b in zip(actions[row], batch["action"][row].tolist(), strict=True)]
         total += weights[-1] * sum(off) / 4
-    found = loss(batch)
-    np.testing.assert_allclose(found["loss_actor"].item(), total / sum(weights), rtol=1e-5)
-    np.testing.assert_allclose(found["weight_clipped"].item(), clipped / 12, rtol=1e-6)
-    np.testing.assert_allclose(found["ESS"].item(), sum(weights) ** 2 / sum(w**2 for w in weights) / 12, rtol=1e-5)
+    result = loss(batch)
+    np.testing.assert_allclose(result["loss_actor"].item(), total / sum(weights), rtol=1e-5)
+    np.testing.assert_allclose(result["weight_clipped"].item(), clipped / 12, rtol=1e-6)
+    np.testing.assert_allclose(result["ESS"].item(), sum(weights) ** 2 / sum(w**2 for w in weights) / 12, rtol=1e-5)
     assert 0 < clipped < 12
-    assert not any(found[key].requires_grad for key in ("ESS", "weight_clipped"))
+    assert not any(result[key].requires_grad for key in ("ESS", "weight_clipped"))
 
 
 @pytest.mark.filterwarnings("ignore:.*target_actor_network_params")
@@ -98,14 +98,14 @@ def test_loss_lies_within_those_of_its_rows_and_grows_with_their_weights(advanta
     """Also for huge advantages, whose weights must not all underflow."""
     batch = make_batch(4).set("advantage", torch.tensor(advantages).unsqueeze(-1))
     loss = lw.objectives.AdvantageWeightedLoss(ACTOR, beta=beta)
-    found = loss(batch)
+    result = loss(batch)
     rows = [lw.objectives.AdvantageWeightedLoss(ACTOR)(batch[i : i + 1])["loss_actor"].item() for i in range(4)]
-    assert min(rows) - 1e-5 <= found["loss_actor"] <= max(rows) + 1e-5
-    assert 0.25 - 1e-5 <= found["ESS"] <= 1 + 1e-5
+    assert min(rows) - 1e-5 <= result["loss_actor"] <= max(rows) + 1e-5
+    assert 0.25 - 1e-5 <= result["ESS"] <= 1 + 1e-5
     order = np.argsort(rows)
     best = batch.clone()  # the advantages in the order of the rows' own losses: no other order gives more
     best["advantage"][torch.from_numpy(order)] = batch["advantage"].sort(0).values
-    assert loss(best)["loss_actor"] >= found["loss_actor"] - 1e-5
+    assert loss(best)["loss_actor"] >= result["loss_actor"] - 1e-5
 
 
 @COMPILING
@@ -116,14 +116,14 @@ def test_loss_lies_within_those_of_its_rows_and_grows_with_their_weights(advanta
 def test_compiled_loss_is_one_graph_with_the_same_gradients(name, distribution):
     torch._dynamo.reset()
     loss = lw.objectives.AdvantageWeightedLoss(make_actor(distribution=distribution), loss_function=name)
-    found = []
+    result = []
     for run in (loss, torch.compile(loss, fullgraph=True, backend="eager")):
         loss.zero_grad()
         value = run(make_batch())["loss_actor"]
         value.backward()
-        found.append([value.detach(), *(p.grad.clone() for p in loss.parameters() if p.grad is not None)])
-    assert len(found[0]) > 5
-    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+        result.append([value.detach(), *(p.grad.clone() for p in loss.parameters() if p.grad is not None)])
+    assert len(result[0]) > 5
+    assert all(torch.equal(one, other) for one, other in zip(*result, strict=True))
 
 
 def test_renamed_and_nested_keys():
@@ -144,13 +144,13 @@ def test_renamed_and_nested_keys():
 def test_in_keys_suffice_and_the_input_stays_unchanged():
     loss, batch = lw.objectives.AdvantageWeightedLoss(make_actor("description")), make_batch()
     before = batch.clone()
-    wanted = loss(batch)
+    expected = loss(batch)
     assert set(batch.keys(True, True)) == set(before.keys(True, True))
     assert (batch == before).all()
     value, clipped, ess = loss(**{key: batch[key] for key in loss.in_keys})
-    assert torch.equal(value, wanted["loss_actor"])
-    assert torch.equal(clipped, wanted["weight_clipped"])
-    assert torch.equal(ess, wanted["ESS"])
+    assert torch.equal(value, expected["loss_actor"])
+    assert torch.equal(clipped, expected["weight_clipped"])
+    assert torch.equal(ess, expected["ESS"])
 
 
 @pytest.mark.parametrize("shape", [(12,), (12, 2), (1, 1), (1, 12)])
@@ -173,12 +173,12 @@ def tensors(rows):
 @settings(max_examples=50, deadline=None)
 @given(rows=ADVANTAGES)
 def test_standardized_advantages_by_hand(rows):
-    found = lw.objectives.standardize_by_task(*tensors(rows))
-    assert (found.shape, found.dtype) == ((len(rows), 1), torch.float32)
-    for (task, advantage), one in zip(rows, found.squeeze(-1).tolist(), strict=True):
+    result = lw.objectives.standardize_by_task(*tensors(rows))
+    assert (result.shape, result.dtype) == ((len(rows), 1), torch.float32)
+    for (task, advantage), one in zip(rows, result.squeeze(-1).tolist(), strict=True):
         own = np.array([np.float64(a) for t, a in rows if t == task])
-        wanted = 0.0 if (own == own[0]).all() else (advantage - own.mean()) / own.std()
-        assert one == pytest.approx(wanted, rel=1e-5, abs=1e-6)
+        expected = 0.0 if (own == own[0]).all() else (advantage - own.mean()) / own.std()
+        assert one == pytest.approx(expected, rel=1e-5, abs=1e-6)
 
 
 @pytest.mark.parametrize("same", [0.1, 1e-30, -1e30])
@@ -195,20 +195,20 @@ ACTOR = make_actor()
 
 @pytest.mark.parametrize("distribution", [None, "normal"])
 def test_reductions(distribution):
-    batch, found = make_batch(spread=3.0), {}
+    batch, result = make_batch(spread=3.0), {}
     name = "l2" if distribution is None else "log_prob"
     for reduction in ("none", "sum", "mean", None):
         loss = lw.objectives.AdvantageWeightedLoss(
             make_actor(distribution=distribution).eval(), beta=1.5, loss_function=name, reduction=reduction
         )
-        found[reduction] = loss(batch)["loss_actor"]
+        result[reduction] = loss(batch)["loss_actor"]
     weights = (1.5 * batch["advantage"].squeeze(-1)).exp().clamp(max=20.0)
-    assert found["none"].shape == (12,)
-    torch.testing.assert_close(found["none"].sum(), found["sum"])
-    torch.testing.assert_close(found["sum"] / weights.sum(), found["mean"])
-    assert torch.equal(found["mean"], found[None])
+    assert result["none"].shape == (12,)
+    torch.testing.assert_close(result["none"].sum(), result["sum"])
+    torch.testing.assert_close(result["sum"] / weights.sum(), result["mean"])
+    assert torch.equal(result["mean"], result[None])
     alone = lw.objectives.AdvantageWeightedLoss(
         make_actor(distribution=distribution).eval(), loss_function=name, beta=0.0
     )
     for row in range(12):  # with the weight 1
-        torch.testing.assert_close(found["none"][row], weights[row] * alone(batch[row : row + 1])["loss_actor"])
+        torch.testing.assert_close(result["none"][row], weights[row] * alone(batch[row : row + 1])["loss_actor"])

@@ -26,11 +26,11 @@ def make(kind, bc_weight=2.0, seed=0, **options):
 
 def values(loss, critic, batch, action):
     """Return the value of each critic, (E, B)."""
-    found = []
+    result = []
     for number in range(loss.num_qvalue_nets):
         with loss.qvalue_network_params.detach()[number].to_module(critic):
-            found.append(critic(batch.copy().set("action", action))["state_action_value"].squeeze(-1))
-    return torch.stack(found)
+            result.append(critic(batch.copy().set("action", action))["state_action_value"].squeeze(-1))
+    return torch.stack(result)
 
 
 @pytest.mark.parametrize("shape", [(24,), (24, 1)])
@@ -38,18 +38,18 @@ def test_td3_actor_loss_by_hand(shape):
     loss, actor, critic = make(lw.objectives.DemonstratedTD3Loss, bc_weight=0.7)
     batch = make_batch()
     batch["is_demonstration"] = batch["is_demonstration"].view(shape)
-    found, about = loss.actor_loss(batch)
+    result, about = loss.actor_loss(batch)
     action = actor(batch.copy())["action"]
     value = values(loss, critic, batch, action).mean(0)
     demonstrated = [row for row in range(24) if batch["is_demonstration"].flatten()[row]]
     assert demonstrated == list(range(12, 24))
     distance = sum(((action[row] - batch["action"][row]) ** 2).sum() for row in demonstrated) / (4 * len(demonstrated))
     expected = -value.mean() / value.abs().mean().detach() + 0.7 * distance
-    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(result, expected)
     torch.testing.assert_close(about["bc_loss"], distance.detach())
     torch.testing.assert_close(about["state_action_value_actor"], value.detach())
     torch.testing.assert_close(about["lmbd"], 1 / value.abs().mean().detach())
-    found.backward()
+    result.backward()
     mine = actor.decoder.network[0].weight.grad.clone()
     actor.zero_grad()
     expected.backward()
@@ -61,11 +61,11 @@ def test_td3_critic_loss_is_torchrls():
     batch = make_batch()
     ours, _, _ = make(lw.objectives.DemonstratedTD3Loss)
     theirs, _, _ = make(TD3Loss, None)
-    found = []
+    result = []
     for loss in (ours, theirs):
         torch.manual_seed(3)
-        found.append(loss(batch.copy())["loss_qvalue"])
-    assert torch.equal(*found)
+        result.append(loss(batch.copy())["loss_qvalue"])
+    assert torch.equal(*result)
 
 
 def test_sac_actor_loss_adds_the_distance_of_the_mode():
@@ -76,15 +76,15 @@ def test_sac_actor_loss_adds_the_distance_of_the_mode():
     theirs.make_value_estimator(gamma=0.9)
     SoftUpdate(theirs, eps=0.9)
     theirs.load_state_dict(ours.state_dict())
-    found = []
+    result = []
     for loss in (ours, theirs):
         torch.manual_seed(3)
-        found.append(loss.actor_loss(batch.copy()))
+        result.append(loss.actor_loss(batch.copy()))
     mode = torch.tanh(actor.get_dist_params(batch.copy())["loc"])
     distance = (mode - batch["action"])[12:].square().mean()
-    torch.testing.assert_close(found[0][0], found[1][0] + 0.7 * distance)
-    torch.testing.assert_close(found[0][1]["bc_loss"], distance.detach())
-    assert found[0][0].abs() < 10
+    torch.testing.assert_close(result[0][0], result[1][0] + 0.7 * distance)
+    torch.testing.assert_close(result[0][1]["bc_loss"], distance.detach())
+    assert result[0][0].abs() < 10
     different = []
     for weight in (0.0, 0.7):
         ours.bc_weight = weight
@@ -136,8 +136,8 @@ def test_all_rows_of_a_demonstration_buffer_are_imitated(tmp_path, sampler):
     )
     loss, actor, _ = make(lw.objectives.DemonstratedTD3Loss)
     batch = replay.sample()
-    found = loss.actor_loss(batch)[1]["bc_loss"]
-    torch.testing.assert_close(found, (actor(batch.copy())["action"] - batch["action"]).square().mean())
+    result = loss.actor_loss(batch)[1]["bc_loss"]
+    torch.testing.assert_close(result, (actor(batch.copy())["action"] - batch["action"]).square().mean())
 
 
 def test_loss_with_and_without_vmap_is_the_same():
@@ -147,15 +147,15 @@ def test_loss_with_and_without_vmap_is_the_same():
 
 @each_kind
 def test_reductions(kind):
-    batch, found = make_batch(), {}
+    batch, result = make_batch(), {}
     for reduction in ("mean", "sum", "none"):
         more = {"scalar_output_mode": "exclude"} if kind is lw.objectives.DemonstratedSACLoss else {}
         loss = make(kind, reduction=reduction, **more)[0]
         torch.manual_seed(3)
-        found[reduction] = loss.actor_loss(batch.copy())[0]
-    torch.testing.assert_close(found["sum"], found["mean"] * 24)
-    torch.testing.assert_close(found["none"].sum(), found["sum"])
-    assert found["none"].shape == (24,)
+        result[reduction] = loss.actor_loss(batch.copy())[0]
+    torch.testing.assert_close(result["sum"], result["mean"] * 24)
+    torch.testing.assert_close(result["none"].sum(), result["sum"])
+    assert result["none"].shape == (24,)
 
 
 def test_action_spec_with_a_batch_dimension_is_refused():

@@ -82,12 +82,12 @@ def test_loss_by_hand(kind, ensemble, steps):
     for expectile in (0.3, 0.7, 1.0):
         loss, batch = make_loss(kind, ensemble, expectile=expectile), make_batch(steps=steps)
         expected, value, priorities, advantages = by_hand(loss, batch, expectile=expectile)
-        found = loss(batch)
-        np.testing.assert_allclose(found["loss_value"].item(), expected, rtol=1e-5)
-        np.testing.assert_allclose(found["value"].item(), value, rtol=1e-5)
+        result = loss(batch)
+        np.testing.assert_allclose(result["loss_value"].item(), expected, rtol=1e-5)
+        np.testing.assert_allclose(result["value"].item(), value, rtol=1e-5)
         np.testing.assert_allclose(batch["td_error"].numpy(), priorities, rtol=1e-4, atol=1e-7)
         np.testing.assert_allclose(loss.advantage(batch).numpy(), advantages, rtol=1e-4, atol=1e-6)
-        assert not found["value"].requires_grad
+        assert not result["value"].requires_grad
         assert not batch["td_error"].requires_grad
 
 
@@ -124,14 +124,14 @@ def test_gradients_reach_every_parameter_but_no_target(kind):
 @pytest.mark.parametrize("kind", CRITICS)
 def test_compiled_loss_is_one_graph_with_the_same_gradients(kind):
     torch._dynamo.reset()
-    loss, found = make_loss(kind), []
+    loss, result = make_loss(kind), []
     for run in (loss, torch.compile(loss, fullgraph=True, backend="eager")):
         loss.zero_grad()
         batch = make_batch()
         value = run(batch)["loss_value"]
         value.backward()
-        found.append([value.detach(), batch["td_error"], *(p.grad.clone() for p in loss.parameters())])
-    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+        result.append([value.detach(), batch["td_error"], *(p.grad.clone() for p in loss.parameters())])
+    assert all(torch.equal(one, other) for one, other in zip(*result, strict=True))
 
 
 def test_renamed_and_nested_keys():
@@ -236,14 +236,14 @@ def test_n_step_rows_of_a_buffer(tmp_path, kind):
 
 @pytest.mark.parametrize("weighted", [False, True])
 def test_reductions(weighted):
-    batch, found = make_batch(), {}
+    batch, result = make_batch(), {}
     if weighted:
         batch["priority_weight"] = torch.rand(12, generator=torch.Generator().manual_seed(0))
     for reduction in ("none", "sum", "mean", None):
-        found[reduction] = make_loss(reduction=reduction)(batch.copy())["loss_value"]
+        result[reduction] = make_loss(reduction=reduction)(batch.copy())["loss_value"]
     one_by_one = [make_loss()(batch[row : row + 1].exclude("priority_weight"))["loss_value"] for row in range(12)]
     weights = batch["priority_weight"] if weighted else torch.ones(12)
-    torch.testing.assert_close(found["none"], torch.stack(one_by_one) * weights)
-    torch.testing.assert_close(found["sum"], found["none"].sum())
-    torch.testing.assert_close(found["mean"], found["sum"] / weights.sum())
-    assert torch.equal(found["mean"], found[None])
+    torch.testing.assert_close(result["none"], torch.stack(one_by_one) * weights)
+    torch.testing.assert_close(result["sum"], result["none"].sum())
+    torch.testing.assert_close(result["mean"], result["sum"] / weights.sum())
+    assert torch.equal(result["mean"], result[None])

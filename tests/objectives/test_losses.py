@@ -163,9 +163,9 @@ def test_loss_is_finite_at_the_action_bounds(name, distribution):
     batch = ready(name, make_batch(), actor, value)
     if name not in ON_POLICY:
         batch["action"] = batch["action"].sign()
-    found = total(loss, batch)
-    found.backward()
-    assert found.isfinite()
+    result = total(loss, batch)
+    result.backward()
+    assert result.isfinite()
     assert all(p.grad.isfinite().all() for p in trained(loss).values())
 
 
@@ -194,9 +194,9 @@ def test_compiled_loss_is_one_graph_with_the_same_gradients(name, condition):
     gradients = []
     for run in (loss, torch.compile(loss, fullgraph=True, backend="eager")):
         loss.zero_grad()
-        found = total(run, batch)
-        found.backward()
-        gradients.append([found.detach(), *(p.grad.clone() for p in trained(loss).values())])
+        result = total(run, batch)
+        result.backward()
+        gradients.append([result.detach(), *(p.grad.clone() for p in trained(loss).values())])
     assert all(torch.equal(one, other) for one, other in zip(*gradients, strict=True))
 
 
@@ -284,10 +284,10 @@ def test_ppo_ratio_is_one_before_an_update():
         if distribution == "normal":
             assert (data["action"].abs() > 1).any()
         data = GAE(gamma=0.9, lmbda=0.9, value_network=value)(data)
-        found = ClipPPOLoss(actor, value, normalize_advantage=False)(data.reshape(-1))
-        assert found["clip_fraction"] == 0
-        torch.testing.assert_close(found["ESS"], torch.tensor(1.0))
-        torch.testing.assert_close(found["kl_approx"], torch.tensor(0.0), atol=1e-6, rtol=0)
+        result = ClipPPOLoss(actor, value, normalize_advantage=False)(data.reshape(-1))
+        assert result["clip_fraction"] == 0
+        torch.testing.assert_close(result["ESS"], torch.tensor(1.0))
+        torch.testing.assert_close(result["kl_approx"], torch.tensor(0.0), atol=1e-6, rtol=0)
 
 
 def test_shared_trunk_is_trained_by_actor_and_critic():
@@ -296,9 +296,9 @@ def test_shared_trunk_is_trained_by_actor_and_critic():
     assert value.trunk.module["mixer"] is actor.module["mixer"]
     batch = ready("PPO", make_batch(), actor, value)
     loss = ClipPPOLoss(actor, value, separate_losses=False)
-    found = loss(batch)
+    result = loss(batch)
     shared = actor.module["mixer"].encoder[0].weight
     names = [name for name, p in loss.named_parameters() if p.shape == shared.shape and p.requires_grad]
     assert len(names) == 1
-    found["loss_critic"].backward()
+    result["loss_critic"].backward()
     assert dict(loss.named_parameters())[names[0]].grad.abs().sum() > 0

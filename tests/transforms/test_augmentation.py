@@ -47,11 +47,11 @@ def test_a_canonical_step_mentions_what_it_moves_and_its_target(skills):
     """Even if its text does not: "lift the puck out of the hole" is on its way to the target location."""
     plans = lw.canonical_plans(lw.load_plans("MT50", skills=skills))
     tables = PlanTables(plans)
-    found = mentioned(plans, tables)
+    result = mentioned(plans, tables)
     for task, plan in plans.items():
         for number, step in enumerate(plan.steps):
             if "target location" in (step.role.moved, step.role.target):
-                assert found[tables.index.row(task), number, 2], (task, step.skill)
+                assert result[tables.index.row(task), number, 2], (task, step.skill)
 
 
 # One condition of push for each row: the puck alone is mentioned, or the goal too.
@@ -67,13 +67,13 @@ KEPT = torch.tensor([[True, False, False], [True, False, True]])
 
 def rows(number=8, seed=0, plans=PUSH, task="push", step=None):
     generator = torch.Generator().manual_seed(seed)
-    found = TensorDict(
+    result = TensorDict(
         observation=torch.randn(number, 39, generator=generator), task_id=torch.full((number,), lw.task_id(task))
     ).auto_batch_size_(1)
-    found["qaf"] = torch.rand(number, plans.num_steps, generator=generator) < 0.5
+    result["qaf"] = torch.rand(number, plans.num_steps, generator=generator) < 0.5
     if step is not None:
-        found["qaf"] = torch.nn.functional.one_hot(torch.as_tensor(step).expand(number), plans.num_steps).bool()
-    return found
+        result["qaf"] = torch.nn.functional.one_hot(torch.as_tensor(step).expand(number), plans.num_steps).bool()
+    return result
 
 
 def seeded(transform, tensordict, seed=0):

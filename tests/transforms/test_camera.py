@@ -100,9 +100,9 @@ def test_state_dict_holds_the_environments_and_requires_a_reset():
     other.load_state_dict(state)
     with pytest.raises(RuntimeError, match=r"reset"):
         other.step(moving(began))
-    found = other.reset()
-    assert found["episode"] == expected["episode"] == 1
-    assert torch.equal(found["pixels"], expected["pixels"])
+    result = other.reset()
+    assert result["episode"] == expected["episode"] == 1
+    assert torch.equal(result["pixels"], expected["pixels"])
     env.close()
     other.close()
 

@@ -67,8 +67,8 @@ def test_answers_equal_a_plain_program_over_any_resets(options, done):
         for row in mask.nonzero().flatten().tolist():
             episodes[row] = [*([] if kind == "reset" else episodes[row]), state["exact"][row]]
         for row in range(ROWS):
-            wanted = expected(episodes[row], ("push", "reach")[row % 2], int(state["episode"][row]), **options)
-            assert torch.equal(state["qaf"][row], wanted), (row, kind)
+            shown_answers = expected(episodes[row], ("push", "reach")[row % 2], int(state["episode"][row]), **options)
+            assert torch.equal(state["qaf"][row], shown_answers), (row, kind)
 
 
 @pytest.mark.parametrize("options", CORRUPTIONS)
@@ -91,17 +91,17 @@ def test_soft_answers_are_corrupted_alike(options):
         TransformedEnv(RandomStates(ROWS), Compose(*(part.clone() for part in parts))),
         both(RandomStates(ROWS), **options),
     )
-    found, expected = env.rollout(12)["qaf"], plain.rollout(12)["qaf"]
-    assert found.dtype == torch.float32
-    assert set(found.unique().tolist()) == {0.25, 0.75}
-    assert torch.equal(found > 0.5, expected)
+    actual, expected = env.rollout(12)["qaf"], plain.rollout(12)["qaf"]
+    assert actual.dtype == torch.float32
+    assert set(actual.unique().tolist()) == {0.25, 0.75}
+    assert torch.equal(actual > 0.5, expected)
 
 
 def test_flip_rate():
-    found = both(RandomStates(6), flip=0.2, seed=5).rollout(200)
+    actual = both(RandomStates(6), flip=0.2, seed=5).rollout(200)
     real = torch.zeros(6, 200, 4, dtype=torch.bool)
     real[0::2, :, :2], real[1::2] = True, True
-    wrong = found["qaf"] ^ found["exact"]
+    wrong = actual["qaf"] ^ actual["exact"]
     assert wrong[real].float().mean() == pytest.approx(0.2, abs=0.02)
     assert not wrong[~real].any(), "padding is false"
     assert not (wrong[:, 1:] & wrong[:, :-1])[real[:, 1:]].float().mean() > 0.06, "each step is drawn for itself"
@@ -111,7 +111,7 @@ def test_flip_rate():
 
 def test_larger_probability_flips_all_that_a_smaller_one_flips():
     few, many = (both(RandomStates(2), flip=p).rollout(50) for p in (0.1, 0.3))
-    few, many = (found["qaf"] ^ found["exact"] for found in (few, many))
+    few, many = (actual["qaf"] ^ actual["exact"] for actual in (few, many))
     assert 0 < few.sum() < many.sum()
     assert not (few & ~many).any()
 
@@ -123,12 +123,12 @@ def test_errors_depend_on_the_seed():
 
 
 def test_errors_beyond_a_block_of_draws_and_in_the_next_episode():
-    found = both(RandomStates(2, length=70), flip=0.3, delay=1).rollout(75, break_when_any_done=False)
-    row = found[0]
+    actual = both(RandomStates(2, length=70), flip=0.3, delay=1).rollout(75, break_when_any_done=False)
+    row = actual[0]
     assert row["episode"][[0, -1]].tolist() == [0, 1]
     for step in (0, 63, 64, 69):
-        wanted = expected(list(row["exact"][: step + 1]), "push", 0, flip=0.3, delay=1)
-        assert torch.equal(row["qaf"][step], wanted)
+        shown_answers = expected(list(row["exact"][: step + 1]), "push", 0, flip=0.3, delay=1)
+        assert torch.equal(row["qaf"][step], shown_answers)
     assert torch.equal(row["qaf"][72], expected(list(row["exact"][70:73]), "push", 1, flip=0.3, delay=1))
 
 
@@ -137,11 +137,11 @@ def test_errors_beyond_a_block_of_draws_and_in_the_next_episode():
 
 def episodes_of(rollout: TensorDictBase) -> dict[tuple[int, int], list[list[bool]]]:
     """Return the answers of each (task id, episode) in a rollout (..., T)."""
-    found: dict[tuple[int, int], list[list[bool]]] = {}
+    actual: dict[tuple[int, int], list[list[bool]]] = {}
     for row in rollout.reshape(-1, rollout.shape[-1]):
         for step in row:
-            found.setdefault((int(step["task_id"]), int(step["episode"])), []).append(step["qaf"].tolist())
-    return found
+            actual.setdefault((int(step["task_id"]), int(step["episode"])), []).append(step["qaf"].tolist())
+    return actual
 
 
 def walk(env: EnvBase, steps: int) -> TensorDictBase:
@@ -183,14 +183,14 @@ def test_rows_of_a_worker_that_end_at_different_steps(place):
         )
     else:
         env = both(SerialEnv(2, [lambda: RandomStates(2, 5), lambda: RandomStates(2, 7, 2)]), **options)
-    found = env.rollout(25, break_when_any_done=False)
-    for row in found.reshape(-1, 25):
+    actual = env.rollout(25, break_when_any_done=False)
+    for row in actual.reshape(-1, 25):
         task = "push" if row["task_id"][0] == lw.task_id("push") else "reach"
         for number in range(int(row["episode"].max()) + 1):
             one = row[row["episode"] == number]
             for step in range(len(one)):
-                wanted = expected(list(one["exact"][: step + 1]), task, number, **options)
-                assert torch.equal(one["qaf"][step], wanted)
+                shown_answers = expected(list(one["exact"][: step + 1]), task, number, **options)
+                assert torch.equal(one["qaf"][step], shown_answers)
     env.close()
 
 
@@ -202,9 +202,9 @@ def test_resumed_environment_continues_with_the_same_errors():
     walk(first, 5)
     second.load_state_dict(first.state_dict())
     walk(whole, 5)
-    expect, found = walk(whole, 12), walk(second, 12)
-    assert torch.equal(found["qaf"], expect["qaf"])
-    assert not torch.equal(found["qaf"], found["exact"])
+    expect, actual = walk(whole, 12), walk(second, 12)
+    assert torch.equal(actual["qaf"], expect["qaf"])
+    assert not torch.equal(actual["qaf"], actual["exact"])
     for env in (whole, first, second):
         env.close()
 
@@ -234,9 +234,9 @@ def test_evaluation_does_not_depend_on_num_envs_or_other_tasks(kind):
     few = answers(tasks=["drawer-open", "reach"], evaluator=corrupted, num_envs=2)
     many = answers(tasks=["drawer-open", "push", "reach"], evaluator=corrupted, num_envs=6)
     exact = answers(tasks=["drawer-open", "reach"])
-    for which, found in few.items():
-        assert (found == many[which]).all(), which
-        assert not torch.equal(found["qaf"], exact[which]["qaf"])
+    for which, actual in few.items():
+        assert (actual == many[which]).all(), which
+        assert not torch.equal(actual["qaf"], exact[which]["qaf"])
 
 
 def test_with_plans_keeps_the_options():

@@ -19,13 +19,13 @@ def turns_of(ways, rows=None, **options):
     """Return the turn after each step of observations (T, B, 39); the first is a reset's."""
     transform = FallbackTurns(**options)
     start = TensorDict(observation=ways[0], batch_size=[ways.shape[1]])
-    found = [transform._reset(TensorDict(batch_size=start.batch_size), start)["turn"]]
+    result = [transform._reset(TensorDict(batch_size=start.batch_size), start)["turn"]]
     for number, now in enumerate(ways[1:]):
         before = TensorDict(batch_size=start.batch_size)
         if rows is not None:
             before["_step"] = rows[number]
-        found.append(transform._step(before, TensorDict(observation=now, batch_size=start.batch_size))["turn"])
-    return torch.stack(found)
+        result.append(transform._step(before, TensorDict(observation=now, batch_size=start.batch_size))["turn"])
+    return torch.stack(result)
 
 
 def standing(steps, rows=1):

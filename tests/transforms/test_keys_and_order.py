@@ -50,10 +50,10 @@ def nested(sample: TensorDict) -> TensorDict:
         ("robot", "move"): sample["action"],
         ("next", "robot", "state"): sample["next", "observation"],
     }
-    found = TensorDict({}, sample.batch_size)
+    result = TensorDict({}, sample.batch_size)
     for key, value in moved.items():
-        found.set(key, value.clone())
-    return found
+        result.set(key, value.clone())
+    return result
 
 
 # --- keys ----------------------------------------------------------------------------------------------------------
@@ -74,9 +74,9 @@ def test_nested_keys_in_an_environment():
     plain = TransformedEnv(make_env(), queries())
     env.set_seed(0)
     plain.set_seed(0)
-    found, expected = (e.rollout(4, lambda td: td.set("action", torch.ones(2, 4))) for e in (env, plain))
-    assert torch.equal(found["plan", "truth"], expected["qaf"])
-    assert torch.equal(found["next", "plan", "truth"], expected["next", "qaf"])
+    result, expected = (e.rollout(4, lambda td: td.set("action", torch.ones(2, 4))) for e in (env, plain))
+    assert torch.equal(result["plan", "truth"], expected["qaf"])
+    assert torch.equal(result["next", "plan", "truth"], expected["next", "qaf"])
     env.close()
     plain.close()
 
@@ -87,10 +87,10 @@ def test_random_yaw_with_renamed_keys():
     expected = lw.RandomYaw(0.5)(sample.clone())
     torch.manual_seed(0)
     keys = [("robot", "state"), ("robot", "move"), ("robot", "expert"), ("robot", "unclipped")]
-    found = lw.RandomYaw(0.5, in_keys=keys)(nested(sample))
-    assert torch.equal(found["robot", "state"], expected["observation"])
-    assert torch.equal(found["next", "robot", "state"], expected["next", "observation"])
-    assert torch.equal(found["robot", "move"], expected["action"])
+    result = lw.RandomYaw(0.5, in_keys=keys)(nested(sample))
+    assert torch.equal(result["robot", "state"], expected["observation"])
+    assert torch.equal(result["next", "robot", "state"], expected["next", "observation"])
+    assert torch.equal(result["robot", "move"], expected["action"])
     torch.manual_seed(0)
     beside = lw.RandomYaw(0.5, out_keys=["turned", "turned_action", "turned_expert", "turned_wish"])(sample.clone())
     assert torch.equal(beside["observation"], sample["observation"])
@@ -153,9 +153,9 @@ def test_random_yaw_before_qaf_is_refused():
 def test_transforms_after_qaf_do_not_change_the_answers():
     plain = TransformedEnv(make_env(), queries())
     env = TransformedEnv(make_env(), Compose(StepCounter(), queries(), norm(), norm("observation", "again")))
-    found, expected = env.reset(), plain.reset()
-    assert torch.equal(found["qaf"], expected["qaf"])
-    assert torch.equal(found["observation"], expected["observation"] * 2.0)
+    result, expected = env.reset(), plain.reset()
+    assert torch.equal(result["qaf"], expected["qaf"])
+    assert torch.equal(result["observation"], expected["observation"] * 2.0)
     env.close()
     plain.close()
 

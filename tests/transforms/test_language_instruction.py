@@ -59,8 +59,8 @@ def test_buffer_rows_have_the_descriptions_of_their_tasks():
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(6), batch_size=6, transform=LanguageInstruction("MT10"))
     ids = torch.tensor([lw.task_id("push"), lw.task_id("door-open")]).repeat(3)
     replay.extend(TensorDict(task_id=ids, batch_size=[6]))
-    found = replay.sample()
+    result = replay.sample()
     names = {lw.task_id(task): lw.TASKS[task].description for task in lw.MT10}
-    assert found["language_instruction"] == [names[number] for number in found["task_id"].tolist()]
+    assert result["language_instruction"] == [names[number] for number in result["task_id"].tolist()]
     with pytest.raises(ValueError, match="is not among the tasks of LanguageInstruction: give it tasks="):
         LanguageInstruction("MT10")(TensorDict(task_id=torch.full((2,), lw.task_id("soccer")), batch_size=[2]))

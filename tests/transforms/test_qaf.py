@@ -52,7 +52,7 @@ def env(few_plans) -> Iterator[TransformedEnv]:
 
 @pytest.fixture(scope="module")
 def rollout(env) -> TensorDictBase:
-    """An episode of the experts and the beginning of the next."""
+    """Return an episode of the experts and the beginning of the next."""
     env.set_seed(0)
     return env.rollout(STEPS + 5, lw.ExpertActor(TASKS), break_when_any_done=False)
 
@@ -60,14 +60,14 @@ def rollout(env) -> TensorDictBase:
 def answers(observation: Tensor, task_id: Tensor) -> Tensor:
     """Answer each condition of each row by a separate program, one state at a time."""
     states, tasks = observation.reshape(-1, 39), task_id.reshape(-1)
-    found = torch.zeros(len(states), WIDTH, dtype=torch.bool)
+    result = torch.zeros(len(states), WIDTH, dtype=torch.bool)
     for task in TASKS:
         rows = torch.nonzero(tasks == lw.task_id(task)).flatten()
         for step, (condition, _) in enumerate(PAIRS[task]):
             program = lw.QueryProgram({task: [condition]})
             for row in rows.tolist():
-                found[row, step] = program(states[row : row + 1], tasks[row : row + 1]).item()
-    return found.reshape(*task_id.shape, WIDTH)
+                result[row, step] = program(states[row : row + 1], tasks[row : row + 1]).item()
+    return result.reshape(*task_id.shape, WIDTH)
 
 
 def test_answers_are_the_programs_at_every_step(rollout):
@@ -139,7 +139,7 @@ def test_other_transforms_around_it(few_plans):
 
 
 def buffer(data: TensorDictBase, plans: lw.Plans) -> TensorDictReplayBuffer:
-    """Whose samples hold every row once, in some order."""
+    """Return a buffer whose samples hold every row once, in some order."""
     replay = TensorDictReplayBuffer(
         storage=LazyTensorStorage(len(data)),
         sampler=SamplerWithoutReplacement(),

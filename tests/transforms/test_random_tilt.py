@@ -23,8 +23,8 @@ def rows(task, step, number=400, reach=0.5, also=None):
     drawn = torch.Generator().manual_seed(0)
     action = (2 * torch.rand(number, 4, generator=drawn) - 1) * reach
     ids = torch.full((number,), lw.task_id(task))
-    found = TensorDict(observation=torch.rand(number, 39, generator=drawn), action=action, qaf=qaf, task_id=ids)
-    return found.auto_batch_size_()
+    result = TensorDict(observation=torch.rand(number, 39, generator=drawn), action=action, qaf=qaf, task_id=ids)
+    return result.auto_batch_size_()
 
 
 def tilted(was, tilt=1.0, scale=0.0):
@@ -33,8 +33,8 @@ def tilted(was, tilt=1.0, scale=0.0):
 
 
 def number_of(task, words):
-    (found,) = (number for number, step in enumerate(PLANS[task].steps) if step.skill == words)
-    return found
+    (result,) = (number for number, step in enumerate(PLANS[task].steps) if step.skill == words)
+    return result
 
 
 def test_random_rotations_are_uniform():

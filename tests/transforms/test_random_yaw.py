@@ -25,12 +25,12 @@ def angle(vectors):
 
 
 def wrapped(angles):
-    """The same angles in [-pi, pi)."""
+    """Return the same angles in [-pi, pi)."""
     return torch.remainder(angles + torch.pi, 2 * torch.pi) - torch.pi
 
 
 def between(first, second):
-    """The angle from one to the other."""
+    """Return the angle from the first to the second."""
     return wrapped(angle(second) - angle(first))
 
 
@@ -111,12 +111,12 @@ def test_next_observation_turns_with_its_row():
 def test_scale_0_changes_nothing_and_the_seed_fixes_the_angles():
     was = rows()
     assert (lw.RandomYaw(0.0)(was.clone()).exclude("observation_yaw") == was).all()
-    found = []
+    result = []
     for seed in (1, 1, 2):
         torch.manual_seed(seed)
-        found.append(lw.RandomYaw(0.3)(was.clone())["observation"])
-    assert torch.equal(found[0], found[1])
-    assert not torch.equal(found[0], found[2])
+        result.append(lw.RandomYaw(0.3)(was.clone())["observation"])
+    assert torch.equal(result[0], result[1])
+    assert not torch.equal(result[0], result[2])
 
 
 def test_written_angle_turns_back():

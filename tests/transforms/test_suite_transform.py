@@ -11,7 +11,7 @@ PUSH = lw.TASKS["push"]
 
 
 def forgetful(observation):
-    """Meta-World's numbers without those of the step before."""
+    """Return Meta-World's numbers without those of the previous step."""
     seen = observation.clone()
     seen[..., 18:36] = torch.nan
     return seen
