@@ -14,10 +14,10 @@ from torch import nn
 import lw_torchrl as lw
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation import attribute_failures
-from lw_torchrl.evaluation.diagnose.counterfactuals import Counterfactuals, own_evaluators, with_true_answers
-from lw_torchrl.evaluation.diagnose.decision import choose_pair, decide
-from lw_torchrl.evaluation.diagnose.findings import ActiveStep, PlanDeparts, WrongAnswers
-from lw_torchrl.evaluation.diagnose.scripts import attended
+from lw_torchrl.evaluation.diagnose.attribution import choose_pair, decide
+from lw_torchrl.evaluation.diagnose.counterfactuals import Counterfactuals
+from lw_torchrl.evaluation.diagnose.failure import ActiveStep, PlanDeparts, WrongAnswers
+from lw_torchrl.evaluation.diagnose.replacements import attended, own_evaluators, with_true_answers
 from lw_torchrl.evaluation.diagnose.states import ScriptComparison, chosen, last_stay_start, stall_step
 from lw_torchrl.record.rollouts import simulate_again
 from lw_torchrl.transforms.qaf import plan_program

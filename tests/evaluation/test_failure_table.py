@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, Failure, plot_failures
-from lw_torchrl.evaluation.diagnose.findings import ActiveStep, Difference, WrongAnswers
+from lw_torchrl.evaluation.diagnose.failure import ActiveStep, Difference, WrongAnswers
 
 CONFIG = {
     "tasks": ["push", "reach"],

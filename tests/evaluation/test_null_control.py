@@ -7,8 +7,8 @@ from tensordict import TensorDict
 import lw_torchrl as lw
 from benchmarks.planted import Altered, Jammed, Sensor, fingers, moved_thing, scaled
 from lw_torchrl.evaluation import attribute_failures
-from lw_torchrl.evaluation.diagnose.findings import Difference, Misled
-from lw_torchrl.evaluation.diagnose.rerun import difference
+from lw_torchrl.evaluation.diagnose.counterfactuals import difference
+from lw_torchrl.evaluation.diagnose.failure import Difference, Misled
 from lw_torchrl.evaluation.diagnose.sentences import finding_text
 
 TASK, SEED = "drawer-open", 7
