@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.evaluation.diagnose.failure import Failure
-from lw_torchrl.evaluation.diagnose.findings import CAUSES
+from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure
 from lw_torchrl.evaluation.diagnose.sentences import replaced_text
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plan_text import one_line
