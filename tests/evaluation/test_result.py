@@ -315,7 +315,9 @@ def test_a_file_that_is_not_a_result_is_refused(tmp_path, name):
 
 
 def test_the_recorded_version_is_that_of_the_running_code(monkeypatch):
-    monkeypatch.setattr("lw_torchrl._util.reproducibility.version", lambda name: "0.0.1")  # as an old editable install says
+    monkeypatch.setattr(
+        "lw_torchrl._util.reproducibility.version", lambda name: "0.0.1"
+    )  # as an old editable install says
     versions = package_versions()
     assert versions["lw_torchrl"] == lw_torchrl.__version__
     assert versions["torch"] == "0.0.1"
