@@ -302,7 +302,7 @@ def test_stopping_after_success_does_not_change_success(make, after):
 
 
 def test_an_unknown_task_is_an_error():
-    with pytest.raises(ValueError, match="episodes: .* drawer-open, sweep"):
+    with pytest.raises(ValueError, match=r"episodes: .* drawer-open, sweep"):
         run(plain_env(2), wavy, {"sweep": [0], "reach": [1], "drawer-open": []})
 
 
