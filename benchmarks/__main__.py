@@ -24,7 +24,7 @@ import tyro
 from benchmarks import environment, language, pipelines, recording, sampling, simulation, training
 from benchmarks.report import Row, Settings, Skipped, as_markdown, as_text
 from lw_torchrl._util.files import write_json, write_text
-from lw_torchrl.suites.metaworld.vectorized.simulated_rows import available_cores
+from lw_torchrl.suites.metaworld.simulated_rows import available_cores
 
 BENCHMARKS: dict[str, Callable[[Settings], list[Row]]] = {
     "steps": simulation.steps,

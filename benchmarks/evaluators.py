@@ -21,7 +21,7 @@ from lw_torchrl.evaluation import EvaluationResult
 from lw_torchrl.modules import transform_of
 from lw_torchrl.modules.query_evaluator import evaluators_of
 
-RECIPE = DemoConfig()
+RECIPE = DemoConfig(demonstrations_per_task=10)
 WHO = ("expert", "scripted", "spoilt-30", "random")
 
 

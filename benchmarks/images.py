@@ -94,7 +94,7 @@ def evaluator(args: Arguments, plans: lw.Plans) -> Any:
     torch.manual_seed(args.seed)
     made = lw.modules.ImageQueryEvaluator(plans, **args.pictures, every=args.every)
     file = args.out / "evaluator.safetensors"
-    lw.training.ImageQueryEvaluatorTrainer(made, labelled, config, checkpoint=file).train()
+    lw.training.QueryEvaluatorTrainer(made, labelled, config, checkpoint=file).train()
     report = write_report(made, labelled, args.out / "reliability.json", most=20)
     plot_wrong_answers(wrong_answers(made, labelled), args.out / "wrong.png")
     print(f"{labelled.describe()['states']['training']} drawn states trained\n{report}", flush=True)

@@ -80,7 +80,7 @@ def test_plugins_are_listed_without_import_and_loaded_by_name(plugin):
     ("name", "message"),
     [
         ("broken", r"method 'broken' is no_such_module:broken of the package my-plugin.*ModuleNotFoundError"),
-        ("uncallable", r"method 'uncallable' is my_plugin:FAR of the package my-plugin.*must be a function of plans"),
+        ("uncallable", r"method 'uncallable' is my_plugin:FAR of the package my-plugin.*must be a function"),
     ],
 )
 def test_a_plugin_that_cannot_be_loaded_is_named_and_others_work(plugin, name, message):
@@ -126,5 +126,5 @@ def test_a_string_is_imported_at_its_first_look_up():
 
 
 def test_a_method_is_a_function():
-    with pytest.raises(TypeError, match="method 'mine' must be a function of plans, got 'PlanConditionedActor'"):
+    with pytest.raises(TypeError, match="method 'mine' must be a function, got 'PlanConditionedActor'"):
         METHODS["mine"] = "PlanConditionedActor"

@@ -111,7 +111,7 @@ class ImitationRun(Run):
             described["members"] = [one.of(self.method).describe() for one in self.preset.members]
             if self.demonstrated:
                 described["demonstrated"] = [one.of("dc").describe() for one in self.demonstrated]
-            described["training"] = self.preset.training.describe()
+            described["training"] = asdict(self.preset.training)
             described |= {name: getattr(self.preset, name) for name in ("label", "after_success", "passes")}
             if self.preset.evaluations > 1:
                 described["evaluations"] = self.preset.evaluations

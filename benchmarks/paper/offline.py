@@ -26,7 +26,7 @@ from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules import ObservationFeatures, QValue, Value, descriptor_trunk, plan_trunk
 from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
 from lw_torchrl.training import OfflineConfig, OfflineTrainer
-from lw_torchrl.training.checkpoint import check_same_description
+from lw_torchrl.training.checkpoint import check_description
 from lw_torchrl.training.cloning import bc_loss
 from lw_torchrl.transforms import QAFTransform
 
@@ -132,7 +132,7 @@ class Advantages(_Learned):
             stored, advantages = read_tensors(file)
         except ValueError as error:
             raise ValueError(f"out: {str(file)!r} is damaged ({error}); delete it to learn them again") from error
-        check_same_description(file, stored, described)
+        check_description(file, described, stored)
         return advantages
 
     def _learn(self, file: Path, described: dict[str, Any], plans: Plans, out: Path, progress: bool) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Unpack
 
 import torch
@@ -13,7 +14,7 @@ from torch.func import functional_call, stack_module_state, vmap
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives.utils import distance_loss
 
-from lw_torchrl._util.checks import checked, differences, passes_on
+from lw_torchrl._util.checks import differences, typed
 from lw_torchrl._util.devices import place
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.training.checkpoint import check_can_be_saved, text_vectors
@@ -55,8 +56,7 @@ class StackedBehavioralCloning(Training):
     Source: paper section 'Conditional Plan Experiments', which trains 50 one-shot models; ``torch.func``.
     """
 
-    @passes_on(Training.__init__)
-    @checked
+    @typed
     def __init__(
         self,
         actors: Sequence[TensorDictModuleBase],
@@ -83,7 +83,7 @@ class StackedBehavioralCloning(Training):
             check_can_be_saved(actors[0])
             self.description = {
                 "actor": describe(actors[0]) | {"number": len(actors)},
-                "training": config.describe(),
+                "training": asdict(config),
                 "data": {str(number): describe_data(replay) for number, replay in enumerate(replays)},
                 "replay": {str(number): describe_replay(replay) for number, replay in enumerate(replays)},
             }

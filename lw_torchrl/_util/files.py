@@ -21,7 +21,7 @@ AnyPath = str | os.PathLike[str]
 _ABANDONED = 3600.0  # seconds after which a temporary file is the leftover of a killed process
 PATIENCE = 1.0  # seconds that `locked` waits for another writer, which may be about to finish
 
-_SHIPPED = Path(__file__).with_name("training") / "data"
+_SHIPPED = Path(__file__).parents[1] / "training" / "data"
 
 
 def shipped_policy(name: AnyPath) -> Path | None:

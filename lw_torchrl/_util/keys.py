@@ -1,7 +1,6 @@
 """Keys of tensordicts as arguments, and modules that are called with a tensordict or with tensors."""
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from functools import wraps
 from inspect import Parameter, Signature
 from typing import Any
@@ -13,15 +12,19 @@ from tensordict.nn import TensorDictModuleBase, dispatch, skip_existing
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 
-from lw_torchrl._util.checks import missing_keys
+from lw_torchrl._util.checks import checker, missing_keys
+from lw_torchrl._util.rendering import naming_absent_renderer
+
+with naming_absent_renderer():  # rooms that use TorchRL import this module first
+    import torchrl.envs  # noqa: F401
+
+Keys = Sequence[NestedKey]
 
 
 def _key(given: Any) -> NestedKey | None:
     """Return a key; None if it is not one. A list is a nested key too, since JSON has no tuples."""
-    with suppress(Exception):  # TorchRL raises different errors
-        key: NestedKey = unravel_key(tuple(given) if isinstance(given, list) else given)
-        return key or None
-    return None
+    given = tuple(given) if isinstance(given, list) else given
+    return unravel_key(given) if checker(NestedKey)(given) and given else None  # type: ignore[no-any-return]
 
 
 def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[str]) -> list[NestedKey]:

@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from lw_torchrl._util.files import AnyPath, parse_json, replacing
-from lw_torchrl._util.versions import package_versions
+from lw_torchrl._util.reproducibility import package_versions
 
 SUFFIX = ".safetensors"
 _METADATA = "lw_torchrl"  # the metadata of a .safetensors file are texts by name; under this name is our JSON

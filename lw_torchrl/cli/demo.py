@@ -19,7 +19,7 @@ class DemoConfig:
     """Settings of the demo, written to config.json in its folder."""
 
     tasks: tuple[str, ...] = MT10
-    demonstrations_per_task: int = 10
+    demonstrations_per_task: int = 20
     demonstration_seed: int = 0
     demonstration_noise: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4)
     noise_hold: int = 10

@@ -304,9 +304,9 @@ class TrainEvaluator:
         labelled = lw.training.LabelledQueries(replay, config)
         if not any(asked for name, asked in labelled.parts.items() if name != "training"):
             raise ValueError("nothing is held out to score the evaluator on; collect at least --episodes 2")
-        make = lw.training.ImageQueryEvaluatorTrainer if self.cameras else lw.training.QueryEvaluatorTrainer
         file = self.out / "evaluator.safetensors"
-        loss = make(evaluator, labelled, config, checkpoint=file, device=self.device).train()
+        trainer = lw.training.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=file, device=self.device)
+        loss = trainer.train()
         evaluator.cpu()
         output = Output(self.json).show("evaluator", file).show("steps", config.steps)
         trained = "" if loss != loss else f", loss {loss:.4f}"  # nan: nothing was left to train

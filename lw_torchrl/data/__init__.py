@@ -1,6 +1,6 @@
 """Demonstrations: collecting them, reading them as a replay buffer, sampling them in exact proportions."""
 
-import lw_torchrl._util.torchrl  # noqa: F401
+import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.data.collect import collect_demonstrations
 from lw_torchrl.data.collection_policy import BEHAVIOURS, Behaviour
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations

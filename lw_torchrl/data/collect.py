@@ -25,7 +25,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from lw_torchrl._util.checks import Count, Scale, differences, typed
 from lw_torchrl._util.files import AnyPath, flush, locked, read_json, replacing, write_json
 from lw_torchrl._util.progress import Progress
-from lw_torchrl._util.versions import SIMULATORS, package_versions, version_changes
+from lw_torchrl._util.reproducibility import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import dataset
 from lw_torchrl.data.collection_policy import Behaviour, SegmentActor, behaviour_of, segment_plans
 from lw_torchrl.data.dataset import (
@@ -43,7 +43,7 @@ from lw_torchrl.envs.episodes import policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import task_id
-from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.parts import evaluating
 from lw_torchrl.modules.policy import plans_of, tasks_of, transform_of
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks

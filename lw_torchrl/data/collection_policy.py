@@ -16,7 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from lw_torchrl._util.checks import Count, Probability, check_choice, shown, typed_fields
-from lw_torchrl._util.seeding import episode_generator
+from lw_torchrl._util.reproducibility import episode_generator
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import task_id

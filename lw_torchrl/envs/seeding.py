@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lw_torchrl._util.checks import Natural, check_value, shown
 from lw_torchrl._util.files import parse_json
-from lw_torchrl._util.seeding import episode_generator, episode_hash
+from lw_torchrl._util.reproducibility import episode_generator, episode_hash
 from lw_torchrl.language.tasks import Task
 
 

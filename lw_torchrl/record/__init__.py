@@ -3,7 +3,7 @@
 Importing this package does not import rerun; making a :class:`RerunLogger` does.
 """
 
-import lw_torchrl._util.torchrl  # noqa: F401
+import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.rollout_recorder import RolloutRecorder
 from lw_torchrl.record.rollouts import log_rollout

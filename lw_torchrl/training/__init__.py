@@ -1,15 +1,15 @@
 """Training: behavioral cloning, any loss over a replay buffer, query evaluators, and their files."""
 
-import lw_torchrl._util.torchrl  # noqa: F401
+import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.training.checkpoint import load_actor, load_evaluator, save_actor, save_evaluator
 from lw_torchrl.training.cloning import BehavioralCloningConfig, BehavioralCloningTrainer
-from lw_torchrl.training.evaluator import ImageQueryEvaluatorTrainer, QueryEvaluatorTrainer
+from lw_torchrl.training.evaluator import QueryEvaluatorTrainer
 from lw_torchrl.training.labelled_queries import ImageQueryEvaluatorConfig, LabelledQueries, QueryEvaluatorConfig
 from lw_torchrl.training.normalization import fit_normalization
 from lw_torchrl.training.offline import OfflineConfig, OfflineTrainer
 
 __all__ = [
-    "BehavioralCloningConfig", "BehavioralCloningTrainer", "ImageQueryEvaluatorConfig", "ImageQueryEvaluatorTrainer",
-    "LabelledQueries", "OfflineConfig", "OfflineTrainer", "QueryEvaluatorConfig", "QueryEvaluatorTrainer",
-    "fit_normalization", "load_actor", "load_evaluator", "save_actor", "save_evaluator",
+    "BehavioralCloningConfig", "BehavioralCloningTrainer", "ImageQueryEvaluatorConfig", "LabelledQueries",
+    "OfflineConfig", "OfflineTrainer", "QueryEvaluatorConfig", "QueryEvaluatorTrainer", "fit_normalization",
+    "load_actor", "load_evaluator", "save_actor", "save_evaluator",
 ]  # fmt: skip

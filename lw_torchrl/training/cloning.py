@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple, Unpack
+from typing import Literal, NamedTuple, Unpack
 
 import torch
 from tensordict import TensorDictBase
@@ -34,15 +34,13 @@ class BehavioralCloningConfig:
     Attributes:
         steps: number of minibatches.
         batch_size: rows of a minibatch; with ``TaskBalancedSampler(exact=True)``, a multiple of the number of tasks.
-        learning_rate: at the start.
-        optimizer: "adamw" or "sgd".
-        weight_decay: of the optimizer.
-        momentum: of "sgd".
-        schedule: of the learning rate, "cosine" to 0 or "constant".
+        learning_rate: initial learning rate.
+        momentum: momentum of "sgd".
+        schedule: schedule of the learning rate, "cosine" to 0 or "constant".
         normalize: before the first step, fit the statistics of the observation's features to the demonstrations.
-        loss_function: distance between the actor's action and the demonstrated one: "l1", "l2" or "smooth_l1".
+        loss_function: distance between the actor's action and the demonstrated one.
         max_grad_norm: gradients are clipped to this norm.
-        seed: of the minibatches, and of what the buffer's transforms and the actor draw while training.
+        seed: seed of the minibatches, and of random numbers in the buffer's transforms and in the actor.
         checkpoint_every: steps between checkpoints; the last step always writes one.
         qaf_anchor: weight of the cross entropy between a learned evaluator's answers and the exact ones. It keeps
             conditions true to their words while imitation trains the evaluator.
@@ -62,10 +60,6 @@ class BehavioralCloningConfig:
     checkpoint_every: Count = 500
     qaf_anchor: Scale = 0.0
 
-    def describe(self) -> dict[str, Any]:
-        """Return the options, as JSON."""
-        return asdict(self)
-
 
 def bc_loss(actor: nn.Module, distance: str) -> BCLoss:
     """Return TorchRL's BCLoss, without its warning about target networks."""
@@ -79,7 +73,7 @@ class _Steps(NamedTuple):
 
 
 class EvaluatorAnchor:
-    """The cross entropy between the answers of the evaluator in a sequence of modules and the exact answers."""
+    """The cross entropy between the answers of a policy's learned evaluator and the exact answers."""
 
     def __init__(self, actor: nn.Module) -> None:
         evaluators = evaluators_of(actor)
@@ -103,14 +97,14 @@ class EvaluatorAnchor:
 
 
 class BehavioralCloningTrainer(Training):
-    """Trains an actor to give the demonstrated actions.
+    """Trains an actor to imitate the demonstrated actions.
 
     Any TensorDict module that writes ``action`` can be trained, for example ``TensorDictSequential(evaluator, actor)``,
     which trains both.
 
     Args:
-        actor: it is trained in place.
-        replay: its samples hold what the actor reads and ``action`` (B, 4) float32.
+        actor: the actor, trained in place.
+        replay: a buffer whose samples hold what the actor reads and ``action`` (B, 4) float32.
         config: hyperparameters; None for the defaults.
         device: where to train: "cpu", "cuda", "cuda:1", "mps", or "auto" for the GPU if there is one. The actor is
             moved there and stays there. None leaves it where it is. Make the buffer with the same ``device``; otherwise
@@ -154,7 +148,7 @@ class BehavioralCloningTrainer(Training):
         self._anchor = EvaluatorAnchor(actor) if config.qaf_anchor else None
         if self.checkpoint is not None:
             check_can_be_saved(actor)
-            self.description = {"actor": describe(actor), "training": config.describe()}
+            self.description = {"actor": describe(actor), "training": asdict(config)}
             self.description |= {"data": describe_data(replay), "replay": describe_replay(replay)}
         self.loss = bc_loss(actor, config.loss_function)
         self.optimizer = make_optimizer([(self.loss.parameters(), config.learning_rate)], config, self.device)

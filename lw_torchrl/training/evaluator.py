@@ -1,11 +1,11 @@
-"""QueryEvaluatorTrainer and ImageQueryEvaluatorTrainer: networks learn the exact answers to queries."""
+"""QueryEvaluatorTrainer: a network learns the exact answers to queries, from observations or from pictures."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from hashlib import blake2b
-from typing import Any, ClassVar, Unpack
+from typing import Any, Unpack
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,7 +15,7 @@ from lw_torchrl._util.checks import typed
 from lw_torchrl._util.devices import place
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
-from lw_torchrl.modules.state_query_evaluator import ClauseEvaluator, Clauses, StateQueryEvaluator
+from lw_torchrl.modules.query_evaluator import ClauseEvaluator, Clauses
 from lw_torchrl.training.checkpoint import check_can_be_saved
 from lw_torchrl.training.labelled_queries import (
     ImageQueryEvaluatorConfig,
@@ -59,6 +59,11 @@ class _StateQueries:
         truth, clauses = self.truths[group][:, None].float(), self.clauses.pick(clause[:, None])
         return TensorDict(observation=self.observation[row], truth=truth, clauses=_as_tensordict(clauses))
 
+    @staticmethod
+    def loss(network: Any, batch: TensorDictBase, config: Any) -> Tensor:
+        logits = network(batch["observation"], Clauses(**batch["clauses"]))
+        return nn.functional.binary_cross_entropy_with_logits(logits, batch["truth"])
+
 
 class _PictureQueries:
     """Pictures of states, equally many of each task, with all clauses of the task and the objects' positions."""
@@ -75,11 +80,11 @@ class _PictureQueries:
     def sample(self, size: int) -> TensorDictBase:
         """Draw ``size`` states in all, as a TensorDict for each task."""
         each = max(1, size // len(self.tasks))
-        drawn = TensorDict()
+        batch = TensorDict()
         for number, task in enumerate(self.tasks):
             rows, clauses = torch.randint(len(task.observation), (each,)), self.clauses[number]
             objects, positions, known = self.positions[number]
-            drawn[task.task.name] = TensorDict(
+            batch[task.task.name] = TensorDict(
                 pixels=task.view("pixels")[rows],
                 truth=task.truth[rows].float(),
                 weights=self.weights[number].gather(0, task.truth[rows].long()),
@@ -88,7 +93,22 @@ class _PictureQueries:
                 positions=positions[rows],
                 known=known,
             )
-        return drawn
+        return batch
+
+    @staticmethod
+    def loss(network: Any, batch: TensorDictBase, config: Any) -> Tensor:
+        """Return the mean over the tasks of the weighted error of the answers plus that of the objects' positions."""
+        losses = []
+        for states in batch.values():
+            places, _ = network.places(states["pixels"], network.names.weight)
+            logits = network.judge_at(places, Clauses(**states["clauses"]))
+            errors = nn.functional.binary_cross_entropy_with_logits(logits, states["truth"], reduction="none")
+            answers = (errors * states["weights"]).sum() / states["weights"].sum()
+            located, known = places.index_select(1, states["objects"]), states["known"]
+            # In units of 5 cm, so that both terms have about the same size.
+            errors = nn.functional.smooth_l1_loss(located / 0.05, states["positions"] / 0.05, reduction="none")
+            losses.append(answers + config.position_weight * (errors * known).sum() / (known.sum() * len(errors)))
+        return torch.stack(losses).mean()
 
 
 def _as_tensordict(clauses: Clauses) -> TensorDict:
@@ -96,8 +116,11 @@ def _as_tensordict(clauses: Clauses) -> TensorDict:
 
 
 def _known_positions(queries: TaskQueries, names: tuple[str, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a task's objects (n,) int64, their positions and how far each is open (R, n, 4), and a mask (n, 4) of the
-    numbers that are known."""
+    """Return the indices of a task's n objects in ``names``, (n,) int64, their positions and openings, and a mask.
+
+    Positions and openings, how far each object is open, are (R, n, 4) float32; the mask (n, 4) is 1 where they are
+    known.
+    """
     own = [name for name in queries.task.object_names if name in names]
     positions, openings = queries.task.positions(queries.observation), queries.task.openings
     values, known = torch.zeros(len(queries.observation), len(own), 4), torch.ones(len(own), 4)
@@ -129,37 +152,45 @@ def _digest(tensors: Iterable[Tensor]) -> str:
 
 
 class QueryEvaluatorTrainer(Training):
-    """Trains an evaluator on the exact answers to all base queries of tasks.
+    """Trains an evaluator of observations or of pictures on the exact answers to all base queries of tasks.
 
-    A minibatch has equally many pairs of a state and a clause of each predicate and truth.
+    A minibatch of observations has equally many pairs of a state and a clause of each predicate and truth. A minibatch
+    of pictures has equally many states of each task, with all of its clauses, weighted to the same effect.
 
     Args:
-        evaluator: it is trained in place; its plans do not matter.
+        evaluator: the evaluator, trained in place; its plans do not matter.
         data: the queries and their answers, some of them held out.
-        config: hyperparameters, those that the data were made with.
-        device: where to train: "cpu", "cuda", "cuda:1", "mps", or "auto" for the GPU if there is one. The evaluator is
-            moved there; None leaves it where it is.
+        config: the config that the data were made with, an :class:`ImageQueryEvaluatorConfig` for pictures.
+        device: where to train, as for :class:`BehavioralCloningTrainer`.
         **options: of :class:`~lw_torchrl.training.loop.Training`, with its errors. :func:`load_evaluator` reads the
             checkpoint.
 
     Raises:
-        TypeError: the evaluator is not a :class:`StateQueryEvaluator`.
+        TypeError: the evaluator reads pictures, and the config is not an :class:`ImageQueryEvaluatorConfig`.
+        ValueError: all data are held out, or the evaluator reads pictures and the rows have none.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
-        >>> with tempfile.TemporaryDirectory() as root:
-        ...     _ = lw.collect_demonstrations("reach", episodes_per_task=2, root=root + "/demos", max_steps=80)
-        ...     replay = lw.LanguageWorldExperienceReplay(root + "/demos", label="executed")
-        ...     config = lw.training.QueryEvaluatorConfig(steps=200, batch_size=64, held_out_pairs=0.0)
-        ...     data = lw.training.LabelledQueries(replay, config)
-        ...     evaluator = lw.StateQueryEvaluator(lw.load_plans("MT10"))
-        ...     lw.training.QueryEvaluatorTrainer(evaluator, data, config).train() < 0.65
+        >>> root, plans = tempfile.mkdtemp(), lw.load_plans("MT10")
+        >>> _ = lw.collect_demonstrations("reach", episodes_per_task=2, root=root, max_steps=40, progress=False)
+        >>> replay = lw.LanguageWorldExperienceReplay(root, label="executed")
+        >>> config = lw.training.QueryEvaluatorConfig(steps=200, batch_size=64, held_out_pairs=0.0)
+        >>> data = lw.training.LabelledQueries(replay, config)
+        >>> lw.training.QueryEvaluatorTrainer(lw.StateQueryEvaluator(plans), data, config).train() < 0.65
+        True
+
+        From pictures:
+
+        >>> lw.data.add_pictures(root, "corner", every=5, progress=False)
+        >>> replay.add_column("pixels", lw.data.load_pictures(replay, "corner", every=5))
+        >>> config = lw.training.ImageQueryEvaluatorConfig(steps=2, batch_size=4, held_out_pairs=0.0)
+        >>> data = lw.training.LabelledQueries(replay, config)
+        >>> evaluator = lw.modules.ImageQueryEvaluator(plans, cameras="corner")
+        >>> lw.training.QueryEvaluatorTrainer(evaluator, data, config).train() < 100.0
         True
     """
 
     part = "evaluator"
-    evaluator_class: ClassVar[type[ClauseEvaluator]] = StateQueryEvaluator
-    queries_class: ClassVar[Any] = _StateQueries
 
     @typed
     def __init__(
@@ -171,17 +202,21 @@ class QueryEvaluatorTrainer(Training):
         device: str | torch.device | None = None,
         **options: Unpack[TrainingOptions],
     ) -> None:
-        if not isinstance(evaluator, self.evaluator_class):
-            expected, got = self.evaluator_class.__name__, type(evaluator).__name__
-            raise TypeError(f"evaluator must be of class {expected}, got {got}")
         config = config or QueryEvaluatorConfig()
         options.setdefault("title", "training the evaluator")
         super().__init__(config, **options)
         self.evaluator, self.module, self.networks = evaluator, evaluator, [evaluator]
         self.device = place(evaluator, device)
-        if not data.parts["training"]:
+        if not (tasks := data.parts["training"]):
             raise ValueError("data must have states and queries to train on, all are held out")
-        queries = self.queries_class(evaluator, data.parts["training"])
+        queries: _StateQueries | _PictureQueries
+        if isinstance(evaluator, ImageQueryEvaluator):
+            if not isinstance(config, ImageQueryEvaluatorConfig):
+                raise TypeError(f"config must be an ImageQueryEvaluatorConfig, got {type(config).__name__}")
+            queries = _PictureQueries(evaluator, tasks)
+        else:
+            queries = _StateQueries(evaluator, tasks)
+        self._loss = queries.loss
         self.minibatches = [Minibatches(queries, config.batch_size, config.seed)]
         trained = [parameter for parameter in evaluator.parameters() if parameter.requires_grad]
         self.optimizer = make_optimizer([(trained, config.learning_rate)], config, self.device)
@@ -192,51 +227,4 @@ class QueryEvaluatorTrainer(Training):
         self.resume()
 
     def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:
-        logits = self.evaluator.network(batch["observation"], Clauses(**batch["clauses"]))
-        return {"loss": nn.functional.binary_cross_entropy_with_logits(logits, batch["truth"])}
-
-
-class ImageQueryEvaluatorTrainer(QueryEvaluatorTrainer):
-    """Trains an evaluator of pictures, as :class:`QueryEvaluatorTrainer` does one of states.
-
-    A minibatch has equally many states of each task, with all of its clauses; each predicate and truth weighs the same.
-
-    Raises:
-        TypeError: the evaluator is not an :class:`ImageQueryEvaluator`, or the config is of another class.
-        ValueError: the rows have no pictures.
-
-    Example:
-        >>> import lw_torchrl as lw, tempfile
-        >>> with tempfile.TemporaryDirectory() as root:
-        ...     _ = lw.collect_demonstrations("reach", episodes_per_task=2, root=root, max_steps=40, progress=False)
-        ...     lw.data.add_pictures(root, "corner", every=5)
-        ...     replay = lw.LanguageWorldExperienceReplay(root, label="executed")
-        ...     replay.add_column("pixels", lw.data.load_pictures(replay, "corner", every=5))
-        ...     config = ImageQueryEvaluatorConfig(steps=2, batch_size=4, held_out_pairs=0.0)
-        ...     data = lw.training.LabelledQueries(replay, config)
-        ...     evaluator = lw.modules.ImageQueryEvaluator(lw.load_plans("MT10"), cameras="corner")
-        ...     ImageQueryEvaluatorTrainer(evaluator, data, config).train() < 100.0
-        True
-    """
-
-    evaluator_class = ImageQueryEvaluator
-    queries_class = _PictureQueries
-
-    def __init__(self, evaluator: Any, data: LabelledQueries, config: Any = None, **options: Any) -> None:
-        if not isinstance(config, ImageQueryEvaluatorConfig):
-            raise TypeError(f"config must be an ImageQueryEvaluatorConfig, got {type(config).__name__}")
-        super().__init__(evaluator, data, config, **options)
-
-    def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:
-        losses = [self._loss(states) for states in batch.values()]
-        return {"loss": torch.stack(losses).mean()}
-
-    def _loss(self, states: TensorDictBase) -> Tensor:
-        network: Any = self.evaluator.network
-        places, _ = network.places(states["pixels"], network.names.weight)
-        logits = network.judge_at(places, Clauses(**states["clauses"]))
-        errors = nn.functional.binary_cross_entropy_with_logits(logits, states["truth"], reduction="none")
-        answers = (errors * states["weights"]).sum() / states["weights"].sum()
-        located, known = places.index_select(1, states["objects"]), states["known"]
-        errors = nn.functional.smooth_l1_loss(located / 0.05, states["positions"] / 0.05, reduction="none")
-        return answers + self.config.position_weight * (errors * known).sum() / (known.sum() * len(errors))
+        return {"loss": self._loss(self.evaluator.network, batch, self.config)}

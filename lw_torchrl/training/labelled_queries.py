@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
-from lw_torchrl._util.checks import Count, Natural, Probability, Scale, check_choice, check_value, typed, typed_fields
+from lw_torchrl._util.checks import Count, Natural, Probability, Scale, check_choice, typed, typed_fields
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.queries import Clause, Query, base_clauses
 from lw_torchrl.language.query_program import QueryProgram
@@ -29,15 +29,15 @@ class QueryEvaluatorConfig:
     """Hyperparameters of a query evaluator's training by AdamW, and what is held out.
 
     Attributes:
-        steps, weight_decay, checkpoint_every: as of :class:`BehavioralCloningConfig`.
+        steps, weight_decay, checkpoint_every: as for :class:`BehavioralCloningConfig`.
         batch_size: pairs of a state and a clause in a minibatch.
-        learning_rate: at the start; a cosine brings it to 0.
+        learning_rate: initial learning rate; it follows a cosine to 0.
         states_per_task: maximum number of states of a task to train on, drawn from its rows.
-        every: use every N-th state of an episode; for pictures, the steps from one picture to the next.
-        held_out_states: fraction of a task's episodes whose states are not trained on.
-        held_out_pairs: fraction of the pairs of object names that are not trained on, in any task.
-        held_out_tasks: tasks that are not trained on: names, or a number of tasks to draw.
-        seed: of what is held out, the states and the minibatches.
+        every: use every N-th state of an episode; with pictures, N is the number of steps between pictures.
+        held_out_states: fraction of a task's episodes whose states are held out, at most 0.9.
+        held_out_pairs: fraction of the pairs of object names that are held out in all tasks, at most 0.9.
+        held_out_tasks: names of held-out tasks, or a number of tasks to draw.
+        seed: seed of what is held out, of the states and of the minibatches.
     """
 
     steps: Count = 4000
@@ -48,31 +48,25 @@ class QueryEvaluatorConfig:
     every: Count = 1
     held_out_states: Probability = 0.2
     held_out_pairs: Probability = 0.1
-    held_out_tasks: int | tuple[str, ...] = 0
+    held_out_tasks: Natural | tuple[str, ...] = 0
     seed: int = 0
     checkpoint_every: Count = 500
 
     def __post_init__(self) -> None:
         for name in ("held_out_states", "held_out_pairs"):
             if getattr(self, name) > 0.9:
-                raise ValueError(f"{name} must leave a tenth to train on, got {getattr(self, name)}")
-        given = self.held_out_tasks
-        if isinstance(given, str) or not isinstance(given, Iterable):
-            check_value("held_out_tasks", given, Natural)
-            return
-        object.__setattr__(self, "held_out_tasks", tuple(given))
-        for task in self.held_out_tasks:  # type: ignore[union-attr]
-            check_value("held_out_tasks", task, str)
+                raise ValueError(f"{name} must be at most 0.9, got {getattr(self, name)}")
 
 
+@typed_fields
 @dataclass(frozen=True)
 class ImageQueryEvaluatorConfig(QueryEvaluatorConfig):
     """Hyperparameters of an :class:`ImageQueryEvaluator`'s training; others are those of :class:`QueryEvaluatorConfig`.
 
     Attributes:
-        batch_size: states in a minibatch; each is asked all clauses of its task.
-        position_weight: weight of the error of the objects' positions, in units of 5 cm, and of how far the gripper is
-            open, which the simulator knows; 0 to learn only from answers.
+        batch_size: states in a minibatch, each with all clauses of its task.
+        position_weight: weight of the error of the objects' positions and openings, which the simulator knows; 0 to
+            learn only from answers.
     """
 
     batch_size: Count = 48
@@ -98,31 +92,30 @@ class TaskQueries:
     pixels: Tensor | None = None
 
     def view(self, key: str) -> Tensor:
-        """Return what an evaluator that reads ``key`` sees of the states."""
-        if key == "observation":
-            return self.observation
-        if key != "pixels" or self.pixels is None:
+        """Return the states as an evaluator that reads ``key``, "observation" or "pixels", sees them."""
+        view = self.observation if key == "observation" else self.pixels
+        if view is None:
             raise ValueError(
-                f"data must have the column {key!r}, which the evaluator reads; make it by lw.data.add_pictures(root, "
-                "...) and replay.add_column('pixels', lw.data.load_pictures(replay, ...))"
+                f"data must have the column {key!r}, which the evaluator reads; call lw.data.add_pictures(root, ...) "
+                "and replay.add_column('pixels', lw.data.load_pictures(replay, ...))"
             )
-        return self.pixels
+        return view
 
 
 class LabelledQueries:
     """Exact answers to all base queries of a dataset's tasks, not only those of plans, some of them held out.
 
     Attributes:
-        tasks, held_out_tasks: the tasks that are trained on, and those that are not.
-        held_out_pairs: pairs of object names, each sorted, that are not trained on.
+        tasks, held_out_tasks: the tasks to train on, and the held-out ones.
+        held_out_pairs: held-out pairs of object names, each sorted.
         parts: the queries by name: "training"; "states", the same clauses in held-out states; "queries", clauses about
             held-out pairs, in these states; "tasks", all clauses of held-out tasks. Each may be empty.
 
     Args:
-        replay: its rows hold ``observation`` (R, 39) float32, ``task_id`` and ``episode`` (R,) int64, and, for an
-            evaluator of pictures, ``pixels`` (R, H, W, 3) uint8.
-        config: what is held out.
-        tasks: definitions of its tasks; None for the shipped ones.
+        replay: a buffer whose rows hold ``observation`` (R, 39) float32, ``task_id`` and ``episode`` (R,) int64, and,
+            for an evaluator of pictures, ``pixels`` (R, H, W, 3) uint8.
+        config: what to hold out.
+        tasks: definitions of the buffer's tasks; None for the shipped ones.
 
     Raises:
         ValueError: a row's or held-out task is not among the tasks; everything is held out; a picture stays the same
@@ -142,7 +135,7 @@ class LabelledQueries:
             rows = rows[(torch.arange(len(rows)) - first) % config.every == 0]
         ids = rows.get("task_id")
         if other := sorted({*ids.unique().tolist()} - {*known}):
-            raise ValueError(f"tasks must have all tasks of the rows, they lack those of the ids {other[:8]}")
+            raise ValueError(f"tasks must have all tasks of the rows, they lack the task ids {other[:8]}")
         present = [known[number] for number in ids.unique().tolist()]
         _check_pictures(rows, present[0].layout)
         generator = torch.Generator().manual_seed(config.seed)
@@ -197,7 +190,7 @@ def _at_most(number: int, rows: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _check_pictures(rows: TensorDictBase, layout: Layout) -> None:
-    """Raise if a picture stays the same while the hand moves: it shows an earlier state, with other answers."""
+    """Raise if a picture stays the same while the hand moves: it would show an earlier state, with other answers."""
     pixels, hand = rows.get("pixels", None), rows.get("observation")[:, layout.positions[0]]
     if pixels is None or len(rows) < 2:
         return
@@ -205,7 +198,7 @@ def _check_pictures(rows: TensorDictBase, layout: Layout) -> None:
     same_episode = rows.get(("collector", "traj_ids"))[1:] == rows.get(("collector", "traj_ids"))[:-1]
     for row in (moved & same_episode).nonzero().flatten().tolist():
         if torch.equal(pixels[row], pixels[row + 1]):
-            raise ValueError("every must be as many steps as the pictures are apart: one stays while the hand moves")
+            raise ValueError("every must be the number of steps between pictures: one stays while the hand moves")
 
 
 def _draw_tasks(held_out: int | tuple[str, ...], names: Sequence[str], generator: torch.Generator) -> tuple[str, ...]:

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import math
+import signal
+import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from types import FrameType
 from typing import Any, TypedDict
 
 import torch
@@ -16,10 +20,12 @@ from lw_torchrl._util.checks import Count, check_value, typed
 from lw_torchrl._util.devices import CPU
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl._util.progress import Progress
-from lw_torchrl.training.checkpoint import check_finite
-from lw_torchrl.training.checkpoint_files import CheckpointFiles, contents_of, interrupts_between_steps
+from lw_torchrl.training.checkpoint import CheckpointFiles, check_finite, contents_of
 from lw_torchrl.training.minibatches import Minibatches
 from lw_torchrl.training.normalization import share_contacts
+
+READ_EVERY = 100
+"""Steps between two readings of the losses; only a reading waits for the device."""
 
 
 def make_optimizer(
@@ -27,7 +33,7 @@ def make_optimizer(
 ) -> torch.optim.Optimizer:
     """Return the config's optimizer over groups of parameters and their learning rates.
 
-    On a CUDA device the learning rates are tensors, and the optimizer's step can be captured in a graph.
+    On a CUDA device the learning rates are tensors, so that a graph can capture the optimizer's step.
     """
     on_gpu = device.type == "cuda"
     groups: list[dict[str, Any]] = []
@@ -36,21 +42,15 @@ def make_optimizer(
         lr = torch.tensor(initial, device=device) if on_gpu else initial
         groups.append({"params": list(parameters), "lr": lr, "initial_lr": initial})
     groups = [group for group in groups if group["params"]]
-    decay = config.weight_decay
     if getattr(config, "optimizer", "adamw") == "sgd":
-        return torch.optim.SGD(groups, momentum=config.momentum, weight_decay=decay, fused=True)
-    return torch.optim.AdamW(groups, weight_decay=decay, fused=True, capturable=on_gpu)
+        return torch.optim.SGD(groups, momentum=config.momentum, weight_decay=config.weight_decay, fused=True)
+    return torch.optim.AdamW(groups, weight_decay=config.weight_decay, fused=True, capturable=on_gpu)
 
 
-def rate_factor(config: Any, step: int) -> float:
-    """Return the factor of the learning rates after N steps: a cosine from 1 to 0, or 1 with schedule="constant"."""
-    if getattr(config, "schedule", "cosine") == "constant":
-        return 1.0
-    return 0.5 * (1.0 + math.cos(math.pi * step / config.steps))
-
-
-def set_learning_rates(optimizer: torch.optim.Optimizer, factor: float) -> None:
-    """Set each group's learning rate to its initial one times a factor."""
+def _set_learning_rates(optimizer: torch.optim.Optimizer, config: Any, step: int) -> None:
+    """Set the learning rates for the step after N steps: on a cosine from the initial ones to 0, or constant."""
+    is_constant = getattr(config, "schedule", "cosine") == "constant"
+    factor = 1.0 if is_constant else 0.5 * (1.0 + math.cos(math.pi * step / config.steps))
     for group in optimizer.param_groups:
         rate = group["initial_lr"] * factor
         if isinstance(group["lr"], Tensor):
@@ -59,20 +59,52 @@ def set_learning_rates(optimizer: torch.optim.Optimizer, factor: float) -> None:
             group["lr"] = rate
 
 
-def check_loss(losses: Tensor, step: int, config: Any) -> None:
+def _check_loss(losses: Tensor, step: int, config: Any) -> None:
     """Raise :class:`ValueError` if a loss, () or (M,) of M actors, is not finite."""
     if losses.isfinite().all():
         return
-    which = int((~losses.reshape(-1).isfinite()).nonzero()[0])
-    model = f" of actor {which}" if losses.ndim else ""
+    number = int((~losses.reshape(-1).isfinite()).nonzero()[0])
+    actor = f" of actor {number}" if losses.ndim else ""
     raise ValueError(
-        f"the loss{model} is {losses.reshape(-1)[which].item()} at step {step}: the demonstrations hold NaN, or the "
+        f"the loss{actor} is {losses.reshape(-1)[number].item()} at step {step}: the demonstrations hold NaN, or the "
         f"learning rate {config.learning_rate} is too high"
     )
 
 
-READ_EVERY = 100
-"""Steps between two readings of the losses; only a reading waits for the device."""
+class _Interrupt:
+    """Records whether Ctrl-C was pressed once (``requested``) or twice (``insisted``)."""
+
+    requested = insisted = False
+
+
+@contextmanager
+def _interrupts_between_steps() -> Iterator[_Interrupt]:
+    """Record the first Ctrl-C, and raise :class:`KeyboardInterrupt` at the end of the block.
+
+    A second Ctrl-C raises at once. Nothing changes outside the main thread, or where SIGINT is ignored.
+    """
+    interrupt = _Interrupt()
+    previous = signal.getsignal(signal.SIGINT) if threading.current_thread() is threading.main_thread() else None
+    if not callable(previous):
+        yield interrupt
+        return
+
+    def record(number: int, frame: FrameType | None) -> None:
+        interrupt.insisted, interrupt.requested = interrupt.requested, True
+        if interrupt.insisted:
+            previous(number, frame)
+
+    signal.signal(signal.SIGINT, record)
+    try:
+        yield interrupt
+    except Exception as error:
+        if interrupt.insisted:  # tensordict may have turned the KeyboardInterrupt into another error
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    if interrupt.requested:
+        raise KeyboardInterrupt
 
 
 class TrainingOptions(TypedDict, total=False):
@@ -96,19 +128,19 @@ class Training:
             it, "mt10.training.safetensors". If the state exists, training resumes from it.
         evaluate: returns numbers to log as ``evaluation/NAME``, for example the success rate on held-out seeds.
         evaluate_every: call ``evaluate`` every N steps, and after the last, with the networks in eval mode.
-        logger: a TorchRL logger, which gets the mean losses of each 100 steps as ``train/NAME``.
+        logger: a TorchRL logger, which receives the mean losses of each 100 steps as ``train/NAME``.
         progress, title: whether to show a progress bar, and its title.
 
     Attributes:
         module, optimizer: hold everything that is trained.
-        networks, device: the networks, in train mode while training runs and in eval mode afterwards; their device.
+        networks, device: the networks, in train mode during training and in eval mode afterwards; their device.
         minibatches: one for each buffer.
-        description: describes the training as JSON; it only resumes from a training state of the same description.
-        part: what ``checkpoint`` is, "actor" or "evaluator"; None if it is the training state itself.
+        description: the training as JSON; it only resumes from a training state with the same description.
+        part: what ``checkpoint`` holds, "actor" or "evaluator"; None if it is the training state itself.
         steps, last: the number of minibatches so far, and the means of the latest 100, by name.
 
     Warns:
-        UserWarning: it resumes, but not bit for bit: on another kind of device, or with another version of torch, say.
+        UserWarning: training resumes, but not bit for bit, for example on another kind of device or version of torch.
 
     Raises:
         ValueError: the checkpoint is damaged, or of another architecture, config or dataset; a loss or weight is NaN.
@@ -137,7 +169,7 @@ class Training:
             raise ValueError("evaluate and evaluate_every must be given together")
         self.config, self.logger, self.progress, self.title = config, logger, progress, title
         self.evaluate, self.evaluate_every, self.checkpoint = evaluate, evaluate_every, checkpoint
-        self._files = CheckpointFiles(checkpoint, self.part)
+        self._files = None if checkpoint is None else CheckpointFiles(checkpoint, self.part)
         self.steps, self.last, self.description = 0, dict[str, float](), dict[str, Any]()
         self.minibatches: list[Minibatches] = []
         self._values: deque[dict[str, Tensor]] = deque(maxlen=READ_EVERY)
@@ -156,20 +188,20 @@ class Training:
         """Train on a given minibatch and return its loss, () float32, or (M,) float32 of M models."""
         values = self.update(batch)
         self.steps += 1
-        set_learning_rates(self.optimizer, rate_factor(self.config, self.steps))
+        _set_learning_rates(self.optimizer, self.config, self.steps)
         self._values.append(values)
         return values["loss"]
 
     def update(self, batch: Any) -> dict[str, Tensor]:
         """Update the parameters and return the values to log, detached: everything that the device does in a step.
 
-        On a GPU no value is read back, and no shape depends on data, so a CUDA graph can capture it.
+        On a GPU no value is read back, and no shape depends on data, so that a CUDA graph can capture it.
         """
         values = dict(self.losses(batch))
         terms = [value for name, value in values.items() if name.startswith("loss")]
         values["loss"] = loss = terms[0] if len(terms) == 1 else torch.stack(terms).sum(0)
-        if self.device == CPU:
-            check_loss(loss.detach(), self.steps, self.config)
+        if self.device == CPU:  # reading the loss on a GPU would wait for it
+            _check_loss(loss.detach(), self.steps, self.config)
         self.optimizer.zero_grad()
         loss.sum().backward()
         self.clip_gradients()
@@ -203,11 +235,12 @@ class Training:
         """Train as :meth:`train` does, and return the latest 100 losses, (n,) or (n, M) float32 on the CPU."""
         total = self.config.steps
         if until is not None and check_value("until", until, Count) > total:
-            raise ValueError(f"until must be at most the configuration's steps, {total}, got {until}")
+            raise ValueError(f"until must be at most the config's steps, {total}, got {until}")
         self._values.clear()
         self._set_training(True)
         last = total if until is None else until
-        with self._files.locked(), interrupts_between_steps() as interrupt:
+        lock = nullcontext() if self._files is None else self._files.locked()
+        with lock, _interrupts_between_steps() as interrupt:
             with Progress(self.title, total, "step", initial=self.steps, show=self.progress) as bar:
                 if self.steps >= last:
                     self.save()  # the process may have been killed after writing the training state, before the policy
@@ -233,7 +266,7 @@ class Training:
         return losses.double().mean().item() if len(losses) else math.nan
 
     def _report(self, bar: Progress, done: bool) -> None:
-        """Log, save and evaluate after a step, where it is time."""
+        """Log, save and evaluate after a step, if any of them is due."""
         logs, saves = (done or self.steps % every == 0 for every in (READ_EVERY, self.config.checkpoint_every))
         if logs or saves:
             self._read_losses()
@@ -264,21 +297,21 @@ class Training:
         read = {name: torch.stack([values[name] for values in self._values]).cpu() for name in names}
         self.last = {name: value.double().mean().item() for name, value in read.items()}
         for step, loss in enumerate(read["loss"], self.steps - len(self._values)):
-            check_loss(loss, step, self.config)
+            _check_loss(loss, step, self.config)
         return read["loss"]
 
     def save(self) -> None:
-        """Write the checkpoint, if there is one to write. Earlier files are replaced whole."""
+        """Write the checkpoint, if the training has one. Earlier files are replaced whole."""
         try:
             check_finite(self.parameters())
         except ValueError as error:
             raise ValueError(f"{error} after step {self.steps}: the learning rate is too high") from error
-        part = self.saved if self.part else None
-        self._files.write(self.description, self.device, self.contents(), self.state_dict(), part)
+        if self._files is not None:
+            self._files.write(self.description, self.device, self.contents(), self.state_dict(), self.saved)
 
     def resume(self) -> bool:
         """Resume from the checkpoint and return True, if there is one."""
-        if not self._files.exist():
+        if self._files is None or not self._files.exist():
             return False
         for minibatches in self.minibatches:
             getattr(minibatches.source, "verify", lambda: None)()  # a dataset's rows must be those it recorded
@@ -289,13 +322,13 @@ class Training:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that training resumes from, except the weights."""
-        minibatches = [one.state_dict() for one in self.minibatches]
+        minibatches = [each.state_dict() for each in self.minibatches]
         return {"step": self.steps, "optimizer": self.optimizer.state_dict(), "minibatches": minibatches}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the result of :meth:`state_dict`."""
-        for own, stored in zip(self.minibatches, state["minibatches"], strict=True):
-            own.load_state_dict(stored)
+        for minibatches, stored in zip(self.minibatches, state["minibatches"], strict=True):
+            minibatches.load_state_dict(stored)
         self.optimizer.load_state_dict(state["optimizer"])
         self.steps = state["step"]
-        set_learning_rates(self.optimizer, rate_factor(self.config, self.steps))
+        _set_learning_rates(self.optimizer, self.config, self.steps)

@@ -26,10 +26,10 @@ _REPLAY_OPTIONS = ("label", "reward", "terminate_on_success", "n_steps", "gamma"
 
 
 class Minibatches:
-    """Minibatches of a buffer, or of anything that has ``sample(size)``.
+    """Minibatches of a buffer, or of any object with ``sample(size)``.
 
-    What sampler, transforms and networks draw depends only on the seed and the step. Samplers draw on the CPU, so
-    minibatches are the same on every device.
+    The random numbers of sampler, transforms and networks depend only on the seed and the step. Samplers draw on the
+    CPU, so minibatches are the same on every device.
     """
 
     def __init__(self, source: Any, size: int, seed: int) -> None:
@@ -60,7 +60,7 @@ class Minibatches:
 
 
 def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, size: int) -> None:
-    """Raise :class:`ValueError` unless networks can be trained on a buffer's minibatches, and training be resumed."""
+    """Raise :class:`ValueError` unless a buffer's minibatches suit the networks, and training can resume."""
     for network in networks:
         own = plans_of(network)
         for answered in map(plans_of, replay.transform):
@@ -71,19 +71,20 @@ def check_minibatches(networks: Iterable[Any], replay: TensorDictReplayBuffer, s
     if replay._prefetch:
         raise ValueError("replay must not prefetch: batches drawn ahead would be lost when training is resumed")
     if replay.batch_size not in (None, size):
-        wanted = f"None or the configuration's, {size}, got {replay.batch_size}"
-        raise ValueError(f"batch_size of the replay buffer must be {wanted}")
+        raise ValueError(f"replay's batch_size must be None or the config's, {size}, got {replay.batch_size}")
     rows, sampler = replay.storage, replay.sampler
     if isinstance(sampler, PrioritizedSampler):
-        raise ValueError("replay: the trainers update no priorities, so a PrioritizedSampler draws uniformly")
+        raise ValueError("replay must not have a PrioritizedSampler, because the trainers update no priorities")
     on_cpu = isinstance(sampler, GroupSampler) or (isinstance(rows, DatasetStorage) and type(sampler) is RandomSampler)
     if not on_cpu and (device := device_of_rows(rows)).type != "cpu":
-        sampled = f"replay: a {type(sampler).__name__} draws on {device} with its own generator, which is not saved"
-        raise ValueError(f"{sampled}; use a TaskBalancedSampler or CoLearningSampler, or keep the rows on the CPU")
+        raise ValueError(
+            f"replay: a {type(sampler).__name__} draws on {device} with its own generator, which is not saved; use a "
+            "TaskBalancedSampler or CoLearningSampler, or keep the rows on the CPU"
+        )
 
 
 def check_replay(actor: Any, replay: TensorDictReplayBuffer, size: int) -> None:
-    """As :func:`check_minibatches`, for a network that writes ``action``."""
+    """Call :func:`check_minibatches` for a network that must write ``action``."""
     if "action" not in actor.out_keys:
         raise ValueError(f"actor must write 'action', it writes {', '.join(map(str, actor.out_keys))}")
     check_minibatches([actor], replay, size)
@@ -92,11 +93,11 @@ def check_replay(actor: Any, replay: TensorDictReplayBuffer, size: int) -> None:
 def check_augmentations(loss: LossModule, networks: Iterable[nn.Module], replay: TensorDictReplayBuffer) -> None:
     """Raise :class:`ValueError` if features would not see how an augmentation moved a row.
 
-    TorchRL's losses, except BCLoss, pass on only the ``in_keys`` of a network. The angle and the offset that the
-    augmentations write are not among them, because environments do not write these.
+    TorchRL's losses, except BCLoss, pass on only the ``in_keys`` of a network. The augmentations' angle and offset are
+    not among them, because environments do not write them.
     """
-    selects = (base for base in type(loss).__mro__ if base not in (LossModule, BCLoss))
-    if isinstance(loss, BCLoss) or not any(base.__module__.startswith("torchrl.objectives") for base in selects):
+    kinds = (base for base in type(loss).__mro__ if base not in (LossModule, BCLoss))
+    if isinstance(loss, BCLoss) or not any(base.__module__.startswith("torchrl.objectives") for base in kinds):
         return
     used = [type(part).__name__ for part in replay.transform.modules() if isinstance(part, (RandomYaw, JitterTarget))]
     parts = (part for network in networks for part in network.modules())
@@ -104,33 +105,32 @@ def check_augmentations(loss: LossModule, networks: Iterable[nn.Module], replay:
     if used and features:
         raise ValueError(
             f"replay: {features[0]} would not see what {used[0]} writes, because {type(loss).__name__} passes on only "
-            f"the in_keys of a network; leave out {used[0]}, use other features, or train by BCLoss, "
+            f"the in_keys of a network; leave out {used[0]}, use other features, or train with BCLoss, "
             "AdvantageWeightedLoss or ExpectileValueLoss"
         )
 
 
 def describe_data(replay: Any) -> dict[str, Any] | None:
-    """Describe a replay buffer's demonstrations as JSON; None for a buffer without."""
+    """Describe a replay buffer's demonstrations as JSON; None for a buffer without demonstrations."""
     demonstrations = getattr(replay, "demonstrations", None)
     return None if demonstrations is None else demonstrations.config.to_json()
 
 
 def describe_replay(replay: Any) -> dict[str, Any]:
     """Describe how a replay buffer makes its batches, as JSON."""
-    transforms = [one for one in replay.transform.modules() if isinstance(one, Transform)]
     options = {name: getattr(replay, name) for name in _REPLAY_OPTIONS if hasattr(replay, name)}
     return options | {
-        "rows": None if describe_data(replay) is None else len(replay),  # after_success leaves so many
+        "rows": None if describe_data(replay) is None else len(replay),  # depends on after_success
         "sampler": type(replay.sampler).__name__,
         "transforms": [
-            {"class": type(one).__name__} | {name: repr(value) for name, value in plain_options(one).items()}
-            for one in transforms
-            if not isinstance(one, Compose)
+            {"class": type(part).__name__} | {name: repr(value) for name, value in plain_options(part).items()}
+            for part in replay.transform.modules()
+            if isinstance(part, Transform) and not isinstance(part, Compose)
         ],
     }
 
 
 def plain_options(module: nn.Module) -> dict[str, bool | int | float | str]:
-    """Return the attributes of a transform or a loss that are flags, numbers and texts."""
+    """Return the attributes of a transform or a loss that are booleans, numbers or strings."""
     options = {name: value for name, value in vars(module).items() if name[0] != "_" and name != "training"}
     return {name: value for name, value in options.items() if isinstance(value, (bool, int, float, str))}

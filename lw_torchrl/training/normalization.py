@@ -23,8 +23,8 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
     weights, except with :class:`CoLearningSampler`, which puts half of the weight on the target task's few rows.
 
     Args:
-        target: an actor, a critic, any module with :class:`~lw_torchrl.modules.Features` in it, or a loss.
-        replay: its rows hold what the features read.
+        target: an actor, a critic, any module that contains :class:`~lw_torchrl.modules.Features`, or a loss.
+        replay: a buffer whose rows hold what the features read.
 
     Raises:
         ValueError: the module holds no features, the buffer is empty, or a row lacks a key or holds NaN or infinity.
@@ -45,9 +45,9 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
 
     Source: ``torchrl.envs.ObservationNorm``.
     """
-    features = [(path, part) for path, part in _modules(target) if isinstance(part, Features)]
+    features = _features_of(target)
     if not features:
-        raise ValueError(f"{type(target).__name__} holds no Features: there is nothing to normalise")
+        raise ValueError(f"target must hold Features to normalise, this {type(target).__name__} holds none")
     if not len(replay):
         raise ValueError("replay must hold rows to fit the features to, and it is empty")
     row_weights = getattr(replay.sampler, "row_weights", None)
@@ -56,9 +56,10 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
     stored = replay.storage.get(slice(0, len(replay)))
     if isinstance(stored, list):  # of a ListStorage
         stored = torch.stack([row.select(*keys, strict=False) for row in stored])
-    rows = stored.select(*keys, strict=False).cpu()  # the same sums on every device
+    rows = stored.select(*keys, strict=False).cpu()  # the sums then have the same bits on every device
     held = statistics_of(target) if isinstance(target, LossModule) else {}
     for path, part in features:
+        # A loss holds its networks' buffers outside the networks, so a copy of the features is fitted.
         fitted = copy.deepcopy(part).cpu() if held else part
         fitted.fit(rows, weights)
         for name, value in fitted.state_dict().items() if held else ():
@@ -74,33 +75,31 @@ def share_contacts(module: nn.Module) -> None:
     A critic of which a loss holds several copies keeps its own buffers, so there is nothing to share.
     """
     changed = {buffer.data_ptr() for buffer in statistics_of(module).values()}
-    for _, part in _modules(module):
+    for _, part in _features_of(module):
         if isinstance(part, RoleFeatures) and part.contact.data_ptr() in changed:
             part.share()
 
 
 def statistics_of(module: nn.Module) -> dict[str, Tensor]:
     """Return the buffers that :func:`fit_normalization` fits, by name; of a loss, those of all copies and targets."""
-    features = [(path, part) for path, part in _modules(module) if isinstance(part, Features)]
-    names = [f"{path}.{name}".lstrip(".") for path, part in features for name in part.state_dict()]
+    names = [f"{path}.{name}".lstrip(".") for path, part in _features_of(module) for name in part.state_dict()]
     buffers = dict(module.named_buffers())
     if isinstance(module, LossModule):
         names = [copied for name in names for copied in _copies(name)]
     return {name: buffers[name].data for name in names if name in buffers}
 
 
-def _modules(module: nn.Module) -> Iterator[tuple[str, nn.Module]]:
-    """Yield the modules in a module with their paths; in a loss, those in its networks, which are not its children."""
-    if not isinstance(module, LossModule):
-        yield from module.named_modules()
-        return
-    for name, network in vars(module).items():
-        if isinstance(network, nn.Module):
-            yield from network.named_modules(prefix=name)
+def _features_of(module: nn.Module) -> list[tuple[str, Features]]:
+    """Return the features in a module with their paths; the networks of a loss are not among its children."""
+    networks: Iterator[tuple[str, nn.Module]] = iter([("", module)])
+    if isinstance(module, LossModule):
+        networks = ((name, value) for name, value in vars(module).items() if isinstance(value, nn.Module))
+    parts = (named for name, network in networks for named in network.named_modules(prefix=name))
+    return [(path, part) for path, part in parts if isinstance(part, Features)]
 
 
 def _copies(name: str) -> list[str]:
-    """Return the names of a loss's copies of a network's buffer: ``actor_network.features.mean``, say."""
+    """Return the names of a loss's copies of a network's buffer, for example of ``actor_network.features.mean``."""
     network, _, path = name.partition(".")
     return [f"{network}_params.{path}", f"target_{network}_params.{path}"]
 
@@ -126,6 +125,6 @@ def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
                 held[restored].copy_(value)
             share_contacts(loss)
             raise ValueError(
-                "normalize: a network of the loss has the statistics of other rows, with which it was trained: give "
-                "normalize=False to keep them, and fresh networks theirs by fit_normalization(network, replay)"
+                "normalize=True would replace the statistics with which a network of the loss was trained; use "
+                "normalize=False, and call fit_normalization(network, replay) for fresh networks"
             )

@@ -1,4 +1,4 @@
-"""OfflineTrainer: train any TorchRL loss, or one of this library, on a replay buffer."""
+"""OfflineTrainer: train any loss of TorchRL or of this library on a replay buffer."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedValue
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
-from lw_torchrl.objectives.reduction import with_n_steps
+from lw_torchrl.objectives.offline import with_n_steps
 from lw_torchrl.training.checkpoint import check_can_be_saved
 from lw_torchrl.training.loop import Training, TrainingOptions, make_optimizer
 from lw_torchrl.training.minibatches import (
@@ -38,6 +38,7 @@ GAMMA, N_STEPS = 0.99, 10
 DISTRIBUTIONS = {"advantage": None, "iql": "normal", "td3-bc": None, "cql": "tanh_normal"}
 """The losses by name, and the distribution of actions that the actor needs."""
 _CHUNK = 20_000  # rows whose advantages are computed together
+_REPLACED = {"loss_actor_bc"}  # CQL's actor minimises this entry instead of another one in its first steps
 
 
 def make_loss(name: str, actor: TensorDictModuleBase, plans: Plans, replay: TensorDictReplayBuffer) -> LossModule:
@@ -83,17 +84,14 @@ def learn_advantages(
     return standardize_by_task(advantage, torch.cat([chunk["task_id"].cpu() for chunk in chunks]))
 
 
-_REPLACED = {"loss_actor_bc"}  # CQL's first steps of the actor minimise it instead of another entry
-
-
 @typed_fields
 @dataclass(frozen=True)
 class OfflineConfig:
     """Hyperparameters of training with any loss, by AdamW. Others are those of :class:`BehavioralCloningConfig`.
 
     Attributes:
-        learning_rate: of the actor, at the start.
-        critic_learning_rate: of everything else that the loss trains.
+        learning_rate: initial learning rate of the actor.
+        critic_learning_rate: initial learning rate of everything else that the loss trains.
         target_eps: the fraction of a target network that is kept in each step, if the loss has target networks.
         normalize: before the first step, fit the statistics of the features to the buffer's rows; False for networks
             that were trained on other rows.
@@ -120,20 +118,20 @@ class OfflineTrainer(Training):
     target networks. CQL's ``loss_actor_bc`` is left out.
 
     Args:
-        loss: of ``torchrl.objectives`` or ``lw_torchrl.objectives``, with its value estimator. Its networks are trained
-            in place, on the device where they are.
-        replay: its samples hold what the loss reads.
+        loss: a loss of ``torchrl.objectives`` or ``lw_torchrl.objectives``, with its value estimator. Its networks are
+            trained in place, on their device.
+        replay: a buffer whose samples hold what the loss reads.
         config: hyperparameters; None for the defaults.
         actor: the policy inside the loss. ``checkpoint`` is then its file, with the training state next to it; None
             writes only the training state.
         **options: of :class:`~lw_torchrl.training.loop.Training`, with its errors.
 
     Raises:
-        ValueError: the buffer answers the queries of other plans, or draws by priorities; the loss's value estimator
-            has another gamma than the buffer's n steps, the loss does not return means, or is CQL's with a Lagrange
-            multiplier, or reads rewards or next observations that the buffer lacks; with ``normalize``, a network was
-            trained with other statistics; the buffer has RandomYaw or JitterTarget, and the loss would not pass on what
-            they write to FocusFeatures or RoleFeatures.
+        ValueError: the buffer answers the queries of other plans, draws by priorities, or lacks rewards or next
+            observations that the loss reads; its n steps have another gamma than the loss's value estimator; the loss
+            does not return means, or is a CQLLoss with a Lagrange multiplier; with ``normalize``, a network was trained
+            with other statistics; the buffer has RandomYaw or JitterTarget, and the loss would not pass on what they
+            write to FocusFeatures or RoleFeatures.
         TypeError: the loss is not a LossModule.
 
     Example:
@@ -155,7 +153,7 @@ class OfflineTrainer(Training):
     @typed
     def __init__(
         self,
-        loss: Any,  # a LossModule; check_loss explains what else it may be
+        loss: Any,  # a LossModule; check_loss explains common mistakes
         replay: TensorDictReplayBuffer,
         config: OfflineConfig | None = None,
         *,
@@ -201,7 +199,7 @@ class OfflineTrainer(Training):
     def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:
         values = self.loss(with_n_steps(self.loss, batch))
         if not any(name.startswith("loss_") for name in values.keys()):
-            raise ValueError(f"loss must give entries that begin with 'loss_', it gives {', '.join(values.keys())}")
+            raise ValueError(f"loss must return entries that begin with 'loss_', got {', '.join(values.keys())}")
         return {name: value for name, value in values.items() if name not in _REPLACED}
 
     def after_update(self) -> None:
@@ -216,29 +214,29 @@ def networks_of(loss: LossModule) -> list[nn.Module]:
 
 
 def check_loss(loss: Any, replay: TensorDictReplayBuffer) -> None:
-    """Raise unless a loss can be trained on a buffer. TorchRL's default value estimator is made, if it has none."""
+    """Raise unless a loss can be trained on a buffer. A loss without a value estimator gets TorchRL's default one."""
     if not isinstance(loss, LossModule):
         hint = "compile one by loss.compile()"
         if loss is None:
             hint = "make_value_estimator of TorchRL's losses returns None, so call it on a line of its own"
         raise TypeError(f"loss must be a LossModule, got {type(loss).__name__}; {hint}")
     if getattr(loss, "reduction", "mean") == "none":
-        raise ValueError("loss must return the mean of its rows, got reduction='none'")
+        raise ValueError("loss must return the mean over the rows, got reduction='none'")
     if getattr(loss, "with_lagrange", False):
         raise ValueError("loss: with_lagrange=True keeps loss_cql from the critics; use with_lagrange=False")
     ahead = [key for key in loss.in_keys if isinstance(key, tuple) and key[0] == "next"]
     if ahead and len(replay) and "next" not in replay.storage[0].keys():
-        needs = f"loss: {type(loss).__name__} needs rewards and next observations, which replay's rows lack"
-        raise ValueError(f"{needs}; open the buffer with label='executed'")
-    summed = [part.gamma for part in replay.transform if isinstance(part, MultiStepTransform)]
-    shown = next(iter(summed), getattr(replay, "gamma", None))  # None where ``next`` is one step ahead
-    if shown is None or loss.default_value_estimator is None:
+        lack = f"{type(loss).__name__} needs rewards and next observations, which replay's rows lack"
+        raise ValueError(f"loss: {lack}; open the buffer with label='executed'")
+    gammas = [part.gamma for part in replay.transform if isinstance(part, MultiStepTransform)]
+    expected = next(iter(gammas), getattr(replay, "gamma", None))  # None where ``next`` is one step ahead
+    if expected is None or loss.default_value_estimator is None:
         return
     gamma = getattr(loss.value_estimator, "gamma", None)
-    if gamma is not None and abs(float(gamma) - shown) > 1e-6:
+    if gamma is not None and abs(float(gamma) - expected) > 1e-6:
         raise ValueError(
-            f"loss: its value estimator's gamma must be that of the replay buffer's n steps, {shown}, got "
-            f"{float(gamma):.6g}; call loss.make_value_estimator(gamma={shown})"
+            f"loss: its value estimator's gamma must be that of the replay buffer's n steps, {expected}, got "
+            f"{float(gamma):.6g}; call loss.make_value_estimator(gamma={expected})"
         )
 
 

@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict
 
 import lw_torchrl as lw
-from lw_torchrl._util.versions import package_versions
+from lw_torchrl._util.reproducibility import package_versions
 from lw_torchrl.data import collect_demonstrations
 from lw_torchrl.data.collect import EpisodeFiles
 from lw_torchrl.data.dataset import (

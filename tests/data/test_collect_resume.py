@@ -13,7 +13,7 @@ import pytest
 from collecting import STEPS, Evil, collect, interrupt_after, tree
 
 from lw_torchrl._util.files import locked
-from lw_torchrl._util.versions import SIMULATORS, package_versions, version_changes
+from lw_torchrl._util.reproducibility import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import DatasetError
 from lw_torchrl.data.collect import EpisodeFiles
 from lw_torchrl.data.dataset import read_metadata
@@ -245,7 +245,9 @@ def test_episodes_of_two_simulators_are_never_mixed(tmp_path, monkeypatch):
             collect(root, num_envs=2)
     recorded, real = package_versions(), importlib.metadata.version
     with monkeypatch.context() as patch:
-        patch.setattr("lw_torchrl._util.versions.version", lambda name: "9.9.9" if name == "mujoco" else real(name))
+        patch.setattr(
+            "lw_torchrl._util.reproducibility.version", lambda name: "9.9.9" if name == "mujoco" else real(name)
+        )
         with pytest.raises(DatasetError, match=rf"another simulator \(mujoco {recorded['mujoco']}, now 9.9.9\)"):
             collect(root)
     assert collect(root).versions == recorded

@@ -16,7 +16,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import lw_torchrl as lw
-from lw_torchrl._util.seeding import episode_generator
+from lw_torchrl._util.reproducibility import episode_generator
 from lw_torchrl.data import BEHAVIOURS, Behaviour, CollectConfig, DatasetError
 from lw_torchrl.data.collection_policy import SegmentActor, policy_fingerprint, segment_plans
 from lw_torchrl.data.dataset import load_rows, read_metadata

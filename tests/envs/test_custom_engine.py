@@ -16,7 +16,7 @@ from lw_torchrl.envs.episodes import run_episodes
 from lw_torchrl.envs.seeding import action_noise, episode_seed
 from lw_torchrl.suites.engine import EngineStep
 from lw_torchrl.suites.metaworld import ENGINES, MetaWorldEngine, make_engine
-from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
+from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 STACK = lw.Task("stack-cups", "Stack the cups.", (*lw.TASKS["reach"].objects,))
 STACK_ID = lw.task_id("stack-cups")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mutations import mutated
 
 import lw_torchrl
-from lw_torchrl._util.versions import package_versions
+from lw_torchrl._util.reproducibility import package_versions
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
 
 CONFIG = {
@@ -186,7 +186,8 @@ def test_a_file_of_another_shape_is_refused_or_holds_together(tmp_path, data):
 
 
 def test_our_version_is_that_of_the_code_that_runs(monkeypatch):
-    monkeypatch.setattr("lw_torchrl._util.versions.version", lambda name: "0.0.1")  # as an old editable install says
+    # An old editable install reports the version that it was installed with.
+    monkeypatch.setattr("lw_torchrl._util.reproducibility.version", lambda name: "0.0.1")
     found = package_versions()
     assert found["lw_torchrl"] == lw_torchrl.__version__
     assert found["torch"] == "0.0.1"

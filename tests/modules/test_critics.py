@@ -78,10 +78,3 @@ def test_an_action_of_another_name():
     rows = rows_of(4)
     rows["agent", "action"] = rows.pop("action")
     assert critic(rows)["state_action_value"].shape == (4, 1)
-    with pytest.raises(TypeError, match="action_key must be a NestedKey"):
-        lw.PlanConditionedQValue(PLANS, action_key=3)
-
-
-def test_a_misspelt_option_is_named_with_the_nearest():
-    with pytest.raises(TypeError, match="did you mean 'quantiles'"):
-        lw.PlanConditionedQValue(PLANS, quantile=3)

@@ -127,7 +127,7 @@ def test_an_assigned_part_is_saved_or_refused(tmp_path):
     lw.save_actor(actor, path)
     assert torch.equal(action_of(lw.load_actor(path), rows), action_of(actor, rows))
     actor.decoder = MLPDecoder(width=4)
-    actor.decoder.network._sizes["width"] = 5  # a config that is not the network's
+    actor.decoder.network._options["width"] = 5  # a config that is not the network's
     with pytest.raises(ValueError, match="its description does not rebuild it"):
         lw.save_actor(actor, path)
 
@@ -159,7 +159,7 @@ def test_a_class_of_a_script_is_passed_by_hand(tmp_path, monkeypatch):
     path = tmp_path / "policy.safetensors"
     monkeypatch.setattr(Gated, "__module__", "__main__")
     lw.save_actor(make("decoder"), path)
-    with pytest.raises(ValueError, match=r"'__main__:Gated' is not known here: pass the class, parts=\[Gated\]"):
+    with pytest.raises(ValueError, match=r"'__main__:Gated' is not known here: pass parts=\[Gated\]"):
         lw.load_actor(path)
     assert type(lw.load_actor(path, parts=[Gated]).decoder.network) is Gated
 

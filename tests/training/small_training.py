@@ -50,8 +50,8 @@ def make_descriptor_actor(tasks="MT10", condition="description", **options):
     return DescriptorConditionedActor(tasks, condition=condition, task_encoder=parts.pop("skill_encoder"), **parts)
 
 
-class Stopping(BehavioralCloningTrainer):
-    """Stops, as Ctrl-C does, when it gets to a step."""
+class StopAt:
+    """Raises KeyboardInterrupt, as Ctrl-C does, when a trainer reaches a step."""
 
     stop_at: int | None = None
 
@@ -59,6 +59,10 @@ class Stopping(BehavioralCloningTrainer):
         if self.steps == self.stop_at:
             raise KeyboardInterrupt
         return super().step()
+
+
+class Stopping(StopAt, BehavioralCloningTrainer):
+    pass
 
 
 def make_trainer(root, checkpoint=None, *, actor=None, config=CONFIG, sampler=None, stop_at=None, **options):
@@ -69,7 +73,7 @@ def make_trainer(root, checkpoint=None, *, actor=None, config=CONFIG, sampler=No
 
 
 def flat(value, path=()):
-    """Every tensor and number of a nested state."""
+    """Every tensor and number of a nested state, by path."""
     if isinstance(value, dict):
         return {key: leaf for name in value for key, leaf in flat(value[name], (*path, str(name))).items()}
     if isinstance(value, (list, tuple)):
@@ -78,7 +82,7 @@ def flat(value, path=()):
 
 
 def everything(trainer):
-    found = flat(
+    state = flat(
         {
             "actor": dict(trainer.actor.state_dict()),
             "optimizer": trainer.optimizer.state_dict(),
@@ -86,16 +90,16 @@ def everything(trainer):
         }
     )
     with trainer.minibatches[0].drawing(trainer.device):
-        return found | {("next batch",): trainer.replay.sample(8)["observation"]}
+        return state | {("next batch",): trainer.replay.sample(8)["observation"]}
 
 
-def assert_same(found, expected):
-    assert found.keys() == expected.keys()
+def assert_same(state, expected):
+    assert state.keys() == expected.keys()
     for key, value in expected.items():
         if isinstance(value, torch.Tensor):
-            assert torch.equal(found[key], value), key
-        elif isinstance(value, float) and isinstance(found[key], torch.Tensor):
-            assert found[key].item() == value, key
+            assert torch.equal(state[key], value), key
+        elif isinstance(value, float) and isinstance(state[key], torch.Tensor):
+            assert state[key].item() == value, key
         else:
-            assert found[key] == value, key
-            assert type(found[key]) is type(value), key  # an integer stays one
+            assert state[key] == value, key
+            assert type(state[key]) is type(value), key  # an integer stays an integer

@@ -1,4 +1,4 @@
-"""Files of policies: load_actor makes the same policy, and says what is wrong with a file."""
+"""Policy files: load_actor rebuilds the same policy, and refuses damaged files and files of other kinds."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from torch.nn.utils import prune
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import lw_torchrl as lw
+from lw_torchrl._util.reproducibility import package_versions
 from lw_torchrl._util.tensor_files import read_tensors, write_tensors
-from lw_torchrl._util.versions import package_versions
 from lw_torchrl.language import embeddings
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.modules import ActorEnsemble, MLPDecoder, ObservationFeatures, SkillEncoder
@@ -97,37 +97,33 @@ def test_load_actor_makes_the_same_policy(path, options):
     assert isinstance(loaded, lw.PlanConditionedActor)
     assert (loaded.plans, loaded.training, describe(loaded)) == (actor.plans, False, describe(actor))
     state = make_rows(seed=1).exclude("action")
-    expected, found = actor.eval()(state.clone()), loaded(state.clone())
+    expected, actual = actor.eval()(state.clone()), loaded(state.clone())
     for key in actor.out_keys:
-        assert torch.equal(found[key], expected[key])
+        assert torch.equal(actual[key], expected[key])
 
 
-def test_own_plans_are_stored_and_the_text_encoder_is_passed_again(path):
+def test_custom_plans_are_stored_and_the_text_encoder_is_passed_again(path):
     actor = train(small(own_plans(), text_encoder=count_vowels), path, own_plans())
     loaded = lw.load_actor(path, text_encoder=count_vowels)
     assert loaded.plans == own_plans()
     assert torch.equal(act(loaded, own_plans()), act(actor, own_plans()))
     lw.load_actor(path, text_encoder=lambda texts: count_vowels(texts) * 3.0)  # the same after scaling
     for encoder in (lambda texts: count_vowels(texts).flip(-1), lambda texts: torch.ones(len(texts), 3), None):
-        with pytest.raises(ValueError, match="text_encoder must be the one that the file was made with"):
+        with pytest.raises(ValueError, match="text_encoder"):
             lw.load_actor(path, text_encoder=encoder)
 
 
-def own_words():
-    return small(own_plans())
-
-
-NOT_SHIPPED = {
-    "a plan": own_words,
+CUSTOM_TEXTS = {
+    "a plan": lambda: small(own_plans()),
     "a description": lambda: lw.DescriptorConditionedActor(
         [replace(lw.TASKS["reach"], description="Bring the hand over to the red spot.")]
     ),
-    "an ensemble": lambda: ActorEnsemble([own_words(), own_words()]),
+    "an ensemble": lambda: ActorEnsemble([small(own_plans()), small(own_plans())]),
 }
 
 
-@pytest.mark.parametrize("make", NOT_SHIPPED.values(), ids=NOT_SHIPPED)
-def test_texts_that_are_not_shipped_load_in_a_new_process(make, path):
+@pytest.mark.parametrize("make", CUSTOM_TEXTS.values(), ids=CUSTOM_TEXTS)
+def test_policies_with_texts_that_are_not_shipped_load_in_a_new_process(make, path):
     lw.save_actor(make(), path)
     embeddings._sentence_transformer.cache_clear()  # as in a new process
     lw.load_actor(path)
@@ -135,7 +131,7 @@ def test_texts_that_are_not_shipped_load_in_a_new_process(make, path):
 
 
 @pytest.mark.parametrize("other", [lambda actor: actor, lambda actor: actor.with_plans(PLANS)])
-def test_members_that_share_weights(path, other):
+def test_an_ensemble_whose_members_share_weights_is_rebuilt(path, other):
     actor = small()
     ensemble = ActorEnsemble([actor, other(actor)])
     lw.save_actor(ensemble, path)
@@ -143,11 +139,11 @@ def test_members_that_share_weights(path, other):
     assert all(torch.equal(value, loaded[name]) for name, value in ensemble.state_dict().items())
 
 
-def test_scripted_skills(path, tmp_path):
+def test_scripted_skills_are_rebuilt_unless_they_are_custom(path, tmp_path):
     actor = lw.ScriptedSkillActor(PLANS, "mix")
     lw.save_actor(actor, path)
     assert torch.equal(act(lw.load_actor(path)), act(actor))
-    with pytest.raises(TypeError, match="with custom skills cannot be saved"):
+    with pytest.raises(TypeError, match="custom skills"):
         lw.save_actor(lw.ScriptedSkillActor(PLANS, skills=load_skills()), tmp_path / "own.safetensors")
 
 
@@ -166,7 +162,7 @@ def test_any_safetensors_reader_reads_the_weights(saved):
     assert all(torch.equal(value, weights[name]) for name, value in saved[1].state_dict().items())
 
 
-def test_the_description_says_how_it_was_made(saved, path):
+def test_the_description_records_architecture_training_and_versions(saved, path):
     description = read_description(saved[0])
     assert description["actor"] == describe(saved[1])
     assert description["actor"]["class"] == "PlanConditionedActor"
@@ -179,10 +175,15 @@ def test_the_description_says_how_it_was_made(saved, path):
 # ---- refused before it is written
 
 
-def test_an_actor_that_cannot_be_saved_is_refused_before_training(tmp_path, path):
-    module = TensorDictModule(nn.Conv1d(39, 4, 1), in_keys=["observation"], out_keys=["action"])
+class NoConfig(nn.Linear):
+    """A network without the attribute config."""
+
+
+@pytest.mark.parametrize("network", [nn.Conv1d(39, 4, 1), NoConfig(39, 4)])
+def test_an_actor_that_cannot_be_saved_is_refused_before_training(tmp_path, path, network):
+    module = TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
     for write in (train, lw.save_actor):
-        with pytest.raises(TypeError, match=r"the policy is a Conv1d, which cannot be saved: give it an attr"):
+        with pytest.raises(TypeError, match=f"{type(network).__name__}, which cannot be saved: .* config"):
             write(module, path)
     assert not list(tmp_path.iterdir())
 
@@ -193,7 +194,7 @@ def pruned(actor):
 
 
 def reconfigured(actor):
-    actor.decoder.network._sizes["width"] = 32
+    actor.decoder.network._options["width"] = 32
     return actor
 
 
@@ -205,16 +206,16 @@ def not_finite(actor):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lw.PlanConditionedActor.double, r"must be torch.float32 of shape .*, got torch.float64"),
-        (pruned, "must hold the same tensors as the module, they differ in module.decoder.network.0.weight"),
-        (reconfigured, r"must be torch.float32 of shape \(32, .*, got torch.float32 of shape \(16, "),
+        (lw.PlanConditionedActor.double, "got torch.float64"),
+        (pruned, "module.decoder.network.0.weight"),
+        (reconfigured, r"of shape \(32, .*, got torch.float32 of shape \(16, "),
         (not_finite, "decoder.network.0.bias must be finite"),
     ],
 )
-def test_what_could_not_be_loaded_is_not_saved(tmp_path, path, change, message):
+def test_an_actor_that_could_not_be_loaded_is_not_saved(tmp_path, path, change, message):
     actor = change(small())
     for write in (lw.save_actor, train):
-        with pytest.raises(ValueError, match=f"actor cannot be kept in a file, .*{message}"):
+        with pytest.raises(ValueError, match=f"actor cannot be saved, .*{message}"):
             write(actor, path)
     assert not list(tmp_path.iterdir())
 
@@ -229,13 +230,13 @@ def test_saving_draws_no_random_numbers(path):
 @pytest.mark.parametrize(
     ("about", "message"),
     [
-        ({"format": 3}, "about must not be named format, which a policy's file says itself"),
-        ({"state": 3}, "about must not be named state"),
+        ({"format": 3}, "about must not use the reserved name format"),
+        ({"state": 3}, "about must not use the reserved name state"),
         ({"note": {1: "a", "1": "b"}}, "names '1' more than once"),
         ({"note": float("nan")}, "JSON"),
     ],
 )
-def test_metadata_that_could_not_be_read_again(tmp_path, path, about, message):
+def test_metadata_that_could_not_be_read_again_is_refused(tmp_path, path, about, message):
     with pytest.raises(ValueError, match=message):
         lw.save_actor(small(), path, **about)
     assert not list(tmp_path.iterdir())
@@ -244,29 +245,28 @@ def test_metadata_that_could_not_be_read_again(tmp_path, path, about, message):
 # ---- other files and damaged ones
 
 
-def refused(path, message):
+def assert_refused(path, message):
     with pytest.raises(ValueError, match=message) as caught:
         lw.load_actor(path)
     assert str(caught.value).startswith("checkpoint: ")
     assert str(path) in str(caught.value)
 
 
-def test_a_missing_file_is_named(path):
-    with pytest.raises(FileNotFoundError, match=r"checkpoint: no file .*c\.safetensors.*; `lw-torchrl train` writes"):
+def test_the_error_for_a_missing_file_names_the_file(path):
+    with pytest.raises(FileNotFoundError, match=r"checkpoint: no file .*c\.safetensors"):
         lw.load_actor(path)
 
 
-def test_files_of_another_kind(saved, tmp_path, path):
-    refused(tmp_path, "cannot be read: it is a folder")
+def test_files_of_another_kind_are_refused(saved, tmp_path, path):
+    assert_refused(tmp_path, "cannot be read: it is a folder")
     for content in (b"", b"\x80\x04K\x01.", b"PK\x03\x04", b"words"):
         path.write_bytes(content)
-        refused(path, "cannot be read: it is damaged or not a .safetensors file")
+        assert_refused(path, "cannot be read: it is damaged or not a .safetensors file")
     save_file({"weight": torch.ones(2)}, path)
-    refused(path, "it is a .safetensors file, but was not written by lw_torchrl")
-    training = saved[0].with_name("policy.training.safetensors")
-    refused(training, "must be a policy of version 2, got format 'lw_torchrl.training', version 2")
+    assert_refused(path, "not written by lw_torchrl")
+    assert_refused(saved[0].with_name("policy.training.safetensors"), "must be a policy .*'lw_torchrl.training'")
     save_evaluator(lw.StateQueryEvaluator(PLANS, width=8), path)
-    refused(path, "must be a policy of version 2, got format 'lw_torchrl.evaluator'")
+    assert_refused(path, "must be a policy .*'lw_torchrl.evaluator'")
 
 
 def test_a_pickle_is_not_loaded(tmp_path, path):
@@ -275,35 +275,34 @@ def test_a_pickle_is_not_loaded(tmp_path, path):
             return (shutil.copy, (str(path), str(tmp_path / "executed")))
 
     torch.save({"weights": Evil()}, path)
-    refused(path, "not a .safetensors file")
+    assert_refused(path, "not a .safetensors file")
     assert not (tmp_path / "executed").exists()
 
 
 NAN = torch.tensor([float("nan"), 0.0, 0.0, 0.0])
 CHANGES = {
-    "other options": ("decoder", "width", 32, r"must be torch.float32 of shape \(32, .* got .* \(16, "),
+    "other options": ("decoder", "width", 32, r"of shape \(32, .* got .* \(16, "),
     "an unknown option": ("decoder", "depht", 1, "depht"),
     "an unknown class": (None, "class", "ElephantActor", "'ElephantActor'"),
     "a plan that cannot be parsed": ("plans", "reach", "def raech(", "plan of 'reach' must be like"),
-    "NaN": ("tensors", "module.decoder.network.2.bias", NAN, "must be finite, it holds NaN"),
+    "NaN": ("tensors", "module.decoder.network.2.bias", NAN, "must be finite"),
     "another dtype": ("tensors", "module.decoder.network.2.bias", NAN.double(), "got torch.float64"),
-    "another tensor": ("tensors", "more", NAN, "they differ in more"),
+    "another tensor": ("tensors", "more", NAN, "they differ in .*more"),
 }
 
 
 @pytest.mark.parametrize(("inside", "name", "value", "message"), CHANGES.values(), ids=CHANGES)
-def test_weights_that_do_not_fit_the_description(saved, path, inside, name, value, message):
+def test_weights_that_do_not_fit_the_description_are_refused(saved, path, inside, name, value, message):
     description, tensors = read_tensors(saved[0])
     actor = description["actor"]
     decoder = actor["options"]["decoder"]["module"]["options"]["network"]["module"]["options"]
     described = {None: actor, "decoder": decoder, "plans": actor["plans"][0], "tensors": tensors}[inside]
     described[name] = value
     write_tensors(path, description, tensors)
-    refused(path, f"the actor of .* cannot be made .*{message}")
+    assert_refused(path, f"the actor of .* cannot be made .*{message}")
 
 
-def test_a_flipped_bit_is_found(tmp_path):
-    path = tmp_path / "policy.safetensors"
+def test_a_flipped_bit_is_detected(path):
     lw.save_actor(small(), path)
     content = path.read_bytes()
     for place in range(len(content) // 3, len(content), len(content) // 7):

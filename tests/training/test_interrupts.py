@@ -1,4 +1,4 @@
-"""Ctrl-C in training: it ends between two steps, with a checkpoint of where it stands, every time."""
+"""Ctrl-C ends training between two steps with a checkpoint."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ def demos(tmp_path_factory):
 
 
 class PressCtrlC(Transform):
-    """Sends SIGINT while the sixth minibatch is drawn, as often as it is told to."""
+    """Sends SIGINT while the sixth minibatch is drawn, once or several times."""
 
     def __init__(self, times=1):
         super().__init__()
-        self.minibatches, self.presses = iter(range(1, 100)), iter(range(times))  # no numbers: all are alike
+        # Iterators are not part of the buffer's description, so that all buffers have the same one.
+        self.minibatches, self.presses = iter(range(1, 100)), iter(range(times))
 
     def forward(self, tensordict):
         if next(self.minibatches) == 6:
@@ -50,7 +51,7 @@ def weights(trainer):
     return torch.cat([p.detach().flatten() for p in trainer.actor.parameters()])
 
 
-def test_it_ends_after_the_step_and_carries_on(demos, tmp_path):
+def test_training_ends_after_the_step_and_resumes_bit_for_bit(demos, tmp_path):
     handler = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         make(demos, tmp_path / "c.safetensors", times=1).train()
@@ -63,7 +64,7 @@ def test_it_ends_after_the_step_and_carries_on(demos, tmp_path):
     assert torch.equal(weights(resumed), weights(whole))
 
 
-def test_the_second_time_it_ends_at_once(demos, tmp_path):
+def test_a_second_ctrl_c_ends_training_at_once(demos, tmp_path):
     trainer = make(demos, tmp_path / "c.safetensors", times=2)
     handler = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
@@ -73,7 +74,7 @@ def test_the_second_time_it_ends_at_once(demos, tmp_path):
     assert not (tmp_path / "c.safetensors").exists()
 
 
-def test_where_it_is_ignored_it_is_ignored(demos, tmp_path):
+def test_an_ignored_sigint_stays_ignored(demos, tmp_path):
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         trainer = make(demos, tmp_path / "c.safetensors", times=1)
@@ -84,7 +85,7 @@ def test_where_it_is_ignored_it_is_ignored(demos, tmp_path):
     assert trainer.steps == CONFIG.steps
 
 
-def test_in_another_thread_nothing_is_changed(demos):
+def test_training_in_another_thread_changes_no_signal_handler(demos):
     trainer = make(demos, None)
     thread = threading.Thread(target=trainer.train)
     thread.start()
@@ -92,47 +93,46 @@ def test_in_another_thread_nothing_is_changed(demos):
     assert trainer.steps == CONFIG.steps
 
 
-# What a command does before it works: note in a file when the work begins, and at which step.
-NOTES = """
+# Runs in a command before its work: writes to a file when the work begins, and at which step.
+RECORD_START = """
 import lw_torchrl as lw
 
-place, method, begun = getattr(lw, {owner!r}), {method!r}, {begun!r}
-original = getattr(place, method)
+owner, method, begun = getattr(lw, {owner!r}), {method!r}, {begun!r}
+original = getattr(owner, method)
 
-def noted(self, *args):
-    setattr(place, method, original)
+def record(self, *args):
+    setattr(owner, method, original)
     with open(begun, "w") as file:
         file.write(f"{{getattr(self, 'steps', 0)}}\\n")
     return original(self, *args)
 
-setattr(place, method, noted)
+setattr(owner, method, record)
 """
 
 
 def interrupted(forks, tmp_path, arguments, runs, owner, method):
-    """(exit status, step at which it began) of each run; each gets the signal at a random moment of its work."""
-    begun, chance, found = tmp_path / "begun", random.Random(0), []
+    """Interrupt each run at a random moment; return its exit status and the step at which it began."""
+    begun, chance, results = tmp_path / "begun", random.Random(0), []
     for _ in range(runs):
         begun.write_text("")
-        forks.start(*arguments, before=NOTES.format(owner=owner, method=method, begun=str(begun)))
+        forks.start(*arguments, before=RECORD_START.format(owner=owner, method=method, begun=str(begun)))
         while not begun.read_text().endswith("\n"):
             assert forks.running(0.005), forks.end()
         time.sleep(chance.uniform(0, 0.15))
         forks.send(signal.SIGINT)
         ended = forks.end()
         assert "Traceback" not in ended.err
-        found.append((ended.status, int(begun.read_text())))
-    return found
+        results.append((ended.status, int(begun.read_text())))
+    return results
 
 
 @pytest.mark.parametrize("times", [5, pytest.param(20, marks=pytest.mark.slow)])
-def test_at_random_moments(forks, demos, tmp_path, times):
-    """Each run carries on from the one before; none loses a step that it made."""
+def test_runs_that_are_interrupted_at_random_moments_lose_no_step(forks, demos, tmp_path, times):
     file = tmp_path / "policy.safetensors"
     arguments = ["train", demos, "--out", file, "--steps", 10**6, "--batch-size", 20, "--width", 16, "--depth", 1]
-    found = interrupted(forks, tmp_path, arguments, times, "BehavioralCloningTrainer", "step")
-    assert [status for status, _ in found] == [130] * times
-    steps = [step for _, step in found]
+    results = interrupted(forks, tmp_path, arguments, times, "BehavioralCloningTrainer", "step")
+    assert [status for status, _ in results] == [130] * times
+    steps = [step for _, step in results]
     assert steps[0] == 0
     assert all(before < after for before, after in pairwise(steps)), steps
 
@@ -146,6 +146,6 @@ OTHERS = (
 
 @pytest.mark.parametrize("arguments", OTHERS, ids=lambda arguments: arguments[0])
 @pytest.mark.slow
-def test_other_work(forks, tmp_path, arguments):
-    given = [tmp_path / "out" if one == "OUT" else one for one in arguments]
-    assert interrupted(forks, tmp_path, given, 2, "LanguageWorldEnv", "_step") == [(130, 0)] * 2
+def test_other_commands_end_with_status_130(forks, tmp_path, arguments):
+    arguments = [tmp_path / "out" if argument == "OUT" else argument for argument in arguments]
+    assert interrupted(forks, tmp_path, arguments, 2, "LanguageWorldEnv", "_step") == [(130, 0)] * 2

@@ -1,4 +1,4 @@
-"""A buffer's statistics reach every network that a loss holds, its targets and copies too."""
+"""fit_normalization reaches every network of a loss, including its targets and copies."""
 
 from __future__ import annotations
 
@@ -31,11 +31,10 @@ def replay():
 
 @pytest.fixture(scope="module")
 def expected(replay):
-    found = {}
-    for kind in ("differences", "raw"):
-        found[kind] = ObservationFeatures(kind)
-        found[kind].fit(replay[:])
-    return found
+    features = {kind: ObservationFeatures(kind) for kind in ("differences", "raw")}
+    for each in features.values():
+        each.fit(replay[:])
+    return features
 
 
 def make(kind="differences", distribution=None):
@@ -58,18 +57,18 @@ def losses(kind="differences"):
 
 
 @pytest.mark.parametrize("kind", ["differences", "raw"])
-def test_it_reaches_all_networks_of_a_loss(replay, expected, kind):
+def test_statistics_reach_all_networks_of_a_loss(replay, expected, kind):
     for loss in losses(kind):
         fit_normalization(loss, replay)
-        found = {name: value for name, value in loss.state_dict().items() if name.endswith(("mean", "std"))}
-        assert len(found) >= 6, type(loss)  # two each of actor and critic, and of the targets
-        for name, value in found.items():
-            wanted = getattr(expected[kind], name.rpartition(".")[2])
-            assert torch.equal(value, wanted.expand_as(value)), (type(loss), name)
+        statistics = {name: value for name, value in loss.state_dict().items() if name.endswith(("mean", "std"))}
+        assert len(statistics) >= 6, type(loss)  # two each of actor and critic, and of the targets
+        for name, value in statistics.items():
+            fitted = getattr(expected[kind], name.rpartition(".")[2])
+            assert torch.equal(value, fitted.expand_as(value)), (type(loss), name)
 
 
-def test_the_loss_sees_it():
-    """The value of a state is what a critic of the same weights says that has these statistics."""
+def test_the_loss_uses_the_statistics():
+    """The loss's critic then gives the same values as a fitted critic with the same weights."""
     _, q, _ = make()
     other = copy.deepcopy(q)
     loss = DDPGLoss(make()[0], q)
@@ -81,47 +80,50 @@ def test_the_loss_sees_it():
     rows = lw.QAFTransform(PLANS)(rows)
     fit_normalization(loss, buffer)
     with loss.value_network_params.to_module(loss.value_network):
-        found = loss.value_network(rows.copy())["state_action_value"]
-    assert not torch.allclose(other(rows.copy())["state_action_value"], found)
+        values = loss.value_network(rows.copy())["state_action_value"]
+    assert not torch.allclose(other(rows.copy())["state_action_value"], values)
     fit_normalization(other, buffer)
-    assert torch.equal(other(rows.copy())["state_action_value"], found)
+    assert torch.equal(other(rows.copy())["state_action_value"], values)
 
 
-def test_of_modules(replay, expected):
+def test_features_of_any_module_are_fitted(replay, expected):
     actor, q, v = make()
     for target in (actor, q, v, nn.ModuleList([make()[0]])):
         fit_normalization(target, replay)
         for module in target.modules():
             if isinstance(module, ObservationFeatures):
                 assert torch.equal(module.mean, expected["differences"].mean)
+
+
+def test_a_module_without_features_and_rows_that_lack_a_key_are_refused(replay):
+    with pytest.raises(ValueError, match="target"):
+        fit_normalization(nn.Linear(2, 2), replay)
     other = TensorDictReplayBuffer(storage=LazyTensorStorage(4), batch_size=2)
     other.extend(TensorDict(seen=torch.rand(4, 39), batch_size=[4]))
     with pytest.raises(ValueError, match="observation"):
-        fit_normalization(actor, other)
-    with pytest.raises(ValueError, match="Linear holds no Features: there is nothing to normalise"):
-        fit_normalization(nn.Linear(2, 2), replay)
+        fit_normalization(make()[0], other)
 
 
-def test_rows_in_a_list_and_in_double_precision(replay, expected):
+def test_rows_may_be_in_a_list_and_in_double_precision(replay, expected):
     rows = TensorDict(observation=replay[:]["observation"].double()).auto_batch_size_(1)
     rows["task_id"] = torch.tensor([lw.task_id("push")] * 10 + [lw.task_id("reach")] * 40)
-    found = []
+    means = []
     for storage in (LazyTensorStorage(50), ListStorage(50)):
         buffer = TensorDictReplayBuffer(storage=storage, sampler=lw.CoLearningSampler("push"), batch_size=8)
-        with pytest.raises(ValueError, match="replay must hold rows to fit the features to, and it is empty"):
+        with pytest.raises(ValueError, match="replay must hold rows"):
             fit_normalization(make()[0], buffer)
         buffer.extend(rows)
         features = ObservationFeatures()
         fit_normalization(features, buffer)
-        found.append(features.mean.clone())
+        means.append(features.mean.clone())
         buffer.set_sampler(RandomSampler())
         fit_normalization(features, buffer)
         torch.testing.assert_close(features.std, expected["differences"].std)
-    assert torch.equal(*found)
-    assert not torch.allclose(found[0], expected["differences"].mean)
+    assert torch.equal(*means)
+    assert not torch.allclose(means[0], expected["differences"].mean)
 
 
-def test_role_features_in_a_loss_get_their_contacts():
+def test_role_features_in_a_loss_are_fitted_with_their_contact_points():
     plans = lw.canonical_plans(PLANS)
     generator = torch.Generator().manual_seed(0)
     rows = TensorDict(
@@ -133,7 +135,7 @@ def test_role_features_in_a_loss_get_their_contacts():
     expected.fit(rows)
     actor = lw.PlanConditionedActor(plans, features=RoleFeatures(plans))
     loss = TD3Loss(actor, lw.PlanConditionedQValue(plans, features=RoleFeatures(plans)), bounds=(-1.0, 1.0))
-    with pytest.raises(ValueError, match="RoleFeatures need the points where demonstrations touch objects"):
+    with pytest.raises(ValueError, match="RoleFeatures need the points"):
         check_contacts(loss)
     fit_normalization(loss, buffer)
     check_contacts(loss)

@@ -1,30 +1,26 @@
-"""A checkpoint of another training, or none, is refused and left alone."""
+"""A checkpoint has one writer, and the checkpoint of another training is refused and left unchanged."""
 
 from __future__ import annotations
 
+import importlib.metadata
+
 import pytest
 import torch
-from small_training import CONFIG, PLANS, collect_demos, make_actor, make_descriptor_actor, make_trainer
+from small_training import CONFIG, PLANS, make_actor, make_descriptor_actor, make_replay, make_trainer
 from torchrl.data import RandomSampler
 from torchrl.envs import Compose
 
+import lw_torchrl as lw
 from lw_torchrl._util.tensor_files import read_tensors, write_tensors
-from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
-from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.training.checkpoint import training_file
-from lw_torchrl.transforms import QAFTransform, RandomYaw
+from lw_torchrl.training.cloning import bc_loss
 
 
 @pytest.fixture(scope="module")
-def demos(tmp_path_factory):
-    return collect_demos(tmp_path_factory.mktemp("trainer") / "demos")
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    """Demonstrations that come to an end: steps follow the first success."""
-    root = tmp_path_factory.mktemp("whole") / "demos"
-    collect_demonstrations(["push", "reach"], episodes_per_task=1, root=root, max_steps=100, progress=False)
+def long_demos(tmp_path_factory):
+    """Demonstrations with steps after the first success."""
+    root = tmp_path_factory.mktemp("long") / "demos"
+    lw.collect_demonstrations(["push", "reach"], episodes_per_task=1, root=root, max_steps=100, progress=False)
     return root
 
 
@@ -35,7 +31,7 @@ def checkpoint(demos, tmp_path_factory):
     return path
 
 
-def refused(path, message, make):
+def assert_refused(path, message, make):
     content = path.read_bytes()
     with pytest.raises(ValueError, match=message) as caught:
         make()
@@ -43,72 +39,52 @@ def refused(path, message, make):
     assert path.stem in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("options", "differs"),
-    [
-        (dict(width=32), r"\S*network.module.options.width \(16, now 32\)"),
-        (dict(depth=2), r"\S*network.module.options.depth \(1, now 2\)"),
-        (dict(latent_size=5), r"\S*encoder.module.options.latent_size \(4, now 5\)"),
-        (dict(kind="raw"), r"\S*features.options.kind \('differences', now 'raw'\)"),
-    ],
-)
-def test_a_checkpoint_of_another_architecture_is_refused(demos, checkpoint, options, differs):
-    actor = make_actor(1, **options)
+SMALLER = {task: plan for task, plan in PLANS.items() if task in ("push", "reach")}
+ACTORS = {
+    r"width \(16, now 32\)": lambda: make_actor(1, width=32),
+    r"depth \(1, now 2\)": lambda: make_actor(1, depth=2),
+    r"latent_size \(4, now 5\)": lambda: make_actor(1, latent_size=5),
+    r"kind \('differences', now 'raw'\)": lambda: make_actor(1, kind="raw"),
+    "plans;": lambda: make_actor(plans=SMALLER),
+    "class": make_descriptor_actor,
+}
+
+
+@pytest.mark.parametrize("difference", ACTORS)
+def test_a_checkpoint_of_another_architecture_is_refused(demos, checkpoint, difference):
+    actor = ACTORS[difference]()
     before = {name: value.clone() for name, value in actor.state_dict().items()}
-    refused(
-        checkpoint,
-        f"of another architecture, its actor differs in {differs}; choose another file, or delete it",
-        lambda: make_trainer(demos, checkpoint, actor=actor),
-    )
+    message = f"of another architecture, its actor differs in .*{difference}"
+    assert_refused(checkpoint, message, lambda: make_trainer(demos, checkpoint, actor=actor))
     assert all(torch.equal(value, before[name]) for name, value in actor.state_dict().items())
 
 
-def test_a_checkpoint_of_other_plans_or_another_kind_is_refused(demos, checkpoint):
-    plans = {task: plan for task, plan in PLANS.items() if task in ("push", "reach")}
-    refused(
-        checkpoint,
-        r"of another architecture, its actor differs in plans;",
-        lambda: make_trainer(demos, checkpoint, actor=make_actor(plans=plans)),
-    )
-    refused(
-        checkpoint,
-        "of another architecture, its actor differs in class",
-        lambda: make_trainer(demos, checkpoint, actor=make_descriptor_actor()),
-    )
+OTHER_VALUES = {
+    "steps": 13,
+    "batch_size": 6,
+    "learning_rate": 1e-3,
+    "loss_function": "l1",
+    "seed": 1,
+    "weight_decay": 0.0,
+}
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("steps", 13),
-        ("batch_size", 6),
-        ("learning_rate", 1e-3),
-        ("loss_function", "l1"),
-        ("seed", 1),
-        ("weight_decay", 0.0),
-    ],
-)
-def test_a_checkpoint_of_another_configuration_is_refused(demos, checkpoint, name, value):
-    config = BehavioralCloningConfig(**{**vars(CONFIG), name: value})
-    refused(
-        checkpoint,
-        rf"of another configuration, its training differs in {name} \({vars(CONFIG)[name]!r}, now {value!r}\);",
-        lambda: make_trainer(demos, checkpoint, config=config),
-    )
+@pytest.mark.parametrize("name", OTHER_VALUES)
+def test_a_checkpoint_of_another_configuration_is_refused(demos, checkpoint, name):
+    config = lw.BehavioralCloningConfig(**{**vars(CONFIG), name: OTHER_VALUES[name]})
+    message = f"of another configuration, its training differs in {name} "
+    assert_refused(checkpoint, message, lambda: make_trainer(demos, checkpoint, config=config))
 
 
 def test_a_checkpoint_of_other_demonstrations_is_refused(checkpoint, tmp_path):
     root = tmp_path / "demos"
-    collect_demonstrations(["push", "reach"], episodes_per_task=1, root=root, max_steps=15, seed=8, progress=False)
-    refused(
-        checkpoint,
-        r"its data differs in episodes_per_task \(.*, now 1\), noise_scale \(.*\), seed \(0, now 8\);",
-        lambda: make_trainer(root, checkpoint),
-    )
+    lw.collect_demonstrations(["push", "reach"], episodes_per_task=1, root=root, max_steps=15, seed=8, progress=False)
+    message = r"its data differs in episodes_per_task .*, seed \(0, now 8\);"
+    assert_refused(checkpoint, message, lambda: make_trainer(root, checkpoint))
 
 
 @pytest.mark.parametrize(
-    ("change", "differs"),
+    ("change", "difference"),
     [
         (dict(label="executed"), "label"),
         (dict(label="unclipped"), "label"),
@@ -119,34 +95,92 @@ def test_a_checkpoint_of_other_demonstrations_is_refused(checkpoint, tmp_path):
         (dict(plans=PLANS), "transforms"),
     ],
 )
-def test_a_checkpoint_of_rows_shown_in_another_way_is_refused(root, tmp_path, change, differs):
+def test_a_checkpoint_of_other_samples_is_refused(long_demos, tmp_path, change, difference):
     path = tmp_path / "c.safetensors"
 
-    def trainer(label="expert", after_success=None, sampler=TaskBalancedSampler, yaw=0.1, plans=None):
-        turned = Compose(QAFTransform(PLANS), *([] if yaw is None else [RandomYaw(yaw, plans=plans)]))
-        replay = LanguageWorldExperienceReplay(
-            root, label=label, after_success=after_success, sampler=sampler(), transform=turned
-        )
-        return BehavioralCloningTrainer(make_actor(), replay, CONFIG, checkpoint=path, progress=False)
+    def trainer(label="expert", after_success=None, sampler=lw.TaskBalancedSampler, yaw=0.1, plans=None):
+        augmentations = [] if yaw is None else [lw.RandomYaw(yaw, plans=plans)]
+        transform = Compose(lw.QAFTransform(PLANS), *augmentations)
+        options = {"label": label, "after_success": after_success, "sampler": sampler(), "transform": transform}
+        replay = lw.LanguageWorldExperienceReplay(long_demos, **options)
+        return lw.BehavioralCloningTrainer(make_actor(), replay, CONFIG, checkpoint=path, progress=False)
 
     trainer().save()
     trainer()
-    refused(path, f"of another configuration, its replay differs in {differs}", lambda: trainer(**change))
+    assert_refused(path, f"of another configuration, its replay differs in {difference}", lambda: trainer(**change))
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not quite", b"years of work\n"])
-def test_a_foreign_file_is_refused(demos, tmp_path, content):
-    path = tmp_path / "thesis.tex"
+def test_a_file_of_another_program_is_refused(demos, tmp_path, content):
+    path, state = tmp_path / "thesis.tex", tmp_path / "thesis.training.tex"
     path.write_bytes(content)
-    refused(path, "checkpoint: .* exists, but not its training state", lambda: make_trainer(demos, path))
-    state = tmp_path / "thesis.training.tex"
+    assert_refused(path, "exists, but not its training state", lambda: make_trainer(demos, path))
     state.write_bytes(content)
-    refused(state, "cannot be read: it is damaged or not a .safetensors file", lambda: make_trainer(demos, path))
+    assert_refused(state, "damaged or not a .safetensors file", lambda: make_trainer(demos, path))
 
 
-def test_a_training_state_without_its_state_is_refused(demos, checkpoint, tmp_path):
+def test_a_policy_without_a_training_state_is_not_overwritten(demos, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    lw.save_actor(make_actor(), path)
+    assert_refused(path, "exists, but not its training state", lambda: make_trainer(demos, path))
+
+
+def test_a_training_file_without_a_state_is_refused(demos, checkpoint, tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     description, tensors = read_tensors(training_file(checkpoint))
     del description["state"]
     write_tensors(training_file(path), description, tensors)
-    refused(training_file(path), "does not fit, .*it holds no state", lambda: make_trainer(demos, path))
+    assert_refused(training_file(path), "it holds no state", lambda: make_trainer(demos, path))
+
+
+OFFLINE = lw.OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
+EVALUATOR = lw.training.QueryEvaluatorConfig(steps=12, batch_size=8, held_out_pairs=0.0)
+
+
+def offline(demos, path):
+    return lw.OfflineTrainer(bc_loss(make_actor(), "l2"), make_replay(demos), OFFLINE, checkpoint=path, progress=False)
+
+
+def evaluator(demos, path):
+    data = lw.training.LabelledQueries(lw.LanguageWorldExperienceReplay(demos, label="executed"), EVALUATOR)
+    torch.manual_seed(0)
+    network = lw.StateQueryEvaluator(PLANS, width=8, depth=1)
+    return lw.training.QueryEvaluatorTrainer(network, data, EVALUATOR, checkpoint=path, progress=False)
+
+
+TRAINERS = {"cloning": make_trainer, "offline": offline, "evaluator": evaluator}
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_one_training_at_a_time_writes_a_checkpoint(demos, tmp_path, holding, monkeypatch, name):
+    make, path = TRAINERS[name], tmp_path / "policy.safetensors"
+    trainer = make(demos, path)
+    release = holding(path)
+    with pytest.raises(ValueError, match=f"checkpoint: another training is writing to '{path}'"):
+        trainer.train()
+    assert not path.exists()
+    release()
+    trainer.train()
+    files = {"policy.safetensors"} | ({"policy.training.safetensors"} if name != "offline" else set())
+    assert {file.name for file in tmp_path.iterdir()} == files
+    assert make(demos, path).steps == CONFIG.steps
+    real = importlib.metadata.version
+    monkeypatch.setattr(
+        "lw_torchrl._util.reproducibility.version", lambda name: "9.9.9" if name == "torch" else real(name)
+    )
+    with pytest.warns(UserWarning, match=r"under other versions \(torch .*, now 9.9.9\)") as caught:
+        make(demos, path)
+    assert len(caught) == 1
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_a_checkpoint_that_another_training_wrote_meanwhile_is_kept(demos, tmp_path, name):
+    make, path = TRAINERS[name], tmp_path / "policy.safetensors"
+    first, second = make(demos, path), make(demos, path)
+    first.train()
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    with pytest.raises(ValueError, match="was written by another training"):
+        second.train()
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+    first.train()
+    make(demos, path).train()

@@ -18,7 +18,7 @@ from torchrl.envs import Compose, EnvBase, SerialEnv, TransformedEnv, check_env_
 from torchrl.envs.transforms import ModuleTransform
 
 import lw_torchrl as lw
-from lw_torchrl._util.seeding import episode_generator
+from lw_torchrl._util.reproducibility import episode_generator
 
 ROWS = 4
 OPEN = CONDITIONS[0]

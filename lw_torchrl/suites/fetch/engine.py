@@ -18,10 +18,10 @@ from lw_torchrl._util.checks import check_choice
 from lw_torchrl._util.rendering import naming_absent_renderer
 from lw_torchrl.suites.engine import BodyPoses, RowModel
 from lw_torchrl.suites.fetch import FETCH
+from lw_torchrl.suites.metaworld.observation import Array, Index, Mask
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
-from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask
-from lw_torchrl.suites.metaworld.vectorized.simulated_rows import ThreadedEngine
-from lw_torchrl.suites.metaworld.vectorized.task_programs import WARNED_ALREADY
+from lw_torchrl.suites.metaworld.simulated_rows import ThreadedEngine
+from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY
 
 HAND_HEIGHT = 0.03
 """Metres of the hand above Fetch's grip site, which is between the finger pads. Meta-World's hand is as high above what
@@ -164,7 +164,7 @@ class FetchEngine(ThreadedEngine):
 
     Observations have 25 numbers (:data:`~lw_torchrl.suites.fetch.FETCH`), in metres and in Meta-World's axes. Reach has
     no object: its numbers are zeros, and its goal is the hand's, 3 cm above the grip site's goal. Rows fault as in
-    :class:`~lw_torchrl.suites.metaworld.vectorized.engine.VectorizedEngine`.
+    :class:`~lw_torchrl.suites.metaworld.vectorized_engine.VectorizedEngine`.
 
     Args:
         tasks: the task of each row.

@@ -11,12 +11,9 @@ import pytest
 from metaworld.policies import ENV_POLICY_MAP
 from metaworld.utils import reward_utils
 
-from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
-from lw_torchrl.suites.metaworld.vectorized import terms
-from lw_torchrl.suites.metaworld.vectorized.dense_reward import DenseReward, EpisodeStarts
-from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
-from lw_torchrl.suites.metaworld.vectorized.formulas import FORMULAS, LIFTS
-from lw_torchrl.suites.metaworld.vectorized.observation import (
+from lw_torchrl.suites.metaworld import reward_terms as terms
+from lw_torchrl.suites.metaworld.dense_reward import DenseReward, EpisodeStarts
+from lw_torchrl.suites.metaworld.observation import (
     CORNERS,
     HAND,
     JOINT,
@@ -33,7 +30,10 @@ from lw_torchrl.suites.metaworld.vectorized.observation import (
     SECOND,
     Observer,
 )
-from lw_torchrl.suites.metaworld.vectorized.tables import reward_table, simulation_table
+from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
+from lw_torchrl.suites.metaworld.reward_formulas import FORMULAS, LIFTS
+from lw_torchrl.suites.metaworld.tables import reward_table, simulation_table
+from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 TASKS = list(simulation_table())
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
-from lw_torchrl.suites.metaworld.vectorized.simulated_rows import SimulatedRow
-from lw_torchrl.suites.metaworld.vectorized.tables import simulation_table
+from lw_torchrl.suites.metaworld.simulated_rows import SimulatedRow
+from lw_torchrl.suites.metaworld.tables import simulation_table
+from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 TASKS = list(simulation_table())
 STATE = ("qpos", "qvel", "qacc", "qacc_warmstart", "xpos", "xquat", "site_xpos", "efc_force", "time")

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import threading
 import time
 import warnings
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import lw_torchrl as lw
+from lw_torchrl._util import reproducibility
 from lw_torchrl.suites.engine import EngineStep
+from lw_torchrl.suites.metaworld.observation import quaternion_of_matrix, row_norm
 from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine
-from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
-from lw_torchrl.suites.metaworld.vectorized.observation import quaternion_of_matrix, row_norm
-from lw_torchrl.suites.metaworld.vectorized.simulated_rows import RowGroup, WorkerPool, split_into_groups
-from lw_torchrl.suites.metaworld.vectorized.tables import simulation_table
-from lw_torchrl.suites.metaworld.vectorized.task_programs import borrow_model, model_path, return_models
+from lw_torchrl.suites.metaworld.simulated_rows import RowGroup, WorkerPool, split_into_groups
+from lw_torchrl.suites.metaworld.tables import simulation_table
+from lw_torchrl.suites.metaworld.task_programs import borrow_model, model_path, return_models
+from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 TASKS = list(simulation_table())
 
@@ -325,11 +327,25 @@ def test_a_reset_moves_nothing_in_a_model_but_bodies_and_sites():
 
 
 @pytest.mark.parametrize(("package", "other"), [("metaworld", "3.2.0"), ("mujoco", "3.4.0")])
-def test_other_versions_are_refused_by_name(monkeypatch, package, other):
-    real = importlib.metadata.version
-    monkeypatch.setattr(importlib.metadata, "version", lambda name: other if name == package else real(name))
-    with pytest.raises(ImportError, match=rf"{package} 3\.\d\.\d.*{other}.*engine='metaworld'"):
-        VectorizedEngine(["reach"])
+def test_plain_engine_runs_other_versions_with_one_warning_unless_vectorized_is_asked_for(monkeypatch, package, other):
+    monkeypatch.setattr(reproducibility, "version", lambda name: other if name == package else metadata.version(name))
+    changed = rf"{package} 3\.\d\.\d, now {other}"
+    with pytest.warns(UserWarning, match=f"{changed}.*4 times slower.*pip install metaworld==") as caught:
+        env = lw.LanguageWorldEnv("reach", num_threads=2, max_steps=2)
+    env.rollout(2)
+    assert isinstance(env.engine, MetaWorldEngine)
+    assert len([warning for warning in caught if "slower" in str(warning.message)]) == 1
+    env.close()
+    for make in (lambda: VectorizedEngine(["reach"]), lambda: lw.LanguageWorldEnv("reach", engine="vectorized")):
+        with pytest.raises(ImportError, match=f"^engine: .*{changed}.*engine='metaworld'"):
+            make()
+
+
+def test_versions_that_were_compared_give_the_vectorized_engine_without_a_warning(recwarn):
+    env = lw.LanguageWorldEnv("reach", num_threads=1)
+    assert isinstance(env.engine, VectorizedEngine)
+    env.close()
+    assert not [warning for warning in recwarn if "slower" in str(warning.message)]
 
 
 def test_the_table_names_metaworlds_tasks():

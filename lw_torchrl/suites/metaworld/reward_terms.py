@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.suites.metaworld.vectorized import observation as at
-from lw_torchrl.suites.metaworld.vectorized import tables
-from lw_torchrl.suites.metaworld.vectorized.observation import Array, Mask, row_norm
-from lw_torchrl.suites.metaworld.vectorized.tables import FIRST_DISTANCE, POINTS, Cage, Funnel, Held, TaskReward, Term
+from lw_torchrl.suites.metaworld import observation as at
+from lw_torchrl.suites.metaworld import tables
+from lw_torchrl.suites.metaworld.observation import Array, Mask, row_norm
+from lw_torchrl.suites.metaworld.tables import FIRST_DISTANCE, POINTS, Cage, Funnel, Held, TaskReward, Term
 
 # The columns of the features: first the sensors, then these. The first four are constant within an episode.
 START, TCP_START, MARK, CONSTANT, GOAL, TCP, GRIP = (

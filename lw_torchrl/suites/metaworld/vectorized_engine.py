@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._util.checks import check_choice
+from lw_torchrl._util.reproducibility import version_changes
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import check_task
-from lw_torchrl.suites.metaworld.vectorized import observation as at
-from lw_torchrl.suites.metaworld.vectorized import simulated_rows, task_programs
-from lw_torchrl.suites.metaworld.vectorized.dense_reward import DenseReward, EpisodeStarts
-from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask, Observer, SuccessFunction
-from lw_torchrl.suites.metaworld.vectorized.tables import reward_table, simulation_table
+from lw_torchrl.suites.metaworld import observation as at
+from lw_torchrl.suites.metaworld import simulated_rows, task_programs
+from lw_torchrl.suites.metaworld.dense_reward import DenseReward, EpisodeStarts
+from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, Observer, SuccessFunction
+from lw_torchrl.suites.metaworld.tables import reward_table, simulation_table
 
 FINGERS = np.array([1.0, -1.0])  # the two fingers are driven against each other by one number of the action
 
@@ -41,7 +42,12 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
     def __init__(
         self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: int | None = None
     ) -> None:
-        task_programs.check_versions()
+        compared = task_programs.COMPARED_VERSIONS
+        if changes := version_changes(compared, compared):
+            raise ImportError(
+                f"engine: the vectorized engine was compared with other versions ({', '.join(changes)}); install "
+                "those, or use engine='metaworld', which runs any version"
+            )
         dense = check_choice("reward", reward, ("sparse", "dense")) == "dense"
         tasks = [check_task(task) for task in tasks]
         super().__init__([task_programs.model_path(task) for task in tasks], METAWORLD, num_threads)

@@ -18,10 +18,10 @@ from lw_torchrl._util.checks import Count, check_value
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
+from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, StateView, sensor_index
 from lw_torchrl.suites.metaworld.plain_engine import UNSTABLE
-from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask, StateView, sensor_index
-from lw_torchrl.suites.metaworld.vectorized.tables import TaskReward, TaskSources
-from lw_torchrl.suites.metaworld.vectorized.task_programs import SharedModel
+from lw_torchrl.suites.metaworld.tables import TaskReward, TaskSources
+from lw_torchrl.suites.metaworld.task_programs import SharedModel
 
 _VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from lw_torchrl.suites.metaworld.vectorized import observation as at
-from lw_torchrl.suites.metaworld.vectorized import terms
-from lw_torchrl.suites.metaworld.vectorized.observation import Array, Index, Mask, row_norm
-from lw_torchrl.suites.metaworld.vectorized.terms import Numbers, hamacher_product, limited, square, tolerance
+from lw_torchrl.suites.metaworld import observation as at
+from lw_torchrl.suites.metaworld import reward_terms as terms
+from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, row_norm
+from lw_torchrl.suites.metaworld.reward_terms import Numbers, hamacher_product, limited, square, tolerance
 
 Cast = Callable[[Any], Any]
 """Brings numbers to the precision that a formula is computed in: single, where a number of a float32 action takes part,

@@ -153,7 +153,7 @@ def _read(file: str, task: Any, parts: Mapping[str, Any]) -> Mapping[str, Any]:
     def plain(table: Mapping[str, Any]) -> dict[str, Any]:
         return {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
 
-    text = (files("lw_torchrl.suites.metaworld.vectorized") / "data" / file).read_text(encoding="utf-8")
+    text = (files("lw_torchrl.suites.metaworld") / "data" / file).read_text(encoding="utf-8")
     tasks = {}
     for name, entry in tomllib.loads(text).items():
         made = {key: parts[key](**plain(entry.pop(key))) for key in parts.keys() & entry.keys()}

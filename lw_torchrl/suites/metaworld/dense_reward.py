@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl._util.checks import check_choice
-from lw_torchrl.suites.metaworld.vectorized import terms
-from lw_torchrl.suites.metaworld.vectorized.formulas import FORMULAS, LIFTS, StepState
-from lw_torchrl.suites.metaworld.vectorized.observation import CURRENT, GRIPPER, OBJECT, Array, Index, Mask
-from lw_torchrl.suites.metaworld.vectorized.tables import FIRST_DISTANCE, TaskReward
+from lw_torchrl.suites.metaworld import reward_terms as terms
+from lw_torchrl.suites.metaworld.observation import CURRENT, GRIPPER, OBJECT, Array, Index, Mask
+from lw_torchrl.suites.metaworld.reward_formulas import FORMULAS, LIFTS, StepState
+from lw_torchrl.suites.metaworld.tables import FIRST_DISTANCE, TaskReward
 
 FULL_REWARD = 10.0
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from lw_torchrl.suites.metaworld.vectorized.tables import TaskReward, TaskSources
+from lw_torchrl.suites.metaworld.tables import TaskReward, TaskSources
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

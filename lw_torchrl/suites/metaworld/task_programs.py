@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import importlib.metadata
 import threading
 from collections.abc import Callable, Iterable
 from functools import cache
@@ -16,18 +15,8 @@ from numpy.typing import NDArray
 
 from lw_torchrl.suites.metaworld.plain_engine import import_metaworld
 
-SUPPORTED_VERSIONS = {"metaworld": "3.1.1", "mujoco": "3.3.0"}
-
-
-def check_versions() -> None:
-    """Raise ImportError for a Meta-World or MuJoCo whose numbers have not been compared with this engine's."""
-    for package, supported in SUPPORTED_VERSIONS.items():
-        if (installed := importlib.metadata.version(package)) != supported:
-            raise ImportError(
-                f"the vectorized engine reproduces {package} {supported}, but the installed version is {installed}. "
-                f"Install {package}=={supported}, or choose engine='metaworld', which runs whatever is installed."
-            )
-
+COMPARED_VERSIONS = {"metaworld": "3.1.1", "mujoco": "3.3.0"}
+"""The versions whose numbers the vectorized engine was compared with, bit for bit."""
 
 Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 
