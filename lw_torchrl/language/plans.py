@@ -111,6 +111,7 @@ class ConditionalPlan:
                     role_object(task, name)
             except ValueError as error:
                 raise PlanError(f"step {number} of {plan}: {error}") from error
+            # A usual goal is stored as None, so that plans with and without it are equal.
             goal = None if goal == usual_goal(skill, task) else goal
             steps.append(replace(step, condition=condition, skill=skill, goal=goal))
         object.__setattr__(self, "definition", task)

@@ -366,7 +366,7 @@ class _ChatClient:
 
     def _complete(self, request: Mapping[str, Any]) -> tuple[bytes, frozenset[str]]:
         """Return the body of a reply, and the fallbacks with which the server accepted the request."""
-        while True:
+        while True:  # at most once for each fallback, since a refusal of an active fallback is raised
             fallbacks = self._fallbacks
             try:
                 fields = _request_fields(self.model, request, fallbacks)

@@ -41,7 +41,7 @@ def test_a_mixed_batch_equals_each_task_alone_and_padding_is_false():
         assert torch.equal(program(states[row], ids[row]), answer[row])
 
 
-@pytest.mark.parametrize("shape", [(), (1,), (600,), (20, 30), (2, 3, 100), (0,), (4, 0)])
+@pytest.mark.parametrize("shape", [(), (600,), (2, 3, 100), (4, 0)])
 def test_any_leading_shape(shape):
     queries, states, ids = all_tasks()
     n = math.prod(shape)

@@ -80,15 +80,18 @@ def py_md(style: Style) -> PlanFormat:
     return PlanFormat("md", encode, PythonReading, prompt, style)
 
 
+# A Python string, with any prefix; possessive quantifiers (*+) keep the time linear in broken text.
 _STRING = r'(?:[fFrRbBuU]{0,2}(?:"(?:[^"\\]|\\.)*+"|\'(?:[^\'\\]|\\.)*+\'))'
 _STRINGS = rf"{_STRING}(?:[\s+]*{_STRING})*"
 _LITERAL = re.compile(r'"(?:[^"\\]|\\.?)*+("|\Z)|\'(?:[^\'\\]|\\.?)*+(\'|\Z)')  # or the start of a cut-off string
 _BRANCH = re.compile(r"(if|elif|while)\b\s*|(else)\s*:")
+# An argument: an optional name, then strings or a plain value.
 _ARGUMENT = re.compile(rf"(?:(\w+)\s*=\s*)?(?:({_STRINGS})|([^\s,()\"'][^,()\"']*))\s*(?:,\s*)?")
 _PRINTED = re.compile(r"\s*print\(\s*(\"|')(.*)\1\s*\)\s*;?")
 _DEF = re.compile(r"(?:async\s+)?def\b\s*(\w*)")
 _CHECK = re.compile(rf"(and\b|or\b)?\s*(not\b)?\s*\(?\s*(?:self\.|robot\.)?check\s*\(\s*({_STRINGS})\s*\)?\s*")
 _CALL = re.compile(r"(?:self\.)?robot\.(\w+)\s*\(\s*")
+# A comment that may begin a task: "# drawer-open: ...".
 _HEADING = re.compile(r"#+\s*([A-Za-z][\w-]*)\s*:")
 _MOST_JOINED = 6  # lines that a statement may span
 
@@ -154,6 +157,7 @@ class PythonReading(Reading):
     def code(self, number: int, line: str, code: str) -> None:
         indent = len(line) - len(line.lstrip())
         call, branch = _CALL.match(code), _BRANCH.match(code)
+        # Models indent in many ways, so the blocks follow the indentation that was seen, not multiples of four.
         while self.blocks:  # close the blocks that do not contain the line
             last = self.blocks[-1]
             if last.body is None and call and indent == last.indent:
