@@ -111,7 +111,7 @@ def open_viewer(
         if screenshot is None:
             with suppress(KeyboardInterrupt):
                 if process.wait():
-                    raise failure(output)
+                    raise viewer_error(output)
             return
         process, output = stack.enter_context(rerun_process(*arguments, "--window-size", window_size, "--headless"))
         picture = stack.enter_context(replacing(screenshot))
@@ -123,7 +123,7 @@ def open_viewer(
             time.sleep(0.5)  # the viewer takes a moment to print its error
             if process.poll() is None:
                 raise RuntimeError(f"rerun's viewer did not answer: {error}") from error
-            raise failure(output) from error
+            raise viewer_error(output) from error
 
 
 def find_recordings(path: AnyPath) -> list[Path]:
@@ -265,7 +265,7 @@ def rerun_process(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[byt
                 process.wait()
 
 
-def failure(output: IO[bytes]) -> RuntimeError:
+def viewer_error(output: IO[bytes]) -> RuntimeError:
     """Return an error with the reason why rerun's program ended, from its output."""
     output.seek(0)
     text = re.sub(r"\x1b\[[0-9;]*m", "", output.read().decode("utf-8", "replace"))  # without colours
