@@ -1,4 +1,4 @@
-"""What recordings cost: an episode's page, its size, and a row recorded while 49 others go on."""
+"""Time and size of recordings: an episode's page, and one of 50 rows recorded live."""
 
 from __future__ import annotations
 

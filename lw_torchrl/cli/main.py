@@ -111,7 +111,7 @@ def _check_ranges(command: Any) -> None:
             _check_ranges(value)
         parts = [*_parts(hint)]
         for allowed, text in _RANGES:
-            if allowed.__metadata__[0] in parts:
+            if get_args(allowed)[1] in parts:
                 for number in value if isinstance(value, tuple) else [] if value is None else [value]:
                     if not is_bearable(number, allowed):
                         raise ValueError(f"--{name.replace('_', '-')} must be {text}, got {number}")

@@ -22,8 +22,8 @@ from lw_torchrl._util.devices import device_of
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.seeding import episode_seed
-from lw_torchrl.evaluation.diagnose.counterfactuals import own_evaluators
 from lw_torchrl.evaluation.diagnose.failure import Failure
+from lw_torchrl.evaluation.diagnose.replacements import own_evaluators
 from lw_torchrl.evaluation.diagnose.sentences import replacement_text
 from lw_torchrl.evaluation.rollout import actor_plans, suite_tasks
 from lw_torchrl.evaluation.rollout import rollout as run_rollout

@@ -16,8 +16,7 @@ from tensordict.nn import TensorDictSequential
 import lw_torchrl as lw
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
-from lw_torchrl.evaluation.diagnose.failure import Failure, MendedEpisode
-from lw_torchrl.evaluation.diagnose.findings import ActiveStep
+from lw_torchrl.evaluation.diagnose.failure import ActiveStep, Failure, MendedEpisode
 from lw_torchrl.record.rollouts import run_recorded
 from lw_torchrl.record.tabs import Tabs
 from lw_torchrl.record.viewer import open_viewer
