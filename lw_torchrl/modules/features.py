@@ -238,7 +238,7 @@ def check_observation(observation: Tensor, layout: Layout) -> None:
 def check_rows(rows: Tensor) -> None:
     """Raise :class:`ValueError` unless there are rows to compute statistics from."""
     if not len(rows):
-        raise ValueError("rows to fit features to must be at least one, got 0")
+        raise ValueError("fit needs at least one of rows, got none")
 
 
 def relative(observation: Tensor, layout: Layout) -> Tensor:

@@ -199,7 +199,7 @@ def test_what_does_not_carry_over_is_named():
         TransferredActor(trained, SUITE.plans)
     with pytest.raises(TypeError, match="needs an actor that follows plans"):
         TransferredActor(lw.DescriptorConditionedActor("MT10"), SUITE.plans)
-    with pytest.raises(ValueError, match=r"speed must be above 0, got 0\.0"):
+    with pytest.raises(ValueError, match="speed"):
         TransferredActor(role_actor(lw.load_plans("MT10"), 4), CANONICAL, speed=0.0)
 
 
