@@ -43,7 +43,7 @@ def test_missing_answers(folder, tmp_path):
     missing = "no answer of 'one' is recorded for push in chain_md, attempt 2.*: 0, 1, 12"
     with pytest.raises(lw.planners.PlannerError, match=missing):
         planner.plans("push", format="chain_md", attempts=3)
-    with pytest.raises(lw.planners.PlannerError, match="reach in chain_md, attempt 0.*none"):
+    with pytest.raises(lw.planners.PlannerError, match=r"reach in chain_md, attempt 0.*none"):
         planner.plans("reach", format="chain_md")
     with pytest.raises(ValueError, match="has answers of one, two_2"):
         lw.FilePlanner(folder)
