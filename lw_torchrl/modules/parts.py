@@ -138,7 +138,7 @@ def _reading(module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[A
 
 
 def _rename_parts(
-    module: nn.Module, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any], in_order: bool = False
+    module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any], in_order: bool = False
 ) -> None:
     """Replace a module's parts by copies that read renamed keys.
 
