@@ -178,7 +178,7 @@ def test_tour_is_stored_with_its_outputs():
     kinds, text = outputs(TOUR)
     assert kinds.count("image/png") == 4
     assert "error" not in kinds
-    assert "WebPage" in text
+    assert "lw-torchrl view" in text
     assert "stderr" not in text
     assert TOUR.stat().st_size < 300_000
 
