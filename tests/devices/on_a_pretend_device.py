@@ -383,9 +383,13 @@ def test_prefetched_rows_are_on_the_device(demos):
 
 
 @pytest.mark.parametrize("name", ["bc", "advantage", "value"])  # copies of critics are drawn where they are
-def test_losses_over_a_buffer_wait_for_nothing_and_equal_the_cpus(demos, name):
-    def trainer(device):
-        loss = offline.make_loss(name, noise=0.0, device=device)
+def test_losses_over_a_buffer_wait_for_nothing_and_equal_the_cpus(demos, name, monkeypatch):
+    originals = {part: getattr(offline, part) for part in ("make_actor", "make_value")}
+
+    def trainer(device):  # losses copy their networks, which must be on the device before
+        for part, make in originals.items():
+            monkeypatch.setattr(offline, part, lambda *args, make=make, **kw: make(*args, **kw).to(device))
+        loss = offline.make_loss(name, noise=0.0)
         return lw.OfflineTrainer(loss, offline.make_replay(demos, device=device), offline.CONFIG, progress=False)
 
     there, cpu = trainer("pretend"), trainer("cpu")
