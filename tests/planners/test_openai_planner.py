@@ -85,48 +85,40 @@ def test_a_damaged_cached_answer_is_requested_again(ask, tmp_path, content):
 
 
 FAILURES = {
-    "429": (error(429, "slow down"), "too many requests, asked 2 times", "lower concurrency"),
-    "429 for long": (error(429, "no", **{"retry-after-ms": "9e9"}), "too many requests, asked 1 time", "Continue"),
-    "500": (error(500, "my fault"), "the server failed, asked 2 times .*my fault", "log"),
-    "500, without a message": (Failure(500, "<p>oops</p>", {"retry-after-ms": "1"}), "failed.*oops", "log"),
-    "429 in 200": (Failure(200, {"error": {"message": "slow down", "code": 429}}), "too many requests", "Continue"),
-    "401": (error(401, "no"), "needs a key, in OPENAI_API_KEY", "Give the key"),
-    "404": (error(404, "no model a/model"), "no such model or address", "/v1/models"),
-    "400": (error(400, "unknown field"), "refused .*unknown field", "Leave out"),
-    "400, plain": (Failure(400, "no top_k"), "refused .*no top_k", "Leave out"),
-    "context": (error(400, "maximum context length is 2048"), "does not fit", "max_tokens"),
-    "cut body": (Failure(200, completion("x" * 99), cut=True), "broke off, asked 2", "server runs"),
-    "cut JSON": (Failure(200, '{"choices": ['), "cut off or is not JSON", "Ask again"),
-    "HTML": (Failure(200, "<style>a{}</style><body>Welcome</body>"), "not a chat completion: Welcome", "ends in /v1"),
-    "other JSON": (Failure(200, {"hello": 1}), "not a chat completion", "ends in /v1"),
-    "no choices": (Failure(200, {"choices": []}), "not a chat completion", "ends in /v1"),
-    "a slow reply": (Failure(200, completion("x"), drip=1.0), "answer within 0.4 s, asked 2 times", "longer"),
-    "a dripping reply": (
-        Failure(200, completion("x"), drip=0.1),
-        "answer within 0.4 s, asked 1 time",
-        "longer",
-    ),
-    "a large reply": (Failure(200, completion("x" * REPLY_LIMIT)), "larger than 4 MiB", "fewer max_tokens"),
+    "429": (error(429, "slow down"), "too many requests, asked 2 times"),
+    "429 for long": (error(429, "no", **{"retry-after-ms": "9e9"}), "too many requests, asked 1 time"),
+    "500": (error(500, "my fault"), "server failed, asked 2 times .*my fault"),
+    "500, without a message": (Failure(500, "<p>oops</p>", {"retry-after-ms": "1"}), "failed.*oops"),
+    "429 in 200": (Failure(200, {"error": {"message": "slow down", "code": 429}}), "too many requests"),
+    "401": (error(401, "no"), "key, in OPENAI_API_KEY"),
+    "404": (error(404, "no model a/model"), "no such model .*/v1/models"),
+    "400": (error(400, "unknown field"), "refused .*unknown field"),
+    "400, plain": (Failure(400, "no top_k"), "refused .*no top_k"),
+    "context": (error(400, "maximum context length is 2048"), "does not fit .*max_tokens"),
+    "cut body": (Failure(200, completion("x" * 99), cut=True), "broke off, asked 2"),
+    "cut JSON": (Failure(200, '{"choices": ['), "cut off or is not JSON"),
+    "HTML": (Failure(200, "<style>a{}</style><body>Welcome</body>"), "not a chat completion: Welcome"),
+    "other JSON": (Failure(200, {"hello": 1}), "not a chat completion"),
+    "no choices": (Failure(200, {"choices": []}), "not a chat completion"),
+    "a slow reply": (Failure(200, completion("x"), drip=1.0), "answer within 0.4 s, asked 2 times"),
+    "a dripping reply": (Failure(200, completion("x"), drip=0.1), "answer within 0.4 s, asked 1 time"),
+    "a large reply": (Failure(200, completion("x" * REPLY_LIMIT)), "larger than 4 MiB"),
 }
 
 
 @pytest.mark.parametrize("name", FAILURES)
 def test_a_failure_is_a_clear_error_and_the_other_answers_are_kept(ask, name):
-    failure, cause, advice = FAILURES[name]
+    failure, cause = FAILURES[name]
     bad, slow = lw.MT10[4], "answer within" in cause
     server = FakeServer(lambda body: failure if asked_for(body) == bad else shipped(body))
     began = time.monotonic()
-    with pytest.raises(PlannerError, match=cause) as caught:
+    with pytest.raises(PlannerError, match=rf"^'a/model' at http://127.0.0.1.*{bad}, attempt 0: .*{cause}") as caught:
         ask(server, concurrency=1, timeout=0.4 if slow else 20.0)
     assert time.monotonic() - began < 10
-    message = str(caught.value)
-    assert message.startswith("'a/model' at http://127.0.0.1")
-    assert f"{bad}, attempt 0: " in message
-    assert advice in message
-    assert message.isprintable()
-    assert len(message) < 1000
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 1000
     kept = 4 if caught.value.fatal else 9
-    assert f"{kept} of 10 answers are kept" in message
+    assert f"{kept} of 10 answers are kept" in str(caught.value)
     working = FakeServer()
     assert len(ask(working, concurrency=1)) == 10
     assert len(working.requests) == 10 - kept
