@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from lw_torchrl._util.checks import Count, check_choice, check_value, counted, shown, typed, unknown_name
-from lw_torchrl._util.files import AnyPath, read_text, write_text
+from lw_torchrl._util.checks import Count, check_choice, check_value, counted, differences, shown, typed, unknown_name
+from lw_torchrl._util.files import AnyPath, read_json, read_text, write_json, write_text
 from lw_torchrl.language.formats import PLAN_FORMATS, encode_plan
 from lw_torchrl.language.nearest import StepMapper
 from lw_torchrl.language.plan_decoding import DecodedPlan, decode_as, decode_plan
@@ -146,6 +146,17 @@ def write_answer(folder: AnyPath, model: str, answer: Answer) -> Path:
         write_text(path.with_suffix(".json"), answer.raw)
     write_text(path, answer.text)
     return path
+
+
+def write_settings(folder: Path, settings: dict[str, Any]) -> None:
+    """Write ``folder/settings.json``; raise :class:`ValueError` if the folder holds answers with other settings."""
+    file = folder / "settings.json"
+    before = read_json(file, "out: the settings") if file.is_file() else settings
+    if before != settings:
+        difference = ", ".join(differences(before, settings))
+        advice = "use these settings again, or give the new answers another name (--name) or out"
+        raise ValueError(f"out: {str(folder)!r} holds answers of other settings: {difference}; {advice}")
+    write_json(file, settings)
 
 
 def recorded_answers(source: AnyPath) -> dict[str, dict[_Place, str | Path]]:

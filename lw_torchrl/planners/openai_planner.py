@@ -16,18 +16,7 @@ from time import monotonic
 from typing import Any
 from urllib.parse import urlsplit
 
-from lw_torchrl._util.checks import (
-    Count,
-    Natural,
-    Positive,
-    Scale,
-    check_choice,
-    check_value,
-    counted,
-    differences,
-    shown,
-    typed,
-)
+from lw_torchrl._util.checks import Count, Natural, Positive, Scale, check_choice, check_value, counted, shown, typed
 from lw_torchrl._util.files import AnyPath, parse_json, read_json, write_json
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
@@ -43,6 +32,7 @@ from lw_torchrl.planners.answer_files import (
     folder_name,
     read_reply,
     write_answer,
+    write_settings,
 )
 from lw_torchrl.planners.prompts import Question, chat_messages, example_plans, plan_schema
 
@@ -229,7 +219,7 @@ class OpenAIPlanner:
             else:
                 answers.append(replace(self._read(reply, question, format), cached=True))
         if out is not None:
-            _write_settings(Path(out) / folder_name(name), self.settings())
+            write_settings(Path(out) / folder_name(name), self.settings())
             for answer in answers:
                 write_answer(out, name, answer)
         errors: list[PlannerError] = []
@@ -291,17 +281,6 @@ class OpenAIPlanner:
                 yield from ((question, result) for question, result in pool.imap_unordered(ask, questions) if result)
             finally:
                 stopped.set()
-
-
-def _write_settings(folder: Path, settings: dict[str, Any]) -> None:
-    """Write ``folder/settings.json``; raise :class:`ValueError` if the folder holds answers with other settings."""
-    file = folder / "settings.json"
-    before = read_json(file, "out: the settings") if file.is_file() else settings
-    if before != settings:
-        difference = ", ".join(differences(before, settings))
-        advice = "use these settings again, or give the new answers another name (--name) or out"
-        raise ValueError(f"out: {str(folder)!r} holds answers of other settings: {difference}; {advice}")
-    write_json(file, settings)
 
 
 def server_address(base_url: str | None) -> str:
