@@ -157,11 +157,6 @@ def test_a_task_without_queries_is_named():
 # ---- the kernel
 
 
-@pytest.fixture
-def without_numba(monkeypatch):
-    monkeypatch.setattr(query_program, "find_kernel", lambda: None)
-
-
 def both(program, states, ids):
     """Return the answers of the kernel and of the tables."""
     assert program._kernel(states, ids) is not None
@@ -260,14 +255,6 @@ def test_without_numba_the_tables_answer(monkeypatch):
         find_kernel.cache_clear()
 
 
-def test_gradients_come_from_the_logits():
-    queries, states, ids = all_tasks()
-    states = states.clone().requires_grad_()
-    assert not QueryProgram(queries)(states, ids).requires_grad
-    QueryProgram(queries).logits(states, ids).sum().backward()
-    assert states.grad.abs().sum() > 0
-
-
 def test_the_tables_are_buffers_that_are_not_saved():
     program = QueryProgram({"push": ["gripper open"]})
     assert isinstance(program, torch.nn.Module)
@@ -276,8 +263,8 @@ def test_the_tables_are_buffers_that_are_not_saved():
     assert {buffer.device.type for buffer in program.to("meta").buffers()} == {"meta"}
 
 
-@pytest.mark.usefixtures("without_numba")
-def test_a_cast_of_the_module_keeps_its_precision():
+def test_a_cast_of_the_module_keeps_its_precision(monkeypatch):
+    monkeypatch.setattr(query_program, "find_kernel", lambda: None)
     queries, states, ids = all_tasks()
     program = QueryProgram(queries)
     expected = program(on_thresholds(states), ids)
