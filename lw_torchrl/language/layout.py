@@ -110,11 +110,7 @@ class Layout:
         return slice(0, 0) if self.gripper is None else slice(self.gripper, self.gripper + 1)
 
     def displaced(self, user: str) -> slice:
-        """Return the hand's displacement among the numbers of an action.
-
-        Raises:
-            ValueError: the layout has none; the message names the ``user`` that needs it.
-        """
+        """Return the hand's displacement in an action; raise :class:`ValueError` for the ``user`` if there is none."""
         if self.displacement is None:
             lacks = f"an action of layout {self.name!r} has no displacement of the hand, which it needs"
             raise ValueError(f"{user}: {lacks}")

@@ -32,10 +32,7 @@ def typed_position(position: Sequence[Coordinate]) -> TypedPosition:
 
 
 def coordinate_indices(position: Sequence[Coordinate], constants: list[float], size: int) -> list[int]:
-    """Return the index of each coordinate in the ``size`` numbers of an observation followed by ``constants``.
-
-    Fixed coordinates that are missing from ``constants`` are appended to it.
-    """
+    """Return the index of each coordinate in an observation (of ``size``) followed by ``constants``, which grow."""
     fixed = dict.fromkeys(c for c in position if not isinstance(c, int))
     constants += [c for c in fixed if c not in constants]
     return [c if isinstance(c, int) else size + constants.index(c) for c in position]

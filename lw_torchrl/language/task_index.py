@@ -29,14 +29,7 @@ def pick(table: Tensor, rows: Tensor) -> Tensor:
 
 
 class TaskIndex:
-    """The rows of tasks in a table, in the order of their ids.
-
-    Args:
-        task_ids: task name to id, as :attr:`Plans.task_ids`.
-
-    Raises:
-        ValueError: two tasks have the same id.
-    """
+    """The rows of tasks in a table, in the order of their ids; ``task_ids`` is as :attr:`Plans.task_ids`."""
 
     def __init__(self, task_ids: Mapping[str, int]) -> None:
         names: dict[int, str] = {}
