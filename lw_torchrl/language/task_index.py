@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from lw_torchrl._util.devices import asserted, plain, readable, waits
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.language.plans import as_plans as as_plans
 from lw_torchrl.language.tasks import MT50
 
 _Kind = tuple[torch.device, torch.dtype, bool]
