@@ -115,7 +115,8 @@ def checker(hint: Any) -> Callable[[Any], bool]:
     if kind in (Union, UnionType):
         alternatives = [checker(part) for part in parts]
         return lambda value: any(check(value) for check in alternatives)
-    if getattr(kind, "__module__", "") not in ("builtins", "collections.abc") or not issubclass(kind, Iterable):
+    is_container = getattr(kind, "__module__", "") in ("builtins", "collections.abc") and issubclass(kind, Iterable)
+    if not is_container or not (parts or kind is tuple):
         return lambda value: is_bearable(_plain(value), hint, conf=_CONF)
     items = [checker(part) for part in parts if part is not ...]
 
