@@ -351,6 +351,15 @@ def test_versions_that_were_compared_give_the_vectorized_engine_without_a_warnin
     assert not [warning for warning in recwarn if "slower" in str(warning.message)]
 
 
+def test_environment_runs_an_engine_that_was_added_by_name(monkeypatch):
+    monkeypatch.setitem(lw.suites.metaworld.ENGINES, "mine", MetaWorldEngine)
+    env = lw.LanguageWorldEnv("reach", engine="mine")
+    assert isinstance(env.engine, MetaWorldEngine)
+    env.close()
+    with pytest.raises(ValueError, match=r"engine must be one of .*'mine'.*got 'mime'"):
+        lw.LanguageWorldEnv("reach", engine="mime")
+
+
 def test_table_has_metaworlds_tasks():
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
