@@ -1,4 +1,4 @@
-"""A custom suite in NumPy: three blocks, no numbers of the previous step, and actions of 7 numbers, of which 4 count."""
+"""A custom suite in NumPy: three blocks, no numbers of the previous step, actions of 7 numbers, of which 4 count."""
 
 from __future__ import annotations
 
