@@ -1,4 +1,4 @@
-"""What results depend on: the random numbers of an episode, and the versions of packages."""
+"""Reproducibility: the random numbers of an episode, and the versions of packages that results depend on."""
 
 import warnings
 from collections.abc import Iterable, Mapping
