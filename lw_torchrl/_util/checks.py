@@ -117,7 +117,8 @@ def checker(hint: Any) -> Callable[[Any], bool]:
     if kind in (Union, UnionType):
         alternatives = [checker(part) for part in parts]
         return lambda value: any(check(value) for check in alternatives)
-    if getattr(kind, "__module__", "") not in ("builtins", "collections.abc") or not issubclass(kind, Iterable):
+    is_container = getattr(kind, "__module__", "") in ("builtins", "collections.abc") and issubclass(kind, Iterable)
+    if not is_container or not (parts or kind is tuple):
         return lambda value: is_bearable(_plain(value), hint, conf=_CONF)
     items = [checker(part) for part in parts if part is not ...]
 
@@ -154,31 +155,31 @@ def _words(hint: Any) -> str:
     return f"{kind.__name__}[{', '.join(items)}]"
 
 
-def check_choice(argument: str, given: Any, allowed: Iterable[str]) -> Any:
-    """Return ``given`` if it is one of ``allowed``; else raise :class:`ValueError` with the nearest name."""
+def check_choice(argument: str, value: Any, allowed: Iterable[str]) -> Any:
+    """Return ``value`` if it is one of ``allowed``; else raise :class:`ValueError` with the nearest name."""
     names = list(allowed)
-    if given not in names:
-        raise unknown_name(argument, given, names)
-    return given
+    if value not in names:
+        raise unknown_name(argument, value, names)
+    return value
 
 
-def unknown_name(argument: str, given: object, allowed: Iterable[str]) -> ValueError:
+def unknown_name(argument: str, value: object, allowed: Iterable[str]) -> ValueError:
     """Return the error for a name that is not in a set of names, with those of similar spelling."""
     names = list(allowed)
     listed = ", ".join(map(repr, names[:12])) + (", ..." if len(names) > 12 else "")
-    close = " or ".join(map(repr, nearest(given, names))) if isinstance(given, str) else ""
+    close = " or ".join(map(repr, nearest(value, names))) if isinstance(value, str) else ""
     hint = f"; did you mean {close}?" if close else ""
-    return ValueError(f"{argument} must be one of {listed}, got {shown(given)}{hint}")
+    return ValueError(f"{argument} must be one of {listed}, got {shown(value)}{hint}")
 
 
-def nearest(given: str, allowed: Iterable[str], *, n: int = 3) -> list[str]:
+def nearest(value: str, allowed: Iterable[str], *, n: int = 3) -> list[str]:
     """Return the ``n`` allowed names of most similar spelling, best first."""
-    return get_close_matches(given, list(allowed), n=n, cutoff=0.4)
+    return get_close_matches(value, list(allowed), n=n, cutoff=0.4)
 
 
-def did_you_mean(given: str, allowed: Iterable[str]) -> str:
+def did_you_mean(value: str, allowed: Iterable[str]) -> str:
     """Return the end of an error message that suggests an allowed name; "" if none is similar."""
-    return "".join(f"; did you mean {name!r}?" for name in nearest(given, allowed, n=1))
+    return "".join(f"; did you mean {name!r}?" for name in nearest(value, allowed, n=1))
 
 
 def missing_keys(present: Iterable[Any], *needed: str) -> ValueError:

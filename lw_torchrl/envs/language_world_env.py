@@ -67,7 +67,9 @@ class LanguageWorldEnv(EnvBase):
         suite: the :class:`~lw_torchrl.suites.Suite` of the tasks, or its name; None for the suite that their names
             begin with, as in "fetch/push", and Meta-World for names without one.
         engine: None for the suite's; for Meta-World "vectorized", the default, or "metaworld", its own environments in
-            a loop, slower with the same numbers; or a callable ``(row_tasks, *, reward, num_threads) -> Engine``.
+            a loop, slower with the same numbers; another name of :data:`~lw_torchrl.suites.metaworld.ENGINES`; or a
+            callable ``(row_tasks, *, reward, num_threads) -> Engine``. For versions of Meta-World or MuJoCo that the
+            vectorized engine does not reproduce, the default is "metaworld", with a warning.
         num_threads: threads of the simulation, by default the cores that this process may use. It never changes a
             result.
         reward: "sparse", the success as 0 and 1, or "dense", Meta-World's own.
@@ -83,8 +85,8 @@ class LanguageWorldEnv(EnvBase):
         RuntimeError: a step of a row that has ended; a reset or step in a process that was forked later.
         TypeError: it is pickled or copied; pass the function that makes it.
         ValueError: the step of a custom engine does not return an EngineStep.
-        ImportError: a rendering library named by MUJOCO_GL is missing, or the vectorized engine does not know the
-            installed version of Meta-World or MuJoCo.
+        ImportError: a rendering library named by MUJOCO_GL is missing, or ``engine="vectorized"`` does not reproduce
+            the installed version of Meta-World or MuJoCo.
 
     Example:
         >>> env = LanguageWorldEnv(["reach", "push"], num_envs=4, seed=0)
@@ -106,7 +108,7 @@ class LanguageWorldEnv(EnvBase):
         num_envs: Count | None = None,
         seed: int = 0,
         suite: str | Suite | None = None,
-        engine: Literal["vectorized", "metaworld"] | Callable[..., Engine] | None = None,
+        engine: str | Callable[..., Engine] | None = None,
         num_threads: Count | None = None,
         reward: Literal["sparse", "dense"] = "sparse",
         max_steps: Count | None = None,
