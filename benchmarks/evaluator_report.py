@@ -19,9 +19,8 @@ from lw_torchrl.evaluation.figures import new_figure, saved, trim
 from lw_torchrl.language.queries import Clause
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules import ImageQueryEvaluator
-from lw_torchrl.modules.networks import evaluating
-from lw_torchrl.modules.query_evaluator import evaluators_of
-from lw_torchrl.modules.state_query_evaluator import ClauseEvaluator
+from lw_torchrl.modules.parts import evaluating
+from lw_torchrl.modules.query_evaluator import ClauseEvaluator, evaluators_of
 from lw_torchrl.training import LabelledQueries
 from lw_torchrl.transforms.qaf import plan_program
 

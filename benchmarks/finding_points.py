@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._util.checks import Count, checked
+from lw_torchrl._util.checks import Count, typed
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.objects import NamedObject, typed_position
 from lw_torchrl.language.tasks import Task, TaskList
@@ -25,7 +25,7 @@ _NEAR = 0.03  # metres, how far a thing's surface may be from the position that 
 _STEP = 0.005  # metres between the places that are looked at
 
 
-@checked
+@typed
 def find_points(tasks: TaskList = "MT50", *, suite: str | Suite | None = None, episodes: Count = 3) -> dict[str, Task]:
     """The tasks without the points that people named on their things, and with those that shapes tell.
 

@@ -29,7 +29,7 @@ import lw_torchrl as lw
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.record.entities import STEP_TIME
 from lw_torchrl.record.meshes import Motion, log_motion
-from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
+from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 EYE, TARGET = np.array([0.75, 0.0, 0.65]), np.array([-0.05, 0.6, 0.15])
 FIELD_OF_VIEW = 55.0  # degrees, of rerun's eye

@@ -18,8 +18,8 @@ from metaworld.policies import ENV_POLICY_MAP
 import lw_torchrl as lw
 from benchmarks.report import Row, Settings, Skipped, bars, compare, timed, times_as_long
 from lw_torchrl.suites.metaworld.plain_engine import make_metaworld_env
-from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
-from lw_torchrl.suites.metaworld.vectorized.simulated_rows import available_cores
+from lw_torchrl.suites.metaworld.simulated_rows import available_cores
+from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 CHUNK = 25  # steps that one contender makes before it is the next one's turn
 SUBSTEPS = 5

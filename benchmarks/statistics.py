@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lw_torchrl._util.checks import checked, counted, shown
+from lw_torchrl._util.checks import counted, typed
 from lw_torchrl.evaluation import EvaluationResult
 
 Array = NDArray[np.float64]
@@ -62,7 +62,6 @@ def check_rates(argument: str, given: Any) -> Array:
     return rates
 
 
-@checked
 def mean_rate(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
     """Return the mean success rate over seeds and tasks of ``rates`` (seeds, tasks), in [0, 1], with its interval.
 
@@ -73,7 +72,6 @@ def mean_rate(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
     return _seed_interval(np.mean, [check_rates("rates", rates)], confidence, least=0.0)
 
 
-@checked
 def interquartile_mean(rates: ArrayLike, *, confidence: float = 0.95) -> Estimate:
     """Return the mean of the middle half of all ``rates`` (seeds, tasks), in [0, 1]: a quarter is cut at each end.
 
@@ -91,7 +89,6 @@ def interquartile_mean(rates: ArrayLike, *, confidence: float = 0.95) -> Estimat
     return _seed_interval(middle, [check_rates("rates", rates)], confidence, least=0.0)
 
 
-@checked
 def mean_difference(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> Estimate:
     """Return the mean over tasks of method X's rate minus Y's on the same task.
 
@@ -104,7 +101,6 @@ def mean_difference(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> 
     return _seed_interval(lambda a, b: a.mean() - b.mean(), _pair(x, y), confidence, least=-1.0)
 
 
-@checked
 def probability_of_improvement(x: ArrayLike, y: ArrayLike, *, confidence: float = 0.95) -> Estimate:
     """Return the probability that a seed of method X beats one of Y on a random task; a tie counts half.
 
@@ -120,7 +116,6 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, *, confidence: float 
     return _seed_interval(lambda a, b: (0.5 + 0.5 * np.sign(a[:, None] - b)).mean(), beats, confidence, least=0.0)
 
 
-@checked
 def count_solved(rates: ArrayLike, threshold: float = 0.8) -> int:
     """Return the number of tasks whose mean over seeds is at least ``threshold``, in (0, 1], up to rounding.
 
@@ -239,7 +234,6 @@ class Summary:
         return "\n".join(lines)
 
 
-@checked
 def summarize_rates(
     rates: Mapping[str, Sequence[float]],
     *,
@@ -282,7 +276,7 @@ def summarize_rates(
     )
 
 
-@checked
+@typed
 def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResult], **options: Any) -> Summary:
     """Summarize the any-step success of several training seeds, one evaluation of the same tasks each.
 
@@ -293,7 +287,6 @@ def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResul
     Raises:
         ValueError: no results, one evaluation given twice, or evaluations that differ in tasks, plans,
             episodes_per_task, noise_scale or max_steps.
-        TypeError: a result is not an :class:`EvaluationResult`.
 
     Example:
         >>> from lw_torchrl.evaluation import EpisodeResult
@@ -306,8 +299,6 @@ def summarize(results: Mapping[Any, EvaluationResult] | Sequence[EvaluationResul
     if not named:
         raise ValueError("results must hold at least one result, got none")
     for number, (seed, result) in enumerate(named.items()):
-        if not isinstance(result, EvaluationResult):
-            raise TypeError(f"results[{seed!r}] must be an EvaluationResult, got {shown(result)}")
         if (twice := next((k for k, one in list(named.items())[:number] if one == result), None)) is not None:
             raise ValueError(f"results must be of different training seeds, {twice!r} and {seed!r} are one evaluation")
     first_seed, first = next(iter(named.items()))

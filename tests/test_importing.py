@@ -1,4 +1,4 @@
-"""Importing loads nothing heavy, and names what is absent."""
+"""Importing loads nothing heavy; an error names a missing library."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import lw_torchrl
 from lw_torchrl.suites.metaworld.plain_engine import import_metaworld
 
 
-class Failing(MetaPathFinder):
-    """Fails as PyOpenGL does where its library is absent."""
+class WithoutOpenGL(MetaPathFinder):
+    """Fails as PyOpenGL does if its library is missing."""
 
     def find_spec(self, fullname, path, target=None):
         if fullname == "metaworld":
@@ -25,31 +25,31 @@ class Failing(MetaPathFinder):
 
 
 @pytest.mark.parametrize(("backend", "package"), [("osmesa", "libosmesa6"), ("EGL", "libegl1")])
-def test_an_absent_rendering_library_is_named(monkeypatch, backend, package):
+def test_error_names_a_missing_rendering_library(monkeypatch, backend, package):
     monkeypatch.setenv("MUJOCO_GL", backend)
     monkeypatch.delitem(sys.modules, "metaworld", raising=False)
-    monkeypatch.setattr(sys, "meta_path", [Failing(), *sys.meta_path])
+    monkeypatch.setattr(sys, "meta_path", [WithoutOpenGL(), *sys.meta_path])
     with pytest.raises(ImportError, match=f"MUJOCO_GL is '{backend.lower()}'.*{package}.*unset MUJOCO_GL"):
         import_metaworld()
 
 
-def test_another_failure_of_the_import_is_not_explained_away(monkeypatch):
+def test_other_failures_of_the_import_stay_as_they_are(monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.delitem(sys.modules, "metaworld", raising=False)
-    monkeypatch.setattr(sys, "meta_path", [Failing(), *sys.meta_path])
+    monkeypatch.setattr(sys, "meta_path", [WithoutOpenGL(), *sys.meta_path])
     with pytest.raises(AttributeError, match="glGetError"):
         import_metaworld()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("backend", "library", "package"), [("osmesa", "OSMesa", "libosmesa6"), ("egl", "EGL", "libegl1")]
 )
-@pytest.mark.slow
-def test_a_library_that_is_really_absent_is_named(python, backend, library, package):
+def test_error_names_a_library_that_is_really_missing(python, backend, library, package):
     if ctypes.util.find_library(library):
         pytest.skip(f"{library} is installed")
-    found = python("import lw_torchrl as lw; lw.LanguageWorldEnv('reach')", MUJOCO_GL=backend)
-    last = found.stderr.strip().splitlines()[-1]
+    process = python("import lw_torchrl as lw; lw.LanguageWorldEnv('reach')", MUJOCO_GL=backend)
+    last = process.stderr.strip().splitlines()[-1]
     assert last.startswith(f"ImportError: MUJOCO_GL is '{backend}', but ")
     assert package in last
 
@@ -66,7 +66,7 @@ class Failing:
 
 sys.meta_path.insert(0, Failing())
 for module in pkgutil.iter_modules(lw_torchrl.__path__):
-    if module.ispkg:
+    if module.ispkg and module.name[0] != "_":
         try:
             import_module(f"lw_torchrl.{module.name}")
             print(module.name, "loads no TorchRL")
@@ -75,14 +75,14 @@ for module in pkgutil.iter_modules(lw_torchrl.__path__):
 """
 
 
-def test_every_room_names_it(python):
-    found = python(EVERY_ROOM, MUJOCO_GL="osmesa")
-    assert found.returncode == 0, found.stderr
-    lines = dict(line.split(" ", 1) for line in found.stdout.splitlines())
+def test_error_of_every_room_names_the_missing_library(python):
+    process = python(EVERY_ROOM, MUJOCO_GL="osmesa")
+    assert process.returncode == 0, process.stderr
+    result = dict(line.split(" ", 1) for line in process.stdout.splitlines())
     light = {"cli", "language", "planners", "suites"}
-    assert {room for room, said in lines.items() if said == "loads no TorchRL"} == light
-    assert all("libosmesa6" in said for room, said in lines.items() if room not in light)
-    assert len(lines) >= 10
+    assert {room for room, text in result.items() if text == "loads no TorchRL"} == light
+    assert all("libosmesa6" in text for room, text in result.items() if room not in light)
+    assert len(result) >= 10
 
 
 LOADED = """
@@ -96,21 +96,21 @@ print(*sorted({name.split(".")[0] for name in sys.modules} - before - {*sys.stdl
 """
 
 
-def test_all_names_together_load_little_that_torchrl_does_not(python):
-    found = python(LOADED)
-    assert found.returncode == 0, found.stderr
-    assert {"lw_torchrl", "safetensors"} <= {*found.stdout.split()}
-    loaded = {name for name in found.stdout.split() if not name.startswith("_cython_")}  # rapidfuzz's own
+def test_all_names_load_few_packages_that_torchrl_does_not(python):
+    process = python(LOADED)
+    assert process.returncode == 0, process.stderr
+    loaded = {name for name in process.stdout.split() if not name.startswith("_cython_")}  # of rapidfuzz
+    assert {"lw_torchrl", "safetensors"} <= loaded
     assert loaded <= {"beartype", "farama_notifications", "gymnasium", "lw_torchrl", "rapidfuzz", "safetensors"}
 
 
-def test_the_package_alone_and_words_load_no_torchrl(python):
+def test_package_loads_no_torch_and_plans_load_no_torchrl(python):
     program = "import sys, lw_torchrl as lw; print('torch' in sys.modules); lw.load_plans('MT10'); "
-    found = python(program + "print([name for name in ('torchrl', 'mujoco') if name in sys.modules])")
-    assert found.stdout.split() == ["False", "[]"], found.stderr
+    process = python(program + "print([name for name in ('torchrl', 'mujoco') if name in sys.modules])")
+    assert process.stdout.split() == ["False", "[]"], process.stderr
 
 
-def test_type_checkers_see_the_names_that_are_there():
+def test_stub_lists_the_names_of_the_package():
     stub = ast.parse(Path(lw_torchrl.__file__).with_suffix(".pyi").read_text("utf-8"))
     lines = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
     stated = {alias.asname: line.module for line in lines for alias in line.names}
@@ -119,7 +119,7 @@ def test_type_checkers_see_the_names_that_are_there():
     assert sorted({*stated} - {*rooms}) == lw_torchrl.__all__
 
 
-def test_the_top_level_is_small_and_each_of_its_names_is_shown():
+def test_top_level_is_small_and_docs_show_each_of_its_names():
     assert len(lw_torchrl.__all__) <= 60
     root = Path(__file__).parent.parent
     pages = [root / "README.md", *root.glob("docs/**/*.md")]
@@ -129,10 +129,10 @@ def test_the_top_level_is_small_and_each_of_its_names_is_shown():
     assert not {*lw_torchrl.__all__} - used
 
 
-def test_names_rooms_and_what_is_neither():
+def test_names_and_rooms_are_attributes():
     assert set(lw_torchrl.__all__) <= set(dir(lw_torchrl))
     assert lw_torchrl.evaluation.evaluate is lw_torchrl.evaluate
     with pytest.raises(AttributeError, match="no attribute 'load_plan'"):
         lw_torchrl.load_plan  # noqa: B018
     rooms = {module.name for module in pkgutil.iter_modules(lw_torchrl.__path__) if module.ispkg}
-    assert {*lw_torchrl._ROOMS, "cli"} == rooms
+    assert {*lw_torchrl._ROOMS, "cli", "_util"} == rooms

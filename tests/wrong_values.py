@@ -1,4 +1,4 @@
-"""Wrong values of arguments by annotation, and good calls of the public names whose arguments need one another."""
+"""Wrong values of arguments, and a good call of each public name whose arguments need one another."""
 
 from __future__ import annotations
 
@@ -12,154 +12,48 @@ import torch
 import lw_torchrl as lw
 
 PLAN = lw.load_plans("MT10")["reach"]
-PLANS = [3, "reach", [], {}, {"reach": "a plan"}, {"push": PLAN}, object()]
-TASKS = [3, "reech", ["reech"], [], [3], ["reach", "reach"], True]
-KEYS = ["observation", 3, [3], [None], ["one", "one"], [], {}]
-DEVICE = [3, "gpu", "cuda:99", [], b"cpu"]
-WIDTH = ["8", 1.5, -1, 0, (0,), ("8",), True, (8, -1)]
-A_CLASS = [3, "one", [], object()]
-FUNCTION = [3, "print", [], {}]
-MAPPING = [3, "one", ["one"], {"one": 3}, {3: "one"}]
-CAMERAS = ["corner9", ["corner", "nose"], 3, [], ["corner", "corner"], [3]]
-WRONG: dict[str, list[Any]] = {
-    "Plans | Mapping[str, ConditionalPlan]": PLANS,
-    "AnyPlans": PLANS,
-    "Plans": [3, "reach", [], {}, object()],
-    "Mapping[str, ConditionalPlan] | Iterable[ConditionalPlan]": [
-        3,
-        "reach",
-        [],
-        {},
-        [3],
-        {"push": PLAN},
-        [PLAN, PLAN],
-    ],
-    "ConditionalPlan": A_CLASS,
-    "Sequence[ConditionalPlan]": [3, "reach", [], [3], object()],
-    "str | int | Task": [3.5, b"reach", []],
-    "Condition": ["no such", 3, None, []],
-    "Callable[[], Mapping[str, float]]": FUNCTION,
-    "Sampler | Callable[[], Sampler]": [3, "balanced", []],
-    "Transform | Callable[[TensorDictBase], TensorDictBase]": [3, "qaf", []],
-    "Literal['rollout'] | Iterable[NestedKey]": ["all"],
-    "StepRole": A_CLASS,
-    "str | Suite": [3, "mujoco", [], b"fetch"],
-    "Callable[[Tensor], Tensor]": [3, "act", []],
-    "str | Task": [3, "reech", b"reach", [], 1.5],
-    "str | Task | Iterable[str | Task]": TASKS,
-    "str | Iterable[str | Task]": TASKS,
-    "str | Iterable[str]": TASKS,
-    "Sequence[NestedKey]": KEYS,
-    "NestedKey": [3, [], {}, 1.5],
-    "TextEncoder": FUNCTION,
-    "str | torch.device": DEVICE,
-    "Features": ["no such", 3, None, []],
-    "Answers": ["no such", 3, None, []],
-    "DistributionName": ["no such", 3, []],
-    "Reduction": ["no such", 3, []],
-    "Label": ["no such", 3, None, []],
-    "RewardName": ["no such", 3, None, []],
-    "Kind": ["no such", 3, None, []],
-    "int | tuple[int, ...]": WIDTH,
-    "int | Sequence[int]": WIDTH,
-    "Mapping[str, ScriptedSkill]": MAPPING,
-    "Skills": MAPPING,
-    "Skills | Iterable[str]": [3, {"one": 3}, ["no such skill"]],
-    "Mapping[str, Task]": [3, "MT10", ["reach"], {"reach": 3}],
-    "Tasks": [3, "MT10", ["reach"], {"reach": 3}],
-    "Mapping[str, Sequence[int]]": [3, "one", ["one"], {"one": [0]}, {"reach": 0}, {"reach": ["0"]}, {"reach": [99]}],
-    "Mapping[str | Task, Sequence[str | Query]]": [3, "one", ["one"], {}, {"reech": []}, {"reach": 3}, {"reach": [3]}],
-    "Iterable[str | Query]": [3, [3], ["no query at all"]],
-    "Iterable[Task]": [3, "reach", [3], ["reach"]],
-    "EpisodeFilter": A_CLASS,
-    "EpisodeChoice | Sequence[EpisodeChoice]": [
-        "all",
-        1.5,
-        -1,
-        99,
-        {"push": 1},
-        {"reach": "x"},
-        {"reach": [9]},
-        [1],
-        {},
-    ],
-    "float | Iterable[float]": ["0.1", -1.0, math.nan, math.inf, [], ["0.1"], [math.nan], None],
-    "Callable[[FinishedEpisode], object]": FUNCTION,
-    "Callable[[TensorDictBase], Mapping[str, Tensor]]": FUNCTION,
-    "Callable[[int, tuple[bool, ...]], object]": FUNCTION,
-    "Literal['vectorized', 'metaworld'] | Callable[..., Engine]": [3, "mujoco", None, []],
-    "tuple[int, int]": [3, (0,), (2, 1), ("0", 1), (0, 0), "01", (0.5, 2)],
-    "tuple[()]": [3, (2,), "x"],
-    "AnyPath | Iterable[AnyPath]": [3, None, [], [3], [None], 1.5],
-    "str | Behaviour | TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase]": [3, None, "expart", [], {}],
-    "str | Sequence[str]": CAMERAS,
-    "Sequence[int]": [3, "0", [-1], ["0"], [0.5]],
-    "Sequence[str]": ["gripper", 3, [3], ["no such"]],
-    "tuple[str, ...]": ["one", 3, [3]],
-    "int | tuple[str, ...]": ["one", 1.5, -1, True, [3]],
-    "tuple[PlanStep, ...]": [3, [3], "one"],
-    "tuple[NamedObject, ...]": [3, [3], "one"],
-    "Iterable[FinishedEpisode | TensorDictBase]": [3, "one", [3]],
-    "Failure | Sequence[Failure | None]": [3, "one", [3]],
-    "str | Sequence[bool] | Tensor": [
-        3,
-        "reech",
-        [],
-        ["yes"],
-        torch.zeros(3),
-        torch.zeros(1, 1, dtype=torch.bool),
-        None,
-    ],
-    "float | Fraction": ["half", -0.1, 1.5, math.nan, None, True],
-    "Sequence[TensorDictModuleBase]": [3, "a", [], [3], ["a"]],
-    "Sequence[type[nn.Module]]": [3],
-    "Sequence[TensorDictReplayBuffer]": [3, "a", [], [3], ["a"]],
-    "TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase]": [None, 3, "expert", []],
-    "TensorDictModuleBase | list[TensorDictModuleBase]": [3, "a", [], [3], None],
-    "Mapping[str, Any]": [3, "one", ["one"]],
-    "ExportFormat": ["no such", 3, None, []],
-    "ImportFormat": ["no such", 3, []],
-    "str | Mapping[str, str]": [3, "reech", [], {"theirs": "reech"}, {"theirs": 3}],
-}
-for name in [
-    "TensorDictModuleBase",
-    "TensorDictModule",
-    "TensorDictReplayBuffer",
-    "LanguageWorldExperienceReplay",
-    "BehavioralCloningConfig",
-    "OfflineConfig",
-    "QueryEvaluatorConfig",
-    "Logger",
-    "Sampler",
-    "Transform",
-    "QueryEvaluator",
-    "ClauseEvaluator",
-    "LabelledQueries",
-    "LossModule",
-    "nn.Module",
-    "TensorDictSequential",
-    "QValue",
-    "RerunLogger",
-    "TensorDictBase",
-    "EvaluationResult",
-    "Query",
-    "Layout",
-    "Suite",
-    "Task",
-    "Tensor",
-]:
-    WRONG[name] = A_CLASS
+# Of these, the values that an argument's annotation does not allow must raise an error that names the argument.
+OF_ANY_TYPE: list[Any] = [
+    *(3, 0, -1, 1.5, -0.1, 1.1, math.nan, math.inf, True, None, "", "no such", "0.1", b"bytes", object()),
+    *([], [3], ["no such"], [None], [0.5], [math.nan], (), ("no such",), (2,), (3, "no such")),
+    *({}, {"one": 3}, {3: "one"}, {"reach": "a plan"}, torch.zeros(3), torch.zeros(1, 1, dtype=torch.bool)),
+]
+# Values that the annotation allows and the function must refuse, by the argument's name or the function's and its own.
 OF_ONE_NAME: dict[str, list[Any]] = {
-    "ImageQueryEvaluator.names": ["gripper", 3, [3]],  # those that a plan speaks of must be there
-    "resolve_tasks.tasks": [3, "MT10", ["reach"]],
-    "OfflineTrainer.loss": A_CLASS,
-    "evaluate.engine": [3, "mujoco", []],
-    "attribute_failures.engine": [3, "mujoco", []],
-    "evaluate.evaluator": FUNCTION,
-    "attribute_failures.evaluator": FUNCTION,
-    "attribute_failures.actor": FUNCTION,
-    "evaluate.also_record": ["observation", 3, [3], [None]],
-    "QueryEvaluatorConfig.held_out_tasks": ["one", 1.5, -1, True, [3]],
+    "plans": [{}, {"push": PLAN}],
+    "reference": [{}, {"push": PLAN}],
+    "Plans.plans": [3, "reach", [], {}, [3], {"push": PLAN}, [PLAN, PLAN]],
+    "RandomYaw.plans": [],
+    "RolloutRecorder.plans": [],
+    "OpenAIPlanner.plans": [{}],
+    "log_rollout.tasks": [],
+    "tasks": ["reech", ["reech"], [], ["reach", "reach"]],
+    "names": ["reech", ["reech"], [], [3], ["reach", "reach"]],
+    "ImageQueryEvaluator.names": [],  # those that a plan names must be among them
+    "task": ["reech"],
+    "RolloutRecorder.task": [],  # the name of any task
+    "in_keys": [["one", "one"], []],
+    "out_keys": [["one", "one"], []],
+    "keys": ["all"],
+    "evaluator": [3, "one", []],
+    "loss": [3, "one", []],
+    "config": [3, "one", []],
+    "device": ["gpu", "cuda:99"],
+    "cameras": ["corner9", ["corner", "nose"], [], ["corner", "corner"]],
+    "engine": ["mujoco", 3, []],
+    "suite": ["mujoco"],
+    "height": [0, -1, 10**6],
+    "width": [0, -1],
+    "every": [0, -1],
+    "members": [[]],
+    "predicates": [["no such"]],
+    "queries": [{}, {"reech": []}, {"reach": ["no query"]}],
+    "episodes": [-1, 99, {"push": 1}, {"reach": [9]}, {}],
+    "noise_scale": [-1.0, [], math.inf],
+    "worker": [(2, 1), (0, 0)],
+    "rows": [[-1]],
+    "target_fraction": [-0.1, 1.5],
+    "root": [[]],
 }
 
 
@@ -179,6 +73,7 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
     actor = lw.PlanConditionedActor(plans)
     expert = lw.ExpertActor("reach")
     evaluator = lw.StateQueryEvaluator(plans, width=8)
+    images = lw.modules.ImageQueryEvaluator(plans, width=8)
     config = lw.training.QueryEvaluatorConfig(steps=1, batch_size=2, held_out_states=0.0, held_out_pairs=0.0)
     data = lw.training.LabelledQueries(replay, config)
     value = lw.PlanConditionedValue(plans, width=8)
@@ -210,6 +105,11 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
         "HideOpening": {"probability": 0.5},
         "ImageQueryEvaluator": {"plans": plans, "width": 8},
         "ImageQueryEvaluatorConfig": {},
+        "ImageQueryEvaluatorTrainer": {
+            "evaluator": images,
+            "data": data,
+            "config": lw.training.ImageQueryEvaluatorConfig(),
+        },
         "JitterTarget": {"plans": lw.canonical_plans(plans), "std": 0.03},
         "LabelledQueries": {"replay": replay, "config": config},
         "LanguageWorldEnv": {"tasks": "reach"},

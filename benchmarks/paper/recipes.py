@@ -10,11 +10,11 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from benchmarks.paper.actors import Parts, reads_plans
-from lw_torchrl._util.checks import Count, Probability, Scale, check_fields
+from lw_torchrl._util.checks import Count, Probability, Scale, typed_fields
 from lw_torchrl._util.files import read_toml
 from lw_torchrl.data import BEHAVIOURS, EpisodeFilter
+from lw_torchrl.data.rewards import RewardName
 from lw_torchrl.data.selection import Label
-from lw_torchrl.data.storage import RewardName
 from lw_torchrl.language.tasks import MT10
 from lw_torchrl.training.cloning import BehavioralCloningConfig
 
@@ -127,6 +127,7 @@ class OfflineMethod:
     version: int = 1  # raised by 1 whenever the method changes, so that earlier results are refused
 
 
+@typed_fields
 @dataclass(frozen=True)
 class OfflineRecipe:
     """The numbers of all methods."""
@@ -149,9 +150,6 @@ class OfflineRecipe:
     depth: Count = 3  # of actors
     critic_depth: Count = 2
     feature_noise: Scale = 0.05  # of actors while they train
-
-    def __post_init__(self) -> None:
-        check_fields(self)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torch.func import functional_call, stack_module_state, vmap
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.objectives.utils import distance_loss
 
-from lw_torchrl._util.checks import checked, differences, passes_on
+from lw_torchrl._util.checks import differences, typed
 from lw_torchrl._util.devices import place
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.training.checkpoint import check_can_be_saved, text_vectors
@@ -56,8 +56,7 @@ class StackedBehavioralCloning(Training):
     Source: paper section 'Conditional Plan Experiments', which trains 50 one-shot models; ``torch.func``.
     """
 
-    @passes_on(Training.__init__)
-    @checked
+    @typed
     def __init__(
         self,
         actors: Sequence[TensorDictModuleBase],

@@ -1,70 +1,159 @@
-"""Checks of arguments: beartype checks types and ranges; these functions check names and word errors."""
+"""Checks of arguments: types and ranges by beartype, names by hand; and the words of errors."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from difflib import get_close_matches
+from functools import cache, wraps
+from math import inf
 from numbers import Integral, Real
 from reprlib import Repr
-from typing import Annotated, Any, TypeVar
+from types import SimpleNamespace, UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-from beartype import BeartypeConf, BeartypeViolationVerbosity, FrozenDict, beartype
+from beartype import BeartypeConf, FrozenDict
 from beartype.door import is_bearable
 from beartype.vale import Is, IsInstance
+
+_NOT_BOOL = ~IsInstance[bool]
+_MOST = float(np.finfo(float).max)
+# True is not an integer; NaN, and an integer too large for a float, are not numbers.
+_CONF = BeartypeConf(
+    hint_overrides=FrozenDict(
+        {
+            int: Annotated[Integral, _NOT_BOOL],
+            float: Annotated[Real, _NOT_BOOL & Is[lambda x: abs(x) <= _MOST or abs(x) == inf]],
+        }
+    )
+)
+Count = Annotated[int, Is[lambda n: n >= 1]]
+Natural = Annotated[int, Is[lambda n: n >= 0]]
+Scale = Annotated[float, Is[lambda x: 0 <= x <= _MOST]]
+Positive = Annotated[float, Is[lambda x: 0 < x <= _MOST]]
+Probability = Annotated[float, Is[lambda p: 0 <= p <= 1]]
+
+_WORDS: dict[Any, str] = {
+    bool: "True or False",
+    int: "an integer",
+    float: "a number",
+    str: "a string",
+    type(None): "None",
+    Callable: "a function",
+    Count: "an integer of at least 1",
+    Natural: "an integer of at least 0",
+    Scale: "a finite number of at least 0",
+    Positive: "a finite number above 0",
+    Probability: "a number from 0 to 1",
+}
+
+Class = TypeVar("Class", bound=type)
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class ArgumentError(TypeError, ValueError):
     """An argument has the wrong type or is out of range."""
 
-    def __init__(self, message: str) -> None:
-        # beartype: "Function lw_torchrl.x.f() parameter n=0 violates type hint typing.Annotated[...]."
-        message = re.sub(r"^\w+ (?:[\w<>]+\.)*?(\w+(?:\.__init__)?)\(\) parameter ", r"\1: ", message)
-        message = message.replace(" violates type hint ", " must be ").replace(".__init__: ", ": ")
-        super().__init__(
-            re.sub(r"\b(?:typing|beartype\.vale|collections\.abc)\.|<class '(?=\w+'>)|(?<=\w)'>", "", message)
-        )
 
+def typed(function: Function) -> Function:
+    """Check a function's arguments by their annotations; raise :class:`ArgumentError` for the first wrong one.
 
-_NOT_BOOL = ~IsInstance[bool, np.bool_]
-_CONF = BeartypeConf(
-    violation_param_type=ArgumentError,
-    violation_verbosity=BeartypeViolationVerbosity.MINIMAL,
-    # NumPy's numbers are numbers, True is not an integer, and NaN is not a number.
-    hint_overrides=FrozenDict(
-        {
-            bool: Annotated[object, IsInstance[bool, np.bool_]],
-            int: Annotated[Integral, _NOT_BOOL],
-            float: Annotated[Real, _NOT_BOOL & Is[lambda x: x == x]],
-        }
-    ),
-)
-typed = beartype(conf=_CONF)
-"""Check a function's arguments, or a dataclass's fields, by their annotations; raise :class:`ArgumentError`."""
+    NumPy's numbers arrive as Python's. Annotations are read at the first call, so each name in them must be imported
+    by then, and not only for type checkers. ``*args`` and ``**kwargs`` are not checked.
+    """
 
-Count = Annotated[int, Is[lambda n: n >= 1]]
-Natural = Annotated[int, Is[lambda n: n >= 0]]
-Scale = Annotated[float, Is[lambda x: 0 <= x < float("inf")]]
-Positive = Annotated[float, Is[lambda x: 0 < x < float("inf")]]
-Probability = Annotated[float, Is[lambda p: 0 <= p <= 1]]
+    def read_hints() -> dict[str, Any]:  # not the result's, whose type may be in a package that is not installed
+        arguments = {name: hint for name, hint in function.__annotations__.items() if name != "return"}
+        return get_type_hints(SimpleNamespace(__annotations__=arguments), function.__globals__, include_extras=True)
 
-Class = TypeVar("Class", bound=type)
+    return _checked(function, read_hints)
 
 
 def typed_fields(kind: Class) -> Class:
-    """Check the fields of a dataclass by their annotations when an instance is made."""
-    kind.__init__ = typed(kind.__init__)  # type: ignore[misc]
+    """Check the fields of a dataclass by their annotations, as :func:`typed` does, when an instance is made."""
+    init = _checked(kind.__init__, lambda: get_type_hints(kind, include_extras=True))  # type: ignore[misc]
+    kind.__init__ = init  # type: ignore[misc]
     return kind
+
+
+def _checked(function: Any, read_hints: Callable[[], dict[str, Any]]) -> Any:
+    code = function.__code__
+    positional = code.co_varnames[: code.co_argcount]
+    named = {*code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]}
+    hints: dict[str, Any] = {}
+
+    def check(name: str, value: Any) -> Any:
+        return check_value(name, value, hints[name]) if name in hints else value
+
+    @wraps(function)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        if not hints:
+            hints.update({name: hint for name, hint in read_hints().items() if name in named and hint is not Any})
+        args = (*map(check, positional, args), *args[len(positional) :])
+        return function(*args, **{name: check(name, value) for name, value in kwargs.items()})
+
+    return run
 
 
 def check_value(argument: str, value: Any, hint: Any) -> Any:
     """Return ``value``, a NumPy number as Python's, if it matches a type hint; else raise :class:`ArgumentError`."""
-    if not is_bearable(value, hint, conf=_CONF):
-        raise ArgumentError(f"{argument}={shown(value)} must be {hint}")
+    if not checker(hint)(value):
+        choices = [choice for part in _parts(hint) if get_origin(part) is Literal for choice in get_args(part)]
+        close = did_you_mean(value, map(str, choices)) if isinstance(value, str) else ""
+        raise ArgumentError(f"{argument} must be {_words(hint)}, got {shown(value)}{close}")
+    return _plain(value)
+
+
+def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
+@cache
+def checker(hint: Any) -> Callable[[Any], bool]:
+    """Return a function that tells whether a value matches a type hint: beartype for all but containers, of which
+    beartype looks at one random item only: it would miss wrong ones, and advance Python's random generator."""
+    kind, parts = get_origin(hint), get_args(hint)
+    if kind in (Union, UnionType):
+        alternatives = [checker(part) for part in parts]
+        return lambda value: any(check(value) for check in alternatives)
+    if getattr(kind, "__module__", "") not in ("builtins", "collections.abc") or not issubclass(kind, Iterable):
+        return lambda value: is_bearable(_plain(value), hint, conf=_CONF)
+    items = [checker(part) for part in parts if part is not ...]
+
+    def check(value: Any) -> bool:
+        if not isinstance(value, kind) or isinstance(value, (str, bytes)):  # a string is not a list of strings
+            return False
+        if issubclass(kind, Mapping):
+            return all(items[0](key) and items[1](entry) for key, entry in value.items())
+        if kind is tuple and ... not in parts:
+            return len(value) == len(items) and all(matches(item) for matches, item in zip(items, value, strict=True))
+        return not isinstance(value, Collection) or all(map(items[0], value))  # an iterator is not consumed
+
+    return check
+
+
+def _parts(hint: Any) -> tuple[Any, ...]:
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+
+
+def _words(hint: Any) -> str:
+    """Describe a type hint in English."""
+    if len(parts := _parts(hint)) > 1:
+        return " or ".join(map(_words, parts))
+    for known in (hint, get_origin(hint)):
+        if known in _WORDS:
+            return _WORDS[known]
+    if get_origin(hint) is Literal:
+        return " or ".join(map(repr, get_args(hint)))
+    if isinstance(hint, type) and get_origin(hint) is None:
+        return f"a {hint.__name__}"
+    if (kind := get_origin(hint)) in (None, Annotated):
+        return str(hint)
+    items = [re.sub("^an? ", "", _words(part)) for part in get_args(hint) if part is not ...]
+    return f"{kind.__name__}[{', '.join(items)}]"
+
+
 def check_choice(argument: str, given: Any, allowed: Iterable[str]) -> Any:
-    """Return ``given`` if it is one of ``allowed``, else raise :class:`ValueError` with the nearest name."""
+    """Return ``given`` if it is one of ``allowed``; else raise :class:`ValueError` with the nearest name."""
     names = list(allowed)
     if given not in names:
         raise unknown_name(argument, given, names)
@@ -72,28 +161,27 @@ def check_choice(argument: str, given: Any, allowed: Iterable[str]) -> Any:
 
 
 def unknown_name(argument: str, given: object, allowed: Iterable[str]) -> ValueError:
-    """The error for a name outside a fixed set, with those close in spelling; the caller raises it."""
+    """Return the error for a name that is not in a set of names, with those of similar spelling."""
     names = list(allowed)
-    listed = ", ".join(repr(name) for name in names[:12]) + (", ..." if len(names) > 12 else "")
-    message = f"{argument} must be one of {listed}, got {shown(given)}"
-    if isinstance(given, str) and (close := nearest(given, names)):
-        message += "; did you mean " + " or ".join(repr(name) for name in close) + "?"
-    return ValueError(message)
+    listed = ", ".join(map(repr, names[:12])) + (", ..." if len(names) > 12 else "")
+    close = " or ".join(map(repr, nearest(given, names))) if isinstance(given, str) else ""
+    hint = f"; did you mean {close}?" if close else ""
+    return ValueError(f"{argument} must be one of {listed}, got {shown(given)}{hint}")
 
 
 def nearest(given: str, allowed: Iterable[str], *, n: int = 3) -> list[str]:
-    """The ``n`` allowed names closest in spelling to ``given``, best first."""
+    """Return the ``n`` allowed names of most similar spelling, best first."""
     return get_close_matches(given, list(allowed), n=n, cutoff=0.4)
 
 
 def did_you_mean(given: str, allowed: Iterable[str]) -> str:
-    """The end of an error's sentence: the allowed name closest in spelling, "" if none is close."""
+    """Return the end of an error message that suggests an allowed name; "" if none is similar."""
     return "".join(f"; did you mean {name!r}?" for name in nearest(given, allowed, n=1))
 
 
-def missing_keys(found: Iterable[Any], *needed: str) -> ValueError:
-    """The error for a tensordict of the keys ``found`` that lacks one of two needed ones; the caller raises it."""
-    names = [str(key) for key in found]
+def missing_keys(present: Iterable[Any], *needed: str) -> ValueError:
+    """Return the error for a tensordict with the keys ``present`` that lacks some of the ``needed`` ones."""
+    names = [str(key) for key in present]
     absent = [key for key in needed if key not in names]
     hint = ": QAFTransform(plans) in the environment, and in the buffer, writes it" if "qaf" in absent else ""
     return ValueError(
@@ -102,32 +190,32 @@ def missing_keys(found: Iterable[Any], *needed: str) -> ValueError:
 
 
 def counted(number: int, noun: str) -> str:
-    """A number and what it counts: "1 task", "50 tasks"."""
+    """Return a number with its noun: "1 task", "50 tasks"."""
     return f"{number} {noun}" + "s" * (number != 1)
 
 
 def differences(was: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
-    """The names under which two nested tables differ, with both values where they are short: "steps (40, now 30)"."""
-    found = []
+    """Return the names whose values differ in two nested mappings, with short values: "steps (40, now 30)"."""
+    names = []
     for key in sorted({**was, **now}):
         before, after = was.get(key), now.get(key)
         if before == after:
             continue
         if isinstance(before, Mapping) and isinstance(after, Mapping):
-            found += differences(before, after, f"{inside}{key}.")
+            names += differences(before, after, f"{inside}{key}.")
         else:
             values = f"{shown(before)}, now {shown(after)}"
-            found.append(f"{inside}{key}" + (f" ({values})" if len(values) <= 60 else ""))
-    return found
+            names.append(f"{inside}{key}" + (f" ({values})" if len(values) <= 60 else ""))
+    return names
 
 
-_SHOWN = Repr()
-_SHOWN.maxlevel, _SHOWN.maxstring, _SHOWN.maxother, _SHOWN.maxlist, _SHOWN.maxtuple, _SHOWN.maxdict = 3, 80, 80, 8, 8, 8
+_SHORT = Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlist, _SHORT.maxtuple, _SHORT.maxdict = 3, 80, 80, 8, 8, 8
 
 
 def shown(value: object) -> str:
-    """``repr`` for an error's text: short, and safe of any value, also of one nested deep or of a huge number."""
+    """Return a short ``repr`` for an error message, which does not fail for huge integers or deep nesting."""
     try:
-        return _SHOWN.repr(value)
-    except (ValueError, RecursionError):  # a number of more digits than Python writes
+        return _SHORT.repr(value)
+    except (ValueError, RecursionError):  # Python refuses to print integers of more than 4,300 digits
         return f"a {type(value).__name__}"

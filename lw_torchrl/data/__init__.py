@@ -1,17 +1,16 @@
 """Demonstrations: collecting them, reading them as a replay buffer, sampling them in exact proportions."""
 
-import lw_torchrl._util.torchrl  # noqa: F401
-from lw_torchrl.data.behaviours import BEHAVIOURS, Behaviour
-from lw_torchrl.data.co_learning_sampler import CoLearningSampler
+import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.data.collect import collect_demonstrations
+from lw_torchrl.data.collection_policy import BEHAVIOURS, Behaviour
 from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations
 from lw_torchrl.data.exchange import ExchangeError, export_dataset, import_dataset
-from lw_torchrl.data.loading import ROLLOUT, load_demonstrations, n_step_returns
+from lw_torchrl.data.loading import ROLLOUT, load_demonstrations
 from lw_torchrl.data.pictures import add_pictures, load_pictures
-from lw_torchrl.data.replay import LanguageWorldExperienceReplay
-from lw_torchrl.data.samplers import TaskBalancedSampler
+from lw_torchrl.data.replay import DatasetStorage, LanguageWorldExperienceReplay
+from lw_torchrl.data.rewards import REWARDS, n_step_returns
+from lw_torchrl.data.samplers import CoLearningSampler, TaskBalancedSampler
 from lw_torchrl.data.selection import EpisodeFilter, JoinedDemonstrations
-from lw_torchrl.data.storage import REWARDS, DatasetStorage
 
 __all__ = [
     "BEHAVIOURS", "REWARDS", "ROLLOUT", "Behaviour", "CoLearningSampler", "CollectConfig", "DatasetError",

@@ -1,35 +1,203 @@
-"""collect_demonstrations: write episodes of an expert, or of another policy, to a dataset; resumable after a kill."""
+"""collect_demonstrations: write episodes of an expert, or of another policy, to a dataset; resumable after a kill.
+
+root/.partial/begun.json    the configuration and the versions of packages
+root/.partial/*.npz         a file for each finished episode, so that a kill loses only running episodes
+"""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import nullcontext
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing, nullcontext
 from numbers import Real
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
+from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from lw_torchrl._util.checks import differences, typed
-from lw_torchrl._util.files import AnyPath, flush, locked, read_json, write_json
-from lw_torchrl._util.versions import SIMULATORS, package_versions, version_changes
+from lw_torchrl._util.checks import Count, Scale, differences, typed
+from lw_torchrl._util.files import AnyPath, flush, locked, read_json, replacing, write_json
+from lw_torchrl._util.progress import Progress
+from lw_torchrl._util.reproducibility import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import dataset
-from lw_torchrl.data.behaviours import Behaviour, behaviour_of
-from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations, write_metadata
-from lw_torchrl.data.memory_map import describe_episode, verify, write_rows
-from lw_torchrl.data.missing_episodes import EpisodeFiles, run_missing_episodes
+from lw_torchrl.data.collection_policy import Behaviour, SegmentActor, behaviour_of, segment_plans
+from lw_torchrl.data.dataset import (
+    COLUMNS,
+    TRAJECTORY,
+    CollectConfig,
+    DatasetError,
+    Demonstrations,
+    describe_episode,
+    verify,
+    write_metadata,
+    write_rows,
+)
+from lw_torchrl.envs.episodes import policy_of, read_action, run_episodes
+from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import task_id
-from lw_torchrl.modules.networks import evaluating
-from lw_torchrl.modules.policy import tasks_of
+from lw_torchrl.modules.parts import evaluating
+from lw_torchrl.modules.policy import plans_of, tasks_of, transform_of
+from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
+from lw_torchrl.transforms.qaf import QAFTransform
+
+_STORED = [key for key in COLUMNS if key != TRAJECTORY]
+_RECORDED = [key for key in _STORED if not key[-1].startswith("reward")] + [("next", "reward")]
+_FAILED = b"FAILED"  # the content of the file of an episode that failed and is drawn again
+_MAX_ATTEMPTS = 20  # episodes run for each kept one, before redrawing gives up
+
+_Actor = Callable[[TensorDictBase], TensorDictBase]
+
+
+class EpisodeFiles:
+    """The files of finished episodes in a folder, one for each episode."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def _path(self, task: str, episode: int) -> Path:
+        return self.folder / f"{task.replace('/', '+')}.{episode}.npz"
+
+    def put(self, task: str, episode: int, steps: TensorDictBase | None) -> None:
+        """Write an episode's rows; None for a failure that is drawn again."""
+        with replacing(self._path(task, episode), sync=False) as path, path.open("wb") as file:
+            if steps is None:
+                file.write(_FAILED)
+            else:
+                np.savez(file, **{"/".join(key): steps.get(key).numpy() for key in _STORED})
+
+    def has(self, task: str, episode: int) -> bool:
+        return self._path(task, episode).is_file()
+
+    def is_kept(self, task: str, episode: int) -> bool:
+        return self._path(task, episode).stat().st_size != len(_FAILED)
+
+    def get(self, task: str, episode: int) -> TensorDict:
+        """Return the rows of an episode; DatasetError if its file is damaged."""
+        path = self._path(task, episode)
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+                columns = {key: torch.from_numpy(arrays["/".join(key)]) for key in _STORED}
+            return TensorDict(columns, [len(columns["episode",])])
+        except Exception as error:  # zipfile and numpy raise many kinds of errors
+            raise DatasetError(f"root: {str(path)!r} is damaged ({error}); delete this file to run it again") from error
+
+
+def _kept_and_missing(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
+    """Return the kept episodes of each task, and those still to run; ``num_envs`` and interruptions do not matter."""
+    kept: dict[str, list[int]] = {}
+    wanted: dict[str, list[int]] = {}
+    for task in config.tasks:
+        kept[task], candidate = [], 0
+        while len(kept[task]) < config.episodes_per_task and files.has(task, candidate):
+            if files.is_kept(task, candidate):
+                kept[task].append(candidate)
+            candidate += 1
+        missing = config.episodes_per_task - len(kept[task])
+        if missing and candidate >= config.episodes_per_task * _MAX_ATTEMPTS:
+            raise RuntimeError(
+                f"task {task!r}: only {len(kept[task])} of {candidate} episodes of {config.behaviour!r} succeeded; "
+                "lower the noise_scale or set redraw_failures=False"
+            )
+        ahead = range(candidate, candidate + missing)
+        wanted[task] = [episode for episode in ahead if not files.has(task, episode)]
+    return kept, wanted
+
+
+def _clipped(policy: _Actor, size: int) -> _Actor:
+    """Return ``policy`` with its action clipped, and the action before that as ``unclipped_action``."""
+
+    def run(tensordict: TensorDictBase) -> TensorDictBase:
+        tensordict = policy(tensordict)
+        action = read_action(tensordict, size)
+        return tensordict.set("unclipped_action", action).set("action", action.clamp(-1.0, 1.0))
+
+    return run
+
+
+def _env_and_actor(config: CollectConfig, policy: Any, env: LanguageWorldEnv) -> tuple[EnvBase, _Actor]:
+    """Return the environment with the transform that the policy needs, and the policy."""
+    if config.policy.kind == "expert":
+        policy = suite_expert(env.suite, config.tasks)
+        if plans_of(policy) is None:
+            return env, policy
+    if policy is None:
+        plans = segment_plans(config.tasks, env.suite)
+        actor: _Actor = SegmentActor(config.policy, plans, config.seed, config.max_steps, skills=env.suite.skills)
+        transform: Transform | None = QAFTransform(plans)
+    else:
+        actor, transform = policy_of(policy), transform_of(policy, plans_of(policy))
+    transformed = env if transform is None else TransformedEnv(env, transform)
+    return transformed, _clipped(actor, env.layout.action_size)
+
+
+def suite_expert(suite: Suite, tasks: Sequence[str]) -> Any:
+    """Return a suite's own expert, or its scripted skills following its plans; ValueError if it has neither."""
+    if suite.make_expert is not None:
+        return suite.make_expert(tasks)
+    if suite.plans is None or suite.skills is None:
+        raise ValueError(f"policy='expert': suite {suite.name!r} has no plans with scripted skills; give a policy")
+    suite.plans.require(tasks)
+    return ScriptedSkillActor(Plans([suite.plans[task] for task in tasks]), skills=suite.skills)
+
+
+def run_missing_episodes(
+    config: CollectConfig, policy: Any, files: EpisodeFiles, num_envs: int | None, suite: Suite, progress: bool
+) -> dict[str, list[int]]:
+    """Run episodes until the files hold all; return the kept ones of each task."""
+    kept, wanted = _kept_and_missing(config, files)
+    missing = sum(map(len, wanted.values()))
+    if not missing:
+        return kept
+    base = LanguageWorldEnv(
+        config.tasks,
+        suite=suite,
+        num_envs=max(len(config.tasks), min(50, missing)) if num_envs is None else num_envs,
+        seed=config.seed,
+        reward="dense",
+        max_steps=config.max_steps,
+        strict=policy is not None,
+    )
+    env, actor = _env_and_actor(config, policy, base)
+    scales = np.array(config.noise_scale)[:, None].repeat(base.layout.action_size, 1)
+    scales[:, base.layout.effort] *= config.gripper_noise_factor
+    total = config.episodes_per_task * len(config.tasks)
+    before = (total - missing) * config.max_steps
+    bar = Progress("collecting", total * config.max_steps, "step", initial=before, show=progress)
+    deterministic = set_exploration_type(ExplorationType.DETERMINISTIC)
+    with bar, closing(env), torch.no_grad(), deterministic:
+        while missing:
+            bar.set_done((total - missing) * config.max_steps)  # steps back by the failures that are drawn again
+            episodes = run_episodes(
+                env,
+                actor,
+                wanted,
+                keys=_RECORDED,
+                noise=(lambda n: scales[n % len(scales)]) if any(config.noise_scale) else None,
+                noise_hold=config.noise_hold,
+                clean_action="expert_action",
+                on_progress=bar.update,
+            )
+            for task, episode, steps in episodes:
+                keep = not config.redraw_failures or bool(steps.get(("next", "success")).any())
+                steps.rename_key_(("next", "reward"), ("next", "reward_dense"))
+                steps.set(("next", "reward_sparse"), steps.get(("next", "success")).float())
+                files.put(task, episode, steps if keep else None)
+            kept, wanted = _kept_and_missing(config, files)
+            missing = sum(map(len, wanted.values()))
+    return kept
 
 
 def _begin(root: Path, config: CollectConfig) -> dict[str, str]:
-    """Begin or resume a dataset; return the versions of packages that it was begun with."""
+    """Begin or resume a dataset; return the versions of packages with which it was begun."""
     path = root / dataset.PARTIAL / "begun.json"
     versions = package_versions()
     if not path.is_file():
@@ -47,10 +215,11 @@ def _begin(root: Path, config: CollectConfig) -> dict[str, str]:
 
 def _check_same(before: CollectConfig, config: CollectConfig, root: Path) -> None:
     if before != config:
-        was, now = (one.to_json() | {"policy": one.policy.to_json()} for one in (before, config))
-        changes = ", ".join(differences(was, now))
-        other = f"root: {str(root)!r} holds a dataset of another configuration ({changes})"
-        raise DatasetError(f"{other}; choose another folder, or delete it to start again")
+        was, now = (each.to_json() | {"policy": each.policy.to_json()} for each in (before, config))
+        raise DatasetError(
+            f"root: {str(root)!r} holds a dataset of another configuration ({', '.join(differences(was, now))}); "
+            "choose another folder, or delete it to start again"
+        )
 
 
 def _assemble(
@@ -63,7 +232,7 @@ def _assemble(
     def episodes() -> Iterator[TensorDictBase]:
         for number, (task, episode) in enumerate(listed):
             rows = files.get(task, episode)
-            rows.set(("collector", "traj_ids"), torch.full(rows.batch_size, number))
+            rows.set(TRAJECTORY, torch.full(rows.batch_size, number))
             start = infos[-1].start + infos[-1].length if infos else 0
             infos.append(describe_episode(task, episode, start, rows))
             yield rows
@@ -80,7 +249,7 @@ def _assemble(
 
 
 def _finished(root: Path, config: CollectConfig) -> Demonstrations | None:
-    """The finished dataset in a folder, compared with its checksums; None if there is none."""
+    """Return the finished dataset in a folder, after comparing it with its checksums; None if there is none."""
     if not (root / dataset.METADATA).is_file():
         return None
     demonstrations = dataset.read_metadata(root)
@@ -93,18 +262,18 @@ def _finished(root: Path, config: CollectConfig) -> Demonstrations | None:
 def collect_demonstrations(
     tasks: str | Iterable[str],
     *,
-    episodes_per_task: int,
+    episodes_per_task: Count,
     root: AnyPath,
     suite: str | Suite | None = None,
     policy: str | Behaviour | TensorDictModuleBase | Callable[[TensorDictBase], TensorDictBase] = "expert",
     behaviour: str | None = None,
     seed: int = 0,
     noise_scale: float | Iterable[float] = 0.0,
-    noise_hold: int = 1,
-    gripper_noise_factor: float = 0.2,
+    noise_hold: Count = 1,
+    gripper_noise_factor: Scale = 0.2,
     redraw_failures: bool = False,
-    max_steps: int | None = None,
-    num_envs: int | None = None,
+    max_steps: Count | None = None,
+    num_envs: Count | None = None,
     progress: bool = True,
 ) -> Demonstrations:
     """Run Meta-World's scripted experts, or other policies, and write their episodes to a dataset.
@@ -127,12 +296,12 @@ def collect_demonstrations(
         episodes_per_task: number of episodes of each task to keep.
         root: the dataset's folder, new or left by an earlier call.
         suite: the :class:`~lw_torchrl.suites.Suite` of the tasks; None for the suite that their names begin with.
-        policy: who acts in the whole dataset. A name in :data:`BEHAVIOURS`: "expert" (Meta-World's script),
-            "scripted", "spoilt-60", "spoilt-30", "wrong" or "random"; a :class:`Behaviour`; a trained policy,
-            any TensorDictModule or a function, run as :func:`evaluate` runs it: it reads ``observation`` (N, 39)
-            float32, ``task_id`` and ``episode`` (N,) int64, and ``qaf`` if it has ``plans``, and writes ``action``
-            (N, 4) float32. Its action in a row must depend only on that row. A function is identified by its label
-            only: resume with the same function.
+        policy: the policy of the whole dataset. A name in :data:`BEHAVIOURS`: "expert" (Meta-World's script),
+            "scripted", "spoilt-60", "spoilt-30", "wrong" or "random"; a :class:`Behaviour`; a trained policy, any
+            TensorDictModule or a function, run as :func:`evaluate` runs it. It reads ``observation`` (N, 39) float32,
+            ``task_id`` and ``episode`` (N,) int64, and ``qaf`` if it has ``plans``, and writes ``action`` (N, 4)
+            float32. Its action in a row must depend only on that row. A function is identified only by its label:
+            resume with the same function.
         behaviour: the label of the episodes, for :class:`EpisodeFilter`; None for the policy's name. Modules and
             functions need a label.
         seed: random seed (use a different one for evaluation).
@@ -158,12 +327,12 @@ def collect_demonstrations(
         (80, {'reach': 1.0})
     """
     tasks = listed_tasks(tasks)
-    found_suite = find_suite(tasks, suite)
-    names = tuple(found_suite.named_tasks(tasks))
+    suite = find_suite(tasks, suite)
+    names = tuple(suite.named_tasks(tasks))
     actor = None if isinstance(policy, (str, Behaviour)) else policy
     known = tasks_of(actor) or names
     if unknown := [task for task in names if task not in known]:
-        raise ValueError(f"tasks must be among the policy's, it was not made for {', '.join(unknown)}")
+        raise ValueError(f"tasks must be among the policy's, which lack {', '.join(unknown)}")
     config = CollectConfig(
         tasks=names,
         episodes_per_task=episodes_per_task,
@@ -172,9 +341,9 @@ def collect_demonstrations(
         noise_hold=noise_hold,
         gripper_noise_factor=gripper_noise_factor,
         redraw_failures=bool(redraw_failures),
-        max_steps=found_suite.max_steps if max_steps is None else max_steps,
-        layout=found_suite.layout,
-        policy=behaviour_of(policy, names, behaviour, found_suite),
+        max_steps=suite.max_steps if max_steps is None else max_steps,
+        layout=suite.layout,
+        policy=behaviour_of(policy, names, behaviour, suite),
     )
     folder, partial = Path(root), Path(root, dataset.PARTIAL)
     if folder.exists() and not folder.is_dir():
@@ -188,7 +357,7 @@ def collect_demonstrations(
     with lock, evaluating(actor) if isinstance(actor, nn.Module) else nullcontext():
         if _finished(folder, config) is None:  # another process may have finished it
             versions, files = _begin(folder, config), EpisodeFiles(partial)
-            kept = run_missing_episodes(config, actor, files, num_envs, found_suite, progress)
+            kept = run_missing_episodes(config, actor, files, num_envs, suite, progress)
             _assemble(folder, config, versions, files, kept)
         for left in (partial, *folder.glob(".metadata.*.tmp.json")):  # a killed process may have left the latter
             shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)

@@ -1,38 +1,50 @@
-"""A demonstration dataset's description: how it was collected, which episodes it holds, and its metadata.json.
+"""A demonstration dataset on disk: its metadata, its rows, memory-mapped, and the checksums of its episodes.
 
-root/data/            the rows, one for each step, in TorchRL's TED layout; see :mod:`.memory_map`
+root/data/            the rows, one for each step, in TorchRL's TED layout: a file for each column
 root/metadata.json    written last: a folder without it is not a finished dataset
-root/.partial/        while collecting: begun.json and the episodes; see :mod:`.missing_episodes`
+root/.partial/        while collecting: begun.json and the episodes; see :mod:`.collect`
 root/.lock            held while collecting
+
+The files in data/ are those of ``TensorDict.memmap``, so ``TensorDict.load_memmap`` reads them too. Here their shapes
+come from :func:`columns_of`, and nothing is unpickled. The map is copy-on-write: a write to a column changes it for
+this process, never the file. The files are not written through a map, since a full disk under a map ends the process
+without an error.
 """
 
 from __future__ import annotations
 
+import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
 from reprlib import repr as short
+from types import MappingProxyType
 from typing import Any
+from zlib import crc32
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from lw_torchrl._util.checks import Count, Scale, check_value, typed_fields
-from lw_torchrl._util.files import AnyPath, read_json, write_json
-from lw_torchrl.data.behaviours import EXPERT, NOISY, Behaviour, check_own_label
+from lw_torchrl._util.files import AnyPath, flush, read_json, write_json
+from lw_torchrl._util.progress import Progress
+from lw_torchrl.data.collection_policy import EXPERT, NOISY, Behaviour, check_own_label
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.tasks import resolve_tasks
 
 DATA, METADATA, PARTIAL, LOCK = "data", "metadata.json", ".partial", ".lock"
+FORMAT, FORMAT_VERSION = "lw_torchrl.demonstrations", 2
+TRAJECTORY, REWARD, DONE = ("collector", "traj_ids"), ("next", "reward"), ("next", "done")
+DATASET = "dataset"  # the column with the index of a row's folder, if several folders are joined
 
 
 class DatasetError(ValueError):
-    """A folder that holds no finished dataset of this format, or a damaged one."""
-
-
-def _own_tasks(tasks: tuple[str, ...], layout: Layout) -> tuple[str, ...]:
-    """The names of another suite's tasks, sorted; the suite itself need not be installed."""
-    if not tasks or not all(task.startswith(f"{layout.name}/") for task in tasks):
-        raise ValueError(f"tasks must be named '{layout.name}/...', got {short(tasks)}")
-    return tuple(sorted(tasks))
+    """A folder does not hold a finished dataset of this format, or its files are damaged."""
 
 
 @typed_fields
@@ -42,13 +54,13 @@ class CollectConfig:
     ``tasks`` are names, sorted; ``noise_scale`` holds a number for each episode in turn, (0.0,) for none."""
 
     tasks: tuple[str, ...]
-    episodes_per_task: int
+    episodes_per_task: Count
     seed: int
     noise_scale: tuple[float, ...] = (0.0,)
-    noise_hold: int = 1
-    gripper_noise_factor: float = 0.2
+    noise_hold: Count = 1
+    gripper_noise_factor: Scale = 0.2
     redraw_failures: bool = False
-    max_steps: int = 500
+    max_steps: Count = 500
     policy: Behaviour = EXPERT
     layout: Layout = METAWORLD
 
@@ -56,20 +68,20 @@ class CollectConfig:
         check_own_label(self.policy)
         if not self.noise_scale:
             raise ValueError("noise_scale must hold at least one number, got an empty sequence")
-        checked = {
-            "tasks": resolve_tasks(self.tasks) if self.layout == METAWORLD else _own_tasks(self.tasks, self.layout),
-            "episodes_per_task": check_value("episodes_per_task", self.episodes_per_task, Count),
-            "seed": check_value("seed", self.seed, int),
-            "noise_scale": tuple(check_value("noise_scale", scale, Scale) for scale in self.noise_scale),
-            "noise_hold": check_value("noise_hold", self.noise_hold, Count),
-            "gripper_noise_factor": check_value("gripper_noise_factor", self.gripper_noise_factor, Scale),
-            "max_steps": check_value("max_steps", self.max_steps, Count),
-        }
-        for name, value in checked.items():
+        if self.layout == METAWORLD:
+            tasks = resolve_tasks(self.tasks)
+        else:  # another suite's, which need not be installed to read a dataset of its tasks
+            tasks = tuple(sorted(self.tasks))
+            if not tasks or not all(task.startswith(f"{self.layout.name}/") for task in tasks):
+                raise ValueError(f"tasks must be named '{self.layout.name}/...', got {short(self.tasks)}")
+        # beartype looks at only one item of a tuple.
+        noise_scale = tuple(check_value("noise_scale", scale, Scale) for scale in self.noise_scale)
+        numbers = {name: value.item() for name, value in vars(self).items() if isinstance(value, np.generic)}
+        for name, value in {"tasks": tasks, "noise_scale": noise_scale, **numbers}.items():
             object.__setattr__(self, name, value)
 
     def to_json(self) -> dict[str, Any]:
-        """As JSON; without ``policy`` for the expert, and without ``layout`` for Meta-World's."""
+        """Return the configuration as JSON, without ``policy`` for the expert and ``layout`` for Meta-World's."""
         config = {each.name: getattr(self, each.name) for each in fields(self)}
         config |= {"tasks": list(self.tasks), "noise_scale": list(self.noise_scale)}
         for key, default in (("policy", EXPERT), ("layout", METAWORLD)):
@@ -79,7 +91,7 @@ class CollectConfig:
 
     @classmethod
     def from_json(cls, config: Mapping[str, Any]) -> CollectConfig:
-        """The configuration that :meth:`to_json` gave."""
+        """Return the configuration that :meth:`to_json` described."""
         options = {**config, "tasks": tuple(config["tasks"]), "noise_scale": tuple(config["noise_scale"])}
         for key, parse in (("policy", Behaviour.from_json), ("layout", Layout.from_json)):
             if key in options:
@@ -88,7 +100,7 @@ class CollectConfig:
 
     @property
     def behaviour(self) -> str:
-        """The label of its episodes: who acts; "noisy" for an expert executed with noise."""
+        """The label of the episodes: the collecting policy's; "noisy" for an expert executed with noise."""
         return NOISY if self.policy == EXPERT and any(self.noise_scale) else self.policy.name
 
 
@@ -108,12 +120,12 @@ class EpisodeInfo:
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """A finished dataset, described; :class:`LanguageWorldExperienceReplay` reads its rows.
+    """The description of a finished dataset; :class:`LanguageWorldExperienceReplay` reads its rows.
 
     Attributes:
         root, config: its folder, and how it was collected.
-        versions: of the packages that it was begun with.
-        task_ids: task name to its number in the files; rows are shown with the present :func:`~lw_torchrl.task_id`.
+        versions: package name to the version with which collecting began.
+        task_ids: task name to its number in the files; loaded rows have the present :func:`~lw_torchrl.task_id`.
         episodes: in the order of the rows.
         attempts: task name to the number of episodes run, with the failures that were redrawn.
     """
@@ -137,12 +149,8 @@ class Demonstrations:
         return {task: succeeded[task] / number for task, number in kept.items()}
 
 
-FORMAT = "lw_torchrl.demonstrations"
-FORMAT_VERSION = 2
-
-
 def write_metadata(demonstrations: Demonstrations) -> None:
-    """Write the metadata, which makes the dataset a finished one."""
+    """Write the metadata, which finishes the dataset."""
     metadata: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "config": demonstrations.config.to_json()}
     metadata |= {key: getattr(demonstrations, key) for key in ("versions", "task_ids", "attempts")}
     names = EpisodeInfo.__dataclass_fields__
@@ -156,9 +164,10 @@ def read_metadata(root: AnyPath) -> Demonstrations:
     path = folder / METADATA
     if not folder.is_dir():
         raise FileNotFoundError(f"root: no dataset folder {str(folder)!r}; make one with collect_demonstrations")
-    if (folder / PARTIAL).is_dir() and not path.is_file():
-        unfinished = f"root: the dataset in {str(folder)!r} is unfinished"
-        raise DatasetError(f"{unfinished}; the same collect_demonstrations resumes it")
+    if not path.is_file() and (folder / PARTIAL).is_dir():
+        raise DatasetError(
+            f"root: the dataset in {str(folder)!r} is unfinished; the same collect_demonstrations resumes it"
+        )
     if not path.is_file():
         raise DatasetError(f"root: {str(folder)!r} is not a dataset: it has no {METADATA}")
     try:
@@ -169,13 +178,13 @@ def read_metadata(root: AnyPath) -> Demonstrations:
         raise damaged(f"the metadata {str(path)!r} are damaged ({type(error).__name__}: {error})") from error
 
 
-def damaged(what: str) -> DatasetError:
+def damaged(problem: str) -> DatasetError:
     """The error for a dataset whose files differ from what was written; the caller raises it."""
-    return DatasetError(f"root: {what}; delete the folder and collect the dataset again")
+    return DatasetError(f"root: {problem}; delete the folder and collect the dataset again")
 
 
 def parse_metadata(metadata: Mapping[str, Any], folder: Path) -> Demonstrations:
-    """The description in metadata; DatasetError if they are of another version."""
+    """Return the description in metadata; DatasetError for another version, another error for damaged metadata."""
     if (metadata["format"], metadata["version"]) != (FORMAT, FORMAT_VERSION):
         version = f"{short(metadata['format'])} version {short(metadata['version'])}"
         raise DatasetError(
@@ -193,3 +202,144 @@ def parse_metadata(metadata: Mapping[str, Any], folder: Path) -> Demonstrations:
         start += episode.length
     task_ids = {task: int(metadata["task_ids"][task]) for task in config.tasks}
     return Demonstrations(folder, config, metadata["versions"], task_ids, episodes, metadata["attempts"])
+
+
+Column = tuple[str, ...]
+
+
+@cache
+def columns_of(layout: Layout) -> Mapping[Column, tuple[tuple[int, ...], torch.dtype]]:
+    """Return the columns of a dataset, with the shape and dtype of a row."""
+    observation, action = ((layout.size,), torch.float32), ((layout.action_size,), torch.float32)
+    return MappingProxyType(
+        {
+            ("observation",): observation,
+            ("task_id",): ((), torch.int64),
+            ("episode",): ((), torch.int64),
+            ("action",): action,
+            ("expert_action",): action,
+            ("unclipped_action",): action,
+            TRAJECTORY: ((), torch.int64),
+            ("next", "observation"): observation,
+            ("next", "task_id"): ((), torch.int64),
+            ("next", "reward_sparse"): ((1,), torch.float32),
+            ("next", "reward_dense"): ((1,), torch.float32),
+            **{("next", flag): ((1,), torch.bool) for flag in ("success", "done", "terminated", "truncated")},
+        }
+    )
+
+
+COLUMNS = columns_of(METAWORLD)
+"""Meta-World's columns; those of other suites have other sizes."""
+
+
+def _path(folder: Path, key: Column) -> Path:
+    return folder.joinpath(*key[:-1], f"{key[-1]}.memmap")
+
+
+def _meta(rows: int, layout: Layout = METAWORLD) -> dict[str, dict[str, Any]]:
+    """Return each folder's meta.json as TensorDict writes it; "" is the folder of the rows."""
+    folders: dict[str, dict[str, Any]] = {"": {}}
+    for (*parents, name), (shape, dtype) in columns_of(layout).items():
+        for parent in parents:
+            folders[""][parent] = {"type": "TensorDict"}
+        leaf = {"device": "cpu", "shape": [rows, *shape], "dtype": str(dtype), "is_nested": False}
+        folders.setdefault("/".join(parents), {})[name] = leaf
+    about = {"shape": [rows], "device": "cpu", "_type": "<class 'tensordict._td.TensorDict'>"}
+    return {folder: entries | about for folder, entries in folders.items()}
+
+
+def write_rows(folder: Path, episodes: Iterable[TensorDictBase], layout: Layout) -> None:
+    """Write episodes one after another, and flush them to the disk; an :class:`OSError` leaves some of them there."""
+    rows = 0
+    for name in _meta(0):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        files = {key: stack.enter_context(_path(folder, key).open("wb")) for key in COLUMNS}
+        for steps in episodes:
+            rows += len(steps)
+            for key, file in files.items():
+                file.write(steps.get(key).contiguous().numpy().data)
+    for name, entries in _meta(rows, layout).items():
+        (folder / name / "meta.json").write_text(json.dumps(entries, separators=(",", ":")), encoding="utf-8")
+    for path in sorted(folder.rglob("*"), reverse=True):
+        flush(path)
+    flush(folder)
+
+
+def describe_episode(task: str, episode: int, start: int, rows: TensorDictBase) -> EpisodeInfo:
+    """Describe an episode by its rows, whose first has the index ``start`` in the dataset."""
+    checksum = 0
+    for key in COLUMNS:
+        checksum = crc32(rows.get(key).contiguous().numpy().data, checksum)
+    successes = rows.get(("next", "success")).flatten().nonzero().flatten()
+    first = int(successes[0]) + 1 if len(successes) else None
+    return EpisodeInfo(task, episode, start, len(rows), first is not None, first, checksum)
+
+
+class MappedColumn(Tensor):
+    """A column in its file. A spawned process maps the file again; results of operations are plain tensors."""
+
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+    _source: tuple[Path, tuple[int, ...], torch.dtype]
+
+    @staticmethod
+    def of(path: Path, shape: tuple[int, ...], dtype: torch.dtype) -> MappedColumn:
+        """Map a file that holds exactly such a column; OSError, ValueError or RuntimeError for another."""
+        content = torch.from_numpy(np.memmap(path, np.uint8, "c"))
+        column = content.view(dtype).view(shape).as_subclass(MappedColumn)
+        column._source = (path.absolute(), shape, dtype)
+        return column
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        return MappedColumn.of, self._source
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Tensor:
+        return self.clone()
+
+
+def load_rows(demonstrations: Demonstrations) -> TensorDict:
+    """Return all rows of a dataset, memory-mapped; DatasetError if a file is missing or has another size."""
+    folder, number = demonstrations.root / DATA, demonstrations.num_steps
+    try:
+        columns = {
+            key: MappedColumn.of(_path(folder, key), (number, *shape), dtype)
+            for key, (shape, dtype) in columns_of(demonstrations.config.layout).items()
+        }
+    except (OSError, ValueError, RuntimeError) as error:
+        raise damaged(f"the rows in {str(folder)!r} are damaged ({error})") from error
+    return TensorDict(columns, [number], device="cpu")
+
+
+# For each folder, the state of its files when this process verified episodes of it, and these episodes.
+_VERIFIED: dict[Path, tuple[list[Any], set[EpisodeInfo]]] = {}
+
+
+def whole_episodes(demonstrations: Demonstrations, *, progress: bool) -> list[EpisodeInfo]:
+    """Return the episodes whose rows match their checksums."""
+    rows, whole = load_rows(demonstrations), []
+    with Progress("checking", len(demonstrations.episodes), "episode", show=progress) as bar:
+        for info in demonstrations.episodes:
+            if _is_whole(info, rows):
+                whole.append(info)
+            bar.update()
+    return whole
+
+
+def _is_whole(info: EpisodeInfo, rows: TensorDictBase) -> bool:
+    return describe_episode(info.task, info.episode, info.start, rows[info.start : info.start + info.length]) == info
+
+
+def verify(demonstrations: Demonstrations, episodes: Sequence[EpisodeInfo]) -> None:
+    """Raise DatasetError unless episodes match their checksums; each is compared once while the files do not change."""
+    rows, root = load_rows(demonstrations), demonstrations.root.resolve()
+    states = [path.stat() for path in (root / METADATA, *(_path(root / DATA, key) for key in COLUMNS))]
+    files = [(state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns) for state in states]
+    files_before, known = _VERIFIED.get(root, (files, set()))
+    if files != files_before:
+        known = set()
+    for info in episodes:
+        if info not in known and not _is_whole(info, rows):
+            episode = f"episode {info.episode} of {info.task!r}"
+            raise damaged(f"the rows in {str(root)!r} are damaged: {episode} differs from its checksum")
+    _VERIFIED[root] = (files, known | set(episodes))

@@ -9,13 +9,23 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict
 
 from lw_torchrl._util.checks import Count, Natural, Probability, check_value, typed, unknown_name
 from lw_torchrl._util.devices import check_device, finite
 from lw_torchrl._util.files import AnyPath
-from lw_torchrl.data.dataset import DatasetError, Demonstrations, read_metadata
-from lw_torchrl.data.memory_map import load_rows, verify
+from lw_torchrl.data.dataset import (
+    DATASET,
+    DONE,
+    REWARD,
+    TRAJECTORY,
+    DatasetError,
+    Demonstrations,
+    load_rows,
+    read_metadata,
+    verify,
+)
+from lw_torchrl.data.rewards import REWARDS, STEPS, RewardName, n_step_returns
 from lw_torchrl.data.selection import (
     EpisodeChoice,
     EpisodeFilter,
@@ -26,17 +36,6 @@ from lw_torchrl.data.selection import (
     kept_rows,
     returns_of,
 )
-from lw_torchrl.data.storage import (
-    DATASET,
-    DEMONSTRATION,
-    DONE,
-    REWARD,
-    REWARDS,
-    STEPS,
-    TRAJECTORY,
-    RewardName,
-    column_name,
-)
 
 _FLAGS = ("done", "terminated", "truncated")
 ROLLOUT: tuple[NestedKey, ...] = (
@@ -44,47 +43,7 @@ ROLLOUT: tuple[NestedKey, ...] = (
     ("next", "reward"), ("next", "success"), *(("next", flag) for flag in _FLAGS),
 )  # fmt: skip
 """The columns of a dataset that rollouts of :class:`LanguageWorldEnv` have too."""
-
-
-def n_step_returns(rollout: TensorDictBase, n_steps: int, gamma: float) -> TensorDictBase:
-    """Look n steps ahead in each row of a rollout, or fewer where its trajectory ends or the rollout is cut.
-
-    All entries under ``"next"`` become those of the last step on the way, the ends of episodes too (TorchRL's
-    ``MultiStep`` leaves those of the first step). ``("next", "reward")`` becomes the discounted sum, and
-    ``steps_to_next_obs``, int64 of the rollout's shape, the number of steps, which TorchRL's value estimators read.
-
-    Args:
-        rollout: (..., T) with ("next", "reward") and ("next", "done"), (..., T, 1); a trajectory also ends where
-            ("collector", "traj_ids") changes, if it is there.
-        n_steps: at least 1.
-        gamma: the discount, in (0, 1]; the loss must use the same.
-
-    Example:
-        >>> done = torch.tensor([False, False, True, False])[:, None]
-        >>> after = TensorDict(reward=torch.ones(4, 1), done=done, x=torch.arange(4))
-        >>> rollout = TensorDict(next=after).auto_batch_size_(1)
-        >>> ahead = n_step_returns(rollout, 2, gamma=0.5)
-        >>> ahead["next", "reward"].flatten().tolist(), ahead["next", "x"].tolist()
-        ([1.5, 1.5, 1.0, 1.0], [1, 2, 2, 3])
-    """
-    check_value("n_steps", n_steps, Count)
-    if not check_value("gamma", gamma, Probability):
-        raise ValueError("gamma must be above 0, got 0")
-    rows = rollout.reshape(-1)
-    end = rows.get(DONE).reshape(-1).clone()
-    end[rollout.shape[-1] - 1 :: rollout.shape[-1]] = True
-    if (trajectory := rows.get(TRAJECTORY, None)) is not None:
-        end[:-1] |= trajectory[1:] != trajectory[:-1]
-    row = torch.arange(len(end), device=end.device)
-    next_end = torch.where(end, row, len(end) - 1).flip(0).cummin(0).values.flip(0)
-    last = torch.minimum(row + n_steps - 1, next_end)
-    reward = rows.get(REWARD)
-    earned = reward.clone()
-    for ahead in range(1, n_steps):  # summed in the order of time
-        inside = (row + ahead <= last).nonzero().flatten()
-        earned[inside] += gamma**ahead * reward[inside + ahead]
-    later = rows.get("next")[last].set("reward", earned)
-    return rows.exclude("next").update({"next": later, STEPS: last - row + 1}).reshape(rollout.shape)
+Keys = Literal["rollout"] | Iterable[NestedKey]
 
 
 def _read_part(
@@ -108,23 +67,22 @@ def _read_part(
     if label == "executed" and after is not None:
         ends = torch.zeros(len(kept), 1, dtype=torch.bool)
         ends[lengths.cumsum(0) - 1] = True
-        rows.set(DONE, ends)
+        terminated = ends & rows.get(("next", "success"))
+        rows.set(DONE, ends).set(("next", "truncated"), ends & ~terminated if terminate else ends)
         if terminate:
-            rows.set(("next", "terminated"), ends & rows.get(("next", "success")))
-            rows.set(("next", "truncated"), ends & ~rows.get(("next", "success")))
-        else:
-            rows.set(("next", "truncated"), ends)
+            rows.set(("next", "terminated"), terminated)
     return rows
 
 
-def _choose_keys(rows: TensorDict, keys: Literal["rollout"] | Iterable[NestedKey]) -> TensorDict:
+def _choose_keys(rows: TensorDict, keys: Keys) -> TensorDict:
     """Select columns, after adding the flags that precede each step of a rollout (all false), which no file holds."""
     for flag in _FLAGS:
         rows.set(flag, torch.zeros(len(rows), 1, dtype=torch.bool))
     known = list(rows.keys(True, True))
     for key in (chosen := list(ROLLOUT if keys == "rollout" else keys)):
         if key not in known:
-            raise unknown_name("keys", column_name(key), sorted(map(column_name, known)))
+            name, *names = ("/".join((each,) if isinstance(each, str) else each) for each in (key, *known))
+            raise unknown_name("keys", name, sorted(names))
     return rows.select(*chosen)
 
 
@@ -138,80 +96,92 @@ class Loaded:
     is_joined: bool  # folders are joined or episodes chosen
 
 
-def load(
-    root: AnyPath | Iterable[AnyPath],
-    *,
-    episodes: EpisodeChoice | Sequence[EpisodeChoice] = None,
-    keep: EpisodeFilter | None = None,
-    label: Label = "expert",
-    reward: RewardName = "sparse",
-    after_success: int | None = None,
-    terminate_on_success: bool = False,
-    n_steps: int = 1,
-    gamma: float | None = None,
-    keys: Literal["rollout"] | Iterable[NestedKey] | None = None,
-    device: str | torch.device | None = None,
-    check: bool = True,
-) -> Loaded:
-    """Load rows with their descriptions; see :func:`load_demonstrations`."""
-    if check_value("n_steps", n_steps, Count) > 1 and gamma is None:
+def _check_options(
+    label: Label, after_success: int | None, terminate_on_success: bool, n_steps: int, gamma: float | None, keys: Any
+) -> None:
+    """Raise :class:`ValueError` for options that exclude or need each other."""
+    if n_steps > 1 and gamma is None:
         raise ValueError(f"n_steps={n_steps} needs gamma, the loss's discount")
     if n_steps == 1 and gamma is not None:
-        raise ValueError(f"gamma needs n_steps of 2 or more, got gamma={gamma!r} with n_steps=1")
+        raise ValueError(f"gamma={gamma!r} needs n_steps of 2 or more, got 1")
     if (n_steps > 1 or terminate_on_success or keys == "rollout") and label != "executed":
         raise ValueError(f"n_steps, terminate_on_success and keys='rollout' need label='executed', got {label!r}")
     if terminate_on_success and after_success is not None:
         raise ValueError("terminate_on_success ends episodes at success; leave out after_success")
-    joined = not isinstance(root, (str, os.PathLike))
-    folders: list[Any] = list(root) if joined else [root]  # type: ignore[arg-type]
-    for folder in folders:
-        check_value("root", folder, AnyPath)
-    twice = episodes is None and len({Path(folder).resolve() for folder in folders}) < len(folders)
-    if not folders or twice:
-        raise ValueError(f"root must be a folder, or a list that names each folder once, got {root}")
-    if joined and episodes is not None:
-        if not isinstance(episodes, Sequence) or len(episodes) != len(folders):
-            raise ValueError(
-                f"episodes must be a list with one choice for each of the {len(folders)} folders, got {episodes!r}"
-            )
-        choices: list[Any] = list(episodes)
-    else:
-        choices = [episodes] * len(folders)
+
+
+def _folders_and_choices(
+    root: AnyPath | Iterable[AnyPath], episodes: EpisodeChoice | Sequence[EpisodeChoice]
+) -> tuple[list[AnyPath], list[Any]]:
+    """Return the folders, and the choice of episodes in each."""
+    if isinstance(root, (str, os.PathLike)):
+        return [root], [episodes]
+    folders = [check_value("root", folder, AnyPath) for folder in root]
+    is_repeated = episodes is None and len({Path(folder).resolve() for folder in folders}) < len(folders)
+    if not folders or is_repeated:
+        raise ValueError(f"root must be a folder, or a list that names each folder once, got {folders}")
+    if episodes is None:
+        return folders, [None] * len(folders)
+    if not isinstance(episodes, Sequence) or len(episodes) != len(folders):
+        raise ValueError(f"episodes must be a list of {len(folders)} choices, one for each folder, got {episodes!r}")
+    return folders, list(episodes)
+
+
+def load(
+    root: AnyPath | Iterable[AnyPath],
+    *,
+    episodes: EpisodeChoice | Sequence[EpisodeChoice],
+    keep: EpisodeFilter | None,
+    label: Label,
+    reward: RewardName,
+    after_success: int | None,
+    terminate_on_success: bool,
+    n_steps: int,
+    gamma: float | None,
+    keys: Keys | None,
+    device: str | torch.device | None,
+    check: bool,
+) -> Loaded:
+    """Load rows with their descriptions; see :func:`load_demonstrations`, which checks the arguments' types."""
+    _check_options(label, after_success, terminate_on_success, n_steps, gamma, keys)
+    is_list = not isinstance(root, (str, os.PathLike))
+    folders, choices = _folders_and_choices(root, episodes)
     whole = [read_metadata(folder) for folder in folders]
     check_label(label, whole)
     check_behaviours(whole)
     parts = [
-        choose_episodes(found, choice, f"episodes[{number}]" if joined else "episodes")
-        for number, (found, choice) in enumerate(zip(whole, choices, strict=True))
+        choose_episodes(dataset, choice, f"episodes[{number}]" if is_list else "episodes")
+        for number, (dataset, choice) in enumerate(zip(whole, choices, strict=True))
     ]
-    for found, chosen in zip(whole, parts, strict=True) if check else ():
-        verify(found, chosen.episodes)
+    for dataset, chosen in zip(whole, parts, strict=True) if check else ():
+        verify(dataset, chosen.episodes)
     sizes = [(part.config.layout.size, part.config.layout.action_size) for part in parts]
     if len(set(sizes)) > 1:
         raise ValueError(f"root: the folders must have rows of one layout, got observation and action sizes {sizes}")
     after = 0 if terminate_on_success else after_success
     if keep is not None:
-        returns = [returns_of(found, chosen, reward, after) for found, chosen in zip(whole, parts, strict=True)]
+        returns = [returns_of(dataset, chosen, reward, after) for dataset, chosen in zip(whole, parts, strict=True)]
         parts = keep.choose(parts, returns)
     behaviours = tuple(sorted({part.config.behaviour for part in whole}))
-    read, trajectories = [], 0
-    for number, (found, chosen) in enumerate(zip(whole, parts, strict=True)):
-        rows = _read_part(found, chosen, label, reward, after, terminate_on_success)
-        rows.set("behaviour", torch.full(rows.batch_size, behaviours.index(found.config.behaviour)))
-        rows.set(DEMONSTRATION, torch.ones(rows.batch_size, dtype=torch.bool))
+    rows_of_parts, trajectories = [], 0
+    for number, (dataset, chosen) in enumerate(zip(whole, parts, strict=True)):
+        rows = _read_part(dataset, chosen, label, reward, after, terminate_on_success)
+        rows.set("behaviour", torch.full(rows.batch_size, behaviours.index(dataset.config.behaviour)))
+        rows.set("is_demonstration", torch.ones(rows.batch_size, dtype=torch.bool))
         if len(whole) > 1:
             rows.set(TRAJECTORY, rows.get(TRAJECTORY) + trajectories)
             rows.set(DATASET, torch.full(rows.batch_size, number))
-        read.append(rows if keys is None or n_steps > 1 else _choose_keys(rows, keys))
-        trajectories += len(found.episodes)
-    rows = read[0] if len(read) == 1 else torch.cat(read)
+        # n-step returns need columns that the choice may leave out.
+        rows_of_parts.append(rows if keys is None or n_steps > 1 else _choose_keys(rows, keys))
+        trajectories += len(dataset.episodes)
+    rows = rows_of_parts[0] if len(rows_of_parts) == 1 else torch.cat(rows_of_parts)
     if n_steps > 1:
         assert gamma is not None
         rows = n_step_returns(rows, n_steps, gamma)
         rows = rows if keys is None else _choose_keys(rows, keys if keys != "rollout" else (*ROLLOUT, STEPS))
     if device is not None:
         rows = rows.to(check_device("device", device))
-    return Loaded(rows, tuple(parts), behaviours, joined or episodes is not None or keep is not None)
+    return Loaded(rows, tuple(parts), behaviours, is_list or episodes is not None or keep is not None)
 
 
 @typed
@@ -224,8 +194,8 @@ def load_demonstrations(
     reward: RewardName = "sparse",
     after_success: Natural | None = None,
     terminate_on_success: bool = False,
-    n_steps: int = 1,
-    gamma: float | None = None,
+    n_steps: Count = 1,
+    gamma: Probability | None = None,
     keys: Literal["rollout"] | Iterable[NestedKey] | None = None,
     device: str | torch.device | None = None,
     check: bool = True,

@@ -1,6 +1,6 @@
-"""Pictures of a dataset's rows: its episodes are run again and rendered, to a file of PNGs for each episode.
+"""Pictures of a dataset's rows: run its episodes again and render them, to a file of PNGs for each episode.
 
-root/pictures/<cameras>-<height>x<width>-every<k>/<task>.<episode>.zip    "0.png", "1.png", ...: of steps 0, k, 2k, ...
+root/pictures/<cameras>-<height>x<width>-every<k>/<task>.<episode>.zip    "0.png", "1.png", ... for steps 0, k, 2k, ...
 """
 
 from __future__ import annotations
@@ -19,29 +19,34 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv, step_mdp
 
-from lw_torchrl._util.checks import Count, check_value, typed
+from lw_torchrl._util.checks import Count, typed
 from lw_torchrl._util.files import AnyPath, replacing
 from lw_torchrl._util.progress import Progress
 from lw_torchrl._util.rendering import check_cameras
-from lw_torchrl.data.dataset import DatasetError, Demonstrations, EpisodeInfo, read_metadata
-from lw_torchrl.data.memory_map import load_rows, verify
+from lw_torchrl.data.dataset import (
+    TRAJECTORY,
+    DatasetError,
+    Demonstrations,
+    EpisodeInfo,
+    load_rows,
+    read_metadata,
+    verify,
+)
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.transforms.camera import CameraTransform
 
-_TOGETHER = 8  # episodes run again at once
+_TOGETHER = 8  # episodes that run at once
 
 
 @dataclass(frozen=True)
 class Pictures:
+    """The cameras, size and interval of pictures, and their files."""
+
     cameras: tuple[str, ...]
     height: int
     width: int
     every: int
-
-    @classmethod
-    def of(cls, cameras: str | Sequence[str], height: int, width: int, every: int) -> Pictures:
-        return cls(check_cameras(cameras, height, width), height, width, check_value("every", every, Count))
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -55,7 +60,7 @@ class Pictures:
         return -(-episode.length // self.every)
 
     def read(self, root: Path, episode: EpisodeInfo) -> Tensor:
-        """The pictures of an episode, (n, height, width·C, 3) uint8; DatasetError if its file is missing or damaged."""
+        """Return an episode's pictures, (n, height, width·C, 3) uint8; DatasetError if the file is damaged."""
         from PIL import Image
 
         path = self.file(root, episode)
@@ -75,15 +80,15 @@ def add_pictures(
     root: AnyPath,
     cameras: str | Sequence[str] = "corner",
     *,
-    height: int = 64,
-    width: int = 64,
-    every: int = 1,
+    height: Count = 64,
+    width: Count = 64,
+    every: Count = 1,
     progress: bool = True,
 ) -> None:
-    """Render the rows of a dataset, as :class:`CameraTransform` would have while it was collected.
+    """Render the rows of a dataset, as :class:`CameraTransform` would have done during collection.
 
     Each episode is run again with its actions, and must give the stored observations bit for bit. The pictures are
-    saved beside the rows as PNGs. Repeat a call that was killed to resume it.
+    saved in the dataset's folder as PNGs. Repeat a call that was killed to resume it.
 
     Args:
         root: the dataset's folder, of :func:`collect_demonstrations`.
@@ -104,7 +109,8 @@ def add_pictures(
         ...     replay.sample()["pixels"].shape
         torch.Size([8, 64, 64, 3])
     """
-    pictures, dataset = Pictures.of(cameras, height, width, every), read_metadata(Path(root))
+    pictures = Pictures(check_cameras(cameras, height, width), height, width, every)
+    dataset = read_metadata(root)
     verify(dataset, dataset.episodes)
     rows = load_rows(dataset)
     missing = [episode for episode in dataset.episodes if not pictures.file(dataset.root, episode).is_file()]
@@ -112,8 +118,8 @@ def add_pictures(
         for task in dataset.config.tasks:
             episodes = [episode for episode in missing if episode.task == task]
             for start in range(0, len(episodes), _TOGETHER):
-                some = episodes[start : start + _TOGETHER]
-                for episode, images in zip(some, _render(dataset, rows, some, pictures), strict=True):
+                group = episodes[start : start + _TOGETHER]
+                for episode, images in zip(group, _render(dataset, rows, group, pictures), strict=True):
                     _write(pictures.file(dataset.root, episode), images)
                     bar.update(len(images))
 
@@ -121,7 +127,7 @@ def add_pictures(
 def _render(
     dataset: Demonstrations, rows: TensorDictBase, episodes: Sequence[EpisodeInfo], pictures: Pictures
 ) -> list[list[np.ndarray[Any, Any]]]:
-    """The pictures of some episodes of one task, which are run again together."""
+    """Run some episodes of one task again together, and return the pictures of each."""
     task, seed, steps = episodes[0].task, dataset.config.seed, dataset.config.max_steps
     base = LanguageWorldEnv(task, num_envs=len(episodes), seed=seed, max_steps=steps)
     camera = CameraTransform(pictures.cameras, height=pictures.height, width=pictures.width, every=pictures.every)
@@ -154,7 +160,8 @@ def _write(path: Path, pictures: Sequence[np.ndarray[Any, Any]]) -> None:
         for number, picture in enumerate(pictures):
             stream = io.BytesIO()
             Image.fromarray(picture).save(stream, "PNG")
-            archive.writestr(zipfile.ZipInfo(f"{number}.png"), stream.getvalue())  # of no date
+            # ZipInfo has no date of today, so that equal pictures give equal files.
+            archive.writestr(zipfile.ZipInfo(f"{number}.png"), stream.getvalue())
 
 
 @typed
@@ -162,24 +169,26 @@ def load_pictures(
     replay: LanguageWorldExperienceReplay,
     cameras: str | Sequence[str] = "corner",
     *,
-    height: int = 64,
-    width: int = 64,
-    every: int = 1,
+    height: Count = 64,
+    width: Count = 64,
+    every: Count = 1,
 ) -> Tensor:
-    """The pictures of a buffer's rows, for ``replay.add_column("pixels", ...)``: (R, height, width·C, 3) uint8.
+    """Return the pictures of a buffer's rows, for ``replay.add_column("pixels", ...)``: (R, height, width·C, 3) uint8.
 
-    They belong to ``observation``, in the order of ``replay[:]``; rows between two pictures show the earlier one.
-    ``cameras``, ``height``, ``width`` and ``every`` are as given to :func:`add_pictures`. A :class:`DatasetError` (a
-    ValueError) is raised if they are missing or damaged.
+    They show ``observation``, in the order of ``replay[:]``; rows between two pictures have the earlier one. Give
+    ``cameras``, ``height``, ``width`` and ``every`` as to :func:`add_pictures`.
+
+    Raises:
+        DatasetError: (a ValueError) the pictures are missing or damaged.
     """
-    pictures = Pictures.of(cameras, height, width, every)
-    _, lengths = torch.unique_consecutive(replay.storage[:].get(("collector", "traj_ids")), return_counts=True)
+    pictures = Pictures(check_cameras(cameras, height, width), height, width, every)
+    _, lengths = torch.unique_consecutive(replay.storage[:].get(TRAJECTORY), return_counts=True)
     episodes = [(part.root, episode) for part in replay.parts for episode in part.episodes]
     images = torch.empty((int(lengths.sum()), *pictures.shape), dtype=torch.uint8)
     row = 0
     for (root, episode), length in zip(episodes, lengths.tolist(), strict=True):
         if not pictures.file(root, episode).is_file():
-            missing = f"root: {str(root)!r} has no such pictures of {episode.task}, episode {episode.episode}"
+            missing = f"root: {str(root)!r} has no such pictures of episode {episode.episode} of {episode.task!r}"
             raise DatasetError(f"{missing}; render them with lw.data.add_pictures({str(root)!r}, ...)")
         images[row : row + length] = pictures.read(root, episode)[torch.arange(length) // every]
         row += length

@@ -1,11 +1,12 @@
-"""GroupSampler and TaskBalancedSampler: fixed shares of rows from each group, each group in passes of its own."""
+"""Samplers of fixed shares: TaskBalancedSampler, CoLearningSampler, and their base class GroupSampler."""
 
 from __future__ import annotations
 
 import os
 from abc import abstractmethod
+from fractions import Fraction
 from functools import reduce
-from math import gcd
+from math import gcd, isclose
 from pathlib import Path
 from typing import Any
 
@@ -16,31 +17,45 @@ from torch.utils.data import get_worker_info
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
-from lw_torchrl._util.checks import Count, check_value
-from lw_torchrl._util.files import reading
-from lw_torchrl._util.keys import check_key
+from lw_torchrl._util.checks import Count, typed
+from lw_torchrl._util.devices import CPU
+from lw_torchrl._util.files import AnyPath, reading
 from lw_torchrl._util.tensor_files import pop_state, read_tensors, write_tensors
-from lw_torchrl.data.storage import to_device_of
+from lw_torchrl.data.dataset import DATASET
+from lw_torchrl.language.tasks import MT50, Task, task_id
 
 _FILE = "sampler.safetensors"
+_STATE = ("order", "size", "cursor", "credit", "known", "written", "length", "ran_out")
+
+
+def device_of_rows(storage: Storage) -> torch.device:
+    """Return the device of a storage's rows; the CPU for a storage that names none."""
+    device = getattr(storage, "device", None)
+    return CPU if device in (None, "auto") else torch.device(device)
+
+
+def to_device_of(storage: Storage, index: Tensor) -> Tensor:
+    """Copy ``index``, drawn on the CPU, to the device of the rows, without blocking."""
+    device = device_of_rows(storage)
+    return index if device.type == "cpu" else index.to(device, non_blocking=True)
 
 
 def column(storage: Storage, key: NestedKey, rows: Tensor | None = None) -> Tensor:
-    """Return the one value of a column in each row, (R,), or in some rows, on the CPU.
+    """Return the value of a column in each row, or in some rows, on the CPU: (R,).
 
-    A row may hold the value in any shape, for example (1,), or (T,) if rows are pieces of trajectories.
+    A row may hold its value in any shape, for example (1,), or (T,) if rows are pieces of trajectories.
     """
     data = storage.get(slice(0, len(storage)))
     leaves = [row.get(key, None) for row in data] if isinstance(data, list) else [data.get(key, None)]
     if any(leaf is None for leaf in leaves):
-        raise KeyError(f"the storage has no column {key!r}, by which rows are to be grouped")
-    whole = (torch.stack(leaves) if isinstance(data, list) else leaves[0]).flatten(0, storage.ndim - 1)
-    values = (whole if rows is None else whole[rows.to(whole.device)]).cpu()
+        raise KeyError(f"the storage has no column {key!r}, by which rows are grouped")
+    values = (torch.stack(leaves) if isinstance(data, list) else leaves[0]).flatten(0, storage.ndim - 1)
+    values = (values if rows is None else values[rows.to(values.device)]).cpu()
     if values.dim() == 1:
         return values
     values = values.flatten(1)
     if not (values == values[:, :1]).all():
-        raise ValueError(f"column {key!r} must have one value a row, got rows with several; split them by {key!r}")
+        raise ValueError(f"column {key!r} must have one value in each row; split rows with several")
     return values[:, 0]
 
 
@@ -49,28 +64,28 @@ class GroupSampler(Sampler):
 
     A subclass gives the group of each row (:meth:`_label`) and the share of each group (:meth:`_weights`). A batch
     holds the groups one after another. If a batch size cannot be divided exactly, the shares are rounded, and later
-    batches make up for it, so that the totals stay within one row of the shares; with ``exact`` such a size is refused.
-    If a group's pass ends within a batch, the rest comes from the next pass, in a new order. For a storage of several
-    dimensions (``ndim=2``) an index is a tuple of tensors. A row that is written takes a random place in the rest of
-    its group's pass. All rows are grouped again, and all passes begin again, if a group comes or goes, or if a subclass
-    cannot tell the group of single rows (:meth:`_keys`).
+    batches make up for it, so that the totals stay within one row of the shares; with ``exact`` such a size is an
+    error. A pass may end within a batch; the next pass has a new order. For a storage of several dimensions
+    (``ndim=2``) an index is a tuple of tensors.
+
+    A row that is written takes a random place in the rest of its group's pass. All passes begin again if a group
+    appears or disappears, or if a subclass cannot tell the group of single rows (:meth:`_keys`).
     """
 
     ran_out = False  # whether the last batch ended an epoch: a pass over the group that takes the most batches
 
+    @typed
     def __init__(self, exact: bool = False) -> None:
-        if not isinstance(exact, bool):
-            raise TypeError(f"exact must be True or False, got {exact!r}")
         self.exact = exact
         self._process = os.getpid()
         self._empty()
 
     def _empty(self) -> None:
         none = torch.empty(0, dtype=torch.int64)
-        self._length = 0  # rows that are grouped; 0 to group again
-        # The rows, group after group, each in the order of its pass; the size of each group, and its rows drawn so far.
+        self._length = 0  # number of rows that are grouped; 0 to group again
+        # The rows, group after group, each in the order of its pass; each group's size, and its rows drawn so far.
         self._order, self._size, self._cursor = none, none, none
-        # The share of each group as whole numbers, and the rows that each is owed by rounding, times their sum.
+        # The share of each group as whole numbers, and what rounding owes each group, as a multiple of 1 / their sum.
         self._weight, self._credit = none, none
         self._known: Tensor | None = None  # the key of each group's rows
         self._written: list[Tensor] = []  # rows written since the last batch
@@ -80,18 +95,18 @@ class GroupSampler(Sampler):
 
     @abstractmethod
     def _label(self, storage: Storage) -> Tensor:
-        """The group of each row: (R,) int64, 0 to G-1 without a gap, or -1 for a row that is left out."""
+        """Return the group of each row: (R,) int64, 0 to G-1 without a gap, or -1 for a row that is left out."""
 
     @abstractmethod
     def _weights(self, groups: int) -> tuple[list[int], str]:
-        """The share of each of G groups as whole numbers of at least 1, and the reason for them, in words."""
+        """Return the share of each of G groups as whole numbers of at least 1, and the reason for an error message."""
 
     def _keys(self, storage: Storage, rows: Tensor) -> Tensor | None:
-        """The key of each row's group, (n,) int64; None if that takes a look at all rows."""
+        """Return the key of each row's group, (n,) int64; None if this needs all rows."""
         return None
 
     def _covered(self, storage: Storage) -> int:
-        """The number of first rows that are grouped."""
+        """Return the number of rows to group, the first ones."""
         return len(storage) if storage.ndim == 1 else storage.shape.numel()
 
     def _group(self, storage: Storage) -> None:
@@ -100,19 +115,17 @@ class GroupSampler(Sampler):
         self._order, self._size = order[int((label < 0).sum()) :], label[label >= 0].bincount()
         self._cursor, self._credit = torch.zeros_like(self._size), torch.zeros_like(self._size)
         self._length, self._laid_out, self._restored = self._covered(storage), None, False
-        self._written, self._known = [], self._keys_of_groups(storage)
+        keys = self._keys(storage, self._order[self._start()]) if storage.ndim == 1 else None
+        self._written, self._known = [], None if keys is None else keys.reshape(-1).cpu()
         for group in range(len(self._size)):
             self._shuffle(group)
-
-    def _keys_of_groups(self, storage: Storage) -> Tensor | None:
-        keys = self._keys(storage, self._order[self._start()]) if storage.ndim == 1 else None
-        return None if keys is None else keys.reshape(-1).cpu()
 
     def _move_written(self, storage: Storage) -> bool:
         """Move the rows that were written to the passes of their groups; False if all rows must be grouped again."""
         if self._known is None or not self._written:
             return False
         rows, length = torch.cat(self._written).unique(), self._covered(storage)
+        # Grouping again is the way out if the storage changed by more than the rows that were reported.
         if rows[0] < 0 or rows[-1] >= length or int((rows >= self._length).sum()) != length - self._length:
             return False
         keys = self._keys(storage, rows)
@@ -149,7 +162,7 @@ class GroupSampler(Sampler):
         self._cursor[group] = 0
 
     def _take(self, group: int, count: int) -> tuple[Tensor, bool]:
-        """``count`` rows of a group, across the end of its pass, and whether a pass ended."""
+        """Return ``count`` rows of a group, across the end of its pass, and whether a pass ended."""
         parts, ended = [], False
         start, size = int(self._start()[group]), int(self._size[group])
         while count:
@@ -164,30 +177,26 @@ class GroupSampler(Sampler):
         return torch.cat(parts), ended
 
     def _layout(self, batch_size: int) -> tuple[Tensor, Tensor, Tensor]:
-        """The share of each group (G,), the group of each row of a batch (B,), its place within the group's (B,)."""
+        """Return each group's share (G,), the group of each row of a batch (B,), and its place in the group's (B,)."""
         if self._laid_out is None or self._laid_out[0] != batch_size:
             weights, reason = self._weights(len(self._size))
             divisor = reduce(gcd, weights)
             self._weight = torch.tensor(weights) // divisor
             unit = sum(weights) // divisor
-            if not batch_size % unit:
-                shares = self._weight * (batch_size // unit)
-            elif self.exact:
-                near = " and ".join(
-                    str(size) for size in (batch_size // unit * unit, (batch_size // unit + 1) * unit) if size
-                )
+            multiple, rest = divmod(batch_size, unit)
+            if rest and self.exact:
+                nearest = " and ".join(str(size) for size in (multiple * unit, (multiple + 1) * unit) if size)
                 raise ValueError(
-                    f"batch_size must be a multiple of {unit}, {reason}, got {batch_size}; the nearest are {near}"
+                    f"batch_size must be a multiple of {unit}, {reason}, got {batch_size}; the nearest are {nearest}"
                 )
-            else:
-                shares = self._rounded(batch_size, unit)
+            shares = self._rounded(batch_size, unit) if rest else self._weight * multiple
             group = torch.repeat_interleave(shares)
             place = torch.arange(len(group)) - (shares.cumsum(0) - shares)[group]
-            self._laid_out = (0 if batch_size % unit else batch_size, shares, group, place)  # rounded ones differ
+            self._laid_out = (0 if rest else batch_size, shares, group, place)  # rounded shares differ in each batch
         return self._laid_out[1:]
 
     def _rounded(self, batch_size: int, unit: int) -> Tensor:
-        """The share of each group in a batch that cannot be exact, with what earlier batches owe."""
+        """Return each group's share of a batch that cannot be divided exactly, with what earlier batches owe."""
         due = self._credit + self._weight * batch_size
         shares = due.div(unit, rounding_mode="floor").clamp(min=0)
         while rest := batch_size - int(shares.sum()):
@@ -200,8 +209,8 @@ class GroupSampler(Sampler):
         self._credit = due - shares * unit
         return shares
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
-        batch_size = check_value("batch_size", batch_size, Count)
+    @typed
+    def sample(self, storage: Storage, batch_size: Count) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
         worker = get_worker_info()
         if worker is not None and worker.num_workers > 1 and self._process != os.getpid():
             raise RuntimeError(
@@ -209,7 +218,7 @@ class GroupSampler(Sampler):
                 "buffer anew, or replay.set_sampler(...) and replay.set_rng(...); see docs/sampling.md"
             )
         if not len(storage):
-            raise ValueError("storage must hold at least one row, got an empty one")
+            raise ValueError("storage must hold at least one row, it is empty")
         if self._restored and self._length:
             self._check_restored(storage)
         if (self._written or self._covered(storage) != self._length) and not self._move_written(storage):
@@ -218,6 +227,7 @@ class GroupSampler(Sampler):
         at = (self._start() + self._cursor)[group].add_(place).clamp_(max=len(self._order) - 1)
         index = self._order[at]
         self.ran_out = False
+        # Most batches end no pass, and one gather draws them; the rows of groups whose pass ends are replaced below.
         ending = self._cursor + shares >= self._size
         self._cursor += torch.where(ending, 0, shares)
         if ending.any():
@@ -238,9 +248,10 @@ class GroupSampler(Sampler):
     extend = mark_update = add
 
     def state_dict(self) -> dict[str, Any]:
-        """The rows in the order of their passes, how far each pass has come, and rows written since the last batch."""
+        """Return the rows in the order of their passes, each pass's position, and rows written since the last batch."""
         none = torch.empty(0, dtype=torch.int64)
-        begun = self._length > 0 and not (self._written and self._known is None)  # otherwise all are grouped again
+        # Without the keys of the groups, rows that were written since force all rows to be grouped again.
+        begun = self._length > 0 and not (self._written and self._known is None)
         order, size, cursor = (self._order, self._size, self._cursor) if begun else (none, none, none)
         return {
             "order": order.clone(),
@@ -254,43 +265,41 @@ class GroupSampler(Sampler):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore a state; ValueError if it is not a sampler's, or at the next sample if it is of other rows."""
-        names = ("order", "size", "cursor", "credit", "known", "written", "length", "ran_out")
-        if missing := [name for name in names if not isinstance(state_dict.get(name), Tensor)]:
-            raise ValueError(f"state_dict must hold {', '.join(names)}; it lacks {', '.join(missing)}")
-        order, size, cursor, credit, known, written, length, ran_out = (state_dict[n].cpu().clone() for n in names)
+        """Restore a state; ValueError if it is not a sampler's, or at the next sample if it belongs to other rows."""
+        if missing := [name for name in _STATE if not isinstance(state_dict.get(name), Tensor)]:
+            raise ValueError(f"state_dict must hold {', '.join(_STATE)}; it lacks {', '.join(missing)}")
+        order, size, cursor, credit, known, written, length, ran_out = (state_dict[n].cpu().clone() for n in _STATE)
         fits = len(order) == int(size.sum()) and size.shape == cursor.shape == credit.shape
         if not fits or bool((cursor >= size).any()):
-            raise ValueError("state_dict must hold the passes of a sampler: rows, and a place in each pass")
+            raise ValueError("state_dict: the rows and positions of the passes do not fit together")
         self._order, self._size, self._cursor, self._credit = order, size, cursor, credit
         self._known, self._written = known if len(known) else None, [written] if len(written) else []
         self._length, self.ran_out = int(length), bool(ran_out)
         self._laid_out, self._restored = None, True
 
     def _check_restored(self, storage: Storage) -> None:
-        """Raise unless a restored state is of the storage's rows; with rows written since, all may be grouped again."""
+        """Raise unless a restored state belongs to the storage's rows; rows written since may need a new grouping."""
         groups, length = torch.repeat_interleave(self._size), self._covered(storage)
         if self._written:
             old = ~torch.isin(self._order, torch.cat(self._written)) & (self._order < length)
             keys = None if self._known is None else self._keys(storage, self._order[old])
             if keys is None or self._known is None or not torch.equal(keys.reshape(-1).cpu(), self._known[groups[old]]):
                 self._length, self._written = 0, []
-            self._restored = False
-            return
-        if length != self._length:
+        elif length != self._length:
             raise ValueError(f"state_dict must be of the storage's {length} rows, got one of {self._length}")
-        label = self._label(storage).cpu()
-        rows = (label >= 0).nonzero().flatten()
-        if not torch.equal(self._order.sort().values, rows) or not torch.equal(label[self._order], groups):
-            raise ValueError("state_dict must be of the storage's rows, got one whose groups differ")
+        else:
+            label = self._label(storage).cpu()
+            rows = (label >= 0).nonzero().flatten()
+            if not torch.equal(self._order.sort().values, rows) or not torch.equal(label[self._order], groups):
+                raise ValueError("state_dict must be of the storage's rows, got one whose groups differ")
         self._restored = False
 
-    def dumps(self, path: Any) -> None:
-        """Write the state to a folder, as one file that is there whole or not at all."""
+    def dumps(self, path: AnyPath) -> None:
+        """Write the state to a folder, as one file, atomically."""
         write_tensors(Path(path) / _FILE, {}, {}, self.state_dict())
 
-    def loads(self, path: Any) -> None:
-        """Read the state that :meth:`dumps` wrote; a ValueError if it is damaged, or of something else."""
+    def loads(self, path: AnyPath) -> None:
+        """Read the state that :meth:`dumps` wrote; ValueError if it is damaged or not a sampler's."""
         with reading(path, "sampler's state"):
             self.load_state_dict(pop_state(*read_tensors(Path(path) / _FILE)))
 
@@ -299,15 +308,15 @@ class TaskBalancedSampler(GroupSampler):
     """Draw equally many rows of every task; within a task every row comes once before any comes again.
 
     It works in any :class:`torchrl.data.ReplayBuffer`. The buffer may grow: a new row takes a random place in the rest
-    of its task's pass, and an overwritten one leaves it. When a task comes or goes, all passes begin again. The sampler
-    draws from the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches; its state is
-    saved with the buffer's. An epoch is a pass over the largest task. TorchRL does not report ``replay[i] = rows`` to
-    samplers: add rows of other tasks by ``extend``.
+    of its task's pass, and an overwritten row leaves it. When a task appears or disappears, all passes begin again. The
+    sampler draws from the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches; its
+    state is saved with the buffer's. An epoch is a pass over the largest task. TorchRL does not report ``replay[i] =
+    rows`` to samplers: add rows of other tasks by ``extend``.
 
     Args:
-        task_key: the entry of the storage that holds the task: one number a row, of any shape.
-        exact: refuse a batch size that the number of tasks does not divide. Otherwise some tasks get one row more, in
-            turn.
+        task_key: the entry of the storage that holds the task: one number in each row, of any shape.
+        exact: raise an error for a batch size that the number of tasks does not divide. Otherwise some tasks get one
+            more row, in turn.
 
     Raises:
         ValueError: at sampling, a row with several tasks; with ``exact``, a size that cannot be divided exactly.
@@ -324,8 +333,8 @@ class TaskBalancedSampler(GroupSampler):
     Source: paper section 'Cross-Task Co-Learning via 1:1 Data Mixing', its minibatches of equal numbers.
     """
 
+    @typed
     def __init__(self, task_key: NestedKey = "task_id", *, exact: bool = False) -> None:
-        check_key("task_key", task_key)
         self.task_key = task_key
         super().__init__(exact)
 
@@ -337,3 +346,112 @@ class TaskBalancedSampler(GroupSampler):
 
     def _weights(self, groups: int) -> tuple[list[int], str]:
         return [1] * groups, "the number of tasks"
+
+
+class CoLearningSampler(GroupSampler):
+    """Draw half of every minibatch from a target task's demonstrations, half in equal numbers from the base tasks.
+
+    It works in any :class:`torchrl.data.ReplayBuffer`. Target and base tasks are drawn without replacement, each in its
+    own passes. An epoch, at whose end ``ran_out`` is true, is the pass that takes the most batches. The sampler draws
+    from the replay buffer's generator; a restored state continues with the same batches.
+
+    If the rows have a column ``dataset``, as :func:`load_demonstrations` writes for several folders, the target's rows
+    come from the last dataset that has any; the target's rows in other datasets are left out. A batch holds the
+    target's rows, then those of the base tasks in the order of their ids, and the column ``is_target`` (B,) bool.
+
+    Args:
+        target: a task's name, a :class:`Task`, or a task's id.
+        target_fraction: the target's share of a minibatch, between 0 and 1, such as 0.5, 1/3 or Fraction(2, 7).
+        task_key: the entry of the storage that holds the task: one number in each row, of any shape.
+        exact: raise an error for a batch size that cannot be split exactly. Otherwise the shares are rounded, and later
+            batches make up for it.
+
+    Raises:
+        ValueError: at sampling, no row of the target or of a base task; with ``exact``, a batch size that cannot be
+            split exactly (the message gives the nearest that can).
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> sampler = CoLearningSampler("coffee-push")
+        >>> replay = TensorDictReplayBuffer(storage=LazyTensorStorage(12), sampler=sampler, batch_size=8)
+        >>> task = torch.tensor([3] * 5 + [7] * 5 + [task_id("coffee-push")] * 2)
+        >>> _ = replay.extend(TensorDict({"task_id": task}, [12]))
+        >>> batch = replay.sample()
+        >>> batch["is_target"].sum().item(), batch["task_id"].unique(return_counts=True)[1].tolist()
+        (4, [2, 2, 4])
+
+    Source: paper section 'Cross-Task Co-Learning via 1:1 Data Mixing'.
+    """
+
+    @typed
+    def __init__(
+        self,
+        target: str | int | Task,
+        *,
+        target_fraction: float | Fraction = 0.5,
+        task_key: NestedKey = "task_id",
+        exact: bool = False,
+    ) -> None:
+        # 1/3 as a float is not a third: the shares of a batch are computed with the fraction that was meant.
+        self.target_fraction = Fraction(target_fraction).limit_denominator(10_000)
+        if not 0 < target_fraction < 1 or not isclose(self.target_fraction, target_fraction, rel_tol=1e-9):
+            ratio = "must be between 0 and 1, a ratio of integers up to 10000"
+            raise ValueError(f"target_fraction {ratio}, got {target_fraction}; the nearest is {self.target_fraction}")
+        self.target, self.task_key = target, task_key
+        name = target.name if isinstance(target, Task) else target
+        self._target_id = task_id(name) if isinstance(name, str) else name
+        super().__init__(exact)
+
+    def _label(self, storage: Storage) -> Tensor:
+        task = column(storage, self.task_key)
+        is_target, is_base = task == self._target_id, task != self._target_id
+        if not is_target.any():
+            tasks = ", ".join(MT50[i] if 0 <= i < len(MT50) else str(i) for i in task.unique().tolist())
+            raise ValueError(f"target: the storage has no row of {self.target!r}; its tasks are {tasks}")
+        if not is_base.any():
+            raise ValueError("target: the storage has no row of any other task, so there are no base tasks")
+        try:
+            dataset = column(storage, DATASET)
+        except KeyError:  # rows of one dataset
+            pass
+        else:
+            is_target &= dataset == dataset[is_target].max()
+        label = torch.where(is_target, 0, -1)
+        label[is_base] = 1 + torch.unique(task[is_base], return_inverse=True)[1]
+        return label
+
+    def row_weights(self, storage: Storage) -> Tensor:
+        """Return each row's mean share of a minibatch: (R,) float32, 0 for a row that is left out."""
+        label = self._label(storage)
+        sizes = label[label >= 0].bincount()
+        share = torch.tensor(self._weights(len(sizes))[0], dtype=torch.float32)
+        return torch.where(label >= 0, (share / share.sum() / sizes)[label.clamp(min=0)], 0.0)
+
+    def _weights(self, groups: int) -> tuple[list[int], str]:
+        base, (part, whole) = groups - 1, self.target_fraction.as_integer_ratio()
+        reason = f"so that {self.target_fraction} of it is the target's and {base} base tasks share the rest equally"
+        return [part * base] + [whole - part] * base, reason
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
+        index, info = super().sample(storage, batch_size)
+        assert self._laid_out is not None
+        info["is_target"] = to_device_of(storage, self._laid_out[2] == 0)
+        return index, info
+
+    def _identity(self) -> dict[str, Tensor]:
+        fraction = torch.tensor([self.target_fraction.numerator, self.target_fraction.denominator])
+        return {"target": torch.tensor(self._target_id), "target_fraction": fraction}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the sampler's state with the target and the ratio."""
+        return super().state_dict() | self._identity()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore a state; ValueError if it is not a sampler's, or has another target or ratio."""
+        for name, own in self._identity().items():
+            stored = state_dict.get(name)
+            if not isinstance(stored, Tensor) or not torch.equal(stored.cpu(), own):
+                raise ValueError(f"state_dict has another {name}, this sampler has {getattr(self, name)}")
+        super().load_state_dict(state_dict)

@@ -1,6 +1,6 @@
-"""The environment, the engines behind it, and the scripted experts."""
+"""The batched environment, its simulation engines, and the scripted experts."""
 
-import lw_torchrl._util.torchrl  # noqa: F401
+import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import episode_seed
 from lw_torchrl.suites.engine import Engine, EngineStep

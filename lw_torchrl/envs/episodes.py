@@ -1,4 +1,4 @@
-"""Running exactly the requested episodes, on any number of rows: what collecting and evaluating share."""
+"""run_episodes: run exactly the requested episodes, on any number of rows, for collecting and evaluating."""
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,7 +17,7 @@ from lw_torchrl.envs.seeding import action_noise
 
 
 class FinishedEpisode(NamedTuple):
-    """One finished episode: the task's name, the episode's index, and the recorded keys of its steps, batch (T,)."""
+    """A finished episode: its task's name, its index, and the recorded keys of its steps, batch (T,)."""
 
     task: str
     episode: int
@@ -25,22 +25,22 @@ class FinishedEpisode(NamedTuple):
 
     @property
     def first_success(self) -> int | None:
-        """The first successful step, from 1; None without success. It needs ("next", "success") recorded."""
-        hits = self.steps.get(("next", "success")).flatten().nonzero().flatten()
-        return int(hits[0]) + 1 if len(hits) else None
+        """The first successful step, from 1; None without success. It needs ("next", "success") in the steps."""
+        successes = self.steps.get(("next", "success")).flatten().nonzero().flatten()
+        return int(successes[0]) + 1 if len(successes) else None
 
 
 def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[[TensorDictBase], TensorDictBase]:
     """Return the actor on a device; networks run on blocks of one size, so that no row depends on the others."""
-    there = place(actor, device)
+    actor_device = place(actor, device)
     policy = actor if getattr(actor, "row_by_row", False) else in_blocks(actor)
-    if there == CPU:
+    if actor_device == CPU:
         return policy
-    return lambda tensordict: tensordict.update(policy(tensordict.to(there)).to(CPU))
+    return lambda tensordict: tensordict.update(policy(tensordict.to(actor_device)).to(CPU))
 
 
 def read_action(tensordict: TensorDictBase, size: int) -> Tensor:
-    """Return the ``action`` that an actor wrote, (N, size) float32; raise :class:`ValueError` for any other."""
+    """Return the ``action`` that an actor wrote; ValueError unless it is (N, size) float32."""
     action, shape = tensordict.get("action", None), (*tensordict.batch_size, size)
     if action is None:
         raise ValueError(f"the actor must write 'action', got {', '.join(map(str, tensordict.keys()))}")
@@ -64,20 +64,21 @@ def run_episodes(
     place: NestedKey | None = None,
     on_progress: Callable[[int], object] | None = None,
 ) -> Iterator[FinishedEpisode]:
-    """Run each task's listed episodes once and yield them as they finish.
+    """Run each task's listed episodes and yield them as they finish.
 
-    A row that finishes takes the next episode of its task; one without work costs a reset.
+    A row whose episode ends starts the next episode of its task.
 
     Args:
         env: a LanguageWorldEnv, with transforms or without.
-        policy: called on all N rows, with a ``_step`` mask of those that count.
-        episodes: task name to episode indices; one that is listed several times is run as often.
-        keys: the keys to record of each step, ``("next", "success")`` say; ``action`` is the executed one.
-        noise, noise_hold: episode index to the A standard deviations of the action's noise; steps of each draw.
-        after_success: end an episode N steps after its first successful one; None for never.
-        clean_action, place: keys for the action before the noise, and for the place of each row's episode in its task's
-            list, (N,) int64, for the policy to read.
-        on_progress: called after each step with the number of steps done, with those that an early end saves.
+        policy: called on all N rows, with a ``_step`` mask of the active ones.
+        episodes: task name to episode indices; an index that is listed several times is run as often.
+        keys: the keys to record of each step, for example ``("next", "success")``; ``action`` is the executed action.
+        noise: episode index to the A standard deviations of the action's noise.
+        noise_hold: number of steps for which each noise value is held.
+        after_success: end an episode N steps after its first success; None for never.
+        clean_action: key for the action before the noise.
+        place: key for the position of each row's episode in its task's list, (N,) int64, which the policy reads.
+        on_progress: called after each step with the number of steps done; an early end counts its remaining steps.
     """
     base = env.base_env if isinstance(env, TransformedEnv) else env
     if not isinstance(base, LanguageWorldEnv):
@@ -85,7 +86,7 @@ def run_episodes(
     rows = len(base.row_tasks)
     waiting = {task: deque(enumerate(listed)) for task, listed in episodes.items()}
     if unknown := set(waiting) - set(base.tasks):
-        raise ValueError(f"episodes names {', '.join(sorted(unknown))}, which env does not have")
+        raise ValueError(f"episodes: env does not have the tasks {', '.join(sorted(unknown))}")
     episode = torch.zeros(rows, dtype=torch.int64)
     listed_at = torch.zeros(rows, dtype=torch.int64)
     active = torch.zeros(rows, dtype=torch.bool)
@@ -95,7 +96,7 @@ def run_episodes(
     buffers: TensorDictBase | None = None
     state: TensorDictBase = env.full_done_spec.zero()
     idle = torch.ones(rows, dtype=torch.bool)
-    fresh = True  # no row was reset yet; policies read the task of idle rows too
+    is_first = True  # the first reset is of all rows, because policies read the task of idle rows too
     while True:
         starting = torch.zeros(rows, dtype=torch.bool)
         for row in torch.nonzero(idle).flatten().tolist():
@@ -111,8 +112,8 @@ def run_episodes(
         if not active.any():
             return
         if starting.any():
-            anew = torch.ones_like(starting) if fresh else starting
-            state, fresh = env.reset(state.set("_reset", anew), episode=episode).exclude("_reset"), False
+            reset = torch.ones_like(starting) if is_first else starting
+            state, is_first = env.reset(state.set("_reset", reset), episode=episode).exclude("_reset"), False
         state.set("_step", active)
         if place is not None:
             state.set(place, listed_at.clone())
@@ -121,9 +122,9 @@ def run_episodes(
         if clean_action is not None:
             state.set(clean_action, action.clone())
         if noise is not None:
-            now = noises[np.arange(rows), np.minimum(steps, base.max_steps - 1)]
-            action = (action + torch.from_numpy(now)).clamp(-1.0, 1.0)
-        # Idle rows get a harmless action: theirs is computed from a state that may be stale.
+            noise_now = noises[np.arange(rows), np.minimum(steps, base.max_steps - 1)]
+            action = (action + torch.from_numpy(noise_now)).clamp(-1.0, 1.0)
+        # Idle rows get a harmless action: the policy computed theirs from a state that may be stale.
         state.set("action", torch.where(active.unsqueeze(-1), action, 0.0))
         state.set("_step", active)
         state = env.step(state)

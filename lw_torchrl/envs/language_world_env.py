@@ -22,7 +22,7 @@ from lw_torchrl._util.devices import check_device
 from lw_torchrl._util.keys import row_mask
 from lw_torchrl._util.rendering import check_picture
 from lw_torchrl.envs.row_states import RowStates, action_spec, clipped_action, done_spec, observation_spec
-from lw_torchrl.envs.seeding import EpisodeCounter, check_worker
+from lw_torchrl.envs.seeding import EpisodeCounter
 from lw_torchrl.language.tasks import Task, one_layout
 from lw_torchrl.suites.engine import Engine, EngineStep
 from lw_torchrl.suites.metaworld import make_engine
@@ -43,46 +43,46 @@ class LanguageWorldEnv(EnvBase):
     in ``ParallelEnv(2, [partial(make_env, worker=(w, 2)) for w in range(2)])``; otherwise all run the same episodes.
 
     ``close()`` frees the simulators; the next ``reset()`` makes new ones and continues with the next episodes.
-    ``state_dict`` holds the seed and the counters; an environment that loads it must be reset, and continues likewise.
-    A TransformedEnv, and a Collector with it, saves it by its :class:`~lw_torchrl.transforms.QAFTransform` or
+    ``state_dict`` holds the seed and the counters; after loading it, reset the environment to continue likewise. A
+    TransformedEnv, and a Collector with it, saves it only with a :class:`~lw_torchrl.transforms.QAFTransform` or
     :class:`~lw_torchrl.transforms.EnvState`.
 
-    Keys (B = (N,)); a ``_step`` mask leaves rows where they are, a ``_reset`` mask resets only its rows:
+    Keys (B = (N,)); rows outside a ``_step`` mask do not move, rows outside a ``_reset`` mask are not reset:
         observation: (N, 39) float32, Meta-World's vector: metres, gripper opening in [0, 1], quaternions.
         task_id, episode: (N,) int64, rank of the task's name among the 50 sorted names, and index of the episode.
         success: (N, 1) bool, Meta-World's success at this step.
         fault: (N, 1) bool, the row was truncated because its action was NaN or its simulation became unstable.
         action: (N, 4) float32, end-effector displacement xyz and gripper effort, each in [-1, 1]. The environment never
-            writes it: a policy's numbers out of range keep their likelihood.
-        executed_action: (N, 4) float32 in [-1, 1], the action of the step that led here, clipped as Meta-World does.
-            Zeros after a reset, and for a row that was not stepped.
+            writes it, so that an action out of range keeps its log-probability.
+        executed_action: (N, 4) float32 in [-1, 1], the action of the last step, clipped as Meta-World does; zeros after
+            a reset, and for a row that was not stepped.
         reward: (N, 1) float32.
         done, terminated, truncated: (N, 1) bool; terminated stays false unless ``terminate_on_success``.
 
     Args:
         tasks: "MT10", "MT50", a task's name, "fetch/push" for another suite's, or a list of names. A
-            :class:`~lw_torchrl.Task` stands for its name; one that no suite has needs an engine of your own.
+            :class:`~lw_torchrl.Task` stands for its name; a task of no suite needs a custom engine.
         num_envs: N, at least the number of tasks; None for one environment each.
         seed: any integer; :meth:`set_seed` starts again at episode 0.
-        suite: the :class:`~lw_torchrl.suites.Suite` that has the tasks, or its name; None for the one that their names
-            begin with, "fetch/push", and Meta-World for those without.
-        engine: None for the suite's. Of Meta-World that is "vectorized", the fast one; "metaworld" for its own
-            environments in a loop, which gives the same numbers; or a callable ``(row_tasks, *, reward, num_threads) ->
-            Engine``.
-        num_threads: of the simulation, by default the cores this process may use. It never changes a result.
+        suite: the :class:`~lw_torchrl.suites.Suite` of the tasks, or its name; None for the suite that their names
+            begin with, as in "fetch/push", and Meta-World for names without one.
+        engine: None for the suite's; for Meta-World "vectorized", the default, or "metaworld", its own environments in
+            a loop, slower with the same numbers; or a callable ``(row_tasks, *, reward, num_threads) -> Engine``.
+        num_threads: threads of the simulation, by default the cores that this process may use. It never changes a
+            result.
         reward: "sparse", the success as 0 and 1, or "dense", Meta-World's own.
         max_steps: steps of the simulation until truncation; None for the suite's, Meta-World's 500.
         frame_skip: steps of the simulation for each action; their rewards are added, and any may succeed.
         terminate_on_success: end an episode at its first success, with ``terminated``.
         strict: raise on a NaN action, instead of truncating the row with a warning as for an unstable simulation.
-        worker: (w, W), the index of this one of W environments; None for the only one.
+        worker: (w, W), this environment's index among W environments; None for a single environment.
         batch_size: () for a single environment without the dimension of rows, for AsyncEnvPool.
-        device: where the tensors of resets and steps are copied to; "auto" for this machine's accelerator.
+        device: device of the tensors of resets and steps; "auto" for this machine's accelerator.
 
     Raises:
-        RuntimeError: a step of a row that has ended; a reset or step in a forked process that did not make it.
+        RuntimeError: a step of a row that has ended; a reset or step in a process that was forked later.
         TypeError: it is pickled or copied; pass the function that makes it.
-        ValueError: the step of an engine of your own returns no EngineStep.
+        ValueError: the step of a custom engine does not return an EngineStep.
         ImportError: a rendering library named by MUJOCO_GL is missing, or the vectorized engine does not know the
             installed version of Meta-World or MuJoCo.
 
@@ -96,7 +96,7 @@ class LanguageWorldEnv(EnvBase):
     Source: paper section 'Task Formalism'; ``metaworld.sawyer_xyz_env.SawyerXYZEnv``.
     """
 
-    _has_frame_skip = True  # else TorchRL puts a transform of its own around it, which knows nothing of rows that end
+    _has_frame_skip = True  # otherwise TorchRL adds a FrameSkipTransform, which steps rows that have ended
 
     @typed
     def __init__(
@@ -124,29 +124,31 @@ class LanguageWorldEnv(EnvBase):
         n = len(self.tasks)
         num_envs = n if num_envs is None else int(num_envs)
         if num_envs < n:
-            raise ValueError(f"num_envs must be at least the number of tasks, {n}, got {num_envs}")
+            raise ValueError(f"num_envs must be at least {n}, the number of tasks, got {num_envs}")
         self.max_steps = self.suite.max_steps if max_steps is None else int(max_steps)
         self.frame_skip = int(frame_skip)
         self.strict, self.terminate_on_success = strict, terminate_on_success
-        if batch_size is not None and (batch_size not in ((), []) or num_envs != 1):
-            wanted = f"(), for a single environment, or None for one dimension of {num_envs} rows"
-            raise ValueError(f"batch_size must be {wanted}, got {batch_size!r}")
+        if batch_size is not None and num_envs != 1:
+            raise ValueError(f"batch_size=() is only for a single environment, num_envs is {num_envs}")
         self.row_tasks = tuple(self.tasks[i % n] for i in range(num_envs))
-        self.worker = (0, 1) if worker is None else check_worker(worker)
+        self.worker = (0, 1) if worker is None else worker
+        if not 0 <= self.worker[0] < self.worker[1]:
+            raise ValueError(f"worker must be (w, W) with 0 <= w < W, got {worker}")
         self._process = os.getpid()
-        self._counter = EpisodeCounter([named[t] for t in self.row_tasks], check_value("seed", seed, int), self.worker)
+        self._counter = EpisodeCounter([named[t] for t in self.row_tasks], int(seed), self.worker)
         super().__init__(device=check_device("device", device), batch_size=(num_envs,) if batch_size is None else ())
         self._rows = RowStates(self.row_tasks, self.layout)
-        which = ... if batch_size is None else 0
-        self.observation_spec = observation_spec(self._rows.task_id, self.layout)[which].to(self.device)
-        self.action_spec = action_spec(num_envs, self.layout)[which].to(self.device)
-        self.reward_spec = Unbounded((num_envs, 1))[which].to(self.device)
-        self.done_spec = done_spec(num_envs)[which].to(self.device)
+        index = ... if batch_size is None else 0
+        self.observation_spec = observation_spec(self._rows.task_id, self.layout)[index].to(self.device)
+        self.action_spec = action_spec(num_envs, self.layout)[index].to(self.device)
+        self.reward_spec = Unbounded((num_envs, 1))[index].to(self.device)
+        self.done_spec = done_spec(num_envs)[index].to(self.device)
         make = self.suite.make_engine if engine is None else partial(make_engine, engine)
         self._make_engine = partial(make, list(self.row_tasks), reward=reward, num_threads=num_threads)
         self._engine: Engine = self._make_engine()
         self.is_closed = False  # EnvBase starts with True
 
+    @typed
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Begin at episode 0, with another seed if one is given; return the seed for the next environment."""
         self._set_seed(seed)
@@ -171,20 +173,20 @@ class LanguageWorldEnv(EnvBase):
         return self._counter.seed
 
     def get_extra_state(self) -> Tensor:
-        """What ``state_dict`` holds: tasks, seed and episode counters, as bytes (n,) uint8."""
+        """Return the content of ``state_dict``: tasks, seed and episode counters, as bytes (n,) uint8."""
         return self._counter.dump()
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Take seed and counters; the episodes that ran are over."""
+        """Restore seed and counters, and end all episodes."""
         self._counter.load(state)
         self._rows.over[:] = True
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Take seed and episode counters from another's ``state_dict()``, of the same rows, and require a reset."""
+        """Restore seed and episode counters of an environment with the same rows; reset before the next step."""
         if strict and not state_dict:
             raise ValueError(
                 "state_dict is empty: a Collector saves the state of an environment only in a TransformedEnv with a "
-                "QAFTransform or EnvState, or in a SerialEnv or ParallelEnv; strict=False begins at the first episode"
+                "QAFTransform or EnvState, or in a SerialEnv or ParallelEnv; use strict=False to begin at episode 0"
             )
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
@@ -194,8 +196,8 @@ class LanguageWorldEnv(EnvBase):
     def _check_process(self) -> None:
         if os.getpid() != self._process:
             raise RuntimeError(
-                "this environment was made in the process that this one was forked from: make the environment in this "
-                "process (give ParallelEnv or a collector a function that makes it)"
+                "this process was forked after the environment was made: make the environment in this process (give "
+                "ParallelEnv or a collector a function that makes it)"
             )
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None) -> TensorDict:
@@ -203,12 +205,12 @@ class LanguageWorldEnv(EnvBase):
         if self.is_closed:
             self._engine, self.is_closed = self._make_engine(), False
         rows = np.flatnonzero(row_mask(tensordict, "_reset", len(self.row_tasks)))
-        episodes = self._counter.next(rows) if episode is None else self._counter.asked(episode, rows)
+        episodes = self._counter.next(rows) if episode is None else self._counter.requested(episode, rows)
         self._rows.begin(rows, episodes, self._engine.reset(rows.tolist(), self._counter.seeds(rows, episodes)))
         self._counter.resets[rows] += 1
-        return self._shown(self._rows.as_tensordict())
+        return self._output(self._rows.as_tensordict())
 
-    def _shown(self, rows: TensorDict) -> TensorDict:
+    def _output(self, rows: TensorDict) -> TensorDict:
         return (rows if self.batch_size else rows[0]).to(self.device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
@@ -218,10 +220,9 @@ class LanguageWorldEnv(EnvBase):
         active = row_mask(tensordict, "_step", len(self.row_tasks))
         if (active & self._rows.over).any():
             rows = np.flatnonzero(active & self._rows.over)[:5].tolist()
-            what = "have ended or were never reset, or not since close or load_state_dict"
-            raise RuntimeError(f"rows {rows} {what}: reset them before the next step")
+            raise RuntimeError(f"rows {rows} have ended, or were not reset: reset them before the next step")
         stepped = active
-        if math.isnan(action.sum()):  # of numbers in [-1, 1], so one of them is NaN
+        if math.isnan(action.sum()):  # numbers in [-1, 1] cannot overflow, so one of them is NaN
             broken = active & np.isnan(action).any(-1)
             self._report(broken, "its action is NaN", self.strict)
             stepped = active & ~broken
@@ -229,19 +230,19 @@ class LanguageWorldEnv(EnvBase):
         self._rows.success &= ~active
         reward = self._simulate(action, stepped)
         for _ in range(self.frame_skip - 1):
-            if not (going := stepped & ~self._rows.over).any():
+            if not (running := stepped & ~self._rows.over).any():
                 break
-            reward += self._simulate(action, going)
+            reward += self._simulate(action, running)
         executed = np.where(stepped[:, None], action, np.float32(0.0))
         rewarded = torch.from_numpy(reward.astype(np.float32)).unsqueeze(-1)
-        return self._shown(self._rows.as_tensordict(executed, reward=rewarded))
+        return self._output(self._rows.as_tensordict(executed, reward=rewarded))
 
     def _simulate(self, action: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """One step of the simulation of some rows, and their reward, (N,) float64."""
+        """Simulate one step of some rows; return the reward, (N,) float64."""
         result = self._engine.step(action, rows)
         if not isinstance(result, EngineStep):
-            engine, got = type(self._engine).__name__, type(result).__name__
-            raise ValueError(f"engine: the step of {engine} must return an EngineStep, got {got}")
+            returned = f"{type(self._engine).__name__}.step returned {type(result).__name__}"
+            raise ValueError(f"engine: {returned}, it must return an EngineStep")
         self._report(result.fault & rows, "its simulation became unstable")
         np.copyto(self._rows.observation, result.observation, casting="same_kind", where=rows[:, None])
         success = result.success & rows
@@ -252,23 +253,24 @@ class LanguageWorldEnv(EnvBase):
         self._rows.over |= self._rows.fault | self._rows.terminated | (self._rows.steps >= self.max_steps)
         return np.where(rows, result.reward, 0.0)
 
-    def _report(self, rows: np.ndarray, what: str, fatal: bool = False) -> None:
+    def _report(self, rows: np.ndarray, problem: str, is_error: bool = False) -> None:
+        """Flag rows as faulty and warn, or raise an error; do nothing if there are none."""
         if not rows.any():
             return
         row = int(np.flatnonzero(rows)[0])
-        where = f"in task {self.row_tasks[row]!r}, seed {self.seed}, episode {self._rows.episode[row]}"
+        place = f"task {self.row_tasks[row]!r}, seed {self.seed}, episode {self._rows.episode[row]}"
         more = f" ({rows.sum()} rows)" if rows.sum() > 1 else ""
-        message = f"row {row}: {what}, {where}, step {self._rows.steps[row]}{more}"
-        if fatal:
+        message = f"row {row}: {problem}, in {place}, step {self._rows.steps[row]}{more}"
+        if is_error:
             raise ValueError(f"action must hold numbers: {message}")
         self._rows.fault |= rows
-        warnings.warn(f"{message}; the row is truncated and flagged, the others go on", stacklevel=4)
+        warnings.warn(f"{message}; the row is truncated and flagged, the others continue", stacklevel=4)
 
     def render(
         self, *, camera: str = "corner2", height: int = 240, width: int = 320, rows: Sequence[int] | None = None
     ) -> Tensor:
-        """Return pictures of rows as they are now, (len(rows), height, width, 3) uint8; without the dimension of rows
-        with ``batch_size=()``. OpenGL draws them; on Linux without a display and MUJOCO_GL it is EGL.
+        """Return pictures of rows in their present state, (len(rows), height, width, 3) uint8; without the dimension
+        of rows with ``batch_size=()``. OpenGL draws them, by EGL on Linux without a display and MUJOCO_GL.
 
         TorchRL's PixelRenderTransform and VideoRecorder, and our :class:`CameraTransform`, call it. With a
         PixelRenderTransform, read the environment's ``observation_spec`` before the first reset.
@@ -276,26 +278,26 @@ class LanguageWorldEnv(EnvBase):
         Args:
             camera: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV".
             height, width: pixels.
-            rows: which to draw, by their numbers; None for all.
+            rows: indices of the rows to draw; None for all.
 
         Raises:
-            RuntimeError: a row was not reset, or the process was forked from one that took pictures.
-            ImportError: there is no OpenGL; it names what to install.
-            NotImplementedError: your own engine has no ``render``.
+            RuntimeError: a row was not reset, or the process was forked from one that rendered.
+            ImportError: there is no OpenGL; the message names what to install.
+            NotImplementedError: a custom engine has no ``render``.
         """
         self._check_process()
         check_picture(camera, height, width)
-        asked = range(len(self.row_tasks)) if rows is None else [check_value("rows", row, Natural) for row in rows]
-        if asked and max(asked) >= len(self.row_tasks):
-            raise ValueError(f"rows must be below {len(self.row_tasks)}, got {max(asked)}")
-        if self.is_closed or (self._rows.episode[list(asked)] < 0).any():
-            raise RuntimeError("there is nothing to see before a reset: call env.reset()")
+        drawn = range(len(self.row_tasks)) if rows is None else [check_value("rows", row, Natural) for row in rows]
+        if drawn and max(drawn) >= len(self.row_tasks):
+            raise ValueError(f"rows must be below {len(self.row_tasks)}, got {max(drawn)}")
+        if self.is_closed or (self._rows.episode[list(drawn)] < 0).any():
+            raise RuntimeError("there is nothing to render before a reset: call env.reset()")
         if not hasattr(self._engine, "render"):
             raise NotImplementedError(f"engine {type(self._engine).__name__} has no render; see suites.cameras")
-        if not asked:
+        if not drawn:
             return torch.zeros(0, height, width, 3, dtype=torch.uint8, device=self.device)
-        drawn = self._engine.render(asked, camera=camera, height=height, width=width)
-        pictures = torch.from_numpy(drawn).to(self.device)
+        pixels = self._engine.render(drawn, camera=camera, height=height, width=width)
+        pictures = torch.from_numpy(pixels).to(self.device)
         return pictures if self.batch_size else pictures[0]
 
     def close(self, *, raise_if_closed: bool = True) -> None:

@@ -1,4 +1,4 @@
-"""The specs of LanguageWorldEnv, and the state of each of its rows."""
+"""The specs of LanguageWorldEnv, and the state of its rows."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from lw_torchrl.language.tasks import MT50, task_id
 
 
 def _with_ids(method: Callable[..., Any], change: Callable[..., Tensor] = lambda ids, *_args, **_kwargs: ids) -> Any:
-    """Wrap a method of Categorical that returns a new spec, so that this keeps the rows' ids, changed likewise."""
+    """Wrap a method of Categorical that returns a new spec, so that the new spec keeps the ids, changed likewise."""
 
-    def make(self: TaskIds, *args: Any, **kwargs: Any) -> TaskIds:
-        made = method(self, *args, **kwargs)
-        made.ids = None if self.ids is None else change(self.zero(), *args, **kwargs)
-        return made
+    def wrapped(self: TaskIds, *args: Any, **kwargs: Any) -> TaskIds:
+        spec = method(self, *args, **kwargs)
+        spec.ids = None if self.ids is None else change(self.zero(), *args, **kwargs)
+        return spec
 
-    return make
+    return wrapped
 
 
 class TaskIds(Categorical):
-    """Each row's task: a Categorical whose zero is the row's own id, (N,) int64, so that policies can act on
-    ``fake_tensordict()``, which is of zeros: they may not know the task of id 0."""
+    """The spec of ``task_id``, whose zero is each row's own id, (N,) int64. TorchRL calls policies with
+    ``fake_tensordict()``, which holds zeros, and a policy may not know the task of id 0."""
 
     ids: Tensor | None = None
 
@@ -41,7 +41,7 @@ class TaskIds(Categorical):
         """Return the rows' ids, with the dimensions of ``shape`` in front."""
         if self.ids is None or self.ids.numel() != self.shape.numel():
             return super().zero(shape)
-        # Transforms such as UnsqueezeTransform assign another shape to the spec.
+        # Transforms such as UnsqueezeTransform assign a new shape to the spec.
         return self.ids.reshape(self.shape).expand((*(shape or ()), *self.shape)).clone()
 
     expand = _with_ids(Categorical.expand, Tensor.expand)
@@ -55,9 +55,9 @@ class TaskIds(Categorical):
 
 
 def observation_spec(task_id: Tensor, layout: Layout) -> Composite:
-    """The outputs beside reward and done, of rows with these tasks, (N,) int64."""
+    """Return the spec of all outputs except reward and done, for rows with these tasks, (N,) int64."""
     n = len(task_id)
-    ids = len(MT50) if int(task_id.max()) < len(MT50) else 2**32  # a task of one's own has a hash
+    ids = len(MT50) if int(task_id.max()) < len(MT50) else 2**32  # a custom task's id is a hash
     return Composite(
         observation=Unbounded((n, layout.size)),
         task_id=TaskIds(ids, task_id),
@@ -82,7 +82,7 @@ def _flag(n: int) -> Categorical:
 
 
 def clipped_action(tensordict: TensorDictBase, shape: tuple[int, ...]) -> Tensor:
-    """Return the action as it is executed, float32 of this shape in [-1, 1]."""
+    """Return the action to execute, float32 of this shape in [-1, 1]."""
     action = tensordict.get("action", None)
     if action is None or action.shape != shape or action.dtype != torch.float32:
         given = "none" if action is None else f"{action.dtype} of shape {tuple(action.shape)}"
@@ -94,8 +94,8 @@ Rows = NDArray[np.intp]
 
 
 class RowStates:
-    """The last observation (N, D) float32 of N rows; the episode, -1 before the first reset, and the steps since the
-    reset, (N,) int64; and the flags over, terminated, fault and success, (N,) bool. A row never reset is over."""
+    """The state of N rows: the last observation (N, D) float32; the episode, -1 before the first reset, and the steps
+    since the reset, (N,) int64; the flags over, terminated, fault and success, (N,) bool. A row never reset is over."""
 
     def __init__(self, tasks: Sequence[str], layout: Layout) -> None:
         self.tasks, self.layout = tasks, layout
@@ -115,7 +115,8 @@ class RowStates:
         self._flags[:, rows] = False
 
     def as_tensordict(self, executed_action: NDArray[np.float32] | None = None, **more: Tensor) -> TensorDict:
-        """All of it as fresh tensors, N rows, with ``executed_action`` (N, A) float32, zeros for None, and ``more``."""
+        """Return copies as a TensorDict of N rows, with ``executed_action`` (N, A) float32, None for zeros, and
+        ``more``."""
         n = len(self.tasks)
         over, terminated, fault, success = (torch.from_numpy(flag.copy()).unsqueeze(-1) for flag in self._flags)
         if executed_action is None:

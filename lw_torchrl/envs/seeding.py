@@ -1,25 +1,24 @@
-"""Which episode each row runs next, and the randomness of an episode, which depends only on (task, seed, episode)."""
+"""The episode that each row runs next, and its random numbers, which depend only on (task, seed, episode)."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lw_torchrl._util.checks import Count, Natural, check_value, shown
+from lw_torchrl._util.checks import Natural, check_value, shown
 from lw_torchrl._util.files import parse_json
-from lw_torchrl._util.seeding import episode_generator, episode_hash
+from lw_torchrl._util.reproducibility import episode_generator, episode_hash
 from lw_torchrl.language.tasks import Task
 
 
 def episode_seed(task: str | Task, seed: int, episode: int) -> int:
-    """Return the seed of one episode for Meta-World's ``env.seed``, in [0, 2**63): a stable hash, so that no two (task,
-    seed, episode) share their randomness. The task is a name, "pick-place", or your own :class:`Task`.
+    """Return an episode's seed for Meta-World's ``env.seed``, in [0, 2**63): a stable hash, different for each (task,
+    seed, episode). The task is a name, "pick-place", or your own :class:`Task`.
 
     Example:
         >>> episode_seed("reach", 0, 1) == episode_seed("reach", 1, 0)
@@ -31,7 +30,7 @@ def episode_seed(task: str | Task, seed: int, episode: int) -> int:
 def action_noise(
     task: str | Task, seed: int, episode: int, steps: int, hold: int = 1, size: int = 4
 ) -> NDArray[np.float32]:
-    """Standard normal noise for an episode's actions, (steps, size) float32; each draw is kept for ``hold`` steps."""
+    """Return standard normal noise for an episode's actions, (steps, size) float32, constant for ``hold`` steps."""
     generator = episode_generator("noise", task, seed, episode)
     draws = generator.standard_normal((-(-steps // hold), size), dtype=np.float32)
     return draws.repeat(hold, axis=0)[:steps]
@@ -41,19 +40,8 @@ Rows = NDArray[np.intp]
 Episodes = NDArray[np.int64]
 
 
-def check_worker(worker: Any) -> tuple[int, int]:
-    """Return ``worker`` as (rank, of), if 0 <= rank < of."""
-    if not isinstance(worker, Sequence) or isinstance(worker, str) or len(worker) != 2:
-        raise TypeError(f"worker must be a pair (rank, of), got {worker!r}")
-    of = check_value("worker's of", worker[1], Count)
-    rank = check_value("worker's rank", worker[0], Natural)
-    if rank >= of:
-        raise ValueError(f"worker's rank must be under the number of workers, {of}, got {rank}")
-    return rank, of
-
-
 class EpisodeCounter:
-    """Which episodes the rows of :class:`LanguageWorldEnv` run, as it says there; ``worker`` is (w, W)."""
+    """The counters of the episodes that the rows of :class:`LanguageWorldEnv` run; ``worker`` is (w, W)."""
 
     def __init__(self, tasks: Sequence[Task], seed: int, worker: tuple[int, int]) -> None:
         self.tasks = tuple(tasks)
@@ -68,14 +56,14 @@ class EpisodeCounter:
     def start_again(self, seed: int | None) -> None:
         """Begin at the first episode, of another seed if one is given."""
         if seed is not None:
-            self.seed = check_value("seed", seed, int)
+            self.seed = int(seed)
         self.resets[:] = 0
 
     def next(self, rows: Rows) -> Episodes:
         return (self.resets * self._stride + self._first)[rows]
 
-    def asked(self, episode: int | Tensor, rows: Rows) -> Episodes:
-        """The requested episodes of ``rows``, from one integer for all, or an int64 tensor (N,) with one for each."""
+    def requested(self, episode: int | Tensor, rows: Rows) -> Episodes:
+        """Return the requested episodes of ``rows``, from one integer for all, or an int64 tensor (N,)."""
         n = len(self.names)
         if isinstance(episode, Tensor):
             if episode.shape not in ((), (n,)) or episode.dtype not in (torch.int64, torch.int32):
@@ -83,10 +71,10 @@ class EpisodeCounter:
                 raise ValueError(f"episode must be an integer, or int64 of shape ({n},), one for each row, got {given}")
         elif check_value("episode", episode, Natural) >= 2**63:
             raise ValueError(f"episode must be below 2**63, got {shown(episode)}")
-        found = torch.as_tensor(episode).expand(n).cpu().numpy().astype(np.int64)[rows]
-        if (found < 0).any():
-            raise ValueError(f"episode must be at least 0, got {found.min()}")
-        return found
+        episodes = torch.as_tensor(episode).expand(n).cpu().numpy().astype(np.int64)[rows]
+        if (episodes < 0).any():
+            raise ValueError(f"episode must be at least 0, got {episodes.min()}")
+        return episodes
 
     def seeds(self, rows: Rows, episodes: Episodes) -> list[int]:
         return [
@@ -94,18 +82,14 @@ class EpisodeCounter:
         ]
 
     def dump(self) -> Tensor:
-        """Tasks, seed and counters as JSON in a tensor (bytes,) uint8."""
+        """Return tasks, seed and counters as JSON in a tensor (bytes,) uint8."""
         state = {"tasks": self.names, "seed": self.seed, "resets": self.resets.tolist()}
         return torch.frombuffer(bytearray(json.dumps(state).encode()), dtype=torch.uint8)
 
     def load(self, dumped: Tensor) -> None:
-        """Take seed and counters of a :meth:`dump` with the same tasks in its rows."""
+        """Restore seed and counters from a :meth:`dump` of the same rows."""
         state = parse_json(dumped.cpu().numpy().tobytes())
-        if (names := state["tasks"]) != self.names:
-            rows = f"{len(names)}: {_few(names)}; this one has {len(self.names)}: {_few(self.names)}"
-            raise ValueError(f"state_dict is of an environment with other rows, {rows}")
+        if state["tasks"] != self.names:
+            rows, own_rows = (f"{len(names)} rows, {shown(names)}" for names in (state["tasks"], self.names))
+            raise ValueError(f"state_dict belongs to an environment with other rows: {rows}; this one has {own_rows}")
         self.seed, self.resets = state["seed"], np.array(state["resets"], dtype=np.int64)
-
-
-def _few(names: Sequence[str]) -> str:
-    return ", ".join(map(str, names[:6])) + (", ..." if len(names) > 6 else "")

@@ -1,6 +1,6 @@
 """Evaluation: exactly k episodes of each task, their results, why they failed, and figures."""
 
-import lw_torchrl._util.torchrl  # noqa: F401
+import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.evaluation.diagnose.attribution import attribute_failures
 from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure, MendedEpisode
 from lw_torchrl.evaluation.evaluator_score import EvaluatorScore, score_evaluator

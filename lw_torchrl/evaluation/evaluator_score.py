@@ -10,8 +10,8 @@ from torch import Tensor
 
 from lw_torchrl._util.checks import typed
 from lw_torchrl._util.files import AnyPath, write_json
-from lw_torchrl.modules.networks import evaluating
-from lw_torchrl.modules.state_query_evaluator import ClauseEvaluator
+from lw_torchrl.modules.parts import evaluating
+from lw_torchrl.modules.query_evaluator import ClauseEvaluator
 from lw_torchrl.training.labelled_queries import LabelledQueries, TaskQueries
 
 PARTS = {

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lw_torchrl._util.checks import Count, Natural, Scale, check_value, shown, typed_fields
 from lw_torchrl._util.files import AnyPath, read_json, write_json
-from lw_torchrl._util.versions import package_versions
+from lw_torchrl._util.reproducibility import package_versions
 from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure, Finite, record_from_json
 
 FORMAT = "lw_torchrl.evaluation"

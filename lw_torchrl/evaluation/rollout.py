@@ -17,7 +17,7 @@ from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, read_action, ru
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.tasks import Task, TaskList
-from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.parts import evaluating
 from lw_torchrl.modules.policy import plans_of, transform_of
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks

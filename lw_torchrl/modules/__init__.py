@@ -1,6 +1,6 @@
 """Policies as TensorDict modules, in parts that can be used alone: attention, mixers, features, decoders, critics."""
 
-import lw_torchrl._util.torchrl  # noqa: F401
+import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.modules.attention import PlanAttention, attend
 from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedValue, QValue, Value
 from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
@@ -11,10 +11,9 @@ from lw_torchrl.modules.image_query_evaluator import IMAGE_ENCODERS, ImageQueryE
 from lw_torchrl.modules.mixer import ActionMixer, SkillEncoder, SkillMixer
 from lw_torchrl.modules.plan_conditioned_actor import ConditionedActor, PlanConditionedActor, plan_trunk
 from lw_torchrl.modules.policy import METHODS, layout_of, make_policy, plans_of, tasks_of, transform_of, with_plans
-from lw_torchrl.modules.query_evaluator import QueryEvaluator
+from lw_torchrl.modules.query_evaluator import QueryEvaluator, StateQueryEvaluator
 from lw_torchrl.modules.relative_features import FocusFeatures, RoleFeatures
 from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
-from lw_torchrl.modules.state_query_evaluator import StateQueryEvaluator
 from lw_torchrl.modules.stochastic import StochasticActor
 from lw_torchrl.modules.wrappers import ActorEnsemble, DecidedGripper, DemonstratedActor, TransferredActor
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -12,16 +9,13 @@ from torch import Tensor
 
 from lw_torchrl._util.checks import typed
 from lw_torchrl._util.devices import check_values
-from lw_torchrl._util.keys import dispatched, key_beside, read, write
-from lw_torchrl.language.task_index import PlanTables, answers_of, as_plans, pick
-from lw_torchrl.modules.networks import in_mode_of
-from lw_torchrl.modules.sequence import Part
-
-if TYPE_CHECKING:
-    from lw_torchrl.language.plans import AnyPlans
+from lw_torchrl._util.keys import Keys, dispatched, key_beside, read, write
+from lw_torchrl.language.plans import AnyPlans, as_plans
+from lw_torchrl.language.task_index import PlanTables, answers_of, pick
+from lw_torchrl.modules.parts import Part, in_mode_of
 
 TRUE_LOGIT = 5.0  # a true condition counts 5, a false one -5 (paper, section "Plan Conditioning")
-ACTIVE_WEIGHT = 0.01  # a false step beside a true one has a weight of 1e-4: above this, a step is active
+ACTIVE_WEIGHT = 0.01  # a step is active above this weight; a false step next to a true one has about 1e-4
 
 
 def attend(logits: Tensor, mask: Tensor) -> Tensor:
@@ -29,7 +23,7 @@ def attend(logits: Tensor, mask: Tensor) -> Tensor:
     return logits.masked_fill(~mask, -torch.inf).softmax(-1)
 
 
-def read_truth(tensordict: TensorDictBase, keys: Sequence[NestedKey], tables: PlanTables) -> tuple[Tensor, Tensor]:
+def read_truth(tensordict: TensorDictBase, keys: Keys, tables: PlanTables) -> tuple[Tensor, Tensor]:
     """Return the truth (..., S) of a plan's conditions and the rows (...) of its tables; raise for other plans."""
     qaf, task_id = read(tensordict, keys)
     return answers_of(qaf, task_id, tensordict.get(key_beside(keys[0], "_plan"), None), tables)
@@ -80,13 +74,7 @@ class PlanAttention(Part):
     mask: Tensor
 
     @typed
-    def __init__(
-        self,
-        plans: AnyPlans,
-        *,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
-    ) -> None:
+    def __init__(self, plans: AnyPlans, *, in_keys: Keys | None = None, out_keys: Keys | None = None) -> None:
         plans = as_plans(plans)
         tables = PlanTables(plans)
         has_fallback = not torch.equal(tables.turns[:, 0], tables.turns[:, 1])
@@ -109,11 +97,13 @@ class PlanAttention(Part):
     def with_plans(self, plans: AnyPlans) -> PlanAttention:
         """Return the attention over other plans' steps."""
         other = PlanAttention(plans, out_keys=self.out_keys_source)
+        # Either of the two may have a turn, which comes last.
         other.in_keys = [*self.in_keys, *other.in_keys[len(self.in_keys) :]][: len(other.in_keys)]
         return in_mode_of(self, other.to(self.mask.device))
 
     def weights(self, qaf: Tensor, rows: Tensor, turn: Tensor | None = None) -> Tensor:
         """Return the attention (..., S) float32 for truth (..., S), table rows (...) int64 and turns (...) int64."""
+        # In the flattened mask (2T, S), row 2t holds task t's own steps and row 2t + 1 its fallback steps.
         mask = pick(self.mask.flatten(0, 1), 2 * rows if turn is None else 2 * rows + turn % 2)
         check_truth(qaf, mask.shape)
         return attend(2 * TRUE_LOGIT * qaf.to(torch.float32) - TRUE_LOGIT, mask)

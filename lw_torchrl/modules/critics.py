@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import nn
 
-from lw_torchrl._util.checks import Count, check_value, typed
-from lw_torchrl._util.keys import as_keys, check_apart, check_key, dispatched, read, write
+from lw_torchrl._util.checks import Count, Natural, typed
+from lw_torchrl._util.keys import Keys, as_keys, check_apart, check_key, dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans
 from lw_torchrl.language.text import TextEncoder
-from lw_torchrl.modules.networks import MLP, materialize
+from lw_torchrl.modules.parts import MLP, RenamedInputs, Width, encoding_keys, encoding_width, materialize
 from lw_torchrl.modules.plan_conditioned_actor import plan_trunk
 from lw_torchrl.modules.policy import layout_of, plans_of
-from lw_torchrl.modules.sequence import RenamedInputs, encoding_keys, encoding_width
 
 
 class Value(RenamedInputs):
@@ -46,18 +44,18 @@ class Value(RenamedInputs):
     """
 
     _written = ("state_value", "state_values")
-    _numbers = 1  # of a value
-    _also_read: Sequence[NestedKey] = ()
+    _outputs = 1  # numbers that a head returns
+    _also_read: Keys = ()
 
     @typed
     def __init__(
         self,
         trunk: TensorDictSequential,
         *,
-        ensemble: int = 1,
-        width: int | Sequence[int] = 256,
-        depth: int = 2,
-        out_keys: Sequence[NestedKey] | None = None,
+        ensemble: Count = 1,
+        width: Width = 256,
+        depth: Natural = 2,
+        out_keys: Keys | None = None,
     ) -> None:
         super().__init__()
         self.trunk = trunk
@@ -65,28 +63,20 @@ class Value(RenamedInputs):
         self.in_keys = [*trunk.in_keys, *self._also_read]
         self.out_keys = as_keys("out_keys", out_keys, self._written[: 1 if ensemble == 1 else 2])
         check_apart(self.in_keys, self.out_keys)
-        self.heads = nn.ModuleList(
-            MLP(self._numbers, width=width, depth=depth, layer_norm=True)
-            for _ in range(check_value("ensemble", ensemble, Count))
-        )
+        heads = [MLP(self._outputs, width=width, depth=depth, layer_norm=True) for _ in range(ensemble)]
+        self.heads = nn.ModuleList(heads)
         if (size := encoding_width(trunk)) is not None:
-            for head in self.heads:
-                materialize(head, torch.zeros(1, size + self._extra))
-
-    @property
-    def _extra(self) -> int:
-        """How many numbers the heads read besides latent and features."""
-        return 0
-
-    def _inputs(self, tensordict: TensorDictBase) -> Tensor:
-        seen = self.trunk(tensordict.copy())
-        return torch.cat([seen.get(key) for key in encoding_keys(self.trunk)], -1)
+            for head in heads:
+                materialize(head, torch.zeros(1, size + self.layout.action_size * len(self._also_read)))
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        inputs = self._inputs(tensordict)
+        outputs = self.trunk(tensordict.copy())
+        encoding = torch.cat([outputs.get(key) for key in encoding_keys(self.trunk)], -1)
+        actions = read(tensordict, self.in_keys[len(self.trunk.in_keys) :])
+        inputs = torch.cat([encoding, *(action.to(encoding.dtype) for action in actions)], -1)
         values = torch.cat([head(inputs) for head in self.heads], -1)
-        if self._numbers > 1:
+        if self._outputs > 1:
             return write(tensordict, self, [values])
         return write(tensordict, self, [values.amin(-1, keepdim=True), values][: len(self.out_keys_source)])
 
@@ -113,29 +103,36 @@ class QValue(Value):
         self,
         trunk: TensorDictSequential,
         *,
-        ensemble: int = 1,
+        ensemble: Count = 1,
         action_key: NestedKey = "action",
-        quantiles: int = 1,
+        quantiles: Count = 1,
         **options: Any,
     ) -> None:
-        self._numbers = check_value("quantiles", quantiles, Count)
         if quantiles > 1 and ensemble != 1:
             raise ValueError(f"ensemble must be 1 with quantiles, got {ensemble}: TQCLoss makes several critics itself")
         check_key("action_key", action_key)
-        self._also_read = (action_key,)
+        self._outputs, self._also_read = quantiles, (action_key,)
         super().__init__(trunk, ensemble=ensemble, **options)
 
-    @property
-    def _extra(self) -> int:
-        return self.layout.action_size
 
-    def _inputs(self, tensordict: TensorDictBase) -> Tensor:
-        (action,) = read(tensordict, self.in_keys[-1:])
-        seen = super()._inputs(tensordict)
-        return torch.cat((seen, action.to(seen.dtype)), -1)
+class _OnPlanTrunk:
+    """Base of critics on :func:`plan_trunk`."""
+
+    @typed
+    def __init__(
+        self,
+        plans: AnyPlans,
+        *,
+        skill_encoder: nn.Module | None = None,
+        features: nn.Module | None = None,
+        text_encoder: TextEncoder | None = None,
+        **options: Any,
+    ) -> None:
+        trunk = plan_trunk(plans, skill_encoder=skill_encoder, features=features, text_encoder=text_encoder)
+        super().__init__(trunk, **options)  # type: ignore[call-arg]
 
 
-class PlanConditionedValue(Value):
+class PlanConditionedValue(_OnPlanTrunk, Value):
     """:class:`Value` on :func:`plan_trunk`.
 
     Reads ``qaf`` (B, S) bool, ``task_id`` (B,) int64 and ``observation`` (B, 39) float32; writes as :class:`Value`.
@@ -150,21 +147,8 @@ class PlanConditionedValue(Value):
         ['state_value']
     """
 
-    @typed
-    def __init__(
-        self,
-        plans: AnyPlans,
-        *,
-        skill_encoder: nn.Module | None = None,
-        features: nn.Module | None = None,
-        text_encoder: TextEncoder | None = None,
-        **options: Any,
-    ) -> None:
-        trunk = plan_trunk(plans, skill_encoder=skill_encoder, features=features, text_encoder=text_encoder)
-        super().__init__(trunk, **options)
 
-
-class PlanConditionedQValue(QValue):
+class PlanConditionedQValue(_OnPlanTrunk, QValue):
     """:class:`QValue` on :func:`plan_trunk`.
 
     Reads what :class:`PlanConditionedValue` does, and ``action`` (B, A) float32; writes as :class:`QValue`.
@@ -179,16 +163,3 @@ class PlanConditionedQValue(QValue):
         >>> plans = lw.load_plans("MT10")
         >>> loss = TD3BCLoss(lw.PlanConditionedActor(plans), lw.PlanConditionedQValue(plans), bounds=(-1.0, 1.0))
     """
-
-    @typed
-    def __init__(
-        self,
-        plans: AnyPlans,
-        *,
-        skill_encoder: nn.Module | None = None,
-        features: nn.Module | None = None,
-        text_encoder: TextEncoder | None = None,
-        **options: Any,
-    ) -> None:
-        trunk = plan_trunk(plans, skill_encoder=skill_encoder, features=features, text_encoder=text_encoder)
-        super().__init__(trunk, **options)

@@ -3,24 +3,42 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import Scale, check_value, typed
-from lw_torchrl._util.keys import dispatched, read, write
-from lw_torchrl.modules.networks import MLP, materialize, probe
-from lw_torchrl.modules.sequence import Part, encoding_keys, encoding_width, trunk_attributes
+from lw_torchrl._util.checks import Count, Natural, Scale, typed
+from lw_torchrl._util.keys import Keys, dispatched, read, write
+from lw_torchrl.modules.parts import (
+    MLP,
+    Part,
+    Width,
+    encoding_keys,
+    encoding_width,
+    materialize,
+    probe,
+    trunk_attributes,
+)
 
 LEAST_STD = 1e-3
 
 
-class MLPDecoder(MLP):
+class _ActionMLP(MLP):
+    """Base of the decoders. ``squash`` can be set after construction, so ``config`` reads its present value."""
+
+    _options: dict[str, Any]
+    squash: bool
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        return {**self._options, "squash": self.squash}
+
+
+class MLPDecoder(_ActionMLP):
     """The paper's action decoder, an MLP from a latent and features (..., D + F) to an action (..., A).
 
     Args:
@@ -37,30 +55,23 @@ class MLPDecoder(MLP):
     """
 
     @typed
-    def __init__(
-        self, *, width: int | Sequence[int] = 256, depth: int = 3, actions: int = 4, squash: bool = True
-    ) -> None:
+    def __init__(self, *, width: Width = 256, depth: Natural = 3, actions: Count = 4, squash: bool = True) -> None:
         super().__init__(actions, width=width, depth=depth)
         self.actions, self.squash = actions, squash
-        self._sizes: dict[str, Any] = {"width": width, "depth": depth, "actions": actions}
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
-        return {**self._sizes, "squash": self.squash}
+        self._options = {"width": width, "depth": depth, "actions": actions}
 
     def forward(self, *inputs: Tensor) -> Tensor:
         action = super().forward(*inputs)
         return torch.tanh(action) if self.squash else action
 
 
-class GaussianDecoder(MLP):
+class GaussianDecoder(_ActionMLP):
     """An MLP from a latent and features (..., D + F) to mean and standard deviation of a Normal, (..., A) each.
 
     Args:
         width, depth, actions: as for :class:`MLPDecoder`.
         squash: keep the mean in (-1, 1), for a Normal around the action; False for a Normal that goes through tanh.
-        init_std: the standard deviation at every state before training.
+        init_std: the standard deviation at every state before training, above 0.001.
 
     Example:
         >>> import lw_torchrl as lw
@@ -77,23 +88,19 @@ class GaussianDecoder(MLP):
     def __init__(
         self,
         *,
-        width: int | Sequence[int] = 256,
-        depth: int = 3,
-        actions: int = 4,
+        width: Width = 256,
+        depth: Natural = 3,
+        actions: Count = 4,
         squash: bool = False,
-        init_std: float = 0.3,
+        init_std: Scale = 0.3,
     ) -> None:
-        if check_value("init_std", init_std, Scale) <= LEAST_STD:
+        if init_std <= LEAST_STD:
             raise ValueError(f"init_std must be above {LEAST_STD}, got {init_std}")
         super().__init__(2 * actions, width=width, depth=depth)
         self.actions, self.squash = actions, squash
-        self._sizes: dict[str, Any] = {"width": width, "depth": depth, "actions": actions, "init_std": init_std}
+        self._options = {"width": width, "depth": depth, "actions": actions, "init_std": init_std}
+        # The inverse of softplus, which is the identity for large numbers.
         self._offset = math.log(math.expm1(init_std - LEAST_STD)) if init_std < 20 else init_std
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
-        return {**self._sizes, "squash": self.squash}
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         loc, scale = super().forward(*inputs).chunk(2, -1)
@@ -113,9 +120,9 @@ class GaussianDecoder(MLP):
 
 
 class Decode(Part):
-    """A decoder as a TensorDict module.
+    """Make a network a decoder: it reads the latent and the features, concatenated.
 
-    Reads ``skill_latent`` (B, D) float32 and ``features`` (B, F) float32; writes what the network returns, by default
+    Reads ``skill_latent`` (B, D) and ``features`` (B, F) float32; writes what the network returns, by default
     ``action`` (B, A) float32.
 
     Args:
@@ -125,9 +132,7 @@ class Decode(Part):
 
     _options = ("network",)
 
-    def __init__(
-        self, network: nn.Module, *, in_keys: Sequence[NestedKey] | None = None, out_keys: Sequence[NestedKey]
-    ) -> None:
+    def __init__(self, network: nn.Module, *, in_keys: Keys | None = None, out_keys: Keys) -> None:
         super().__init__(("skill_latent", "features"), list(map(str, out_keys)) or ("action",), in_keys, out_keys)
         self.network = network
 
@@ -141,21 +146,20 @@ class Decode(Part):
         return write(tensordict, self, outputs)
 
 
-def as_decoder(
-    decoder: nn.Module, trunk: TensorDictSequential, out_keys: Sequence[NestedKey] | None = None
-) -> TensorDictModuleBase:
+def as_decoder(decoder: nn.Module, trunk: TensorDictSequential, out_keys: Keys | None = None) -> TensorDictModuleBase:
     """Return a decoder behind a trunk: a plain module reads the trunk's latent and features and writes ``out_keys``."""
-    own = isinstance(decoder, Decode) or not isinstance(decoder, TensorDictModuleBase)
     width = encoding_width(trunk)
-    if own and width is not None:
-        materialize(getattr(decoder, "network", decoder), torch.zeros(1, width))
+    network = decoder.network if isinstance(decoder, Decode) else decoder
+    if width is not None and not isinstance(network, TensorDictModuleBase):
+        materialize(network, torch.zeros(1, width))
     if isinstance(decoder, TensorDictModuleBase):
         if out_keys is not None and list(out_keys) != list(decoder.out_keys_source):
             raise ValueError(f"out_keys: a TensorDict module has its own, {decoder.out_keys_source}; got {out_keys}")
         return decoder
     decode = Decode(decoder, in_keys=encoding_keys(trunk), out_keys=("action",) if out_keys is None else out_keys)
-    if width is not None and len(decode.out_keys) == 1:
-        found, size = probe(decoder, torch.zeros(1, width)), trunk_attributes(trunk)["layout"].action_size
-        if found.shape[-1:] != (size,):
-            raise ValueError(f"decoder must return actions (B, {size}) from (B, {width}), got {tuple(found.shape)}")
+    if width is not None and len(decode.out_keys) == 1:  # several outputs are parameters of a distribution
+        _, _, layout = trunk_attributes(trunk)
+        action, size = probe(decoder, torch.zeros(1, width)), layout.action_size
+        if action.shape[-1:] != (size,):
+            raise ValueError(f"decoder must return actions (B, {size}) from (B, {width}), got {tuple(action.shape)}")
     return decode

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from inspect import signature
 from typing import Any
 
@@ -29,15 +29,15 @@ _NETWORKS: dict[type[nn.Module], tuple[str, ...]] = {
     nn.LayerNorm: ("normalized_shape", "eps", "elementwise_affine"),
 }
 """PyTorch's own modules that need no ``config``, and the arguments that rebuild them."""
-_TENSORDICT = {kind.__name__: kind for kind in (TensorDictSequential, TensorDictModule)}
+_SEQUENCES: dict[str, Any] = {"TensorDictSequential": TensorDictSequential, "Sequential": nn.Sequential}
 _KEYS = ("in_keys", "out_keys")
 
 
 def describe(module: nn.Module) -> dict[str, Any]:
     """Return a module's description, from which :func:`from_description` builds it again, with fresh weights.
 
-    It holds the class of each part, by its import path, and its arguments, those of the attribute ``config``: JSON
-    values, plans, tasks, layouts and other modules.
+    It holds the class of each part, by its import path, and its arguments, from the attribute ``config``: JSON values,
+    plans, tasks, layouts and other modules.
 
     Raises:
         TypeError: a part that has no ``config``, by name.
@@ -54,17 +54,16 @@ def describe(module: nn.Module) -> dict[str, Any]:
 
 def _encode_module(module: nn.Module, plans: list[Plans], path: str) -> dict[str, Any]:
     kind = type(module)
-    if kind in (TensorDictSequential, nn.Sequential):
+    where = path or "the policy"
+    if kind in _SEQUENCES.values():
         parts: Any = module.module if kind is TensorDictSequential else module
         named = isinstance(parts, nn.ModuleDict) or [*parts._modules] != [str(n) for n in range(len(parts))]
-        children = [(name, _encode_module(part, plans, _join(path, name))) for name, part in parts._modules.items()]
-        return {"class": kind.__name__, "parts": dict(children) if named else [node for _, node in children]}
+        children = {name: _encode_module(part, plans, _join(path, name)) for name, part in parts._modules.items()}
+        return {"class": kind.__name__, "parts": children if named else [*children.values()]}
     if kind is TensorDictModule:
         wrapped: Any = module
         if wrapped._kwargs is not None or wrapped.method or wrapped.method_kwargs:
-            raise TypeError(
-                f"{path or 'the policy'} is a TensorDictModule with method= or keyword arguments; wrap them"
-            )
+            raise TypeError(f"{where} is a TensorDictModule with method= or keyword arguments; wrap them")
         inner = _encode_module(wrapped.module, plans, path)
         keys = {"in_keys": list(wrapped.in_keys), "out_keys": list(wrapped.out_keys_source)}
         return {"class": "TensorDictModule", "options": {"module": {"module": inner}, **keys}}
@@ -77,8 +76,8 @@ def _encode_module(module: nn.Module, plans: list[Plans], path: str) -> dict[str
         options = getattr(module, "config", None)
         if not isinstance(options, Mapping):
             raise TypeError(
-                f"{path or 'the policy'} is a {kind.__qualname__}, which cannot be saved: give it an attribute config, "
-                "a dict of its constructor's keyword arguments, as JSON"
+                f"{where} is a {kind.__qualname__}, which cannot be saved: give it an attribute config, a dict of its "
+                "constructor's keyword arguments, as JSON"
             )
         if "plans" not in options and "plans" in signature(getattr(kind, "rebuild", kind)).parameters:
             options = {"plans": module.plans, **options}
@@ -89,19 +88,19 @@ def _encode_module(module: nn.Module, plans: list[Plans], path: str) -> dict[str
 def _encode(value: Any, plans: list[Plans], path: str) -> Any:
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
+    if isinstance(value, (list, tuple, torch.Size, nn.ModuleList)):
+        return [_encode(each, plans, f"{path}[{number}]") for number, each in enumerate(value)]
     if isinstance(value, nn.Module):
         return {"module": _encode_module(value, plans, path)}
     if isinstance(value, Plans):
-        same = (number for number, other in enumerate(plans) if other is value or other == value)
-        number = next(same, len(plans))
-        plans += [value] if number == len(plans) else []
-        return {"plans": number}
+        # Most parts have the same plans, so a description holds each Plans once.
+        if value not in plans:
+            plans.append(value)
+        return {"plans": plans.index(value)}
     if isinstance(value, Task):
         return value.name if value == TASKS.get(value.name) else {"task": {"name": value.name, **value.to_json()}}
     if isinstance(value, Layout):
         return {"layout": METAWORLD.name if value == METAWORLD else value.to_json()}
-    if isinstance(value, (list, tuple, torch.Size)):
-        return [_encode(each, plans, f"{path}[{number}]") for number, each in enumerate(value)]
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
         return {"dict": {key: _encode(each, plans, _join(path, key)) for key, each in value.items()}}
     raise TypeError(f"{path} must be JSON, plans, a task, a layout or a module to be saved, got {shown(value)}")
@@ -119,7 +118,7 @@ def from_description(
     Args:
         description: what :func:`describe` returned.
         text_encoder: passed to parts that encode texts; None for the shipped sentence encoder.
-        parts: classes of your own. A class is also found if the module that defines it is imported already. Modules are
+        parts: custom classes. A class is also found if the module that defines it is imported already. Modules are
             never imported because a file names them: the file may come from a stranger.
 
     Raises:
@@ -128,20 +127,7 @@ def from_description(
     if not isinstance(description, Mapping) or not isinstance(description.get("plans"), list):
         raise ValueError(f"a description must have class, options and plans, got {shown(description)}")
     plans = [Plans.from_json(row) for row in description["plans"]]
-    decoder = _Decoder(plans, text_encoder, parts)
-    decoder.check_classes({key: value for key, value in description.items() if key != "plans"})
-    return decoder.module(description)
-
-
-def _class_names(value: Any) -> Iterator[str]:
-    """Yield the name of each class in a part of a description."""
-    if isinstance(value, Mapping):
-        if isinstance(name := value.get("class"), str):
-            yield name
-        for key, each in value.items():
-            yield from _class_names([*each.values()] if key == "dict" and isinstance(each, Mapping) else each)
-    for each in value if isinstance(value, list) else ():
-        yield from _class_names(each)
+    return _Decoder(plans, text_encoder, parts).module(description)
 
 
 class _Decoder:
@@ -149,21 +135,22 @@ class _Decoder:
         if wrong := [part for part in parts if not (isinstance(part, type) and issubclass(part, nn.Module))]:
             raise TypeError(f"parts must be classes of modules, got {shown(wrong[0])}")
         self.plans, self.text_encoder = plans, text_encoder
-        self.own = {f"{kind.__module__}:{kind.__qualname__}": kind for kind in parts}
-        self.own |= {f"__main__:{kind.__qualname__}": kind for kind in parts}
+        self.custom = {f"{kind.__module__}:{kind.__qualname__}": kind for kind in parts}
+        # A class that was saved by a script may now be in a module.
+        self.custom |= {f"__main__:{kind.__qualname__}": kind for kind in parts}
 
     def module(self, node: Any) -> Any:
         if not isinstance(node, Mapping) or not isinstance(node.get("class"), str):
             raise ValueError(f"a part must have a class, got {shown(node)}")
-        name, parts = node["class"], node.get("parts")
-        if name in ("TensorDictSequential", "Sequential"):
+        name = node["class"]
+        if name in _SEQUENCES:
+            parts = node.get("parts")
             if isinstance(parts, Mapping):
-                named = OrderedDict((key, self.module(part)) for key, part in parts.items())
-                return (TensorDictSequential if name in _TENSORDICT else nn.Sequential)(named)
+                return _SEQUENCES[name](OrderedDict((key, self.module(part)) for key, part in parts.items()))
             if not isinstance(parts, list):
                 raise ValueError(f"parts of a {name} must be a list or a table, got {shown(parts)}")
-            return (TensorDictSequential if name in _TENSORDICT else nn.Sequential)(*map(self.module, parts))
-        kind: Any = self.find(name)
+            return _SEQUENCES[name](*map(self.module, parts))
+        kind = self.find(name)
         if not isinstance(node.get("options"), Mapping):
             raise ValueError(f"options of a {name} must be a table, got {shown(node.get('options'))}")
         options = {key: self.value(value) for key, value in node["options"].items()}
@@ -172,39 +159,31 @@ class _Decoder:
         rebuild: Callable[..., Any] = getattr(kind, "rebuild", kind)
         if "text_encoder" in signature(rebuild).parameters and "text_encoder" not in options:
             options["text_encoder"] = self.text_encoder
-        several = [value for key, values in options.items() if key.startswith("*") for value in values]
-        return rebuild(*several, **{key: value for key, value in options.items() if not key.startswith("*")})
+        positional = [value for key, values in options.items() if key.startswith("*") for value in values]
+        return rebuild(*positional, **{key: value for key, value in options.items() if not key.startswith("*")})
 
-    def check_classes(self, description: Any) -> None:
-        """Raise :class:`ValueError` that names all classes that are not known here."""
-        names = [name for name in dict.fromkeys(_class_names(description)) if self.find(name) is None]
-        if not names:
-            return
-        own = [(place, path) for place, _, path in (name.rpartition(":") for name in names) if place]
-        places, paths = list(dict.fromkeys(place for place, _ in own)), ", ".join(path for _, path in own)
-        options = " ".join(f"--import {place}" for place in places)
-        hint = f": import {' and '.join(places)} first, on the command line by {options}, or pass parts=[{paths}]"
-        hint = f": pass the class{'es' * (len(own) > 1)}, parts=[{paths}]" if "__main__" in places else hint
-        unknown = f"class {shown(names[0])} is" if len(names) == 1 else f"classes {', '.join(map(shown, names))} are"
-        raise ValueError(f"the {unknown} not known here{hint if own else ''}")
-
-    def find(self, name: str) -> type[nn.Module] | None:
-        """Return the class of a name: ours, given ones, or one of a module that is imported already; else None."""
+    def find(self, name: str) -> Any:
+        """Return the class of a name: ours, a custom one, or one of a module that is imported already."""
         from lw_torchrl import modules
 
         place, _, path = name.rpartition(":")
         kind: Any
-        if name in _TENSORDICT or name == "Sequential":
-            kind = _TENSORDICT.get(name, nn.Sequential)
+        hint = ""
+        if name == "TensorDictModule":
+            kind = TensorDictModule
         elif not place:
             kind = getattr(modules, path, None) if path.isidentifier() else None
         elif place == "torch.nn":
-            kind = next((one for one in _NETWORKS if one.__name__ == path), None)
+            kind = next((network for network in _NETWORKS if network.__name__ == path), None)
         else:
-            kind = self.own.get(name) or sys.modules.get(place)
+            kind = self.custom.get(name) or sys.modules.get(place)
             for step in path.split(".") if not isinstance(kind, type) else ():
                 kind = getattr(kind, step, None)
-        return kind if isinstance(kind, type) and issubclass(kind, nn.Module) else None
+            by_import = f"import {place} first, on the command line by --import {place}, or " * (place != "__main__")
+            hint = f": {by_import}pass parts=[{path}]"
+        if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
+            raise ValueError(f"the class {shown(name)} is not known here{hint}")
+        return kind
 
     def value(self, value: Any) -> Any:
         if isinstance(value, list):

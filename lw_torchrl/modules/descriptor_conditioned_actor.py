@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from lw_torchrl._util.checks import typed
-from lw_torchrl._util.keys import dispatched, read, write
+from lw_torchrl._util.keys import Keys, dispatched, read, write
 from lw_torchrl.language.task_index import TaskIndex, pick
 from lw_torchrl.language.tasks import MT50, Task, named_tasks, one_layout, task_ids
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.features import as_features
 from lw_torchrl.modules.mixer import SkillEncoder, unit_scale
-from lw_torchrl.modules.networks import materialize, probe
+from lw_torchrl.modules.parts import Part, materialize, probe
 from lw_torchrl.modules.plan_conditioned_actor import ConditionedActor
-from lw_torchrl.modules.sequence import Part
 
 Condition = Literal["description", "one-hot"]
 
@@ -55,15 +53,17 @@ class TaskLatent(Part):
         encoder: nn.Module | None = None,
         *,
         text_encoder: TextEncoder | None = None,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
     ) -> None:
         super().__init__(("task_id",), ("task_latent",), in_keys, out_keys)
         self.definitions = named_tasks(tasks)
         self.tasks, self.layout = tuple(self.definitions), one_layout(self.definitions.values())
         self.condition, self.text_encoder = condition, text_encoder
-        own = (lambda texts: torch.eye(len(texts))) if text_encoder is None and condition == "one-hot" else text_encoder
-        vectors = encoded([task.description for task in self.definitions.values()], own)
+        if text_encoder is None and condition == "one-hot":
+            vectors = torch.eye(len(self.tasks))
+        else:
+            vectors = encoded([task.description for task in self.definitions.values()], text_encoder)
         self.index = TaskIndex(task_ids(self.tasks))
         order = [self.tasks.index(task) for task in self.index.tasks]
         # Matrix products round differently for different numbers of rows, so there are always at least 50 rows.
@@ -85,13 +85,13 @@ class TaskLatent(Part):
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        (given,) = read(tensordict, self.in_keys)
-        rows = self.index.rows(_one_per_row(given, tensordict), "tasks this actor was not made for")
+        (task_id,) = read(tensordict, self.in_keys)
+        rows = self.index.rows(_one_per_row(task_id, tensordict), "tasks this actor was not made for")
         return write(tensordict, self, [pick(self.encoder(self.vectors)[: len(self.tasks)], rows)])
 
 
 def _one_per_row(task_id: Tensor, tensordict: TensorDictBase) -> Tensor:
-    """Return task ids (...) also if they are (..., 1): the batch's dimensions, or those of all entries, tell which."""
+    """Return task ids (...) for ids (...) or (..., 1); the shapes of the batch and of all entries decide which."""
     if task_id.shape[-1:] != (1,) or task_id.dim() <= tensordict.batch_dims:
         return task_id
     shapes = [value.shape[: task_id.dim()] for value in tensordict.values(True, True)]
@@ -99,9 +99,9 @@ def _one_per_row(task_id: Tensor, tensordict: TensorDictBase) -> Tensor:
 
 
 class DescriptorConditionedActor(ConditionedActor):
-    """The paper's descriptor conditioning (DC): the description's latent and the observation give the action.
+    """A policy that is conditioned on the task's description instead of a plan, the paper's baseline DC.
 
-    Its parts are ``latent``, :class:`TaskLatent`, then ``features`` and ``decoder`` as of
+    Its parts are ``latent``, a :class:`TaskLatent`, then ``features`` and ``decoder`` as in
     :class:`PlanConditionedActor`. Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes
     ``task_latent`` (B, D), ``features`` (B, F) and ``action`` (B, 4) float32 in (-1, 1).
 
@@ -131,13 +131,13 @@ class DescriptorConditionedActor(ConditionedActor):
         features: nn.Module | None = None,
         decoder: nn.Module | None = None,
         text_encoder: TextEncoder | None = None,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
     ) -> None:
-        known = named_tasks(tasks)
-        features = as_features(features, one_layout(known.values()), noise=0.05)
+        known = list(named_tasks(tasks).values())
+        features = as_features(features, one_layout(known), noise=0.05)
         trunk = descriptor_trunk(
-            known.values(), condition=condition, task_encoder=task_encoder, features=features, text_encoder=text_encoder
+            known, condition=condition, task_encoder=task_encoder, features=features, text_encoder=text_encoder
         )
         super().__init__(trunk, decoder, in_keys=in_keys, out_keys=out_keys)
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -13,19 +13,15 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import add_random_module
 
-from lw_torchrl._util.checks import Scale, check_choice, check_value, typed
+from lw_torchrl._util.checks import Scale, check_value, typed
 from lw_torchrl._util.devices import check_finite
-from lw_torchrl._util.keys import as_keys, check_apart, dispatched, read, write
-from lw_torchrl.language.task_index import as_plans
-from lw_torchrl.modules.networks import in_mode_of, probe
-from lw_torchrl.modules.sequence import follow, written_key
-
-if TYPE_CHECKING:
-    from lw_torchrl.language.layout import Layout
-    from lw_torchrl.language.plans import AnyPlans
+from lw_torchrl._util.keys import Keys, as_keys, check_apart, dispatched, read, write
+from lw_torchrl.language.layout import METAWORLD, Layout
+from lw_torchrl.language.plans import AnyPlans, as_plans
+from lw_torchrl.modules.parts import follow, in_mode_of, probe, written_key
 
 Kind = Literal["raw", "differences", "relative", "opening", "none", "both"]
-_FINE, _COARSE = 0.02, 0.1  # metres: where the two squashed copies of each difference bend
+_FINE, _COARSE = 0.02, 0.1  # metres: the scales at which tanh squashes each difference
 
 
 class Features(TensorDictModuleBase):
@@ -44,7 +40,7 @@ class Features(TensorDictModuleBase):
 
     width: int
 
-    def __init__(self, noise: float, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey] | None = None) -> None:
+    def __init__(self, noise: float, in_keys: Keys, out_keys: Keys | None = None) -> None:
         super().__init__()
         self.noise = check_value("noise", noise, Scale)
         self.in_keys, self.out_keys = list(in_keys), as_keys("out_keys", out_keys, ("features",))
@@ -61,7 +57,7 @@ class Features(TensorDictModuleBase):
         raise NotImplementedError(f"{type(self).__name__} must override compute")
 
     def fit(self, rows: TensorDictBase, weights: Tensor | None = None) -> None:
-        """Take statistics from R rows of a dataset, weighted by ``weights`` (R,) float32 of sum 1; by default none."""
+        """Compute statistics from R rows of a dataset, weighted by ``weights`` (R,) float32 of sum 1; none here."""
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -71,8 +67,11 @@ class Features(TensorDictModuleBase):
         return write(tensordict, self, [features])
 
 
+add_random_module(Features)  # losses that vmap over networks then let each network draw its own noise
+
+
 class ObservationFeatures(Features):
-    """Normalised features of the observation alone.
+    """Normalised features of the observation only.
 
     Reads ``observation`` (B, D) float; writes ``features`` (B, F), within 10 standard deviations of the mean.
 
@@ -103,16 +102,11 @@ class ObservationFeatures(Features):
         noise: float = 0.0,
         layout: Layout | None = None,
         *,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
     ) -> None:
         super().__init__(noise, as_keys("in_keys", in_keys, ("observation",)), out_keys)
-        if layout is None:
-            from lw_torchrl.language.layout import METAWORLD
-
-            layout = METAWORLD
-        self.layout: Layout = layout
-        self.kind = check_choice("kind", kind, _KINDS)
+        self.kind, self.layout = kind, layout or METAWORLD
         self.width = _KINDS[kind](torch.zeros(self.layout.size), self.layout).shape[-1]
         self.register_buffer("mean", torch.zeros(self.width))
         self.register_buffer("std", torch.ones(self.width))
@@ -124,7 +118,11 @@ class ObservationFeatures(Features):
         return {"kind": self.kind, "noise": self.noise, "layout": self.layout, **keys}
 
     def with_plans(self, plans: AnyPlans) -> ObservationFeatures:
-        """Return the features, with the same statistics, for plans of a layout; ValueError if they differ there."""
+        """Return the features, with the same statistics, for the layout of other plans.
+
+        Raises:
+            ValueError: features that mean something else in that layout.
+        """
         layout = as_plans(plans).layout
         if layout == self.layout:
             return self
@@ -144,18 +142,18 @@ class ObservationFeatures(Features):
 
     @torch.no_grad()
     def fit(self, rows: TensorDictBase, weights: Tensor | None = None) -> None:
-        """Take mean and standard deviation from the rows; a feature that hardly varies keeps its scale."""
+        """Compute mean and standard deviation of the rows; a feature that hardly varies keeps its scale."""
         (observation,) = read(rows, self.in_keys)
-        found = self._select(observation.reshape(-1, self.layout.size))
-        check_rows(found)
-        if not found.shape[-1]:
-            return  # PyTorch warns of the deviation of nothing
+        features = self._select(observation.reshape(-1, self.layout.size))
+        check_rows(features)
+        if not features.shape[-1]:
+            return  # PyTorch warns about the deviation of nothing
         if weights is None:
-            mean, std = found.mean(0), found.std(0, unbiased=False)
+            mean, std = features.mean(0), features.std(0, unbiased=False)
         else:
-            weights = weights.to(found)
-            mean = weights @ found
-            std = (weights @ (found - mean).square()).sqrt()
+            weights = weights.to(features)
+            mean = weights @ features
+            std = (weights @ (features - mean).square()).sqrt()
         self.mean.copy_(mean)
         self.std.copy_(torch.where(std > 1e-4, std, 1.0))
 
@@ -175,14 +173,13 @@ class Concat(TensorDictModuleBase):
     Example:
         >>> import lw_torchrl as lw
         >>> plans = lw.load_plans("MT10")
-        >>> seen = lw.modules.Concat(lw.modules.ObservationFeatures(), lw.modules.FocusFeatures(plans))
-        >>> seen.width
+        >>> lw.modules.Concat(lw.modules.ObservationFeatures(), lw.modules.FocusFeatures(plans)).width
         74
 
     Source: ``torchrl.envs.CatTensors``, as a module.
     """
 
-    def __init__(self, *parts: TensorDictModuleBase, out_keys: Sequence[NestedKey] | None = None) -> None:
+    def __init__(self, *parts: TensorDictModuleBase, out_keys: Keys | None = None) -> None:
         super().__init__()
         if not parts or not all(isinstance(part, TensorDictModuleBase) for part in parts):
             raise TypeError(f"parts must be at least one TensorDict module, got {parts!r:.200}")
@@ -194,7 +191,7 @@ class Concat(TensorDictModuleBase):
         return list(dict.fromkeys(key for part in self.parts for key in part.in_keys))
 
     @in_keys.setter
-    def in_keys(self, keys: Sequence[NestedKey]) -> None:
+    def in_keys(self, keys: Keys) -> None:
         renamed = dict(zip(self.in_keys, as_keys("in_keys", keys, list(map(str, self.in_keys))), strict=True))
         for part in self.parts:
             part.in_keys = [renamed[key] for key in part.in_keys]
@@ -216,8 +213,8 @@ class Concat(TensorDictModuleBase):
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        seen = [part(tensordict.copy()).get(written_key(part)) for part in self.parts]
-        return write(tensordict, self, [torch.cat(seen, -1)])
+        features = [part(tensordict.copy()).get(written_key(part)) for part in self.parts]
+        return write(tensordict, self, [torch.cat(features, -1)])
 
 
 def as_features(features: nn.Module | None, layout: Layout, noise: float = 0.0) -> TensorDictModuleBase:
@@ -239,7 +236,7 @@ def check_observation(observation: Tensor, layout: Layout) -> None:
 
 
 def check_rows(rows: Tensor) -> None:
-    """Raise :class:`ValueError` unless there are rows to take statistics from."""
+    """Raise :class:`ValueError` unless there are rows to compute statistics from."""
     if not len(rows):
         raise ValueError("rows to fit features to must be at least one, got 0")
 
@@ -249,16 +246,17 @@ def relative(observation: Tensor, layout: Layout) -> Tensor:
 
     With Meta-World's two objects, (..., 39) gives (..., 54). Differences to an object that a task lacks are 0.
     """
-    places = [observation[..., place] for place in layout.positions]
-    absent = {n: (places[n] == 0).all(-1, keepdim=True) for n in range(2, len(places) - 1)}
+    positions = [observation[..., place] for place in layout.positions]
+    # Positions of all zeros mark an absent object; only objects after the first can be absent.
+    absent = {n: (positions[n] == 0).all(-1, keepdim=True) for n in range(2, len(positions) - 1)}
     pairs = []
-    for first, second in combinations(range(len(places)), 2):
-        difference = places[second] - places[first]
+    for first, second in combinations(range(len(positions)), 2):
+        difference = positions[second] - positions[first]
         for number in {first, second} & absent.keys():
             difference = torch.where(absent[number], 0.0, difference)
         pairs.append(difference)
-    d = torch.cat(pairs, -1)
-    return torch.cat((d, *squash(d)), -1)
+    metres = torch.cat(pairs, -1)
+    return torch.cat((metres, *squash(metres)), -1)
 
 
 def differences(observation: Tensor, layout: Layout) -> Tensor:
@@ -282,5 +280,3 @@ _KINDS: dict[str, Callable[[Tensor, Layout], Tensor]] = {
 }
 TRANSFERS = ("opening", "none")
 """The kinds of features that mean the same in every layout."""
-
-add_random_module(Features)  # losses that vmap over networks then let each network draw its own noise

@@ -9,19 +9,19 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import Count, check_choice, check_value, typed
+from lw_torchrl._util.checks import Count, check_choice, typed
 from lw_torchrl._util.registry import Registry, is_function
 from lw_torchrl._util.rendering import check_cameras
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.modules.networks import MLP, materialize
-from lw_torchrl.modules.query_evaluator import Answers
-from lw_torchrl.modules.state_query_evaluator import ClauseEvaluator, ClauseNetwork, Clauses
+from lw_torchrl.modules.parts import MLP, materialize
+from lw_torchrl.modules.query_evaluator import Answers, ClauseEvaluator, ClauseNetwork, Clauses
 from lw_torchrl.transforms.camera import CameraTransform
 
-KEYS = 32  # size of the vector by which an object is found in a picture
-_KEPT = 16  # features at that place which help to locate it
-_LANDMARKS = 32  # points that are found in every picture
+KEYS = 32  # size of the vector by which an object is located in a picture
+_KEPT = 16  # features at an object's place from which its position is estimated
+_LANDMARKS = 32  # points that are located in every picture
 _SHARP = 30.0  # scale of the scores in the softmax over a picture: at 1 a fresh network attends to the whole picture
+_LARGEST = 512  # pixels
 
 
 class SmallImageEncoder(nn.Module):
@@ -44,7 +44,7 @@ def _conv(before: int, after: int, stride: int = 1) -> nn.Sequential:
 
 
 class PointingNetwork(ClauseNetwork):
-    """Locates objects in pictures and judges clauses by their positions, as :class:`ClauseNetwork` does.
+    """A network that locates objects in pictures and judges clauses by their positions.
 
     An object's learned vector is compared with the features at every place of each camera's picture; a softmax over the
     places attends to one of them. From the mean coordinates and features there, and the coordinates of landmarks that
@@ -78,8 +78,8 @@ class PointingNetwork(ClauseNetwork):
         )
         return self.judge(first - second, clauses)
 
-    def places(self, seen: Tensor, things: Tensor) -> tuple[Tensor, Tensor]:
-        """Locate objects with vectors (N, 32) float32 in pictures (B, H, W·C, 3) uint8.
+    def places(self, seen: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
+        """Locate objects, described by learned vectors (N, 32) float32, in pictures (B, H, W·C, 3) uint8.
 
         Returns:
             Positions in metres and how far each object is open, (B, N, 4) float32; and the attention over each picture,
@@ -89,40 +89,38 @@ class PointingNetwork(ClauseNetwork):
         pictures = seen.unflatten(-2, (self.cameras, -1)).permute(0, 2, 4, 1, 3).flatten(0, 1)
         features = self.encoder(pictures.to(torch.float32) / 255.0)
         height, width = features.shape[-2:]
-        scores = torch.einsum("nk,bkp->bnp", things, self.key(features).flatten(-2))
-        pointed = (_SHARP / sqrt(KEYS) * scores).softmax(-1)
+        scores = torch.einsum("nk,bkp->bnp", objects, self.key(features).flatten(-2))
+        attention = (_SHARP / sqrt(KEYS) * scores).softmax(-1)
         axes = [torch.linspace(-1.0, 1.0, size, device=seen.device) for size in (height, width)]
         grid = torch.stack(torch.meshgrid(*axes, indexing="ij")).flatten(-2)
         values = torch.cat((grid.expand(len(features), -1, -1), self.seen(features).flatten(-2)), -2)
-        there = torch.einsum("bnp,bfp->bnf", pointed, values)  # (B·C, N, 2 + 16)
-        there = there.unflatten(0, (rows, self.cameras)).transpose(1, 2).flatten(-2)
+        attended = torch.einsum("bnp,bfp->bnf", attention, values)  # (B·C, N, 2 + 16)
+        attended = attended.unflatten(0, (rows, self.cameras)).transpose(1, 2).flatten(-2)
         marks = (_SHARP * self.landmarks(features).flatten(-2)).softmax(-1) @ grid.T  # (B·C, 32, 2)
-        marks = marks.reshape(rows, 1, -1).expand(-1, len(things), -1)
-        places = self.place(torch.cat((there, marks, things.expand(rows, -1, -1)), -1))
-        return places, pointed.unflatten(0, (rows, self.cameras)).unflatten(-1, (height, width))
+        marks = marks.reshape(rows, 1, -1).expand(-1, len(objects), -1)
+        places = self.place(torch.cat((attended, marks, objects.expand(rows, -1, -1)), -1))
+        return places, attention.unflatten(0, (rows, self.cameras)).unflatten(-1, (height, width))
 
 
 IMAGE_ENCODERS = Registry("image encoder", "lw_torchrl.image_encoders", {"small": SmallImageEncoder}, is_function)
 """Factories of picture encoders by name: modules from (n, 3, H, W) float32 in [0, 1] to features (n, F, h, w). Add your
 own, which may be frozen by ``requires_grad_(False)``, so that files can name it."""
 
-_LARGEST = 512
-
 
 class ImageQueryEvaluator(ClauseEvaluator):
-    """Answers conditions from pictures, by a network that was trained on exact answers.
+    """A query evaluator that answers conditions from camera pictures, by a network trained on exact answers.
 
     Reads ``pixels`` (B, height, width·C, 3) uint8, of C cameras side by side, and ``task_id`` (B,) int64; writes
     ``qaf`` and ``qaf_logits`` (B, S) float32 as :class:`QueryEvaluator` does. See :class:`PointingNetwork` for the
-    network. ``transform()`` returns the :class:`CameraTransform` that takes its pictures.
+    network. ``transform()`` returns the :class:`CameraTransform` that renders its pictures.
 
     Args:
-        plans, answers, predicates: as for :class:`~lw_torchrl.modules.state_query_evaluator.ClauseEvaluator`, with its
+        plans, answers, predicates: as for :class:`~lw_torchrl.modules.query_evaluator.ClauseEvaluator`, with its
             errors and source.
         cameras, height, width: as for :class:`CameraTransform`; at most 512 pixels.
-        every: steps from one picture to the next when it acts; in between its answers stay.
+        every: take a picture every N steps when it acts; the answers stay the same in between.
         encoder: a name in :data:`IMAGE_ENCODERS`.
-        hidden, depth: hidden layers of the network that judges differences.
+        hidden, depth: units and number of the hidden layers of the network that judges differences.
         names: the objects that it can tell apart; None for those of the plans' tasks.
 
     Example:
@@ -143,12 +141,12 @@ class ImageQueryEvaluator(ClauseEvaluator):
         plans: Plans,
         *,
         cameras: str | Sequence[str] = ("corner", "corner3"),
-        height: int = 64,
-        width: int = 64,
-        every: int = 1,
+        height: Count = 64,
+        width: Count = 64,
+        every: Count = 1,
         encoder: str = "small",
-        hidden: int = 128,
-        depth: int = 3,
+        hidden: Count = 128,
+        depth: Count = 3,
         answers: Answers = "soft",
         predicates: Sequence[str] | None = None,
         names: Sequence[str] | None = None,
@@ -156,10 +154,10 @@ class ImageQueryEvaluator(ClauseEvaluator):
         if names is None:
             names = sorted({name for plan in plans.values() for name in plan.definition.object_names})
         super().__init__(plans, answers=answers, predicates=predicates, names=names)
-        self.cameras, self.every = check_cameras(cameras, height, width), check_value("every", every, Count)
+        self.cameras = check_cameras(cameras, height, width)
         if max(height, width) > _LARGEST:
             raise ValueError(f"height and width must be at most {_LARGEST} pixels, got {height} and {width}")
-        self.height, self.width = height, width
+        self.height, self.width, self.every = height, width, every
         self.in_keys = ["pixels", "task_id"]
         check_choice("encoder", encoder, IMAGE_ENCODERS)
         image_encoder = IMAGE_ENCODERS[encoder]()
@@ -172,31 +170,26 @@ class ImageQueryEvaluator(ClauseEvaluator):
             depth=depth,
             predicates=len(self.predicates),
         )
-        self.config |= dict(cameras=list(self.cameras), height=height, width=width, every=self.every, encoder=encoder)
+        self.config |= dict(cameras=list(self.cameras), height=height, width=width, every=every, encoder=encoder)
         self.config |= dict(hidden=hidden, depth=depth, names=list(self.names))
 
     def transform(self) -> CameraTransform:
-        """Return a new transform that takes its pictures."""
+        """Return a new transform that renders its pictures."""
         return CameraTransform(self.cameras, height=self.height, width=self.width, every=self.every)
 
     def check_seen(self, seen: Tensor) -> None:
         shape = (self.height, self.width * len(self.cameras), 3)
         if seen.shape[-3:] != shape or seen.dtype != torch.uint8:
-            expected = f"uint8 of shape (..., {', '.join(map(str, shape))}), pictures by {', '.join(self.cameras)}"
-            got = f"{seen.dtype} of shape {tuple(seen.shape)}; evaluator.transform() takes them"
-            raise ValueError(f"pixels must be {expected} side by side, got {got}")
+            got = f"{seen.dtype} of shape {tuple(seen.shape)}; evaluator.transform() writes them"
+            raise ValueError(f"pixels must be uint8 of shape (..., {', '.join(map(str, shape))}), got {got}")
 
 
 @torch.no_grad()
 def _num_features(encoder: nn.Module, name: str, height: int, width: int) -> int:
     """Return F, the number of features that an encoder returns."""
     features = encoder(torch.zeros(1, 3, height, width))
-    if (
-        not isinstance(features, Tensor)
-        or features.dim() != 4
-        or len(features) != 1
-        or not features.is_floating_point()
-    ):
-        got = tuple(features.shape) if isinstance(features, Tensor) else type(features).__name__
-        raise ValueError(f"encoder {name!r} must give a map of features (n, F, h, w), got {got}")
+    is_tensor = isinstance(features, Tensor)
+    if not is_tensor or features.dim() != 4 or len(features) != 1 or not features.is_floating_point():
+        got = tuple(features.shape) if is_tensor else type(features).__name__
+        raise ValueError(f"encoder {name!r} must return a map of features (n, F, h, w), got {got}")
     return features.shape[1]

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from lw_torchrl._util.checks import Count, check_value, typed
-from lw_torchrl._util.keys import dispatched, read, write
-from lw_torchrl.language.task_index import PlanTables, as_plans, one_per_row, pick
+from lw_torchrl._util.keys import Keys, dispatched, read, write
+from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
+from lw_torchrl.language.roles import role_vectors
+from lw_torchrl.language.task_index import PlanTables, one_per_row, pick
 from lw_torchrl.language.text import TextEncoder, encoded
-from lw_torchrl.modules.networks import MLP, in_mode_of, materialize, probe
-from lw_torchrl.modules.sequence import Part
-
-if TYPE_CHECKING:
-    from lw_torchrl.language.plans import AnyPlans, Plans
+from lw_torchrl.modules.parts import MLP, Part, Width, in_mode_of, materialize, probe
 
 
 def unit_scale(vectors: Tensor) -> Tensor:
@@ -40,13 +36,13 @@ class SkillEncoder(MLP):
         torch.Size([5, 32])
     """
 
-    def __init__(self, latent_size: int = 64, *, width: int | Sequence[int] = 128, depth: int = 1) -> None:
+    def __init__(self, latent_size: int = 64, *, width: Width = 128, depth: int = 1) -> None:
         super().__init__(check_value("latent_size", latent_size, Count), width=width, depth=depth)
         self.config = {"latent_size": latent_size, "width": width, "depth": depth}
 
 
 class _Mixer(Part):
-    """Base of the mixers: the vector of each different skill, and which of them each step has."""
+    """Base of the mixers: the vector of each different skill, and the index of each step's skill."""
 
     index: Tensor
     vectors: Tensor
@@ -55,7 +51,7 @@ class _Mixer(Part):
         self.plans, self.text_encoder = as_plans(plans), text_encoder
         self.tables = PlanTables(self.plans)
         if self.plans.has_roles:
-            index, vectors = _role_vectors(self.plans, self.tables)
+            index, vectors = _vectors_of_roles(self.plans, self.tables)
         else:
             index, vectors = self.tables.skill_index, encoded(self.plans.skills, text_encoder)
         # The tables come from the plans, not from training: they are not part of the state that is saved.
@@ -125,8 +121,8 @@ class SkillMixer(_Mixer):
         encoder: nn.Module | None = None,
         *,
         text_encoder: TextEncoder | None = None,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
     ) -> None:
         super().__init__(("skill_weights", "task_id"), ("skill_latent",), in_keys, out_keys)
         self._encode(plans, encoder, text_encoder)
@@ -171,8 +167,8 @@ class ActionMixer(_Mixer):
         encoder: nn.Module | None = None,
         *,
         text_encoder: TextEncoder | None = None,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
     ) -> None:
         super().__init__(("skill_weights", "task_id", "features"), ("action",), in_keys, out_keys)
         self._encode(plans, encoder, text_encoder)
@@ -183,17 +179,15 @@ class ActionMixer(_Mixer):
         weights, task_id, features = read(tensordict, self.in_keys)
         latents = self.latents()
         shape = *features.shape[:-1], *latents.shape
-        each = torch.cat((latents.expand(shape), features.unsqueeze(-2).expand(*shape[:-1], -1)), -1)
-        actions = self.decoder(each)  # (..., K, A)
+        inputs = torch.cat((latents.expand(shape), features.unsqueeze(-2).expand(*shape[:-1], -1)), -1)
+        actions = self.decoder(inputs)  # (..., K, A)
         return write(tensordict, self, [(self.per_skill(weights, task_id, latents).unsqueeze(-1) * actions).sum(-2)])
 
 
-def _role_vectors(plans: Plans, tables: PlanTables) -> tuple[Tensor, Tensor]:
+def _vectors_of_roles(plans: Plans, tables: PlanTables) -> tuple[Tensor, Tensor]:
     """Return the index (T, S) int64 of each step's vector, and the different vectors (K, E) float32."""
-    from lw_torchrl.language.roles import role_vectors
-
-    index, different = torch.zeros_like(tables.skill_index), dict[tuple[float, ...], int]()
+    index, numbers = torch.zeros_like(tables.skill_index), dict[tuple[float, ...], int]()
     for task, plan in sorted(plans.items()):
-        for number, vector in enumerate(role_vectors([step.role for step in plan.steps if step.role is not None])):
-            index[tables.index.row(task), number] = different.setdefault(tuple(vector), len(different))
-    return index, torch.tensor([*different])
+        for step, vector in enumerate(role_vectors([step.role for step in plan.steps if step.role is not None])):
+            index[tables.index.row(task), step] = numbers.setdefault(tuple(vector), len(numbers))
+    return index, torch.tensor([*numbers])

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Self
 
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.data import Composite
 
 from lw_torchrl._util.checks import typed
-from lw_torchrl.language.task_index import as_plans
+from lw_torchrl._util.keys import Keys
+from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.attention import PlanAttention
 from lw_torchrl.modules.decoder import MLPDecoder, as_decoder
 from lw_torchrl.modules.features import as_features
 from lw_torchrl.modules.mixer import SkillMixer
-from lw_torchrl.modules.networks import in_mode_of
-from lw_torchrl.modules.sequence import NamedParts, action_spec, check_same_plans, follow, trunk_attributes
+from lw_torchrl.modules.parts import NamedParts, action_spec, check_same_plans, follow, in_mode_of, trunk_attributes
 
 if TYPE_CHECKING:
-    from lw_torchrl.language.plans import AnyPlans
     from lw_torchrl.modules.stochastic import DistributionName, StochasticActor
 
 
@@ -33,15 +30,15 @@ def plan_trunk(
     features: nn.Module | None = None,
     text_encoder: TextEncoder | None = None,
 ) -> TensorDictSequential:
-    """Return attention, mixer and features: what a plan says to do now, and what is seen of the state.
+    """Return attention, mixer and features as one sequence: the latent of the active skills, and the features.
 
     Reads ``qaf`` (B, S) bool, ``task_id`` (B,) int64 and ``observation`` (B, 39) float32; writes ``skill_weights``
     (B, S), ``skill_latent`` (B, D) and ``features`` (B, F) float32. The arguments are :class:`PlanConditionedActor`'s,
     but the default features have no noise.
     """
     attention, mixer = PlanAttention(plans), SkillMixer(plans, skill_encoder, text_encoder=text_encoder)
-    seen = as_features(features, mixer.plans.layout)
-    return TensorDictSequential(OrderedDict(attention=attention, mixer=mixer, features=seen))
+    features = as_features(features, mixer.plans.layout)
+    return TensorDictSequential(OrderedDict(attention=attention, mixer=mixer, features=features))
 
 
 class ConditionedActor(NamedParts):
@@ -70,10 +67,10 @@ class ConditionedActor(NamedParts):
         trunk: TensorDictSequential,
         decoder: nn.Module | None = None,
         *,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
     ) -> None:
-        plans, tasks, layout = trunk_attributes(trunk).values()
+        plans, tasks, layout = trunk_attributes(trunk)
         decoder = MLPDecoder(actions=layout.action_size) if decoder is None else decoder
         super().__init__(OrderedDict(**trunk.module, decoder=as_decoder(decoder, trunk, out_keys)))
         check_same_plans(dict(self.module.items()))
@@ -83,15 +80,15 @@ class ConditionedActor(NamedParts):
 
     def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
         if name == "decoder":
-            own = isinstance(module, TensorDictModuleBase)
-            return as_decoder(module, self.trunk, None if own else self.decoder.out_keys_source)
+            has_keys = isinstance(module, TensorDictModuleBase)
+            return as_decoder(module, self.trunk, None if has_keys else self.decoder.out_keys_source)
         return super().as_part(name, module)
 
     @classmethod
     def rebuild(cls, trunk: TensorDictSequential, decoder: TensorDictModuleBase) -> Self:
         """Return an actor of these parts."""
         actor = cls.__new__(cls)
-        ConditionedActor.__init__(actor, trunk, decoder)
+        ConditionedActor.__init__(actor, trunk, decoder)  # subclasses have other arguments
         return actor
 
     @property
@@ -178,8 +175,8 @@ class PlanConditionedActor(ConditionedActor):
         features: nn.Module | None = None,
         decoder: nn.Module | None = None,
         text_encoder: TextEncoder | None = None,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
     ) -> None:
         features = as_features(features, as_plans(plans).layout, noise=0.05)
         trunk = plan_trunk(plans, skill_encoder=skill_encoder, features=features, text_encoder=text_encoder)

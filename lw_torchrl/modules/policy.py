@@ -10,22 +10,14 @@ from torch import nn
 from torchrl.envs import Compose, Transform
 
 from lw_torchrl._util.checks import check_choice, typed
-from lw_torchrl._util.registry import Registry
+from lw_torchrl._util.registry import Registry, is_function
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
-from lw_torchrl.modules.sequence import follow
+from lw_torchrl.modules.parts import follow
 from lw_torchrl.transforms.fallback_turns import FallbackTurns
 from lw_torchrl.transforms.qaf import QAFTransform
 
 Method = Callable[..., TensorDictModuleBase]
-
-
-def _check_method(name: str, entry: Any) -> Method:
-    if not callable(entry):
-        raise TypeError(f"method {name!r} must be a function of plans, got {entry!r:.80}")
-    method: Method = entry
-    return method
-
 
 METHODS: Registry[Method] = Registry(
     "method",
@@ -35,7 +27,7 @@ METHODS: Registry[Method] = Registry(
         "dc": "lw_torchrl.modules.policy:descriptor_actor",
         "one-hot": "lw_torchrl.modules.policy:one_hot_actor",
     },
-    _check_method,
+    is_function,
 )
 """Functions from plans, and keyword arguments, to an actor: conditioned on plans, on descriptions, or on numbers."""
 
@@ -75,6 +67,7 @@ def _parts(actor: Any) -> Iterator[Any]:
 
 
 def _first(actor: Any, name: str) -> Any:
+    """Return the first attribute ``name`` that is not None, of an actor or of one of its parts."""
     return next((value for part in _parts(actor) if (value := getattr(part, name, None)) is not None), None)
 
 
@@ -85,7 +78,7 @@ def plans_of(actor: Any) -> Plans | None:
 
 
 def tasks_of(actor: Any) -> tuple[str, ...] | None:
-    """Return the tasks that an actor knows: its own ``tasks``, or those of its plans; None if it does not say."""
+    """Return the tasks that an actor knows: its own ``tasks``, or those of its plans; None if unknown."""
     tasks = _first(actor, "tasks")
     return None if tasks is None else tuple(tasks)
 
@@ -98,7 +91,7 @@ def layout_of(actor: Any) -> Layout:
 
 
 def draws(actor: Any) -> bool:
-    """Return whether an actor's actions, without exploration, depend on random numbers that were drawn before."""
+    """Return whether an actor draws random numbers even without exploration: actions then depend on earlier calls."""
     return any(getattr(part, "draws", False) for part in _parts(actor))
 
 
@@ -116,7 +109,7 @@ def with_plans(actor: Any, plans: AnyPlans) -> Any:
 
 
 def transform_of(actor: Any, plans: Plans | None = None) -> Transform | None:
-    """Return a new transform that writes what an actor reads and an environment does not give; None for nothing.
+    """Return a new transform that writes the keys that an actor reads and an environment lacks; None if none.
 
     Args:
         actor: any actor; a part with a method ``transform()`` states its own.
@@ -124,17 +117,18 @@ def transform_of(actor: Any, plans: Plans | None = None) -> Transform | None:
             if it reads ``qaf``.
     """
     own, reads = plans_of(actor), list(getattr(actor, "in_keys", ()))
-    parts: list[Transform] = []
+    transforms: list[Transform] = []
     for part in _parts(actor):
-        if callable(ask := getattr(part, "transform", None)) and (asked := ask()) is not None:
-            parts += asked.transforms if isinstance(asked, Compose) else [asked]
+        transform = part.transform() if callable(getattr(part, "transform", None)) else None
+        if transform is not None:
+            transforms += transform.transforms if isinstance(transform, Compose) else [transform]
     qaf, task_id = _first(actor, "truth_keys") or ("qaf", "task_id")
     observation = _first(actor, "observation_key") or "observation"
     answered = plans or (own if qaf in reads else None)
     if answered is not None:
-        parts.insert(0, QAFTransform(answered, in_keys=[observation, task_id], out_keys=[qaf]))
+        transforms.insert(0, QAFTransform(answered, in_keys=[observation, task_id], out_keys=[qaf]))
     if own is not None and (turn := _first(actor, "turn_key")) in reads:
-        parts.append(FallbackTurns(own.layout, in_keys=[observation], out_keys=[turn]))
-    if not parts:
-        return None
-    return parts[0] if len(parts) == 1 else Compose(*parts)
+        transforms.append(FallbackTurns(own.layout, in_keys=[observation], out_keys=[turn]))
+    if len(transforms) > 1:
+        return Compose(*transforms)
+    return transforms[0] if transforms else None

@@ -8,12 +8,11 @@ from weakref import WeakSet
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._util.checks import typed
+from lw_torchrl._util.checks import Scale, typed
 from lw_torchrl._util.devices import check_finite
-from lw_torchrl._util.keys import as_keys, read
+from lw_torchrl._util.keys import Keys, as_keys, read
 from lw_torchrl.language.layout import places
 from lw_torchrl.language.objects import GOAL, GRIPPER, NamedObject, coordinate_indices
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, as_plans
@@ -25,10 +24,10 @@ from lw_torchrl.modules.features import Features, check_observation, check_rows,
 from lw_torchrl.transforms.qaf import plan_program
 from lw_torchrl.transforms.random_yaw import tilt_key, turn_observation, turn_vectors, yaw_key
 
-_SCALE = 0.1  # metres
-_FAR = 0.25  # metres, beyond which demonstrations say nothing
-_LIFTED = 0.15  # metres above its target, on the way there
-_AWAY = 0.15  # metres: a place to the left, for what is moved to the left
+_SCALE = 0.1  # metres: the unit of the positions that a network reads
+_FAR = 0.25  # metres: farther positions count as this far, since demonstrations hardly show them
+_LIFTED = 0.15  # metres: the height at which an object is carried above its target
+_AWAY = 0.15  # metres: "move the puck to the left" has a target this far away
 _KEYS = ("observation", "skill_weights", "task_id")
 Pair = tuple[NamedObject, NamedObject]
 
@@ -51,25 +50,26 @@ class _RelativePositions(Features):
         pairs: Callable[[ConditionalPlan], Sequence[Sequence[Pair]]],
         number: int,
         noise: float = 0.0,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
     ) -> None:
         super().__init__(noise, as_keys("in_keys", in_keys, _KEYS), out_keys)
         self.plans = plans = as_plans(plans)
         self.tables = PlanTables(plans)
         self.width = 9 * number
+        # Coordinates are looked up in the observation followed by constants, of which the first is 0: fixed places
+        # are constants, and a pair that is absent is the difference of two zeros.
         constants = [0.0]
         shape = (len(plans), plans.num_steps, number, 3)
         self.layout, size = plans.layout, plans.layout.size
-        index = torch.full((2, *shape), size)  # the constant 0
-        offset = torch.zeros(shape)
+        index, offset = torch.full((2, *shape), size), torch.zeros(shape)
         for task, plan in plans.items():
-            for step, of_step in enumerate(pairs(plan)):
-                for one, ends in enumerate(of_step):
-                    at = (self.tables.index.row(task), step, one)
-                    for side, thing in enumerate(ends):
-                        index[(side, *at)] = torch.tensor(coordinate_indices(thing.position, constants, size))
-                        offset[at] += torch.tensor(thing.offset) * (2 * side - 1)
+            for step, pairs_of_step in enumerate(pairs(plan)):
+                for place, pair in enumerate(pairs_of_step):
+                    at = (self.tables.index.row(task), step, place)
+                    for side, item in enumerate(pair):
+                        index[(side, *at)] = torch.tensor(coordinate_indices(item.position, constants, size))
+                        offset[at] += torch.tensor(item.offset) * (2 * side - 1)
         # The tables come from the plans, not from training: they are not part of the state that is saved.
         self.register_buffer("begin", index[0], persistent=False)
         self.register_buffer("end", index[1], persistent=False)
@@ -90,18 +90,18 @@ class _RelativePositions(Features):
 
         ``yaw`` (...) is the angle in radians by which :class:`RandomYaw` turned the observation (..., D).
         """
-        if yaw is not None:
+        if yaw is not None:  # fixed places and offsets are those of the scene before it was turned
             observation = turn_observation(observation, -yaw, self.layout)
-        found = (weights[..., None, None] * self.of_steps(observation, rows)).sum(-3)
-        return found if yaw is None else turn_vectors(found, yaw.unsqueeze(-1))
+        positions = (weights[..., None, None] * self.of_steps(observation, rows)).sum(-3)
+        return positions if yaw is None else turn_vectors(positions, yaw.unsqueeze(-1))
 
     def of_steps(self, observation: Tensor, rows: Tensor) -> Tensor:
         """Return the relative positions of each step, (..., S, P, 3) in metres."""
-        known = torch.cat((observation, self.constants.expand(*observation.shape[:-1], -1)), -1)
+        numbers = torch.cat((observation, self.constants.expand(*observation.shape[:-1], -1)), -1)
         begin, end = pick(self.begin, rows), pick(self.end, rows)  # (..., S, P, 3)
         flat = (*begin.shape[: rows.ndim], begin.shape[rows.ndim :].numel())
-        found = (known.gather(-1, end.reshape(flat)) - known.gather(-1, begin.reshape(flat))).reshape(begin.shape)
-        return found + pick(self.offset, rows)
+        positions = numbers.gather(-1, end.reshape(flat)) - numbers.gather(-1, begin.reshape(flat))
+        return positions.reshape(begin.shape) + pick(self.offset, rows)
 
     def _inputs(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         observation, weights, task_id = read(tensordict, self.in_keys)
@@ -117,9 +117,10 @@ class _RelativePositions(Features):
 
 
 def _compared(plan: ConditionalPlan) -> list[list[Pair]]:
-    of = plan.definition.object
-    each = [[(of(c.subject), of(c.object)) for c in step.condition.clauses if c.object] for step in plan.steps]
-    return [[pairs[0], pairs[-1]] if pairs else [] for pairs in each]
+    """Return for each step the pairs of objects in its condition's first and last clause with two objects."""
+    item = plan.definition.object
+    steps = [[(item(c.subject), item(c.object)) for c in step.condition.clauses if c.object] for step in plan.steps]
+    return [[pairs[0], pairs[-1]] if pairs else [] for pairs in steps]
 
 
 class FocusFeatures(_RelativePositions):
@@ -127,7 +128,7 @@ class FocusFeatures(_RelativePositions):
 
     A condition names what its skill is about: "the gripper is above the handle and not near the handle". The position
     of the handle relative to the gripper stands in the same place as that of the puck in another task, so that what was
-    learned there is of use here.
+    learned there helps here.
 
     Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64; writes
     ``features`` (B, 18): for the first and the last clause with two objects, the position of the second object relative
@@ -146,12 +147,7 @@ class FocusFeatures(_RelativePositions):
 
     @typed
     def __init__(
-        self,
-        plans: AnyPlans,
-        noise: float = 0.0,
-        *,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
+        self, plans: AnyPlans, noise: Scale = 0.0, *, in_keys: Keys | None = None, out_keys: Keys | None = None
     ) -> None:
         super().__init__(plans, _compared, 2, noise, in_keys, out_keys)
 
@@ -160,12 +156,12 @@ class RoleFeatures(_RelativePositions):
     """The target's position relative to the object that the active step moves, and the step's direction.
 
     "lower the gripper around the puck" and "... the mug" are the same motion in this relative position, so that what
-    was learned in one task is of use in another. "push the dial to the right" points right, "push it toward the target
+    was learned in one task helps in another. "push the dial to the right" points right, "push it toward the target
     location" from the object to the goal. Positions farther than 25 cm count as 25 cm away.
 
-    Where the gripper acts on an object that is touched beside its position, the target is the *contact*, which
-    demonstrations of the task show, see :meth:`fit`; a task without demonstrations has the points that its plan names.
-    What is carried in such a task is lifted first, to 15 cm above its target, and comes down over it.
+    Where the gripper touches an object away from its position, the target is the *contact*, which demonstrations of
+    the task show, see :meth:`fit`; a task without demonstrations has the points that its plan names. An object that is
+    carried in such a task is lifted first, to 15 cm above its target, and comes down over it.
 
     Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64, and what
     :class:`RandomYaw` and :class:`JitterTarget` wrote; writes ``features`` (B, 12): the relative position in units of
@@ -190,7 +186,7 @@ class RoleFeatures(_RelativePositions):
         >>> lw.PlanConditionedActor(plans, features=lw.modules.RoleFeatures(plans)).features.width
         12
 
-    Source: ours; like the keypoints of task-axis controllers, read from words.
+    Source: ours; like the keypoints of task-axis controllers, but read from language.
     """
 
     contact: Tensor
@@ -204,12 +200,7 @@ class RoleFeatures(_RelativePositions):
 
     @typed
     def __init__(
-        self,
-        plans: AnyPlans,
-        noise: float = 0.0,
-        *,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
+        self, plans: AnyPlans, noise: Scale = 0.0, *, in_keys: Keys | None = None, out_keys: Keys | None = None
     ) -> None:
         plans = as_plans(plans)
         if not plans.has_roles:
@@ -227,7 +218,7 @@ class RoleFeatures(_RelativePositions):
                 touches = role.verb in ("close", "pull") or (role.verb == "push" and role.manner == "push")
                 acts[at] = _is_first(plan, role.moved) or (at_contact[at] and touches)
                 lifts[at] = role.verb == "carry"
-                if role.verb == "move":  # a place next to its current position
+                if role.verb == "move":  # the target is next to the object's current position
                     self.offset[at] += _AWAY * way
                 else:
                     direction[at] = way
@@ -241,7 +232,7 @@ class RoleFeatures(_RelativePositions):
         self._sharing: WeakSet[RoleFeatures] = WeakSet([self])  # features of actors with the same weights
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_sharing": None}  # a copy has weights of its own
+        return {**self.__dict__, "_sharing": None}  # a copy or a pickle has its own contacts
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
@@ -256,7 +247,7 @@ class RoleFeatures(_RelativePositions):
         return other
 
     def share(self) -> None:
-        """Give the contacts to the features that :meth:`with_plans` made, after the buffers were changed."""
+        """Copy the contacts to the features that :meth:`with_plans` made; call it after changing the buffers."""
         for other in self._sharing:
             if other is not self:
                 other._copy(self)
@@ -267,7 +258,7 @@ class RoleFeatures(_RelativePositions):
 
     @torch.no_grad()
     def fit(self, rows: TensorDictBase, weights: Tensor | None = None) -> None:
-        """Take the contacts from demonstrations, in place.
+        """Compute the contacts from demonstrations, in place.
 
         A contact is the median of hand minus object while a step is active that closes the gripper around the first
         object, pushes or pulls it, or moves it, but not while it is pressed from above.
@@ -278,11 +269,11 @@ class RoleFeatures(_RelativePositions):
         truth = plan_program(self.plans)(observation, task_id)
         at = self.tables.rows(task_id)
         observation, truth, at = (tensor.to(self.contact.device) for tensor in (observation, truth, at))
-        held = (self.attention.weights(truth, at) * self.acts[at]).sum(-1) > 0.5
+        acting = (self.attention.weights(truth, at) * self.acts[at]).sum(-1) > 0.5
         hand, first, *_ = self.layout.positions
-        away = observation[:, hand] - observation[:, first]
-        for row in at[held].unique().tolist():
-            self.contact[row] = away[held & (at == row)].median(0).values
+        contacts = observation[:, hand] - observation[:, first]
+        for row in at[acting].unique().tolist():
+            self.contact[row] = contacts[acting & (at == row)].median(0).values
         self.demonstrated[at.unique()] = True
         self.fitted.fill_(True)
         self.share()
@@ -295,24 +286,26 @@ class RoleFeatures(_RelativePositions):
             self.contact[own], self.demonstrated[own] = other.contact[theirs], other.demonstrated[theirs]
 
     def of_steps(self, observation: Tensor, rows: Tensor) -> Tensor:
-        """Return the relative positions of each step; targets are contacts, and what is carried is lifted first."""
-        found = super().of_steps(observation, rows)
-        found = found + (pick(self.at_contact, rows)[..., None] * pick(self.contact, rows).unsqueeze(-2)).unsqueeze(-2)
+        """Return the relative positions of each step; targets are contacts, and carried objects are lifted first."""
+        contact = pick(self.at_contact, rows)[..., None] * pick(self.contact, rows).unsqueeze(-2)
+        positions = super().of_steps(observation, rows) + contact.unsqueeze(-2)
         lifts = (pick(self.lifts, rows) & ~pick(self.demonstrated, rows).unsqueeze(-1))[..., None, None]
-        beside, height = found[..., :2], found[..., 2:]
-        far = beside.norm(dim=-1, keepdim=True)
-        height = height + _LIFTED * ((far - 0.03) / 0.04).clamp(0.0, 1.0) * lifts
-        rising = torch.where(lifts, ((0.06 - height) / 0.04).clamp(0.0, 1.0), 1.0)
-        return torch.cat((beside * rising, height), -1)
+        sideways, height = positions[..., :2], positions[..., 2:]
+        # More than 3 to 7 cm to the side of its target, the target is 15 cm higher; until the object is nearly that
+        # high, there is no way to the side.
+        distance = sideways.norm(dim=-1, keepdim=True)
+        height = height + _LIFTED * ((distance - 0.03) / 0.04).clamp(0.0, 1.0) * lifts
+        lifted = torch.where(lifts, ((0.06 - height) / 0.04).clamp(0.0, 1.0), 1.0)
+        return torch.cat((sideways * lifted, height), -1)
 
     def directions(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
         """Return the direction of the active step, (..., 3); arguments as for :meth:`positions`."""
         if yaw is not None:
             observation = turn_observation(observation, -yaw, self.layout)
         ahead = self.ahead.of_steps(observation, rows).squeeze(-2)
-        each = pick(self.direction, rows) + ahead / ahead.norm(dim=-1, keepdim=True).clamp(min=0.02)
-        found = (weights.unsqueeze(-1) * each).sum(-2)
-        return found if yaw is None else turn_vectors(found, yaw)
+        directions = pick(self.direction, rows) + ahead / ahead.norm(dim=-1, keepdim=True).clamp(min=0.02)
+        direction = (weights.unsqueeze(-1) * directions).sum(-2)
+        return direction if yaw is None else turn_vectors(direction, yaw)
 
     def compute(self, tensordict: TensorDictBase) -> Tensor:
         inputs = self._inputs(tensordict)
@@ -336,6 +329,7 @@ def _moved_to_target(plan: ConditionalPlan) -> list[list[Pair]]:
 
 
 def _ahead(plan: ConditionalPlan) -> list[list[Pair]]:
+    """Return for each step toward the goal, or toward an object, the pair from the first object to it."""
     task = plan.definition
     x, y, z = places(task.layout.positions[1])
     first = NamedObject("first object", (x, y, z))
@@ -346,5 +340,5 @@ def _ahead(plan: ConditionalPlan) -> list[list[Pair]]:
 
 def _is_first(plan: ConditionalPlan, name: str) -> bool:
     """Return whether a name is that of the first object itself, not of a point beside it."""
-    thing = role_object(plan.definition, name)
-    return thing.position == places(plan.definition.layout.things[0].xyz) and not any(thing.offset)
+    item = role_object(plan.definition, name)
+    return item.position == places(plan.definition.layout.things[0].xyz) and not any(item.offset)

@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from lw_torchrl._util.checks import shown, typed
-from lw_torchrl._util.keys import dispatched, read, write
+from lw_torchrl._util.keys import Keys, dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.skill_program import SkillProgram
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.modules.attention import check_truth, read_truth
-from lw_torchrl.modules.networks import in_mode_of
-from lw_torchrl.modules.sequence import Part
+from lw_torchrl.modules.parts import Part, in_mode_of
 
 
 class ScriptedSkillActor(Part):
-    """A plan that is carried out by scripted skills: the skill of a true step acts, or the last step's if none is true.
+    """Carry out a plan by scripted skills: the skill of a true step acts, or the last step's if none is true.
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool, or float in [0, 1] for soft
     truth; writes ``action`` (B, 4) float32 in [-1, 1] and ``skill_weights`` (B, S) float32, which sum to 1. Soft truth
@@ -32,7 +32,7 @@ class ScriptedSkillActor(Part):
         plans: a plan for each task; every step's skill is the text of a scripted skill.
         select: which of several true steps acts: "first", "random" (as in the paper), or "mix" (all, equally).
         skills: the scripted skills by text, as from :func:`load_skills`; None for the shipped ones.
-        seed: of the random choice, from -2**63 to 2**64 - 1.
+        seed: seed of the random choice, from -2**63 to 2**64 - 1.
         in_keys, out_keys: other names for what it reads and writes, in the order above; nested keys are allowed.
 
     Raises:
@@ -58,19 +58,18 @@ class ScriptedSkillActor(Part):
         *,
         skills: Mapping[str, ScriptedSkill] | None = None,
         seed: int = 0,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
     ) -> None:
         super().__init__(("observation", "task_id", "qaf"), ("action", "skill_weights"), in_keys, out_keys)
         self.plans = as_plans(plans)
         self.tasks, self.layout = tuple(self.plans), self.plans.layout
         if not -(2**63) <= seed < 2**64:
             raise ValueError(f"seed must be from -2**63 to 2**64 - 1, got {shown(seed)}")
-        self.select, self.seed = select, seed
-        self.draws = self.select == "random"
+        self.select, self.seed, self.draws = select, seed, select == "random"
         self._skills = None if skills is None else dict(skills)
-        listed: Any = {plan.definition: [step.skill for step in plan.steps] for plan in self.plans.values()}
-        self.program = SkillProgram(listed, skills)
+        texts: Any = {plan.definition: [step.skill for step in plan.steps] for plan in self.plans.values()}
+        self.program = SkillProgram(texts, skills)
         self.tables = PlanTables(self.plans)
         self._last = self.tables.mask.sum(-1) - 1
         self._generator = torch.Generator().manual_seed(seed)
@@ -102,17 +101,14 @@ class ScriptedSkillActor(Part):
         """Return the weight of each step, (B, S) float32."""
         qaf, rows = read_truth(tensordict, self.truth_keys, self.tables)
         check_truth(qaf, torch.Size((*rows.shape, self.tables.mask.shape[-1])))
-        qaf = qaf > 0.5
-        last = torch.nn.functional.one_hot(self._last.to(rows.device)[rows], qaf.shape[-1]).bool()
-        true = torch.where(qaf.any(-1, keepdim=True), qaf, last).float()
+        qaf, steps = qaf > 0.5, qaf.shape[-1]
+        last = one_hot(self._last.to(rows.device)[rows], steps).bool()
+        active = torch.where(qaf.any(-1, keepdim=True), qaf, last).float()
         if self.select == "mix":
-            return true / true.sum(-1, keepdim=True)
-        if self.select == "first":
-            chosen = true.argmax(-1)
-        else:
-            score = torch.rand(true.shape, generator=self._generator).to(true.device) + true
-            chosen = score.argmax(-1)
-        return torch.nn.functional.one_hot(chosen, qaf.shape[-1]).float()
+            return active / active.sum(-1, keepdim=True)
+        # Noise in [0, 1) orders the active steps at random, and never lifts another step above them.
+        noise = torch.rand(active.shape, generator=self._generator).to(active.device) if self.draws else 0.0
+        return one_hot((noise + active).argmax(-1), steps).float()
 
     def skill_actions(self, tensordict: TensorDictBase) -> Tensor:
         """Return the action of each step's skill, (B, S, A) float32."""

@@ -22,8 +22,15 @@ from lw_torchrl._util.checks import check_choice, typed
 from lw_torchrl._util.keys import any_arguments, key_beside
 from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
 from lw_torchrl.modules.features import Features
-from lw_torchrl.modules.networks import in_mode_of, materialize
-from lw_torchrl.modules.sequence import NamedParts, action_spec, encoding_width, follow, trunk_attributes
+from lw_torchrl.modules.parts import (
+    NamedParts,
+    action_spec,
+    encoding_width,
+    follow,
+    in_mode_of,
+    materialize,
+    trunk_attributes,
+)
 
 DistributionName = Literal["tanh_normal", "normal"]
 DISTRIBUTIONS: dict[str, Any] = {"tanh_normal": TanhNormal, "normal": IndependentNormal}
@@ -60,7 +67,6 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
         *,
         action: Any = "action",
     ) -> None:
-        check_choice("distribution", distribution, DISTRIBUTIONS)
         action = tuple(action) if isinstance(action, list) else action  # JSON has no tuples
         loc, scale = decoder.out_keys
         if isinstance(decoder, Decode) and (width := encoding_width(trunk)) is not None:
@@ -74,7 +80,7 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
             log_prob_key=key_beside(action, "_log_prob"),
         )
         super().__init__(OrderedDict(**dict(trunk.module.items()), decoder=decoder, sampler=sampler))
-        self.plans, self.tasks, self.layout = trunk_attributes(trunk).values()
+        self.plans, self.tasks, self.layout = trunk_attributes(trunk)
         self.distribution, self.action = distribution, action
 
     @any_arguments
@@ -88,11 +94,10 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
         Its features have no noise, which would change the likelihoods from call to call.
 
         Raises:
-            TypeError: the actor's decoder is not an :class:`MLPDecoder`; give a custom decoder that returns mean and
-                standard deviation, and ``out_keys=["loc", "scale"]``, and wrap the actor by TorchRL's
-                ``ProbabilisticActor``.
+            TypeError: the actor's decoder is not an :class:`MLPDecoder`.
             ValueError: a Normal through tanh, of an actor that does not squash its actions.
         """
+        check_choice("distribution", distribution, DISTRIBUTIONS)
         old = getattr(actor.decoder, "network", None)
         if not isinstance(old, MLPDecoder):
             raise TypeError(
@@ -103,7 +108,7 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
         if distribution == "tanh_normal" and not old.squash:
             raise ValueError("distribution 'tanh_normal' squashes actions, and this actor does not; use 'normal'")
         options = {**old.config, "squash": distribution == "normal" and old.squash, "init_std": init_std}
-        with torch.random.fork_rng(devices=[]):
+        with torch.random.fork_rng(devices=[]):  # the fresh weights are replaced: do not advance the user's generator
             decoder = GaussianDecoder(**options)
             materialize(decoder, torch.zeros(1, old[0].weight.shape[-1]))
         decoder.to(next(old.parameters())).copy_from(old)
@@ -119,8 +124,8 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
     @property
     def config(self) -> dict[str, Any]:
         """The keyword arguments that rebuild it."""
-        made = {"distribution": self.distribution, "action": self.action}
-        return {"trunk": self.trunk, "decoder": self.module["decoder"], **made}
+        options = {"distribution": self.distribution, "action": self.action}
+        return {"trunk": self.trunk, "decoder": self.module["decoder"], **options}
 
     def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
         raise TypeError(f"{name} of a StochasticActor cannot be replaced; replace the deterministic actor's part first")

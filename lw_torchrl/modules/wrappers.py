@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -11,18 +11,53 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import shown, typed
+from lw_torchrl._util.checks import Positive, typed
 from lw_torchrl._util.keys import dispatched, last_name, read, write
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.descriptor_conditioned_actor import TaskLatent
-from lw_torchrl.modules.networks import in_mode_of
+from lw_torchrl.modules.parts import RenamedInputs, in_mode_of
 from lw_torchrl.modules.policy import layout_of, plans_of, tasks_of, with_plans
-from lw_torchrl.modules.sequence import RenamedInputs
 
 
-class ActorEnsemble(RenamedInputs):
+class _Wrapper(RenamedInputs):
+    """Base of the wrappers. ``_options`` are the constructor's arguments, which are attributes of the same names."""
+
+    _options: ClassVar[Sequence[str]]
+
+    def _wrap(self, actors: Sequence[TensorDictModuleBase], out_keys: Sequence[NestedKey]) -> None:
+        """Read what all actors read, and state the plans, tasks and layout of the first."""
+        self.plans, self.tasks, self.layout = plans_of(actors[0]), tasks_of(actors[0]), layout_of(actors[0])
+        self.in_keys = list(dict.fromkeys(key for actor in actors for key in actor.in_keys))
+        self.out_keys = list(out_keys)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        return {name: getattr(self, name) for name in self._options}
+
+
+class _ActionWrapper(_Wrapper):
+    """Base of the wrappers of one actor, which change its action."""
+
+    def __init__(self, actor: TensorDictModuleBase) -> None:
+        super().__init__()
+        self.actor = actor
+        self._wrap([actor], actor.out_keys)
+
+    def converted(self, action: Tensor) -> Tensor:
+        """Return the actor's actions, (..., A), as this policy's."""
+        raise NotImplementedError(f"{type(self).__name__} must override converted")
+
+    @dispatched
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        outputs, key = self.actor(tensordict.copy()), _action_key(self.actor)
+        outputs.set(key, self.converted(outputs.get(key)))
+        return write(tensordict, self, [outputs.get(key) for key in self.actor.out_keys])
+
+
+class ActorEnsemble(_Wrapper):
     """The mean action of actors that were trained separately on the same demonstrations.
 
     Where the demonstrations do not say what to do, each member errs in its own way, and the mean errs less, most so
@@ -46,26 +81,22 @@ class ActorEnsemble(RenamedInputs):
     Source: the mean of ``torchrl.modules.EnsembleModule``.
     """
 
+    _options = ("members",)
+
     @typed
     def __init__(self, members: Sequence[TensorDictModuleBase]) -> None:
         super().__init__()
         if not members:
             raise ValueError("members must be at least one actor, got none")
         first = members[0]
-        for name, of in (("plans", lambda actor: getattr(plans_of(actor), "fingerprint", None)), ("tasks", tasks_of)):
-            if any(of(member) != of(first) for member in members):
-                raise ValueError(f"members must have the same {name}")
+        if any(_fingerprint(member) != _fingerprint(first) for member in members):
+            raise ValueError("members must have the same plans")
+        if any(tasks_of(member) != tasks_of(first) for member in members):
+            raise ValueError("members must have the same tasks")
         self.members: Any = nn.ModuleList(members)
-        self.plans, self.tasks, self.layout = plans_of(first), tasks_of(first), layout_of(first)
-        self.in_keys = list(dict.fromkeys(key for member in members for key in member.in_keys))
         written = [key for key in first.out_keys if last_name(key) in ("action", "skill_weights")]
         self._written: list[NestedKey] = sorted(written, key=last_name)
-        self.out_keys = list(self._written)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
-        return {"members": list(self.members)}
+        self._wrap(members, self._written)
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -78,27 +109,7 @@ class ActorEnsemble(RenamedInputs):
         return in_mode_of(self, ActorEnsemble([with_plans(member, plans) for member in self.members]))
 
 
-class _Wrapper(RenamedInputs):
-    """Base of the wrappers of one actor, which change its action."""
-
-    def __init__(self, actor: TensorDictModuleBase) -> None:
-        super().__init__()
-        self.actor = actor
-        self.plans, self.tasks, self.layout = plans_of(actor), tasks_of(actor), layout_of(actor)
-        self.in_keys, self.out_keys = list(actor.in_keys), list(actor.out_keys)
-
-    def converted(self, action: Tensor) -> Tensor:
-        """Return the actor's actions, (..., A), as this policy's."""
-        raise NotImplementedError(f"{type(self).__name__} must override converted")
-
-    @dispatched
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        outputs, key = self.actor(tensordict.copy()), _action(self.actor)
-        outputs.set(key, self.converted(outputs.get(key)))
-        return write(tensordict, self, [outputs.get(key) for key in self.actor.out_keys])
-
-
-class DecidedGripper(_Wrapper):
+class DecidedGripper(_ActionWrapper):
     """Open or close the gripper fully while not training.
 
     Half open fingers push objects over, and half closed ones lose them.
@@ -134,9 +145,8 @@ class DecidedGripper(_Wrapper):
         return action if self.training else decided(action, self.action_layout, self.closes_above)
 
     def with_plans(self, plans: AnyPlans) -> DecidedGripper:
-        """Return the policy with the same networks that follows other plans."""
-        actor = with_plans(self.actor, plans)
-        return in_mode_of(self, DecidedGripper(actor, self.closes_above, self.action_layout))
+        """Return the policy with the same networks that follows other plans; the actions keep their layout."""
+        return in_mode_of(self, DecidedGripper(**{**self.config, "actor": with_plans(self.actor, plans)}))
 
 
 def decided(action: Tensor, layout: Layout, closes_above: float | None = None) -> Tensor:
@@ -147,7 +157,7 @@ def decided(action: Tensor, layout: Layout, closes_above: float | None = None) -
     return action
 
 
-class DemonstratedActor(RenamedInputs):
+class DemonstratedActor(_Wrapper):
     """Two policies: one without plans for the tasks that were demonstrated, one with plans for all others.
 
     A plan adds nothing in a task that ten demonstrations cover.
@@ -173,6 +183,8 @@ class DemonstratedActor(RenamedInputs):
     Source: ours.
     """
 
+    _options = ("demonstrated", "others")
+
     @typed
     def __init__(self, demonstrated: TensorDictModuleBase, others: TensorDictModuleBase) -> None:
         super().__init__()
@@ -183,15 +195,8 @@ class DemonstratedActor(RenamedInputs):
             layouts = f"{layout_of(demonstrated).name!r} and {layout_of(others).name!r}"
             raise ValueError(f"demonstrated and others must have one layout, got {layouts}")
         self.demonstrated, self.others = demonstrated, others
-        self.plans, self.tasks, self.layout = plans_of(others), tasks_of(others), layout_of(others)
-        self.in_keys = list(dict.fromkeys([*others.in_keys, *demonstrated.in_keys]))
-        self.out_keys = list(others.out_keys)
+        self._wrap([others, demonstrated], others.out_keys)
         self._ids = torch.tensor([task_id(task) for task in known])
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
-        return {"demonstrated": self.demonstrated, "others": self.others}
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -200,21 +205,23 @@ class DemonstratedActor(RenamedInputs):
         (task,) = read(tensordict, [key])
         ids = self._ids.to(task.device)
         known = torch.isin(task, ids)
-        shown_tasks = tensordict.copy().set(key, torch.where(known, task, ids[0]))
-        learned = self.demonstrated(shown_tasks).get(_action(self.demonstrated))
-        key = _action(self.others)
+        # The first policy acts on all rows, as shapes must not depend on data; a task that it does not know becomes
+        # one that it knows, and its action is dropped.
+        rows = tensordict.copy().set(key, torch.where(known, task, ids[0]))
+        learned = self.demonstrated(rows).get(_action_key(self.demonstrated))
+        key = _action_key(self.others)
         outputs.set(key, torch.where(known.unsqueeze(-1), learned, outputs.get(key)))
         return write(tensordict, self, [outputs.get(key) for key in self.others.out_keys])
 
     def with_plans(self, plans: AnyPlans) -> TensorDictModuleBase:
         """Return the policy for other plans; for those of another suite only ``others``."""
         others: TensorDictModuleBase = with_plans(self.others, plans)
-        if layout_of(others) != self.layout:  # no task of which was demonstrated
+        if layout_of(others) != self.layout:  # no task of that suite was demonstrated
             return others
         return in_mode_of(self, DemonstratedActor(self.demonstrated, others))
 
 
-class TransferredActor(_Wrapper):
+class TransferredActor(_ActionWrapper):
     """An actor with the same weights for another suite's plans, whose actions are converted to that suite's.
 
     A displacement keeps its metres a step, times ``speed``: it is multiplied by the ratio of the layouts' ``reach`` and
@@ -230,7 +237,7 @@ class TransferredActor(_Wrapper):
         trained: the layout that the actor was trained with; None for the actor's.
 
     Raises:
-        ValueError: features that do not transfer; a layout without a displacement; a speed of 0 or less.
+        ValueError: features that do not transfer; a layout without a displacement.
         TypeError: an actor without plans.
 
     Example:
@@ -245,24 +252,18 @@ class TransferredActor(_Wrapper):
     Source: ours; a plan says what matters, so the motion relative to it is the same with another robot.
     """
 
+    _options = ("actor", "plans", "speed", "trained")
+
     @typed
     def __init__(
-        self, actor: TensorDictModuleBase, plans: AnyPlans, *, speed: float = 1.0, trained: Layout | None = None
+        self, actor: TensorDictModuleBase, plans: AnyPlans, *, speed: Positive = 1.0, trained: Layout | None = None
     ) -> None:
-        if speed <= 0:
-            raise ValueError(f"speed must be above 0, got {shown(speed)}")
-        plans, before = as_plans(plans), trained or layout_of(actor)
-        same = getattr(plans_of(actor), "fingerprint", None) == plans.fingerprint
-        super().__init__(actor if same else with_plans(actor, plans))
-        self.trained, self.speed = before, speed
+        plans, trained = as_plans(plans), trained or layout_of(actor)
+        super().__init__(actor if _fingerprint(actor) == plans.fingerprint else with_plans(actor, plans))
+        self.trained, self.speed = trained, speed
         self.plans, self.tasks, self.layout = plans, tuple(plans), plans.layout
         for layout in (self.trained, self.layout):
-            layout.displaced("TransferredActor")
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
-        return {"actor": self.actor, "plans": self.plans, "speed": self.speed, "trained": self.trained}
+            layout.displaced("TransferredActor")  # raises for a layout without a displacement
 
     def converted(self, action: Tensor) -> Tensor:
         """Return actions of the layout that was trained with, (..., A), as actions of this layout."""
@@ -276,16 +277,18 @@ class TransferredActor(_Wrapper):
 
     def with_plans(self, plans: AnyPlans) -> TransferredActor:
         """Return the policy with the same networks that follows other plans."""
-        actor = with_plans(self.actor, plans)
-        return in_mode_of(self, TransferredActor(actor, plans, speed=self.speed, trained=self.trained))
+        other = {"actor": with_plans(self.actor, plans), "plans": plans}
+        return in_mode_of(self, TransferredActor(**{**self.config, **other}))
 
 
-def _action(actor: TensorDictModuleBase) -> NestedKey:
+def _fingerprint(actor: TensorDictModuleBase) -> str | None:
+    return getattr(plans_of(actor), "fingerprint", None)
+
+
+def _action_key(actor: TensorDictModuleBase) -> NestedKey:
     return next(key for key in actor.out_keys if last_name(key) == "action")
 
 
 def _task_key(actor: TensorDictModuleBase) -> NestedKey:
-    latents = (part for part in actor.modules() if isinstance(part, TaskLatent))
-    return next((part.in_keys[0] for part in latents), None) or next(
-        k for k in actor.in_keys if last_name(k) == "task_id"
-    )
+    keys = [part.in_keys[0] for part in actor.modules() if isinstance(part, TaskLatent)]
+    return (keys or [key for key in actor.in_keys if last_name(key) == "task_id"])[0]

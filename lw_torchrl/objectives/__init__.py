@@ -1,9 +1,8 @@
 """Losses that TorchRL lacks: expectile values, advantage-weighted imitation, and TD3 and SAC with demonstrations."""
 
-import lw_torchrl._util.torchrl  # noqa: F401
-from lw_torchrl.objectives.advantage_weighted import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
+import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.objectives.demonstrated import DemonstratedSACLoss, DemonstratedTD3Loss
-from lw_torchrl.objectives.reduction import with_n_steps
+from lw_torchrl.objectives.offline import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task, with_n_steps
 
 __all__ = [
     "AdvantageWeightedLoss", "DemonstratedSACLoss", "DemonstratedTD3Loss", "ExpectileValueLoss",

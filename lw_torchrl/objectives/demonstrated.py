@@ -15,27 +15,18 @@ from torchrl.data import Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss, TD3BCLoss
 
-from lw_torchrl._util.checks import Scale, check_value, shown, typed
-from lw_torchrl.objectives.reduction import Reduction, clear_references, priority_weight
-
-
-def imitation(action: Tensor, demonstrated: Tensor, is_demonstration: Tensor) -> Tensor:
-    """Return the squared distance of (B, A) float32 actions to the demonstrated ones, (B,) float32: 0 for others,
-    and scaled so that the mean over all rows is the mean over demonstrations."""
-    rows = is_demonstration.reshape(action.shape[:-1])
-    distance = (action - demonstrated).square().mean(-1) * rows
-    return distance * (rows.numel() / rows.sum().clamp(min=1))
-
+from lw_torchrl._util.checks import Scale, shown, typed
+from lw_torchrl.objectives.offline import Reduction
 
 if TYPE_CHECKING:
     from torchrl.objectives import LossModule as _Loss
 else:
-    _Loss = object  # a LossModule's metaclass would give its own forward
+    _Loss = object  # a LossModule's metaclass would wrap this class's methods
 
 
 class _ImitatesDemonstrations(_Loss):
     _fixed: Mapping[str, Any] = {}  # options that users cannot set
-    in_keys: list[NestedKey]
+    _in_keys: list[NestedKey]
 
     @typed
     def __init__(
@@ -43,7 +34,7 @@ class _ImitatesDemonstrations(_Loss):
         actor_network: TensorDictModuleBase,
         qvalue_network: TensorDictModuleBase | list[TensorDictModuleBase],
         *,
-        bc_weight: float = 2.0,
+        bc_weight: Scale = 2.0,
         reduction: Reduction | None = None,
         **options: Any,
     ) -> None:
@@ -57,15 +48,17 @@ class _ImitatesDemonstrations(_Loss):
         if not critics or not all(isinstance(critic, TensorDictModuleBase) for critic in critics):
             raise TypeError(f"qvalue_network must be a TensorDictModule, or a list, got {shown(qvalue_network)}")
         super().__init__(actor_network, qvalue_network, reduction=reduction, **self._fixed, **options)
-        self.bc_weight = check_value("bc_weight", bc_weight, Scale)
-        self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
+        self.bc_weight = bc_weight
 
-    def set_keys(self, **keys: NestedKey) -> None:
-        """See :class:`torchrl.objectives.LossModule`."""
-        super().set_keys(**keys)
-        self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
+    def _set_in_keys(self) -> None:  # TorchRL calls it when in_keys are first read, and when set_keys changes them
+        super()._set_in_keys()
+        self._in_keys.append(self.tensor_keys.is_demonstration)
 
     def _imitation(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
+        """Return the squared distance of actions (B, A) to the demonstrated ones, (B,) float32, 0 for other rows.
+
+        It is scaled so that the mean over all rows is the mean over demonstrations.
+        """
         key = self.tensor_keys.is_demonstration
         if (is_demonstration := tensordict.get(key, None)) is None:
             raise ValueError(
@@ -74,7 +67,9 @@ class _ImitatesDemonstrations(_Loss):
             )
         if is_demonstration.dtype != torch.bool:
             raise ValueError(f"{key!r} must be torch.bool, true for demonstrations, got {is_demonstration.dtype}")
-        return imitation(action, tensordict.get(self.tensor_keys.action), is_demonstration)
+        rows = is_demonstration.reshape(action.shape[:-1])
+        distance = (action - tensordict.get(self.tensor_keys.action)).square().mean(-1) * rows
+        return distance * (rows.numel() / rows.sum().clamp(min=1))
 
 
 class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
@@ -97,8 +92,7 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
             ``action_spec``, ``num_qvalue_nets``, ``policy_noise``, ...
 
     Raises:
-        ValueError: ``bc_weight`` is negative or not finite; an unknown ``reduction``; ``action_spec`` has a batch
-            dimension; at call time, rows without ``is_demonstration``.
+        ValueError: ``action_spec`` has a batch dimension; at call time, rows without ``is_demonstration``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -123,29 +117,21 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict]:
         """Return the actor's loss, () float32, and detached values to log."""
-        seen = tensordict.select(*self.actor_network.in_keys, strict=False)
+        outputs = tensordict.select(*self.actor_network.in_keys, strict=False)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            seen = self.actor_network(seen)
-        value = self._judged(seen).mean(0)
-        bc = self._imitation(tensordict, seen.get(self.tensor_keys.action))
+            outputs = self.actor_network(outputs)
+        rows = outputs.select(*self.qvalue_network.in_keys, strict=False)
+        judged = self._vmap_qvalue_network00(
+            rows.expand(self.num_qvalue_nets, *rows.batch_size), self._cached_detach_qvalue_network_params
+        )
+        # TD3BCLoss takes the first critic's value; the mean of all is smoother.
+        value = judged.get(self.tensor_keys.state_action_value).squeeze(-1).mean(0)
+        bc = self._imitation(tensordict, outputs.get(self.tensor_keys.action))
         scale = self.alpha / value.abs().mean().detach().clamp(min=1e-6)
-        weights = priority_weight(self, tensordict)
+        weights = self._maybe_get_priority_weight(tensordict)
         loss = self._reduce_loss(self.bc_weight * bc - scale * value, tensordict=tensordict, weights=weights)
-        clear_references(tensordict, self.actor_network_params, self.qvalue_network_params)
+        self._clear_weakrefs(tensordict, "actor_network_params", "qvalue_network_params")
         return loss, {"state_action_value_actor": value.detach(), "bc_loss": bc.mean().detach(), "lmbd": scale}
-
-    def _judged(self, seen: TensorDictBase) -> Tensor:
-        """Return the value that each critic gives the rows, (E, B), without a gradient for the critics."""
-
-        def judge(rows: TensorDictBase, params: TensorDictBase) -> Tensor:
-            with params.to_module(self.qvalue_network, preserve_module_state=False):
-                return self.qvalue_network(rows).get(self.tensor_keys.state_action_value)
-
-        number, params = self.num_qvalue_nets, self.qvalue_network_params.detach()
-        rows = seen.select(*self.qvalue_network.in_keys, strict=False).expand(number, *seen.batch_size)
-        if self.deactivate_vmap:
-            return torch.stack([judge(rows[k], params[k]) for k in range(number)]).squeeze(-1)
-        return torch.vmap(judge, randomness=self.vmap_randomness)(rows, params).squeeze(-1)
 
 
 class DemonstratedSACLoss(_ImitatesDemonstrations, SACLoss):
@@ -192,6 +178,6 @@ class DemonstratedSACLoss(_ImitatesDemonstrations, SACLoss):
         ):
             mode = self.actor_network.get_dist(tensordict.copy()).deterministic_sample
         bc = self._imitation(tensordict, mode)
-        weights = priority_weight(self, tensordict)
+        weights = self._maybe_get_priority_weight(tensordict)
         term = self._reduce_loss(self.bc_weight * bc, tensordict=tensordict, weights=weights)
         return loss + term, {**metadata, "bc_loss": bc.mean().detach()}

@@ -1,6 +1,6 @@
 """Training: behavioral cloning, any loss over a replay buffer, query evaluators, and their files."""
 
-import lw_torchrl._util.torchrl  # noqa: F401
+import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.training.checkpoint import load_actor, load_evaluator, save_actor, save_evaluator
 from lw_torchrl.training.cloning import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.training.evaluator import QueryEvaluatorTrainer

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from lw_torchrl._util.checks import differences, typed
 from lw_torchrl._util.files import AnyPath, absent_policy, locked, shipped_policy
+from lw_torchrl._util.reproducibility import LIBRARIES, warn_of_other_versions
 from lw_torchrl._util.tensor_files import pop_state, read_tensors, write_tensors
-from lw_torchrl._util.versions import LIBRARIES, warn_of_other_versions
 from lw_torchrl.language.plans import AnyPlans, PlanError, as_plans
 from lw_torchrl.language.text import TEXT_DIMENSION, TextEncoder
 from lw_torchrl.modules.describe import describe, from_description, same_keys

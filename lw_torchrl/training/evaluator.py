@@ -15,7 +15,7 @@ from lw_torchrl._util.checks import typed
 from lw_torchrl._util.devices import place
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.modules.image_query_evaluator import ImageQueryEvaluator
-from lw_torchrl.modules.state_query_evaluator import ClauseEvaluator, Clauses
+from lw_torchrl.modules.query_evaluator import ClauseEvaluator, Clauses
 from lw_torchrl.training.checkpoint import check_can_be_saved
 from lw_torchrl.training.labelled_queries import (
     ImageQueryEvaluatorConfig,

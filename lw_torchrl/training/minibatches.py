@@ -14,8 +14,8 @@ from torchrl.envs import Compose, Transform
 from torchrl.objectives import BCLoss, LossModule
 
 from lw_torchrl._util.devices import CPU, seeded
-from lw_torchrl.data.samplers import GroupSampler
-from lw_torchrl.data.storage import DatasetStorage, device_of_rows
+from lw_torchrl.data.replay import DatasetStorage
+from lw_torchrl.data.samplers import GroupSampler, device_of_rows
 from lw_torchrl.modules.critics import Value
 from lw_torchrl.modules.policy import plans_of
 from lw_torchrl.modules.relative_features import FocusFeatures, RoleFeatures

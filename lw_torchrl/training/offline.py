@@ -20,7 +20,7 @@ from lw_torchrl.language.plans import Plans
 from lw_torchrl.modules.critics import PlanConditionedQValue, PlanConditionedValue
 from lw_torchrl.modules.describe import describe
 from lw_torchrl.objectives import AdvantageWeightedLoss, ExpectileValueLoss, standardize_by_task
-from lw_torchrl.objectives.reduction import with_n_steps
+from lw_torchrl.objectives.offline import with_n_steps
 from lw_torchrl.training.checkpoint import check_can_be_saved
 from lw_torchrl.training.loop import Training, TrainingOptions, make_optimizer
 from lw_torchrl.training.minibatches import (

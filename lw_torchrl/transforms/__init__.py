@@ -1,26 +1,15 @@
 """TorchRL transforms: query answers, also corrupted ones, pictures and language for environments, and augmentations."""
 
-import lw_torchrl._util.torchrl  # noqa: F401
+import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.transforms.augmentation import HideOpening, JitterTarget, SwapUnmentioned
 from lw_torchrl.transforms.camera import CameraTransform
-from lw_torchrl.transforms.corrupt_qaf import CorruptQAF
-from lw_torchrl.transforms.environment import EnvState
+from lw_torchrl.transforms.environment import EnvState, LanguageInstruction
 from lw_torchrl.transforms.fallback_turns import FallbackTurns
-from lw_torchrl.transforms.language_instruction import LanguageInstruction
-from lw_torchrl.transforms.qaf import QAFTransform
+from lw_torchrl.transforms.qaf import CorruptQAF, QAFTransform
 from lw_torchrl.transforms.random_yaw import RandomYaw
 from lw_torchrl.transforms.suite_transform import SuiteTransform
 
 __all__ = [
-    "CameraTransform",
-    "CorruptQAF",
-    "EnvState",
-    "FallbackTurns",
-    "HideOpening",
-    "JitterTarget",
-    "LanguageInstruction",
-    "QAFTransform",
-    "RandomYaw",
-    "SuiteTransform",
-    "SwapUnmentioned",
-]
+    "CameraTransform", "CorruptQAF", "EnvState", "FallbackTurns", "HideOpening", "JitterTarget", "LanguageInstruction",
+    "QAFTransform", "RandomYaw", "SuiteTransform", "SwapUnmentioned",
+]  # fmt: skip

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NoReturn
 
 import torch
 from tensordict import TensorDictBase, unravel_key
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase, Transform
 
 from lw_torchrl._util.checks import Probability, Scale, typed
 from lw_torchrl._util.devices import plain
-from lw_torchrl._util.keys import as_keys, check_apart, read
+from lw_torchrl._util.keys import Keys, as_keys, check_apart, read
 from lw_torchrl.language.layout import METAWORLD, Layout, places
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.roles import StepRole
@@ -22,16 +21,15 @@ from lw_torchrl.language.task_index import PlanTables, answers_of
 from lw_torchrl.language.tasks import role_object
 from lw_torchrl.transforms.qaf import plan_number_key
 
-ACTIVE = 0.01  # attention of an active step: a step whose condition is false beside a true one has 1e-4
+ACTIVE = 0.01  # a step with more attention is active; a false step next to a true one has about 1e-4
 
 
 class Augmentation(Transform):
     """Base class of transforms that change sampled rows at random. An environment refuses them."""
 
     def _refuse(self) -> NoReturn:
-        raise TypeError(
-            f"{type(self).__name__} is for replay buffers: in an environment it would change what the policy acts on"
-        )
+        name = type(self).__name__
+        raise TypeError(f"{name} is for replay buffers: in an environment it would change what the policy acts on")
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._refuse()
@@ -69,16 +67,16 @@ class PlanAugmentation(Augmentation):
         self.register_buffer("steps", self._tables.turns, persistent=False)  # (T, 2, S) bool
         return plans
 
-    def answers(self, tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> tuple[Tensor, Tensor, Tensor]:
+    def answers(self, tensordict: TensorDictBase, keys: Keys) -> tuple[Tensor, Tensor, Tensor]:
         """Return qaf (B, S), the rows' place in the tables (B,) int64, and the steps of the row's turn (B, S) bool."""
         qaf, task_id = read(tensordict, keys)
         qaf, rows = answers_of(qaf, task_id, tensordict.get(plan_number_key(keys[0]), None), self._tables)
-        if qaf.shape != (wanted := (*rows.shape, self._tables.mask.shape[-1])):
-            raise ValueError(f"qaf must have shape {wanted}, one column for each step of plans, got {tuple(qaf.shape)}")
+        if qaf.shape != (shape := (*rows.shape, self._tables.mask.shape[-1])):
+            raise ValueError(f"qaf must have shape {shape}, one column for each step of plans, got {tuple(qaf.shape)}")
         turn = tensordict.get("turn", None)
         return qaf, rows, self.table("steps", rows.device)[rows, torch.zeros_like(rows) if turn is None else turn % 2]
 
-    def active(self, tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> tuple[Tensor, Tensor]:
+    def active(self, tensordict: TensorDictBase, keys: Keys) -> tuple[Tensor, Tensor]:
         """Return which steps are active, (B, S) bool, and the rows' place in the tables, (B,) int64."""
         qaf, rows, steps = self.answers(tensordict, keys)
         weights = (10.0 * qaf.to(torch.float32) - 5.0).masked_fill(~steps, -torch.inf).softmax(-1)
@@ -89,19 +87,19 @@ class SwapUnmentioned(PlanAugmentation):
     """Put objects that no active step mentions where they are in another row, so that a policy cannot rely on them.
 
     A step mentions the objects and the goal that its condition and its skill name. For replay buffers, after a
-    :class:`QAFTransform`: the answers are those of the scene as it was.
+    :class:`QAFTransform`, which must see the unchanged scene.
 
     Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); changes ``observation`` (B, D), and ``("next", "observation")``
-    alike, where an object stays that an active step of either mentions. Draws from PyTorch's global generator.
+    alike: an object stays if an active step of either mentions it. Draws from PyTorch's global generator.
 
     Args:
         plans: the plans whose conditions ``qaf`` answers.
-        probability: of each object, and of the goal, in each row.
+        probability: probability of swapping each object, and the goal, in each row.
         in_keys: other names for observation, task_id and qaf, in this order.
 
     Raises:
         ValueError: at call time, a missing key, a task without a plan, or the answers of other plans.
-        TypeError: it is given to an environment.
+        TypeError: use in an environment.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -118,9 +116,7 @@ class SwapUnmentioned(PlanAugmentation):
     mentioned: Tensor
 
     @typed
-    def __init__(
-        self, plans: AnyPlans, probability: Probability, *, in_keys: Sequence[NestedKey] | None = None
-    ) -> None:
+    def __init__(self, plans: AnyPlans, probability: Probability, *, in_keys: Keys | None = None) -> None:
         keys = as_keys("in_keys", in_keys, ("observation", "task_id", "qaf"))
         super().__init__(in_keys=keys, out_keys=keys[:1])
         self.probability = probability
@@ -134,7 +130,7 @@ class SwapUnmentioned(PlanAugmentation):
         return (active.unsqueeze(-1) & self.table("mentioned", rows.device)[rows]).any(-2)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = tensordict.copy()  # of a buffer's whole range it may be the storage itself
+        tensordict = tensordict.copy()  # replay[:] may give the storage itself
         key, task, qaf = self.in_keys
         observations = {key: read(tensordict, [key])[0]}
         kept = self._kept(tensordict)
@@ -143,18 +139,18 @@ class SwapUnmentioned(PlanAugmentation):
         following = tensordict.get("next", None)
         if following is not None and following.get(key, None) is not None:
             observations[unravel_key(("next", key))] = following.get(key)
-            if following.get(qaf, None) is not None:  # its task is that of the row
+            if following.get(qaf, None) is not None:  # the next observation has the row's task
                 kept = kept | self._kept(following.copy().set(task, tensordict.get(task)))
         kept = kept.reshape(-1, kept.shape[-1])
         number, device = kept.shape[0], kept.device
         flat = {name: values.reshape(number, -1) for name, values in observations.items()}
         swapped = {name: values.clone() for name, values in flat.items()}
-        for thing, parts in enumerate(self._parts):
-            away = (~kept[:, thing] & (torch.rand(number, device=device) < self.probability)).unsqueeze(-1)
+        for item, parts in enumerate(self._parts):  # an object may have several parts, such as its old position
+            swap = (~kept[:, item] & (torch.rand(number, device=device) < self.probability)).unsqueeze(-1)
             others = torch.randint(number, (number,), device=device)
             for name, values in flat.items():
                 for part in parts:
-                    swapped[name][:, part] = torch.where(away, values[others, part], values[:, part])
+                    swapped[name][:, part] = torch.where(swap, values[others, part], values[:, part])
         for name, values in swapped.items():
             tensordict.set(name, values.reshape(observations[name].shape))
         return tensordict
@@ -167,12 +163,12 @@ class HideOpening(Augmentation):
     generator.
 
     Args:
-        probability: of each row.
-        layout: of the observations.
+        probability: probability of replacing the opening of a row.
+        layout: the layout of the observations.
         in_keys: another name for observation.
 
     Raises:
-        TypeError: it is given to an environment.
+        TypeError: use in an environment.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -183,9 +179,7 @@ class HideOpening(Augmentation):
     """
 
     @typed
-    def __init__(
-        self, probability: Probability, *, layout: Layout = METAWORLD, in_keys: Sequence[NestedKey] | None = None
-    ) -> None:
+    def __init__(self, probability: Probability, *, layout: Layout = METAWORLD, in_keys: Keys | None = None) -> None:
         keys = as_keys("in_keys", in_keys, ("observation",))
         super().__init__(in_keys=keys, out_keys=keys)
         self.probability, self._opening = probability, layout.opening
@@ -217,7 +211,7 @@ class JitterTarget(PlanAugmentation):
 
     Raises:
         ValueError: the plans have no roles; or at call time, as for :class:`SwapUnmentioned`.
-        TypeError: it is given to an environment.
+        TypeError: use in an environment.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -232,7 +226,7 @@ class JitterTarget(PlanAugmentation):
     scale: Tensor
 
     @typed
-    def __init__(self, plans: AnyPlans, std: Scale, *, in_keys: Sequence[NestedKey] | None = None) -> None:
+    def __init__(self, plans: AnyPlans, std: Scale, *, in_keys: Keys | None = None) -> None:
         super().__init__(in_keys=as_keys("in_keys", in_keys, ("task_id", "qaf")), out_keys=["target_offset"])
         check_apart(self.in_keys, self.out_keys)
         self.std = std
@@ -253,14 +247,11 @@ def mentioned(plans: Plans, tables: PlanTables) -> Tensor:
     numbers = [{number for part in parts for number in places(part)} for parts in plans.layout.parts]
     table = torch.zeros(*tables.mask.shape, len(numbers), dtype=torch.bool)
     for task, plan in plans.items():
-        for step, names in enumerate(step.mentions(plan.definition) for step in plan.steps):
-            positions = {
-                number
-                for name in names
-                for number in role_object(plan.definition, name).position
-                if isinstance(number, int)  # a float is a fixed number of metres
-            }
-            table[tables.index.row(task), step] = torch.tensor([not positions.isdisjoint(own) for own in numbers])
+        for number, step in enumerate(plan.steps):
+            objects = [role_object(plan.definition, name) for name in step.mentions(plan.definition)]
+            # An int is an index into the observation, a float a fixed number of metres.
+            indices = {place for item in objects for place in item.position if isinstance(place, int)}
+            table[tables.index.row(task), number] = torch.tensor([not indices.isdisjoint(own) for own in numbers])
     return table
 
 

@@ -7,14 +7,13 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, UnboundedDiscrete
 from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-from lw_torchrl._util.checks import Count, check_value, typed
-from lw_torchrl._util.keys import as_keys
+from lw_torchrl._util.checks import Count, typed
+from lw_torchrl._util.keys import Keys, as_keys
 from lw_torchrl._util.rendering import check_cameras
 from lw_torchrl.transforms.environment import KeepsEnvState, base_env, reset_rows
 
@@ -23,16 +22,17 @@ class CameraTransform(KeepsEnvState):
     """Write ``pixels`` (B, height, width·C, 3) uint8, pictures by C cameras side by side, the first on the left.
 
     A picture of a row is taken at its reset and then every N steps of its episode, and held in between; rows that a
-    ``_step`` or ``_reset`` mask leaves out are not drawn. Its ``state_dict`` holds the environment's, as
+    ``_step`` or ``_reset`` mask leaves out are not rendered. Its ``state_dict`` holds the environment's, as
     :class:`EnvState` does. With SerialEnv and ParallelEnv put it into each worker.
 
     Args:
         cameras: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV", or several.
-        height, width, every: pixels of each picture, and N.
+        height, width: size of each picture, in pixels.
+        every: N.
         out_keys: another name for pixels.
 
     Raises:
-        ValueError: a wrong argument, or on a replay buffer.
+        ValueError: an unknown camera, a picture that is too large, or use on a replay buffer.
         TypeError: there is no LanguageWorldEnv right under it.
         RuntimeError: a step of an environment that was never reset, or not since ``load_state_dict``.
         ImportError: there is no OpenGL; it names what to install.
@@ -52,13 +52,13 @@ class CameraTransform(KeepsEnvState):
         self,
         cameras: str | Sequence[str] = "corner",
         *,
-        height: int = 64,
-        width: int = 64,
-        every: int = 1,
-        out_keys: Sequence[NestedKey] | None = None,
+        height: Count = 64,
+        width: Count = 64,
+        every: Count = 1,
+        out_keys: Keys | None = None,
     ) -> None:
         self.cameras = check_cameras(cameras, height, width)
-        self.height, self.width, self.every = height, width, check_value("every", every, Count)
+        self.height, self.width, self.every = height, width, every
         super().__init__(in_keys=[], out_keys=as_keys("out_keys", out_keys, ("pixels",)))
         self.shape = self.height, self.width * len(self.cameras), 3  # of a row's pictures
         self._forget_episodes()
@@ -71,21 +71,21 @@ class CameraTransform(KeepsEnvState):
         super().set_container(container)
         env = base_env(self)
         if isinstance(env, BatchedEnvBase):
-            workers = f"the workers of a {type(env).__name__}: put it into each of them"
-            raise TypeError(f"CameraTransform cannot see into {workers}")
+            raise TypeError(f"CameraTransform must be in each worker of a {type(env).__name__}, not around it")
         if env is not None and not hasattr(env, "row_tasks"):
             raise TypeError(f"CameraTransform must be around a LanguageWorldEnv, got {type(env).__name__}")
 
     def _draw(self, which: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
-        """Draw rows, (N,) bool, and write all rows' pictures."""
+        """Render the rows ``which``, (N,) bool, and write all rows' pictures."""
         env: Any = base_env(self)
         rows = which.nonzero().flatten()
         if self._taken is None:
             self._taken = torch.zeros(len(which), *self.shape, dtype=torch.uint8)
         if len(rows):
             size = {"height": self.height, "width": self.width, "rows": rows.tolist()}
-            drawn = [env.render(camera=camera, **size) for camera in self.cameras]
-            self._taken[rows] = torch.cat([one if one.dim() == 4 else one[None] for one in drawn], -2)
+            pictures = [env.render(camera=camera, **size) for camera in self.cameras]
+            # An environment of one row returns its picture without a batch dimension.
+            self._taken[rows] = torch.cat([each if each.dim() == 4 else each[None] for each in pictures], -2)
         return tensordict.set(self.out_keys[0], self._taken.clone().reshape(*tensordict.batch_size, *self.shape))
 
     def _rows(self, mask: Tensor | None) -> Tensor:
@@ -100,15 +100,15 @@ class CameraTransform(KeepsEnvState):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self._steps is None:
-            raise RuntimeError("no picture was taken of these episodes: reset the environment before the next step")
+            raise RuntimeError("no episode has begun: reset the environment before the first step")
         moved = self._rows(tensordict.get("_step", None))
         self._steps = self._steps + moved
         return self._draw(moved & (self._steps % self.every == 0), next_tensordict)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         raise ValueError(
-            "CameraTransform draws an environment's rows; a dataset's are drawn by lw.data.add_pictures(root, ...), "
-            "and replay.add_column('pixels', lw.data.load_pictures(replay, ...)) shows them"
+            "CameraTransform renders an environment; for a dataset use lw.data.add_pictures(root, ...), then "
+            "replay.add_column('pixels', lw.data.load_pictures(replay, ...))"
         )
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:

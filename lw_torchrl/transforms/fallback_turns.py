@@ -1,17 +1,15 @@
 """FallbackTurns: switch between a plan's own steps and the fallback plan's when nothing moves any more."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from lw_torchrl._util.checks import Count, Scale, typed
-from lw_torchrl._util.keys import as_keys, check_apart, read
+from lw_torchrl._util.keys import Keys, as_keys, check_apart, read
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.transforms.environment import reset_rows
 
@@ -36,14 +34,14 @@ class FallbackTurns(Transform):
     a replay buffer keep the turn with which they were collected; rows without one get 0.
 
     Args:
-        layout: of the observations.
-        patience: steps without motion that end a turn.
+        layout: the layout of the observations.
+        patience: number of steps without motion that end a turn.
         longest: maximum length of a turn, in steps.
         still: metres, the largest motion that counts as none.
         in_keys, out_keys: other names for observation and turn.
 
     Raises:
-        ValueError: a wrong argument, or no observation.
+        ValueError: at call time, no observation.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -63,17 +61,17 @@ class FallbackTurns(Transform):
         patience: Count = 60,
         longest: Count = 250,
         still: Scale = 0.02,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
     ) -> None:
-        super().__init__(
-            in_keys=as_keys("in_keys", in_keys, ("observation",)), out_keys=as_keys("out_keys", out_keys, ("turn",))
-        )
+        keys = as_keys("in_keys", in_keys, ("observation",))
+        super().__init__(in_keys=keys, out_keys=as_keys("out_keys", out_keys, ("turn",)))
         check_apart(self.in_keys, self.out_keys)
         self.layout, self.patience, self.longest, self.still = layout, patience, longest, still
         self._rows: _Rows | None = None
 
     def _positions(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the positions of the hand and the objects, (B, P, 3); the goal, which comes last, does not move."""
         (observation,) = read(tensordict, self.in_keys)
         return torch.stack([observation[..., part] for part in self.layout.positions[:-1]], -2)
 
@@ -91,7 +89,7 @@ class FallbackTurns(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self._rows is None:
-            raise RuntimeError("rows have begun no episode: reset the environment")
+            raise RuntimeError("no episode has begun: reset the environment before the first step")
         now, (turn, waited, lasted, stood) = self._positions(next_tensordict), self._rows
         moved = ((now - stood).norm(dim=-1) > self.still).any(-1)
         waited, lasted = torch.where(moved, 0, waited + 1), lasted + 1

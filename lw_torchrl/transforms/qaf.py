@@ -1,8 +1,7 @@
-"""QAFTransform: answer the conditions of each row's plan, as a tensor of their truth."""
+"""QAFTransform: answer the conditions of each row's plan as a tensor; CorruptQAF: make the answers late or wrong."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -13,14 +12,22 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase, Transform
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-from lw_torchrl._util.checks import missing_keys, typed
-from lw_torchrl._util.keys import as_keys, check_apart, key_beside
+from lw_torchrl._util.checks import Count, Natural, Probability, missing_keys, typed
+from lw_torchrl._util.keys import Keys, as_keys, check_apart, key_beside, read
+from lw_torchrl._util.reproducibility import episode_generator
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.task_index import PlanTables, TaskTables, one_per_row
-from lw_torchrl.transforms.environment import KeepsEnvState, base_env, refuse_changed, reset_rows
+from lw_torchrl.transforms.environment import (
+    EpisodeTransform,
+    KeepsEnvState,
+    base_env,
+    refuse_changed,
+    reset_rows,
+)
 
-_HALF = (torch.float16, torch.bfloat16)  # in which metres are not told apart as conditions do
+_HALF = (torch.float16, torch.bfloat16)  # too coarse for metres: conditions compare centimetres
+_BLOCK = 64  # steps of an episode whose random numbers are drawn together
 
 
 class _Number(NamedTuple):
@@ -28,12 +35,12 @@ class _Number(NamedTuple):
 
 
 def plan_program(plans: Plans) -> QueryProgram:
-    """The conditions of ``plans`` as one :class:`QueryProgram`, a column for each step."""
+    """Return the conditions of ``plans`` as one :class:`QueryProgram`, a column for each step."""
     return QueryProgram({plan.definition: [step.condition for step in plan.steps] for plan in plans.values()})
 
 
 def plan_number_key(qaf: NestedKey) -> NestedKey:
-    """Where :class:`QAFTransform` writes the plan's number: beside ``qaf``, ``qaf_plan``."""
+    """Return the key to which :class:`QAFTransform` writes the plan's number: ``qaf_plan`` for ``qaf``."""
     return key_beside(qaf, "_plan")
 
 
@@ -47,7 +54,7 @@ class QAFTransform(KeepsEnvState):
     the environment's, as :class:`EnvState` does.
 
     Conditions are about metres, so put it before transforms that change the observation, such as a normaliser or
-    :class:`RandomYaw`: one before it is refused, except in the workers of a SerialEnv or ParallelEnv.
+    :class:`RandomYaw`. It refuses to stand behind one, except in the workers of a SerialEnv or ParallelEnv.
 
     Args:
         plans: a plan for each task that will be seen.
@@ -56,8 +63,8 @@ class QAFTransform(KeepsEnvState):
 
     Raises:
         PlanError: (a ValueError) the environment has a task without a plan.
-        ValueError: a wrong argument, a task_id without a plan, a malformed observation, one of half precision, or a
-            transform before it that changes it.
+        ValueError: a task_id without a plan, an observation that is malformed or of half precision, or a transform
+            before it that changes it.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -70,13 +77,7 @@ class QAFTransform(KeepsEnvState):
     """
 
     @typed
-    def __init__(
-        self,
-        plans: AnyPlans,
-        *,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
-    ) -> None:
+    def __init__(self, plans: AnyPlans, *, in_keys: Keys | None = None, out_keys: Keys | None = None) -> None:
         truth = as_keys("out_keys", out_keys, ("qaf",))
         keys = as_keys("in_keys", in_keys, ("observation", "task_id"))
         super().__init__(in_keys=keys, out_keys=[*truth, plan_number_key(truth[0])])
@@ -96,7 +97,7 @@ class QAFTransform(KeepsEnvState):
         if observation is None or task_id is None:
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys))
         if observation.dtype in _HALF:
-            got = f"got {observation.dtype}: put QAFTransform before what casts it"
+            got = f"got {observation.dtype}; put QAFTransform before the transform that casts it"
             raise ValueError(f"observation must be float32 or float64, {got}")
         task_id = one_per_row(task_id, observation)
         tensordict.set(self.out_keys[0], self.program(observation, task_id))
@@ -136,3 +137,155 @@ class QAFTransform(KeepsEnvState):
         observation_spec[self.out_keys[0]] = Binary(steps, shape=(*shape, steps), dtype=torch.bool, device=device)
         observation_spec[self.out_keys[1]] = Unbounded(shape, dtype=torch.int64, device=device)
         return observation_spec
+
+
+class CorruptQAF(EpisodeTransform):
+    """Make the answers in ``qaf`` late, held and wrong, to measure what slow or unreliable answers cost.
+
+    For environments, after a :class:`QAFTransform`. Reads ``qaf`` (B, S) bool, or float in [0, 1], ``task_id`` (B,) and
+    ``episode`` (B,) int64, and ``qaf_plan`` (B,) int64 where it exists; changes only ``qaf``:
+
+    - **every, delay** (held, late): in step t of its episode, 0 at the reset, a row shows the answers of step
+      every · ⌊max(t - delay, 0) / every⌋;
+    - **flip** (wrong): in each step, the reset included, each answer is then inverted with this probability.
+
+    The draws depend only on (task, seed, episode, step) and the answer's place in its plan; a larger probability
+    inverts all that a smaller one inverts. In :func:`lw_torchrl.evaluate` it can be the ``evaluator``. To corrupt a
+    learned evaluator's answers, put a transform before this one that calls the evaluator in ``_reset`` and ``_call``.
+
+    Args:
+        plans: the plans whose conditions ``qaf`` answers.
+        every: update a row's answers every N steps.
+        delay: number of steps until new answers are shown.
+        flip: probability of inverting an answer.
+        seed: random seed, any integer.
+        in_keys: other names for qaf, task_id and episode, in this order.
+
+    Raises:
+        ValueError: ``qaf`` is missing, or of another shape, dtype or plan; or the transform is used in a replay buffer.
+        RuntimeError: a step of an environment that was never reset, or not since ``load_state_dict``.
+
+    Example:
+        >>> import lw_torchrl as lw
+        >>> plans = lw.load_plans("MT10")
+        >>> actor, noisy = lw.ScriptedSkillActor(plans), lw.CorruptQAF(plans, every=2, flip=0.05)
+        >>> lw.evaluate(actor, tasks="reach", episodes_per_task=2, seed=1_000, evaluator=noisy).success_once
+        {'reach': 1.0}
+
+    Source: the paper names a visual question answering model as a query answering function; such a model errs.
+    """
+
+    @typed
+    def __init__(
+        self,
+        plans: AnyPlans,
+        *,
+        every: Count = 1,
+        delay: Natural = 0,
+        flip: Probability = 0.0,
+        seed: int = 0,
+        in_keys: Keys | None = None,
+    ) -> None:
+        keys = as_keys("in_keys", in_keys, ("qaf", "task_id", "episode"))
+        super().__init__(in_keys=keys, out_keys=keys[:1])
+        self.plans = as_plans(plans)
+        self.every, self.delay, self.flip, self.seed = every, delay, flip, seed
+        self._tables = PlanTables(self.plans)
+        self._task: Tensor | None = None  # B int64, of the rows' episodes
+        self._episode: Tensor | None = None
+        self._plan = torch.empty(0, dtype=torch.int64)  # B int64, where their plans are in the tables
+        self._forget_episodes()
+
+    def _forget_episodes(self) -> None:
+        self._places = -(-self.delay // self.every) + 1  # maximum number of answers waiting to be shown
+        self._steps: Tensor | None = None  # B int64, of each row's episode
+        self._answers: Tensor | None = None  # (B, places, S); the n-th answers are in place n % places
+        self._draws = _Draws(self.seed, self._tables, self.plans)
+
+    def with_plans(self, plans: AnyPlans) -> CorruptQAF:
+        """Return a transform that corrupts the answers of other plans alike."""
+        options = {name: getattr(self, name) for name in ("every", "delay", "flip", "seed", "in_keys")}
+        return CorruptQAF(plans, **options)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        truth, task, episode = read(tensordict_reset, self.in_keys)
+        begun = tensordict.get("_reset", None)
+        self._task, self._episode = reset_rows(self._task, task, begun), reset_rows(self._episode, episode, begun)
+        self._plan = self._tables.rows(self._task)
+        self._tables.refuse_others(tensordict_reset.get(plan_number_key(self.in_keys[0]), None), self._plan)
+        shape = (*self._plan.shape, self.plans.num_steps)
+        if truth.shape != shape or not (truth.dtype == torch.bool or truth.is_floating_point()):
+            got = f"{truth.dtype} of shape {tuple(truth.shape)}"
+            raise ValueError(f"qaf must be bool, or float for soft truth, of shape {shape}, got {got}")
+        self._steps = reset_rows(self._steps, torch.zeros_like(self._plan), begun)
+        self._answers = reset_rows(self._answers, torch.stack([truth] * self._places, -2), begun, 2)
+        return self._show(tensordict_reset)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if self._steps is None or self._answers is None:
+            raise RuntimeError("no episode has begun, or none since load_state_dict: reset the environment")
+        moved = tensordict.get("_step", None)
+        moved = torch.ones_like(self._steps, dtype=torch.bool) if moved is None else moved.reshape(self._steps.shape)
+        self._steps = self._steps + moved
+        due = moved & (self._steps % self.every == 0)
+        place = torch.arange(self._places, device=due.device) == self._place(self._steps).unsqueeze(-1)
+        truth = next_tensordict.get(self.in_keys[0]).unsqueeze(-2)
+        self._answers = torch.where((place & due.unsqueeze(-1)).unsqueeze(-1), truth, self._answers)
+        return self._show(next_tensordict)
+
+    def _place(self, step: Tensor) -> Tensor:
+        return step // self.every % self._places
+
+    def _show(self, tensordict: TensorDictBase) -> TensorDictBase:
+        assert self._steps is not None
+        assert self._answers is not None
+        assert self._episode is not None
+        place = self._place((self._steps - self.delay).clamp(min=0))[..., None, None]
+        answers = self._answers.gather(-2, place.expand(*place.shape[:-1], self._answers.shape[-1])).squeeze(-2)
+        if self.flip:
+            wrong = self._draws(self._plan, self._episode, self._steps) < self.flip
+            answers = answers ^ wrong if answers.dtype == torch.bool else torch.where(wrong, 1 - answers, answers)
+        return tensordict.set(self.in_keys[0], answers)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        raise ValueError(
+            "CorruptQAF counts the steps of an environment's episodes, which rows of a replay buffer do not record: "
+            "put it into the environment, after QAFTransform, or give it to evaluate(evaluator=...)"
+        )
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        assert isinstance(observation_spec, Composite)
+        keys = list(observation_spec.keys(True, True))
+        if any(key not in keys for key in self.in_keys):
+            raise missing_keys(keys, *map(str, self.in_keys))
+        return observation_spec
+
+
+class _Draws:
+    """Uniform numbers for the answers of rows, in blocks of steps, by (task, seed, episode, block); 1 on padding."""
+
+    def __init__(self, seed: int, tables: PlanTables, plans: Plans) -> None:
+        self._seed = seed
+        self._plans = [plans[task] for task in tables.index.tasks]
+        self._width = plans.num_steps
+        self._which = torch.empty(0, 3, dtype=torch.int64)  # the row of the tables, episode and block of each row
+        self._numbers = torch.empty(0, _BLOCK, self._width)
+
+    def __call__(self, rows: Tensor, episode: Tensor, step: Tensor) -> Tensor:
+        """Return numbers (B, S) float64 in [0, 1] for rows of the tables, their episodes and steps, each B int64."""
+        which = torch.stack([each.reshape(-1).cpu() for each in (rows, episode, step // _BLOCK)], -1)
+        if which.shape != self._which.shape:
+            self._which = torch.full_like(which, -1)
+            self._numbers = torch.ones(len(which), _BLOCK, self._width, dtype=torch.float64)
+        if not torch.equal(which, self._which):
+            for place in (which != self._which).any(-1).nonzero().flatten().tolist():
+                row, number, block = which[place].tolist()
+                if number < 0:  # never reset
+                    continue
+                plan = self._plans[row]
+                generator = episode_generator(f"answers/flip/{block}", plan.definition, self._seed, number)
+                steps = len(plan.steps)
+                self._numbers[place, :, :steps] = torch.from_numpy(generator.random((_BLOCK, steps)))
+            self._which = which
+        numbers = self._numbers[torch.arange(len(which)), step.reshape(-1).cpu() % _BLOCK]
+        return numbers.reshape(*step.shape, -1).to(step.device)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import Probability, Scale, check_value, missing_keys, typed
-from lw_torchrl._util.keys import as_keys, check_apart, key_beside
+from lw_torchrl._util.checks import Probability, Scale, missing_keys, typed
+from lw_torchrl._util.keys import Keys, as_keys, check_apart, key_beside
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import AnyPlans
 from lw_torchrl.language.roles import StepRole
@@ -51,7 +49,7 @@ def tilt_key(observation: NestedKey) -> NestedKey:
 
 
 def random_rotations(number: int, device: torch.device | None = None) -> Tensor:
-    """Rotations (number, 3, 3) float32, uniform over all, from PyTorch's global generator.
+    """Return rotations (number, 3, 3) float32, uniform over all rotations, from PyTorch's global generator.
 
     Source: K. Shoemake, "Uniform random rotations", from unit quaternions.
     """
@@ -68,30 +66,31 @@ class RandomYaw(PlanAugmentation):
     """Turn each sampled row, its positions and its actions, by a random angle about the vertical.
 
     A policy then learns to move towards the goal, and not in the direction that the demonstrations happened to have.
-    For replay buffers, after a :class:`QAFTransform`: conditions such as "left of" hold in the scene as it was.
+    For replay buffers, after a :class:`QAFTransform`, which must see the unchanged scene: "left of" has a direction.
 
     Changes ``observation`` (B, 39), ``action`` (B, 4), and, where they exist, ``expert_action``, ``unclipped_action``
     (B, 4) and ``("next", "observation")``, all float32. Writes the angle in radians, ``observation_yaw`` (B,) float32,
-    and ``("next", "observation_yaw")``; features of fixed places turn these by it. An action's displacement in the
-    plane is shortened if turning would lead it out of [-1, 1]. Orientations are not turned: use features without them,
-    "differences" or "relative". Angles are drawn from PyTorch's global generator. Rows that were turned before get the
-    sum of both angles. TorchRL's losses, except BCLoss, do not pass the angle on to features that read it, so
+    and ``("next", "observation_yaw")``, by which features turn fixed places. An action's displacement in the plane is
+    shortened if it would leave [-1, 1]. Orientations are not turned: use features without them, "differences" or
+    "relative". Angles are drawn from PyTorch's global generator. Rows that were turned before get the sum of both
+    angles. TorchRL's losses, except BCLoss, do not pass the angle on to features that read it, so
     :class:`~lw_torchrl.OfflineTrainer` refuses them.
 
     Args:
         scale: standard deviation of the angle, in radians; 10 is any angle.
-        plans: the actor's plans. Rows whose true conditions lead to no direction ("move the puck to the target
-            location"), by ``qaf`` (B, S) and ``task_id`` (B,) int64, are then turned by any angle.
-        tilt: the probability that a row whose steps move something freely to a place is also turned in space, by any
-            rotation, ``observation_tilt`` (B, 3, 3) float32, by which :class:`~lw_torchrl.modules.RoleFeatures` turns
-            the relative position. It needs canonical plans, see :func:`~lw_torchrl.canonical_plans`.
-        layout: of the observations and actions; None for that of the plans, or Meta-World's without plans.
+        plans: the actor's plans. Rows in which no active step has a direction ("move the puck to the target
+            location" has none), by ``qaf`` (B, S) and ``task_id`` (B,) int64, are then turned by any angle.
+        tilt: the probability that a row whose active steps carry or move an object to a place is also turned in space,
+            by any rotation, ``observation_tilt`` (B, 3, 3) float32, by which
+            :class:`~lw_torchrl.modules.RoleFeatures` turns the relative position. It needs canonical plans, see
+            :func:`~lw_torchrl.canonical_plans`.
+        layout: the layout of observations and actions; None for that of the plans, or Meta-World's without plans.
         in_keys: other names for observation, action, expert_action and unclipped_action, in this order.
         out_keys: names for the turned ones; None for the same names.
 
     Raises:
-        ValueError: a wrong argument; a sample without observation or action, or, with plans, without their answers.
-        TypeError: it is given to an environment.
+        ValueError: a sample without observation or action, or, with plans, without their answers.
+        TypeError: use in an environment.
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -106,13 +105,13 @@ class RandomYaw(PlanAugmentation):
     @typed
     def __init__(
         self,
-        scale: float,
+        scale: Scale,
         *,
         plans: AnyPlans | None = None,
-        tilt: float = 0.0,
+        tilt: Probability = 0.0,
         layout: Layout | None = None,
-        in_keys: Sequence[NestedKey] | None = None,
-        out_keys: Sequence[NestedKey] | None = None,
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
     ) -> None:
         super().__init__(
             in_keys=as_keys("in_keys", in_keys, _KEYS),
@@ -121,8 +120,7 @@ class RandomYaw(PlanAugmentation):
         for own, there in zip(self.in_keys, self.out_keys, strict=True):
             if there != own:
                 check_apart(self.in_keys, [there])
-        self.scale, self.tilt = check_value("scale", scale, Scale), check_value("tilt", tilt, Probability)
-        self.has_plans = plans is not None
+        self.scale, self.tilt, self.has_plans = scale, tilt, plans is not None
         if plans is not None:
             plans = self._read_plans(plans)
             if layout not in (None, plans.layout):
@@ -133,7 +131,7 @@ class RandomYaw(PlanAugmentation):
             if tilt:
                 self.register_buffer("to_places", role_table(plans, self._tables, _moves_to_a_place), persistent=False)
         elif tilt:
-            raise ValueError(f"tilt needs plans, which say what moves freely, and plans is None; got tilt={tilt}")
+            raise ValueError(f"tilt needs plans, which say how objects move, got tilt={tilt} and plans=None")
         self.layout = METAWORLD if layout is None else layout
         self._begin = self.layout.displaced("RandomYaw").start
 
@@ -151,38 +149,40 @@ class RandomYaw(PlanAugmentation):
         return (self.table(name, rows.device)[rows] | ~true).all(-1) & true.any(-1)
 
     def _tilt(self, tensordict: TensorDictBase) -> Tensor:
-        """(B, 3, 3) float32, the rotation of each row."""
+        """Return the rotation of each row, (B, 3, 3) float32."""
         free = self._all_true(tensordict, "to_places")
         chosen = free & (torch.rand(free.shape, device=free.device) < self.tilt)
-        found = random_rotations(free.numel(), free.device).reshape(*free.shape, 3, 3)
-        return torch.where(chosen[..., None, None], found, torch.eye(3, device=free.device))
+        rotations = random_rotations(free.numel(), free.device).reshape(*free.shape, 3, 3)
+        return torch.where(chosen[..., None, None], rotations, torch.eye(3, device=free.device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = tensordict.copy()  # of a buffer's whole range it may be the storage itself
-        seen, *actions = zip(self.in_keys, self.out_keys, strict=True)
-        observation = tensordict.get(seen[0], None)
+        tensordict = tensordict.copy()  # replay[:] may give the storage itself
+        (source, target), *actions = zip(self.in_keys, self.out_keys, strict=True)
+        observation = tensordict.get(source, None)
         if observation is None or tensordict.get(actions[0][0], None) is None:
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys[:2]))
         angle = self._angle(tensordict, observation)
         tilt = self._tilt(tensordict) if self.tilt else None
-        old_yaw, old_tilt = (tensordict.get(key(seen[0]), None) for key in (yaw_key, tilt_key))
+        old_yaw, old_tilt = tensordict.get(yaw_key(source), None), tensordict.get(tilt_key(source), None)
         yaw = angle if old_yaw is None else old_yaw + angle
-        if old_tilt is not None:  # it came before this turn: in the turned axes it is another rotation
+        if old_tilt is not None:  # the row was tilted before this turn: in the turned axes the tilt has another matrix
             old_tilt = turn_vectors(turn_vectors(old_tilt.mT, angle.unsqueeze(-1)).mT, angle.unsqueeze(-1))
-            tensordict.set(tilt_key(seen[1]), old_tilt if tilt is None else tilt @ old_tilt)
+            tensordict.set(tilt_key(target), old_tilt if tilt is None else tilt @ old_tilt)
         elif tilt is not None:
-            tensordict.set(tilt_key(seen[1]), tilt)
+            tensordict.set(tilt_key(target), tilt)
         cos, sin, begin = angle.cos(), angle.sin(), self._begin
-        tensordict.set(seen[1], turn_observation(observation, angle, self.layout)).set(yaw_key(seen[1]), yaw)
-        if (following := tensordict.get(unravel_key(("next", seen[0])), None)) is not None:
-            after = unravel_key(("next", seen[1]))
+        tensordict.set(target, turn_observation(observation, angle, self.layout)).set(yaw_key(target), yaw)
+        if (following := tensordict.get(unravel_key(("next", source)), None)) is not None:
+            after = unravel_key(("next", target))
             tensordict.set(after, turn_observation(following, angle, self.layout)).set(yaw_key(after), yaw)
         for key, turned_key in actions:
             if (action := tensordict.get(key, None)) is None:
                 continue
             turned = _turned(action, (begin,), cos, sin)
-            before, now = (one[..., begin : begin + 2].abs().amax(-1, keepdim=True) for one in (action, turned))
-            turned[..., begin : begin + 2] /= torch.where(before <= 1.0, now.clamp(min=1.0), 1.0)
+            # Shorten what leaves [-1, 1], unless it was outside before: unclipped actions may be.
+            plane = slice(begin, begin + 2)
+            before, now = (each[..., plane].abs().amax(-1, keepdim=True) for each in (action, turned))
+            turned[..., plane] /= torch.where(before <= 1.0, now.clamp(min=1.0), 1.0)
             if tilt is not None:
                 way = turned[..., begin : begin + 3]
                 tilted = (tilt @ way.unsqueeze(-1)).squeeze(-1)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from lw_torchrl._util.checks import typed
-from lw_torchrl._util.keys import check_key, read
+from lw_torchrl._util.keys import Keys, check_key, read
 from lw_torchrl.language.tasks import Task, task_id
 
 
@@ -21,14 +20,15 @@ class SuiteTransform(Transform):
 
     After it, :class:`QAFTransform`, actors, collectors and losses work as with :class:`~lw_torchrl.LanguageWorldEnv`.
 
-    Reads ``in_keys``; writes ``observation`` (..., D) float32 and ``task_id`` (...) int64. It fills the numbers of the
-    step before, if the layout has them; at a reset they are the present ones. With ``act``, ``action`` (..., A) float32
-    in [-1, 1] is an action of the layout.
+    Reads ``in_keys``; writes ``observation`` (..., D) float32 and ``task_id`` (...) int64. If the layout has the
+    numbers of the previous step, it writes them; at a reset they are the present ones. With ``act``, ``action``
+    (..., A) float32 in [-1, 1] is an action of the layout.
 
     Args:
         task: the task, whose layout has D numbers and A actions.
-        observe: from the tensors of ``in_keys`` to (..., D) numbers in the layout's order and frame; any for the past.
-        act: from an action of the layout (..., A) to one of the environment; None if they are the same.
+        observe: a function from the tensors of ``in_keys`` to (..., D) numbers in the layout's order and frame; those
+            of the previous step may be any.
+        act: a function from an action of the layout (..., A) to an action of the environment; None if they are equal.
         in_keys: the keys that ``observe`` reads.
 
     Raises:
@@ -54,7 +54,7 @@ class SuiteTransform(Transform):
         observe: Callable[..., Tensor],
         *,
         act: Callable[[Tensor], Tensor] | None = None,
-        in_keys: Sequence[NestedKey] = ("observation",),
+        in_keys: Keys = ("observation",),
     ) -> None:
         for key in in_keys:
             check_key("in_keys", key)
@@ -63,11 +63,11 @@ class SuiteTransform(Transform):
         self.task, self.observe, self.act, self.layout = task, observe, act, task.layout
 
     def _seen(self, tensordict: TensorDictBase) -> Tensor:
-        found = self.observe(*read(tensordict, self.in_keys)).to(torch.float32)
-        if found.shape[-1:] != (self.layout.size,):
-            wanted = f"the {self.layout.size} numbers of layout {self.layout.name!r}"
-            raise ValueError(f"observe must give {wanted}, got shape {tuple(found.shape)}")
-        return found.clone()
+        observation = self.observe(*read(tensordict, self.in_keys)).to(torch.float32)
+        if observation.shape[-1:] != (self.layout.size,):
+            numbers = f"the {self.layout.size} numbers of layout {self.layout.name!r}"
+            raise ValueError(f"observe must return {numbers}, got shape {tuple(observation.shape)}")
+        return observation.clone()  # it may be the environment's own tensor
 
     def _write(self, tensordict: TensorDictBase, before: Tensor | None) -> TensorDictBase:
         seen, past = self._seen(tensordict), self.layout.past

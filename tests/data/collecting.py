@@ -8,9 +8,8 @@ import torch
 
 import lw_torchrl as lw
 from lw_torchrl.data import collect_demonstrations
-from lw_torchrl.data.dataset import read_metadata
-from lw_torchrl.data.memory_map import describe_episode, load_rows
-from lw_torchrl.data.missing_episodes import EpisodeFiles
+from lw_torchrl.data.collect import EpisodeFiles
+from lw_torchrl.data.dataset import describe_episode, load_rows, read_metadata
 
 TASKS = ("push", "reach")
 NOISE = (0.0, 0.3)

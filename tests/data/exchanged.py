@@ -9,9 +9,17 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from lw_torchrl._util.versions import package_versions
-from lw_torchrl.data.dataset import DATA, CollectConfig, Demonstrations, read_metadata, write_metadata
-from lw_torchrl.data.memory_map import COLUMNS, describe_episode, write_rows
+from lw_torchrl._util.reproducibility import package_versions
+from lw_torchrl.data.dataset import (
+    COLUMNS,
+    DATA,
+    CollectConfig,
+    Demonstrations,
+    describe_episode,
+    read_metadata,
+    write_metadata,
+    write_rows,
+)
 from lw_torchrl.language.tasks import task_id
 
 ODD = np.array([0.0, -0.0, 1e-45, -1e-38, 3.4e38, np.pi, 1 / 3], dtype=np.float32)  # where bits get lost

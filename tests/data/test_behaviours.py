@@ -11,11 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
-from lw_torchrl._util.seeding import episode_generator
-from lw_torchrl.data import BEHAVIOURS, Behaviour, CollectConfig, DatasetError, missing_episodes
-from lw_torchrl.data.behaviours import SegmentActor, segment_plans
-from lw_torchrl.data.dataset import read_metadata
-from lw_torchrl.data.memory_map import load_rows
+from lw_torchrl._util.reproducibility import episode_generator
+from lw_torchrl.data import BEHAVIOURS, Behaviour, CollectConfig, DatasetError, collect
+from lw_torchrl.data.collection_policy import SegmentActor, segment_plans
+from lw_torchrl.data.dataset import load_rows, read_metadata
 from lw_torchrl.envs.episodes import run_episodes
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer

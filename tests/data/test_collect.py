@@ -13,8 +13,7 @@ from collecting import EPISODES, NOISE, SEED, STEPS, TASKS, collect
 
 import lw_torchrl as lw
 from lw_torchrl.data import CollectConfig
-from lw_torchrl.data.dataset import read_metadata
-from lw_torchrl.data.memory_map import load_rows
+from lw_torchrl.data.dataset import load_rows, read_metadata
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import action_noise, episode_seed
 from lw_torchrl.language.tasks import MT50

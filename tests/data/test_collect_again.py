@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from collecting import collect, interrupt_after, tree
 
-from lw_torchrl.data import DatasetError, missing_episodes
+from lw_torchrl.data import DatasetError, collect
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from collecting import collect, tree
 
 from lw_torchrl._util.files import locked
 from lw_torchrl.data import DatasetError
-from lw_torchrl.data.missing_episodes import EpisodeFiles
+from lw_torchrl.data.collect import EpisodeFiles
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ import pytest
 from collecting import STEPS, collect, interrupt_after, tree
 
 from lw_torchrl.data import DatasetError
+from lw_torchrl.data.collect import EpisodeFiles
 from lw_torchrl.data.dataset import read_metadata
-from lw_torchrl.data.missing_episodes import EpisodeFiles
 
 
 @pytest.fixture(scope="module")

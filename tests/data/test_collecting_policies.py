@@ -10,9 +10,8 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase
 
 import lw_torchrl as lw
 from lw_torchrl.data import Behaviour, DatasetError
-from lw_torchrl.data.behaviours import policy_fingerprint
-from lw_torchrl.data.dataset import read_metadata
-from lw_torchrl.data.memory_map import load_rows
+from lw_torchrl.data.collection_policy import policy_fingerprint
+from lw_torchrl.data.dataset import load_rows, read_metadata
 from lw_torchrl.modules.policy import with_plans
 
 

@@ -11,9 +11,8 @@ import pytest
 from collecting import EPISODES, STEPS, TASKS, collect, tree
 from tensordict import NonTensorData, TensorDict
 
-from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, memory_map
-from lw_torchrl.data.dataset import FORMAT, FORMAT_VERSION, read_metadata
-from lw_torchrl.data.memory_map import COLUMNS, load_rows
+from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay
+from lw_torchrl.data.dataset import COLUMNS, FORMAT, FORMAT_VERSION, load_rows, read_metadata
 
 ALL = [(task, episode) for task in TASKS for episode in range(EPISODES)]
 

@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from lw_torchrl.data import ExchangeError
+from lw_torchrl.data.dataset import load_rows
 from lw_torchrl.data.exchange import FORMATS
-from lw_torchrl.data.memory_map import load_rows
 
 
 def skip_without(format):

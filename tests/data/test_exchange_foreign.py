@@ -13,7 +13,7 @@ from collecting import tree
 
 import lw_torchrl as lw
 from lw_torchrl.data import ExchangeError
-from lw_torchrl.data.memory_map import load_rows
+from lw_torchrl.data.dataset import load_rows
 
 DRAWS = np.random.default_rng(0)
 STATES = DRAWS.standard_normal((9, 39))

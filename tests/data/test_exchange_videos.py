@@ -11,7 +11,6 @@ from collecting import tree
 from exchanged import random_dataset
 
 import lw_torchrl as lw
-from lw_torchrl.data.exchange import video
 from lw_torchrl.data.pictures import Pictures, _write
 
 KEY = "observation.images.corner-32x48-every2"

@@ -13,10 +13,9 @@ from torchrl.data import RandomSampler, SliceSampler
 
 import lw_torchrl as lw
 from lw_torchrl.data import CoLearningSampler, CollectConfig, Demonstrations, EpisodeFilter, TaskBalancedSampler
-from lw_torchrl.data.behaviours import behaviour_of
+from lw_torchrl.data.collection_policy import behaviour_of
 from lw_torchrl.data.dataset import EpisodeInfo
-from lw_torchrl.data.selection import episode_returns
-from lw_torchrl.data.storage import REWARDS
+from lw_torchrl.data.rewards import REWARDS, episode_returns
 
 TASKS = ("push", "reach")
 STEPS = 34

@@ -13,7 +13,7 @@ from lw_torchrl.data import (
     LanguageWorldExperienceReplay,
     collect_demonstrations,
 )
-from lw_torchrl.data.memory_map import load_rows
+from lw_torchrl.data.dataset import load_rows
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules import PlanConditionedActor

@@ -20,7 +20,7 @@ from torchrl.trainers.algorithms.offline_to_online import OfflineToOnlineReplayB
 
 import lw_torchrl as lw
 from lw_torchrl.data import ROLLOUT
-from lw_torchrl.data.memory_map import MappedColumn
+from lw_torchrl.data.dataset import MappedColumn
 
 
 @pytest.fixture(scope="module")

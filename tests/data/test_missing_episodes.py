@@ -6,7 +6,7 @@ import pytest
 import torch
 from collecting import collect, interrupt_after, tree
 
-from lw_torchrl.data.memory_map import load_rows
+from lw_torchrl.data.dataset import load_rows
 from lw_torchrl.language.tasks import MT50
 
 

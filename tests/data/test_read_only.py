@@ -12,8 +12,7 @@ from collecting import collect, tree
 from torchrl.data import SliceSampler
 
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler
-from lw_torchrl.data.dataset import read_metadata
-from lw_torchrl.data.memory_map import MappedColumn, load_rows
+from lw_torchrl.data.dataset import MappedColumn, load_rows, read_metadata
 
 KINDS = {
     "expert": {},

@@ -7,7 +7,7 @@ import torch
 from torchrl.data import SliceSampler
 
 from lw_torchrl.data import LanguageWorldExperienceReplay, TaskBalancedSampler, collect_demonstrations
-from lw_torchrl.data.memory_map import load_rows
+from lw_torchrl.data.dataset import load_rows
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.transforms import QAFTransform

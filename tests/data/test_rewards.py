@@ -7,8 +7,8 @@ import torch
 from collecting import collect
 
 import lw_torchrl as lw
-from lw_torchrl.data.memory_map import load_rows
-from lw_torchrl.data.storage import REWARDS
+from lw_torchrl.data.dataset import load_rows
+from lw_torchrl.data.rewards import REWARDS
 
 
 def by_hand(name, dense, success):

@@ -7,7 +7,7 @@ import importlib.metadata
 import pytest
 from collecting import collect, interrupt_after
 
-from lw_torchrl._util.versions import SIMULATORS, package_versions, version_changes
+from lw_torchrl._util.reproducibility import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import DatasetError
 
 
@@ -26,7 +26,9 @@ def test_episodes_of_two_simulators_are_not_mixed(tmp_path, monkeypatch):
             collect(root, num_envs=2)
     recorded, real = package_versions(), importlib.metadata.version
     with monkeypatch.context() as patch:
-        patch.setattr("lw_torchrl._util.versions.version", lambda name: "9.9.9" if name == "mujoco" else real(name))
+        patch.setattr(
+            "lw_torchrl._util.reproducibility.version", lambda name: "9.9.9" if name == "mujoco" else real(name)
+        )
         with pytest.raises(DatasetError, match=rf"another simulator \(mujoco {recorded['mujoco']}, now 9.9.9\)"):
             collect(root)
     assert collect(root).versions == recorded

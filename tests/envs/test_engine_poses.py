@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lw_torchrl.suites.metaworld import MetaWorldEngine
-from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
+from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 
 def test_poses_are_metaworlds():

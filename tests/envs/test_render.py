@@ -203,7 +203,7 @@ if __name__ == "__main__":
 @pytest.mark.slow
 def test_a_process_forked_after_a_picture_is_told_and_does_not_hang():
     done = subprocess.run([sys.executable, "-c", _FORK], capture_output=True, text=True, check=True)
-    assert "forked from one that took pictures" in done.stdout
+    assert "forked from one that rendered" in done.stdout
     assert done.stdout.endswith("closed\n")
 
 
@@ -240,5 +240,5 @@ def test_a_library_may_ask_for_egl_after_mujoco_was_imported():
     asking_late = "import mujoco, os\nos.environ['MUJOCO_GL'] = 'egl'  # as robosuite does\n" + _SHOW
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     done = subprocess.run([sys.executable, "-c", asking_late], env=environment, capture_output=True, text=True)
-    assert "pictures need OpenGL" not in done.stdout + done.stderr
+    assert "camera images need OpenGL" not in done.stdout + done.stderr
     assert not done.returncode

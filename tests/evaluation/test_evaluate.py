@@ -20,7 +20,7 @@ from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.modules import DescriptorConditionedActor, ObservationFeatures, PlanConditionedActor
 from lw_torchrl.suites.metaworld.plain_engine import MetaWorldEngine, make_metaworld_env
-from lw_torchrl.suites.metaworld.vectorized.engine import VectorizedEngine
+from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
 from lw_torchrl.transforms import QAFTransform
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mutations import mutated
 
 import lw_torchrl
-from lw_torchrl._util.versions import package_versions
+from lw_torchrl._util.reproducibility import package_versions
 from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, Failure, plot_failures
 from lw_torchrl.evaluation.diagnose.failure import ActiveStep, Difference, WrongAnswers
 
@@ -315,7 +315,8 @@ def test_a_file_that_is_not_a_result_is_refused(tmp_path, name):
 
 
 def test_the_recorded_version_is_that_of_the_running_code(monkeypatch):
-    monkeypatch.setattr("lw_torchrl._util.versions.version", lambda name: "0.0.1")  # as an old editable install says
+    # An old editable install reports the version that it was installed with.
+    monkeypatch.setattr("lw_torchrl._util.reproducibility.version", lambda name: "0.0.1")
     versions = package_versions()
     assert versions["lw_torchrl"] == lw_torchrl.__version__
     assert versions["torch"] == "0.0.1"

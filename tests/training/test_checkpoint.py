@@ -15,8 +15,8 @@ from torch.nn.utils import prune
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import lw_torchrl as lw
+from lw_torchrl._util.reproducibility import package_versions
 from lw_torchrl._util.tensor_files import read_tensors, write_tensors
-from lw_torchrl._util.versions import package_versions
 from lw_torchrl.language import embeddings
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.modules import ActorEnsemble, MLPDecoder, ObservationFeatures, SkillEncoder
@@ -194,7 +194,7 @@ def pruned(actor):
 
 
 def reconfigured(actor):
-    actor.decoder.network._sizes["width"] = 32
+    actor.decoder.network._options["width"] = 32
     return actor
 
 

@@ -165,7 +165,9 @@ def test_one_training_at_a_time_writes_a_checkpoint(demos, tmp_path, holding, mo
     assert {file.name for file in tmp_path.iterdir()} == files
     assert make(demos, path).steps == CONFIG.steps
     real = importlib.metadata.version
-    monkeypatch.setattr("lw_torchrl._util.versions.version", lambda name: "9.9.9" if name == "torch" else real(name))
+    monkeypatch.setattr(
+        "lw_torchrl._util.reproducibility.version", lambda name: "9.9.9" if name == "torch" else real(name)
+    )
     with pytest.warns(UserWarning, match=r"under other versions \(torch .*, now 9.9.9\)") as caught:
         make(demos, path)
     assert len(caught) == 1

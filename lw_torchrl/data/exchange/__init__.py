@@ -13,20 +13,23 @@ from lw_torchrl._util.checks import Count, typed
 from lw_torchrl._util.files import AnyPath, read_json, replacing_folder
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.dataset import METADATA, Demonstrations, parse_metadata, read_metadata
-from lw_torchrl.data.exchange import incoming
-from lw_torchrl.data.exchange.table import ExchangeError, Table, table_of
+from lw_torchrl.data.exchange.table import (
+    ExchangeError,
+    Table,
+    complete_columns,
+    describe,
+    exported_columns,
+    table_of,
+    task_names,
+    write_dataset,
+)
 from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.suites.suite import Suite, find_suite, load_suite
 
 __all__ = [
-    "FORMATS",
-    "ExchangeError",
-    "ExportFormat",
-    "ImportFormat",
-    "MissingDataWarning",
-    "export_dataset",
+    "FORMATS", "ExchangeError", "ExportFormat", "ImportFormat", "MissingDataWarning", "export_dataset",
     "import_dataset",
-]
+]  # fmt: skip
 
 ExportFormat = Literal["lerobot", "minari"]
 ImportFormat = Literal["lerobot", "minari", "robomimic"]
@@ -35,12 +38,12 @@ _EXTRAS = {"av": "exchange", "h5py": "exchange", "minari": "minari"}  # package 
 
 
 class MissingDataWarning(UserWarning):
-    """Warns that an imported source lacks data that our datasets hold."""
+    """An imported source lacks columns of a dataset."""
 
 
 @contextmanager
 def _format(name: str) -> Iterator[Any]:
-    """The module of a format; an ImportError names the extra to install."""
+    """Yield the module of a format; an ImportError in the block names the extra to install."""
     try:
         yield import_module(f"lw_torchrl.data.exchange.{name}")
     except ModuleNotFoundError as error:
@@ -59,12 +62,11 @@ def export_dataset(
     plans: AnyPlans | None = None,
     suite: str | Suite | None = None,
 ) -> Path:
-    """Write a dataset in a format that others read, and return its folder. :func:`import_dataset` restores it bit for
-    bit.
+    """Write a dataset in another library's format, and return its folder.
 
-    A row is a step. docs/data.md lists the columns of both formats: those of the dataset, the task's name and
-    description, the plan's text, and ``plan_holds`` (R, S) bool: which of the plan's conditions hold in the
-    observation. Pictures of :func:`add_pictures` become videos in "lerobot".
+    :func:`import_dataset` restores it bit for bit. A row is a step. docs/data.md lists the columns of both formats: the
+    dataset's own, the task's name and description, the plan's text, and ``plan_holds`` (R, S) bool, which of the plan's
+    conditions hold in the observation. Pictures of :func:`add_pictures` become videos in "lerobot".
 
     Args:
         root: the dataset's folder, of :func:`collect_demonstrations`.
@@ -89,10 +91,10 @@ def export_dataset(
     Source: huggingface/lerobot ``datasets``, Farama's Minari.
     """
     demonstrations = read_metadata(root)
-    there = find_suite(demonstrations.config.tasks, suite)
+    suite = find_suite(demonstrations.config.tasks, suite)
     target = _new_folder(out)
     metadata = read_json(demonstrations.root / METADATA, "root: the metadata")
-    table = table_of(demonstrations, metadata, there, there.plans if plans is None else as_plans(plans))
+    table = table_of(demonstrations, metadata, suite, suite.plans if plans is None else as_plans(plans))
     with replacing_folder(target) as folder, Progress("exporting", table.rows, "row") as bar, _format(format) as module:
         module.write(table, folder, bar)
     return target
@@ -109,19 +111,19 @@ def import_dataset(
     behaviour: str = "imported",
     episodes_per_task: Count | None = None,
 ) -> Demonstrations:
-    """Make a dataset of files that :func:`export_dataset` wrote, or of other people's demonstrations, and return its
-    description.
+    """Convert files to a dataset, and return its description.
 
-    Our exports are restored bit for bit, so the options after ``format`` are for other people's files. These need
-    observations and actions of the suite's sizes. docs/data.md lists the column names that are recognised, and the
-    values of missing columns. Use such datasets with ``label="executed"``: they hold no expert actions.
+    Files of :func:`export_dataset` are restored bit for bit, so the options after ``format`` are only for files from
+    elsewhere. These need observations and actions of the suite's sizes. docs/data.md lists the column names that are
+    recognised, and the values of missing columns. Use such datasets with ``label="executed"``: they hold no expert
+    actions.
 
     Args:
         source: the file or folder.
         out: the dataset's folder, new or empty.
         format: "lerobot", "minari" or "robomimic" (HDF5, also LIBERO's); None to recognise it by the files.
-        task: the task of all episodes, or a mapping from the file's words to tasks; None if the file has our names or
-            descriptions, or Meta-World's own names, "reach-v3".
+        task: the task of all episodes, or a mapping from the file's task names to ours; None if the file has our names
+            or descriptions, or Meta-World's own names, "reach-v3".
         suite: the :class:`~lw_torchrl.suites.Suite` of the tasks.
         behaviour: the label of the episodes, for :class:`EpisodeFilter`.
         episodes_per_task: number of episodes of each task, the first ones; None for all.
@@ -139,33 +141,32 @@ def import_dataset(
     source, target = Path(source), _new_folder(out)
     if not source.exists():
         raise FileNotFoundError(f"source: there is no file or folder {str(source)!r}")
-    name = _format_of(source) if format is None else format
-    options = {"task": task is not None, "episodes_per_task": episodes_per_task is not None}
-    options |= {"suite": suite != "metaworld", "behaviour": behaviour != "imported"}
-    with _format(name) as module, _reading(source):
+    with _format(_format_of(source) if format is None else format) as module, _reading(source):
         table: Table = module.read(source)
-    if table.about is not None:
-        if named := [name for name, is_given in options.items() if is_given]:
-            raise ValueError(f"{named[0]} must not be given: {str(source)!r} is an export, restored as it was")
+    if table.metadata is not None:
+        options = {"task": task is not None, "episodes_per_task": episodes_per_task is not None}
+        options |= {"suite": suite != "metaworld", "behaviour": behaviour != "imported"}
+        if given := [name for name, is_given in options.items() if is_given]:
+            raise ValueError(f"{given[0]} must not be given: {str(source)!r} is our own export, which is restored")
         with _reading(source):
-            description = parse_metadata(table.about, target)
-            columns, spans = incoming.exported_columns(table), [*table.spans()]
-            if [episode.length for episode in description.episodes] != [end - start for start, end in spans]:
+            description = parse_metadata(table.metadata, target)
+            columns, spans = exported_columns(table), [*table.spans()]
+            if tuple(episode.length for episode in description.episodes) != table.lengths:
                 raise ExchangeError("its episodes have other lengths than those that were exported")
-        return incoming.write_dataset(columns, spans, description, target, exported_as=source)
-    there = load_suite(suite)
-    names = incoming.task_names(table, there, task)
-    description, spans = incoming.describe(names, table, there, behaviour, episodes_per_task)
+        return write_dataset(columns, spans, description, target, exported_as=source)
+    suite = load_suite(suite)
+    names = task_names(table, suite, task)
+    description, spans = describe(names, table, suite, behaviour, episodes_per_task)
     with _reading(source):
-        columns, lacking = incoming.complete_columns(table, there)
+        columns, lacking = complete_columns(table, suite)
     if lacking:
         warnings.warn(f"source: {str(source)!r} lacks {'; '.join(lacking)}", MissingDataWarning, stacklevel=3)
-    return incoming.write_dataset(columns, spans, description, target)
+    return write_dataset(columns, spans, description, target)
 
 
 @contextmanager
 def _reading(source: Path) -> Iterator[None]:
-    """Let errors in the block name the source."""
+    """Add the source to errors in the block."""
     try:
         yield
     except (ImportError, MemoryError):
@@ -177,7 +178,6 @@ def _reading(source: Path) -> Iterator[None]:
 
 
 def _new_folder(out: AnyPath) -> Path:
-    """The path of a new or empty folder; ValueError for another."""
     folder = Path(out)
     if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
         raise ValueError(f"out must be a new folder, or an empty one, {str(folder)!r} is not")
@@ -185,7 +185,7 @@ def _new_folder(out: AnyPath) -> Path:
 
 
 def _format_of(source: Path) -> ImportFormat:
-    """The format of a file, or of a folder by the files in it."""
+    """Recognise the format of a file, or of a folder by its files."""
     if (source / "meta" / "info.json").is_file():
         return "lerobot"
     if (source / "data" / "metadata.json").is_file() or (source / "main_data.hdf5").is_file():

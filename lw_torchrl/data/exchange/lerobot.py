@@ -1,11 +1,11 @@
 """LeRobot's dataset format, written as version 3, read as version 2.0, 2.1 or 3.
 
-meta/info.json                                    the columns, their types and shapes; the rate of steps
-meta/stats.json                                   of each column min, max, mean, std and count
-meta/tasks.parquet                                task_index, by the description of the task; its name and plan beside
-meta/episodes/chunk-000/file-000.parquet          where each episode is, and its statistics
+meta/info.json                                    the columns, their types and shapes; steps per second
+meta/stats.json                                   min, max, mean, std and count of each column
+meta/tasks.parquet                                task_index, by the task's description; the task's name and plan
+meta/episodes/chunk-000/file-000.parquet          the place of each episode, and its statistics
 data/chunk-000/file-000.parquet                   the steps
-videos/CAMERA/chunk-000/file-000.mp4              the pictures
+videos/CAMERA/chunk-000/file-000.mp4              the pictures of ``add_pictures``
 meta/lw_torchrl.json                              the metadata of our dataset, which LeRobot does not read
 
 Version 2 has a file of steps for each episode, and ``meta/tasks.jsonl``.
@@ -14,6 +14,7 @@ Version 2 has a file of steps for each episode, and ``meta/tasks.jsonl``.
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -22,26 +23,30 @@ import numpy as np
 from lw_torchrl._util.checks import shown
 from lw_torchrl._util.files import read_json
 from lw_torchrl._util.progress import Progress
-from lw_torchrl.data.exchange import video
+from lw_torchrl.data.dataset import Demonstrations
 from lw_torchrl.data.exchange.table import ABOUT, KNOWN, NAMES, Array, ExchangeError, Table
+from lw_torchrl.data.pictures import Pictures
 
 INFO, ABOUT_FILE = "meta/info.json", f"meta/{ABOUT}.json"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _EPISODES = "meta/episodes/chunk-000/file-000.parquet"
-_FILE_MB, _FILES = 100, 1000  # megabytes of a file of steps (about), and files in a folder
+_FILE_MB, _FILES = 100, 1000  # approximate megabytes of a file of steps, and files in a folder
 _NAMES = {name: others[0] for name, others in NAMES.items()}
+_VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+_EPISODES_IN_VIDEO = 100
+_PICTURES = re.compile(r"(.+)-(\d+)x(\d+)-every(\d+)")  # the folder of pictures with these options
 
 
 def _columns(table: Table) -> dict[str, Array]:
-    """The columns of the steps' files, under LeRobot's names."""
+    """Return the columns of the steps' files, under LeRobot's names."""
     frame = np.concatenate([np.arange(length) for length in table.lengths])
-    descriptions = [*table.words]
+    descriptions = [*table.descriptions]
     return {_NAMES.get(name, name): column for name, column in table.columns.items()} | {
         "timestamp": (frame / table.fps).astype(np.float32),
         "frame_index": frame,
-        "episode_index": table.of_rows(range(len(table.lengths))),
+        "episode_index": table.repeat(range(len(table.lengths))),
         "index": np.arange(table.rows),
-        "task_index": table.of_rows([descriptions.index(task) for task in table.tasks]),
+        "task_index": table.repeat([descriptions.index(task) for task in table.tasks]),
     }
 
 
@@ -61,16 +66,16 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
     rows_of_file = max(1, int(_FILE_MB * 1e6 / sum(column.nbytes / len(column) for column in columns.values())))
     place = np.array([start // rows_of_file for start, _ in spans])  # the file of each episode
     for number, file in enumerate(dict.fromkeys(place.tolist())):
-        own = [span for span, one in zip(spans, place, strict=True) if one == file]
+        in_file = [span for span, each in zip(spans, place, strict=True) if each == file]
         path = folder / _DATA.format(chunk_index=number // _FILES, file_index=number % _FILES)
         path.parent.mkdir(parents=True, exist_ok=True)
-        steps = arrow.slice(own[0][0], own[-1][1] - own[0][0])
+        steps = arrow.slice(in_file[0][0], in_file[-1][1] - in_file[0][0])
         pq.write_table(steps, path, compression="zstd", use_dictionary=False)
         bar.update(len(steps))
     place = np.unique(place, return_inverse=True)[1]
     episodes: dict[str, Any] = {
         "episode_index": np.arange(len(lengths)),
-        "tasks": [[table.words[task]] for task in table.tasks],
+        "tasks": [[table.descriptions[task]] for task in table.tasks],
         "length": lengths,
         "data/chunk_index": place // _FILES,
         "data/file_index": place % _FILES,
@@ -82,17 +87,17 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
     features, statistics = {name: _feature(column) for name, column in columns.items()}, {}
     for name, column in columns.items():
         values = column.astype(np.float64).reshape(len(column), -1)
-        each = [video.statistics(values[start:end]) for start, end in spans]
-        episodes |= {f"stats/{name}/{kind}": [one[kind].tolist() for one in each] for kind in each[0]}
+        each = [_statistics(values[start:end]) for start, end in spans]
+        episodes |= {f"stats/{name}/{kind}": [stats[kind].tolist() for stats in each] for kind in each[0]}
         if np.isfinite(values).all():  # JSON has no NaN
-            statistics[name] = {kind: value.tolist() for kind, value in video.combined(each).items()}
+            statistics[name] = {kind: value.tolist() for kind, value in _combined(each).items()}
     assert table.demonstrations is not None
-    for key, pictures in video.existing_pictures(table.demonstrations).items():
-        features[key] = video.feature_of(pictures, table.fps)
-        places, each = video.write_videos(table.demonstrations, pictures, folder, key, table.fps)
+    for key, pictures in _existing_pictures(table.demonstrations).items():
+        features[key] = _video_feature(pictures, table.fps)
+        places, each = _write_videos(table.demonstrations, pictures, folder, key, table.fps)
         episodes |= {f"videos/{key}/{name}": column for name, column in places.items()}
-        episodes |= {f"stats/{key}/{kind}": [one[kind].tolist() for one in each] for kind in each[0]}
-        statistics[key] = {kind: value.tolist() for kind, value in video.combined(each).items()}
+        episodes |= {f"stats/{key}/{kind}": [stats[kind].tolist() for stats in each] for kind in each[0]}
+        statistics[key] = {kind: value.tolist() for kind, value in _combined(each).items()}
     (folder / _EPISODES).parent.mkdir(parents=True)
     pq.write_table(pa.table(episodes), folder / _EPISODES)
     pq.write_table(_tasks(table), folder / "meta" / "tasks.parquet")
@@ -101,26 +106,30 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
         "robot_type": "sawyer" if "/" not in table.tasks[0] else table.tasks[0].partition("/")[0],
         "total_episodes": len(lengths),
         "total_frames": table.rows,
-        "total_tasks": len(table.words),
+        "total_tasks": len(table.descriptions),
         "chunks_size": _FILES,
         "data_files_size_in_mb": _FILE_MB,
         "video_files_size_in_mb": 200,
         "fps": table.fps,
         "splits": {"train": f"0:{len(lengths)}"},
         "data_path": _DATA,
-        "video_path": video.PATH if any(one["dtype"] == "video" for one in features.values()) else None,
+        "video_path": _VIDEO if any(feature["dtype"] == "video" for feature in features.values()) else None,
         "features": features,
     }
-    for name, value in ((INFO, info), ("meta/stats.json", statistics), (ABOUT_FILE, table.about)):
+    for name, value in ((INFO, info), ("meta/stats.json", statistics), (ABOUT_FILE, table.metadata)):
         (folder / name).write_text(json.dumps(value, indent=4), encoding="utf-8")
 
 
 def _tasks(table: Table) -> Any:
-    """The table of tasks, whose index for pandas is the description."""
+    """Return the table of tasks, whose index for pandas is the description."""
     import pyarrow as pa
 
-    columns = {"task_index": [*range(len(table.words))], "name": [*table.words]}
-    columns |= {"plan": [table.plans.get(task, "") for task in table.words], "task": [*table.words.values()]}
+    columns = {
+        "task_index": [*range(len(table.descriptions))],
+        "name": [*table.descriptions],
+        "plan": [table.plans.get(task, "") for task in table.descriptions],
+        "task": [*table.descriptions.values()],
+    }
     described = [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
         for name, (kind, numpy) in zip(columns, [("int64", "int64"), *3 * [("unicode", "object")]], strict=True)
@@ -130,15 +139,91 @@ def _tasks(table: Table) -> Any:
 
 
 def _arrow_column(column: Array) -> Any:
-    """A column as an Arrow array; lists of one number are numbers in LeRobot's tables."""
+    """Convert a column to an Arrow array; LeRobot's tables hold a list of one number as a number."""
     import pyarrow as pa
 
     flat, width = pa.array(np.ascontiguousarray(column).reshape(-1)), column.size // len(column)
     return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
 
 
+def _existing_pictures(demonstrations: Demonstrations) -> dict[str, Pictures]:
+    """Return the pictures that all episodes of a dataset have, by LeRobot's name of their column."""
+    pictures = {}
+    for path in (demonstrations.root / "pictures").glob("*"):
+        if (match := _PICTURES.fullmatch(path.name)) is None:
+            continue
+        cameras, *sizes = match.groups()
+        rendered = Pictures(tuple(cameras.split("+")), *map(int, sizes))
+        if all(rendered.file(demonstrations.root, episode).is_file() for episode in demonstrations.episodes):
+            pictures[f"observation.images.{match[0]}"] = rendered
+    return pictures
+
+
+def _pixel_format(pictures: Pictures) -> str:
+    return "yuv444p" if any(size % 2 for size in pictures.shape[:2]) else "yuv420p"
+
+
+def _video_feature(pictures: Pictures, fps: int) -> dict[str, Any]:
+    """Return a video's entry in LeRobot's info.json."""
+    height, width, _ = pictures.shape
+    info = {"video.height": height, "video.width": width, "video.channels": 3, "video.is_depth_map": False}
+    info |= {"video.codec": "h264", "video.pix_fmt": _pixel_format(pictures), "video.fps": fps, "has_audio": False}
+    return {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": info}
+
+
+def _statistics(values: Array) -> dict[str, Array]:
+    """Return statistics of rows (R, n), as LeRobot names them."""
+    statistics = {name: getattr(values, name)(0) for name in ("min", "max", "mean", "std")}
+    return statistics | {"count": np.array([len(values)])}
+
+
+def _combined(parts: list[dict[str, Array]]) -> dict[str, Array]:
+    """Combine the statistics of parts to those of all rows."""
+    each = {name: np.stack([part[name] for part in parts]) for name in parts[0]}
+    share = (each["count"] / each["count"].sum()).reshape(-1, *[1] * (each["mean"].ndim - 1))
+    mean = (each["mean"] * share).sum(0)
+    variance = ((each["std"] ** 2 + (each["mean"] - mean) ** 2) * share).sum(0)
+    whole = {"min": each["min"].min(0), "max": each["max"].max(0), "mean": mean, "std": np.sqrt(variance)}
+    return whole | {"count": each["count"].sum(0)}
+
+
+def _write_videos(
+    demonstrations: Demonstrations, pictures: Pictures, folder: Path, key: str, fps: int
+) -> tuple[dict[str, list[Any]], list[dict[str, Array]]]:
+    """Write a picture for each row, for rows between two rendered pictures the earlier one. Return the place of each
+    episode, and the statistics of its pixels, from 0 to 1, (3, 1, 1)."""
+    import av
+
+    names = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+    places: dict[str, list[Any]] = {name: [] for name in names}
+    each = []
+    with Progress("writing videos", demonstrations.num_steps, "picture") as bar:
+        for number in range(0, len(demonstrations.episodes), _EPISODES_IN_VIDEO):
+            chunk, file = divmod(number // _EPISODES_IN_VIDEO, 1000)
+            path = folder / _VIDEO.format(video_key=key, chunk_index=chunk, file_index=file)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            frame = 0
+            with av.open(str(path), "w") as container:
+                stream = container.add_stream("libx264", rate=fps, options={"crf": "18", "g": "2", "bf": "0"})
+                stream.height, stream.width, stream.pix_fmt = *pictures.shape[:2], _pixel_format(pictures)
+                for episode in demonstrations.episodes[number : number + _EPISODES_IN_VIDEO]:
+                    images = pictures.read(demonstrations.root, episode).numpy()
+                    for image in images[np.arange(episode.length) // pictures.every]:
+                        container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+                    values = _statistics(images.reshape(-1, 3) / 255)
+                    values |= {kind: values[kind].reshape(3, 1, 1) for kind in ("min", "max", "mean", "std")}
+                    each.append(values)
+                    times = frame / fps, (frame + episode.length) / fps
+                    for name, value in zip(names, (chunk, file, *times), strict=True):
+                        places[name].append(value)
+                    frame += episode.length
+                    bar.update(episode.length)
+                container.mux(stream.encode())
+    return places, each
+
+
 def _numbers(name: str, column: Any) -> Array:
-    """An Arrow column as numbers, (R,) or (R, n)."""
+    """Convert an Arrow column to numbers, (R,) or (R, n)."""
     import pyarrow as pa
 
     column = column.combine_chunks()
@@ -154,14 +239,14 @@ def _numbers(name: str, column: Any) -> Array:
 
 
 def _steps(source: Path, frames: Any) -> dict[str, Array]:
-    """The known columns of the files of steps, sorted by episode and frame."""
+    """Return the known columns of the files of steps, sorted by episode and frame."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     paths = sorted(path for path in (source / "data").rglob("*.parquet") if not path.name.startswith("."))
     rows = sum(pq.read_metadata(path).num_rows for path in paths)
     if not rows or rows != frames:  # before the rows take memory
-        raise ExchangeError(f"its data must hold the {frames} steps that {INFO} states, found {rows}")
+        raise ExchangeError(f"{INFO} promises {frames} steps, the files hold {rows}")
     known = KNOWN | {"episode_index", "frame_index", "task_index"}
     names = [name for name in pq.read_schema(paths[0]).names if name in known]
     table = pa.concat_tables(pq.read_table(path, columns=names, partitioning=None) for path in paths)
@@ -171,8 +256,8 @@ def _steps(source: Path, frames: Any) -> dict[str, Array]:
     return {name: column[order] for name, column in columns.items()}
 
 
-def _task_words(source: Path) -> dict[int, str]:
-    """The words of each task_index: our name for it, or the description."""
+def _task_texts(source: Path) -> dict[int, str]:
+    """Return the text of each task_index: our name of the task, or its description."""
     import pyarrow.parquet as pq
 
     lines = source / "meta" / "tasks.jsonl"
@@ -188,13 +273,13 @@ def read(source: Path) -> Table:
     """Read a LeRobot dataset of version 2.0, 2.1 or 3.0."""
     info = read_json(source / INFO, "the description")
     if not (version := str(info["codebase_version"])).startswith(("v2.", "v3.")):
-        raise ExchangeError(f"it has LeRobot's version {shown(version)}, this package reads v2.0 to v3.0")
+        raise ExchangeError(f"LeRobot's version {shown(version)} is not supported; supported are v2.0 to v3.0")
     columns = _steps(source, info["total_frames"])
     starts = np.flatnonzero(np.diff(columns["episode_index"], prepend=-1))
     lengths = np.diff(starts, append=len(columns["episode_index"]))
-    words, number = _task_words(source), columns.pop("task_index")
+    texts, number = _task_texts(source), columns.pop("task_index")
     if (number != np.repeat(number[starts], lengths)).any():
         raise ExchangeError("task_index must be the same in all rows of an episode")
-    tasks = tuple(words[task] for task in number[starts].tolist())
-    about = read_json(source / ABOUT_FILE, "our metadata") if (source / ABOUT_FILE).is_file() else None
-    return Table(columns, tuple(lengths.tolist()), tasks, about=about)
+    tasks = tuple(texts[task] for task in number[starts].tolist())
+    metadata = read_json(source / ABOUT_FILE, "our metadata") if (source / ABOUT_FILE).is_file() else None
+    return Table(columns, tuple(lengths.tolist()), tasks, metadata=metadata)

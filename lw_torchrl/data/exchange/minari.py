@@ -1,8 +1,8 @@
 """Minari's datasets, written and read by Minari itself.
 
-data/main_data.hdf5    a group for each episode: observations (T + 1, 39), actions (T, 4), rewards, the dense ones,
-                       terminations and truncations (T,), infos/... (T + 1, ...): success and reward_sparse belong to
-                       the step before, and are zero in the first row; the others to the step after, zero in the last
+data/main_data.hdf5    a group for each episode: observations (T + 1, 39), actions (T, 4), dense rewards, terminations
+                       and truncations (T,), infos/... (T + 1, ...): success and reward_sparse belong to the step before
+                       and are zero in the first row; the others belong to the step after and are zero in the last row
 data/metadata.json     Minari's description, and the metadata of our dataset
 """
 
@@ -29,7 +29,7 @@ _OF_STEP = {*NAMES["success"], *NAMES["reward_sparse"], *NAMES["reward_dense"]}
 
 
 def _infos(table: Table, start: int, end: int) -> dict[str, Array]:
-    """The other columns of an episode, a row longer; next observations only if they differ from the next rows."""
+    """Return an episode's other columns, a row longer; next observations only if they differ from the next rows."""
     infos = {}
     observation, after = (table.columns[name][start:end] for name in ("observation", "next_observation"))
     for name in (*_AFTER, *_BEFORE):
@@ -42,7 +42,7 @@ def _infos(table: Table, start: int, end: int) -> dict[str, Array]:
 
 
 def write(table: Table, folder: Path, bar: Progress) -> None:
-    """Write a table as a dataset. Its id is the name of its folder, with -v0 if that has no version."""
+    """Write a table as a dataset. Its id is its folder's name, followed by -v0 if the name has no version."""
     if shutil.disk_usage(folder).free < 2 * sum(column.nbytes for column in table.columns.values()):
         # A write that fails inside HDF5 leaves the file open, and the process crashes when it ends.
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
@@ -74,24 +74,25 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
 
     storage.update_episodes(episodes())
     storage.update_episode_metadata(
-        {"task": task, "task_description": table.words[task], "plan": table.plans.get(task, "")} for task in table.tasks
+        {"task": task, "task_description": table.descriptions[task], "plan": table.plans.get(task, "")}
+        for task in table.tasks
     )
     name = re.sub(r"[^-\w]", "-", re.sub(r"^\.|\.[0-9a-f]{16}\.tmp$", "", folder.name))
     about = "Demonstrations of tasks whose descriptions and plans are in the episodes' metadata."
     versioned = name if re.search(r"-v\d+$", name) else f"{name}-v0"
     metadata = {"dataset_id": versioned, "minari_version": minari.__version__, "description": about}
-    storage.update_metadata({**metadata, ABOUT: json.dumps(table.about)})
+    storage.update_metadata({**metadata, ABOUT: json.dumps(table.metadata)})
 
 
 def _flat(name: str, value: Any) -> dict[str, Array]:
-    """The arrays in nested ones, by their names joined by dots."""
+    """Return the arrays in nested ones, by their names joined by dots."""
     if isinstance(value, Mapping):
-        return {key: one for inner, part in value.items() for key, one in _flat(f"{name}.{inner}", part).items()}
+        return {key: array for inner, part in value.items() for key, array in _flat(f"{name}.{inner}", part).items()}
     return {name: np.asarray(value)}
 
 
 def _columns(episode: Mapping[str, Any]) -> dict[str, Array]:
-    """The columns of an episode's rows."""
+    """Return the columns of an episode's rows."""
     steps = len(episode["rewards"])
     columns = {name: np.asarray(episode[name]) for name in ("rewards", "terminations", "truncations")}
     columns |= _flat("actions", episode["actions"])
@@ -115,6 +116,6 @@ def read(source: Path) -> Table:
     metadata = [*storage.get_episode_metadata(numbers)]
     text = storage.metadata.get(ABOUT)
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    tasks = (next((str(one[name]) for name in TASK_NAMES if name in one), "") for one in metadata)
+    tasks = (next((str(episode[name]) for name in TASK_NAMES if name in episode), "") for episode in metadata)
     lengths = tuple(len(part["rewards"]) for part in parts)
-    return Table(columns, lengths, tuple(tasks), about=parse_json(str(text).encode()) if text else None)
+    return Table(columns, lengths, tuple(tasks), metadata=parse_json(str(text).encode()) if text else None)

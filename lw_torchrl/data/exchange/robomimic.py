@@ -1,4 +1,4 @@
-"""HDF5 in the layout of robomimic and LIBERO, which is read, not written.
+"""Read HDF5 files in the layout of robomimic and LIBERO.
 
 data                        attributes: env_args, JSON with env_name; task or another name of it; LIBERO's problem_info
 data/demo_0                 a group for each episode; attributes: task or another name of it
@@ -19,7 +19,7 @@ from lw_torchrl.data.exchange.table import KNOWN, TASK_NAMES, Array, ExchangeErr
 
 
 def _files(source: Path) -> list[Path]:
-    """The HDF5 files at a path, sorted by name, numbers by their value."""
+    """Return the HDF5 files at a path, sorted by name, numbers by their value."""
     if source.is_file():
         return [source]
     paths = [path for path in source.iterdir() if path.suffix in (".hdf5", ".h5") and path.name[0] != "."]
@@ -27,15 +27,15 @@ def _files(source: Path) -> list[Path]:
 
 
 def _episode(group: Any) -> dict[str, Array]:
-    """The known columns of an episode's group."""
+    """Return the known columns of an episode's group."""
     columns: dict[str, Array] = {}
 
-    def note(path: str, item: Any) -> None:
+    def add(path: str, item: Any) -> None:
         name = path.replace("/", ".")
         if name in KNOWN and getattr(item, "dtype", np.dtype("O")).kind in "biuf" and item.ndim:
             columns[name] = item[()]
 
-    group.visititems(note)
+    group.visititems(add)
     if "actions" not in columns:
         raise ExchangeError(f"{group.name} has no actions")
     steps = len(columns["actions"])
@@ -48,11 +48,11 @@ def _episode(group: Any) -> dict[str, Array]:
 
 
 def _task(attributes: Any) -> str:
-    """The task that attributes name; "" if they do not."""
-    stated = {name: attributes[name] for name in TASK_NAMES if name in attributes}
+    """Return the task that attributes name; "" if they do not."""
+    texts = {name: attributes[name] for name in TASK_NAMES if name in attributes}
     for name, keys in {"problem_info": TASK_NAMES, "env_args": ("env_name",)}.items():
-        stated |= {key: value for key, value in json.loads(attributes.get(name, "{}")).items() if key in keys}
-    text = next(iter(stated.values()), "")
+        texts |= {key: value for key, value in json.loads(attributes.get(name, "{}")).items() if key in keys}
+    text = next(iter(texts.values()), "")
     return text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
 
 
@@ -70,6 +70,6 @@ def read(source: Path) -> Table:
                 parts.append(_episode(groups[name]))
                 tasks.append(_task(groups[name].attrs) or _task(file["data"].attrs))
     if not parts or any(part.keys() != parts[0].keys() for part in parts):
-        raise ExchangeError("it must hold at least one episode, and the same columns in each")
+        raise ExchangeError("it needs at least one episode, and the same columns in all")
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return Table(columns, tuple(len(part["actions"]) for part in parts), tuple(tasks))

@@ -1,17 +1,35 @@
-"""Table: the rows and episodes of a dataset, the common form of all formats in :mod:`lw_torchrl.data.exchange`."""
+"""Table: the common form of all formats in :mod:`lw_torchrl.data.exchange`; from a dataset to a table, and back."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDict
 
-from lw_torchrl.data.dataset import DatasetError, Demonstrations
-from lw_torchrl.data.memory_map import load_rows, verify
+from lw_torchrl._util.checks import shown, unknown_name
+from lw_torchrl._util.files import replacing_folder
+from lw_torchrl._util.progress import Progress
+from lw_torchrl.data import dataset
+from lw_torchrl.data.collection_policy import Behaviour
+from lw_torchrl.data.dataset import (
+    TRAJECTORY,
+    CollectConfig,
+    DatasetError,
+    Demonstrations,
+    EpisodeInfo,
+    describe_episode,
+    load_rows,
+    verify,
+    write_rows,
+)
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.suites.suite import Suite
@@ -25,7 +43,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
         name: ("next", name) for name in ("reward_sparse", "reward_dense", "success", "done", "terminated", "truncated")
     },
 }
-"""The columns of an exported table, and their keys in a dataset; the other keys follow from the episodes."""
+"""The columns of an exported table, and their keys in a dataset; the dataset's other keys follow from the episodes."""
 WIDE = ("observation", "next_observation", "action", "expert_action", "unclipped_action")  # the others are scalars
 NAMES: Mapping[str, tuple[str, ...]] = {
     "observation": (
@@ -49,13 +67,13 @@ NAMES: Mapping[str, tuple[str, ...]] = {
 """The names of each column in files, the most likely first; names in groups are joined by dots."""
 KNOWN = frozenset(name for names in NAMES.values() for name in names)
 TASK_NAMES = ("task", "task_name", "language_instruction", "instruction", "task_description", "language")
-HOLDS = "plan_holds"  # (R, S) bool: which conditions of its plan hold in a row, false beyond the plan's last
+HOLDS = "plan_holds"  # (R, S) bool: which conditions of the plan hold in a row, false beyond the plan's last
 ABOUT = "lw_torchrl"  # the name of our metadata in exported files
-_BLOCK = 50_000  # rows whose conditions are answered at once
+_BLOCK = 50_000  # rows whose conditions are evaluated at once
 
 
 class ExchangeError(DatasetError):
-    """A file or folder of another format that is damaged, is not of that format, or lacks what a dataset needs."""
+    """A file or folder of another format is damaged, has another format, or lacks columns that a dataset needs."""
 
 
 @dataclass(frozen=True)
@@ -64,20 +82,20 @@ class Table:
 
     Attributes:
         columns: name to (R, ...), scalars as (R,): the names of :data:`KEYS` and :data:`HOLDS` for a table to export,
-            the file's own names for one that was read.
+            the file's own names for a table that was read.
         lengths: the number of rows of each episode.
-        tasks: the task of each episode, by name or in the file's words; "" if the file does not say.
-        words, plans: task to its description and to its plan's text.
-        about: the metadata of the exported dataset; None for other people's files.
+        tasks: the task of each episode, by name or in the file's own text; "" if the file does not name it.
+        descriptions, plans: task to its description and to its plan's text.
+        metadata: of the exported dataset; None for files from elsewhere.
         demonstrations, fps: the dataset that is exported, and its steps per second.
     """
 
     columns: Mapping[str, Array]
     lengths: tuple[int, ...]
     tasks: tuple[str, ...]
-    words: Mapping[str, str] = field(default_factory=dict)
+    descriptions: Mapping[str, str] = field(default_factory=dict)
     plans: Mapping[str, str] = field(default_factory=dict)
-    about: Mapping[str, Any] | None = None
+    metadata: Mapping[str, Any] | None = None
     demonstrations: Demonstrations | None = None
     fps: int = 80
 
@@ -86,47 +104,207 @@ class Table:
         return sum(self.lengths)
 
     def spans(self) -> Iterator[tuple[int, int]]:
-        """The first row of each episode, and the row behind its last."""
+        """Yield the first row of each episode, and the row after its last."""
         return pairwise(accumulate(self.lengths, initial=0))
 
-    def of_rows(self, values: Any) -> Array:
+    def repeat(self, values: Any) -> Array:
         """Repeat a value of each episode for each of its rows."""
         return np.repeat(np.asarray(values), self.lengths)
 
 
-def table_of(dataset: Demonstrations, metadata: Mapping[str, Any], suite: Suite, plans: Plans | None) -> Table:
-    """The checked rows of a dataset, with the truth of the conditions of its tasks' plans."""
-    verify(dataset, dataset.episodes)
-    rows = load_rows(dataset)
+def table_of(demonstrations: Demonstrations, metadata: Mapping[str, Any], suite: Suite, plans: Plans | None) -> Table:
+    """Return a dataset's rows, compared with their checksums, and the truth of its tasks' conditions."""
+    verify(demonstrations, demonstrations.episodes)
+    rows, tasks = load_rows(demonstrations), demonstrations.config.tasks
     columns: dict[str, Array] = {name: np.asarray(rows.get(key)) for name, key in KEYS.items()}
     columns |= {name: column[:, 0] for name, column in columns.items() if name not in WIDE}
-    texts = {name: plans[name] for name in dataset.config.tasks if plans is not None and name in plans}
+    planned = {name: plans[name] for name in tasks if plans is not None and name in plans}
     table = Table(
         columns,
-        tuple(episode.length for episode in dataset.episodes),
-        tuple(episode.task for episode in dataset.episodes),
-        {name: suite.tasks[name].description for name in dataset.config.tasks},
-        {name: str(plan).rstrip() for name, plan in texts.items()},
+        tuple(episode.length for episode in demonstrations.episodes),
+        tuple(episode.task for episode in demonstrations.episodes),
+        {name: suite.tasks[name].description for name in tasks},
+        {name: str(plan).rstrip() for name, plan in planned.items()},
         metadata,
-        dataset,
+        demonstrations,
         round(1 / suite.step_time),
     )
-    if texts:
-        columns[HOLDS] = _holds(table, Plans(texts))
+    if planned:
+        columns[HOLDS] = _holds(table, Plans(planned))
     return table
 
 
 def _holds(table: Table, plans: Plans) -> Array:
     program = plan_program(plans)
-    number = torch.from_numpy(table.of_rows([task_id(task) for task in table.tasks]))
-    planned = torch.from_numpy(table.of_rows([task in plans for task in table.tasks])).nonzero().flatten()
+    task = torch.from_numpy(table.repeat([task_id(task) for task in table.tasks]))
+    planned = torch.from_numpy(table.repeat([task in plans for task in table.tasks])).nonzero().flatten()
     observation = torch.from_numpy(table.columns["observation"])
     holds = torch.zeros(table.rows, max(len(plan.steps) for plan in plans.values()), dtype=torch.bool)
     for rows in planned.split(_BLOCK):
-        holds[rows] = program(observation[rows], number[rows])
+        holds[rows] = program(observation[rows], task[rows])
     return holds.numpy()
 
 
 def names_in(columns: Mapping[str, Any], name: str) -> list[str]:
-    """The names in a file under which it may have a column, the most likely first."""
-    return [one for one in NAMES[name] if one in columns]
+    """Return the columns of a file that may hold our column ``name``, the most likely first."""
+    return [candidate for candidate in NAMES[name] if candidate in columns]
+
+
+def write_dataset(
+    columns: Mapping[str, Array],
+    spans: Sequence[tuple[int, int]],
+    description: Demonstrations,
+    out: Path,
+    exported_as: Path | None = None,
+) -> Demonstrations:
+    """Write rows, an episode for each span, as the described dataset, atomically. Rows of an export must match the
+    checksums in the description."""
+    infos: list[EpisodeInfo] = []
+
+    def episodes() -> Iterator[TensorDict]:
+        with Progress("importing", sum(end - start for start, end in spans), "row") as bar:
+            for number, (info, (start, end)) in enumerate(zip(description.episodes, spans, strict=True)):
+                rows = TensorDict({}, [end - start])
+                for name, key in KEYS.items():
+                    part = torch.from_numpy(np.array(columns[name][start:end], order="C"))
+                    rows.set(key, part if name in WIDE else part.unsqueeze(-1))
+                task = torch.full((end - start,), description.task_ids[info.task])
+                rows.set("task_id", task).set(("next", "task_id"), task)
+                rows.set("episode", torch.full_like(task, info.episode))
+                rows.set(TRAJECTORY, torch.full_like(task, number))
+                first = infos[-1].start + infos[-1].length if infos else 0
+                infos.append(describe_episode(info.task, info.episode, first, rows))
+                yield rows
+                bar.update(end - start)
+
+    with replacing_folder(out) as folder:
+        write_rows(folder / dataset.DATA, episodes(), description.config.layout)
+        if exported_as and tuple(infos) != description.episodes:
+            raise ExchangeError(f"source: {str(exported_as)!r} is damaged: its rows differ from their checksums")
+        dataset.write_metadata(replace(description, root=folder, episodes=tuple(infos)))
+    return dataset.read_metadata(out)
+
+
+def exported_columns(table: Table) -> dict[str, Array]:
+    """Return the columns of our own export, under our names."""
+    columns: dict[str, Array] = {}
+    for name in KEYS:
+        if name == "done" and "terminations" in table.columns:  # Minari stores only the two kinds of ends
+            columns[name] = table.columns["terminations"] | table.columns["truncations"]
+        elif names := names_in(table.columns, name):
+            columns[name] = table.columns[names[0]]
+        else:
+            raise ExchangeError(f"the exported column {name} is missing")
+    return columns
+
+
+def complete_columns(table: Table, suite: Suite) -> tuple[dict[str, Array], list[str]]:
+    """Return all columns of a dataset, from files made elsewhere, and a sentence for each missing column."""
+    layout, rows = suite.layout, table.rows
+    columns: dict[str, Array] = {}
+    for name in KEYS:
+        width = 1 if name not in WIDE else layout.action_size if "action" in name else layout.size
+        names = names_in(table.columns, name)
+        if fitting := [candidate for candidate in names if table.columns[candidate].size == rows * width]:
+            column = table.columns[fitting[0]].reshape(rows, -1)
+            columns[name] = _converted(name, fitting[0], column if name in WIDE else column[:, 0])
+        elif name in ("observation", "action"):
+            sizes = ", ".join(f"{name} ({column.size // rows})" for name, column in table.columns.items())
+            raise ExchangeError(
+                f"suite {suite.name!r} needs a column {name} of {width} numbers; the columns are {sizes}"
+            )
+    lacking = []
+    last = np.zeros(rows, dtype=bool)
+    last[np.cumsum(table.lengths) - 1] = True
+    observation, action = columns["observation"], columns["action"]
+    if (action != action.clip(-1, 1)).any():
+        columns.setdefault("unclipped_action", action)
+        action = columns["action"] = action.clip(-1, 1)
+        lacking.append("actions in [-1, 1]: larger ones are clipped, as the environment does")
+    for name in ("expert_action", "unclipped_action"):
+        columns.setdefault(name, action)
+    if "next_observation" not in columns:
+        columns["next_observation"] = np.where(last[:, None], observation, np.roll(observation, -1, 0))
+        lacking.append("the observation after the last action of an episode: the observation before it is used")
+    reward = columns.get("reward_sparse", columns.get("reward_dense"))
+    if "success" not in columns:
+        is_sparse = reward is not None and np.isin(reward, (0.0, 1.0)).all()
+        columns["success"] = np.asarray(reward == 1.0) if is_sparse else np.zeros(rows, dtype=bool)
+        if not is_sparse:
+            lacking.append("success: no row succeeds")
+    if "reward_dense" not in columns or (columns["reward_dense"] == columns["success"]).all():
+        columns["reward_dense"] = np.full(rows, np.nan, dtype=np.float32)
+        lacking.append("a dense reward: it is NaN, so use reward='sparse' or 'cost'")
+    if max(table.lengths) > suite.max_steps:
+        lacking.append(f"episodes of at most {suite.max_steps} steps: the longest has {max(table.lengths)}")
+    columns["reward_sparse"] = columns["success"].astype(np.float32)
+    terminated = columns.get("terminated", ~last) & last
+    return columns | {"done": last, "terminated": terminated, "truncated": last & ~terminated}, lacking
+
+
+def _converted(name: str, source_name: str, column: Array) -> Array:
+    if name in WIDE or name.startswith("reward"):
+        with np.errstate(over="ignore"):
+            column = column.astype(np.float32)
+        if not np.isfinite(column).all():
+            raise ExchangeError(f"{source_name} holds NaN or infinity")
+        return column
+    if (odd := column[~np.isin(column, (0, 1))]).size:
+        raise ExchangeError(f"{source_name} must hold booleans, or 0 and 1, got {odd[0]}")
+    return column.astype(bool)
+
+
+def task_names(table: Table, suite: Suite, task: str | Mapping[str, str] | None) -> list[str]:
+    """Return the suite's name of each episode's task: by ``task``, or by a name or description that the suite has."""
+    known = {name: name for name in suite.tasks}
+    known |= {name.removeprefix(f"{suite.name}/"): name for name in suite.tasks}
+    known |= {each.description: name for name, each in suite.tasks.items()}
+    if isinstance(task, Mapping):
+        known |= {text: _one_task(suite, name) for text, name in task.items()}
+    elif task is not None:
+        return [_one_task(suite, task)] * len(table.tasks)
+    names = {}
+    for text in {*table.tasks}:
+        plain = re.sub(r"-v[0-9]+(-goal-(observable|hidden))?$", "", text.strip())
+        name = known.get(text, known.get(plain, known.get(plain.lower().replace("_", "-").replace(" ", "-"))))
+        if name is None and not text:
+            raise ValueError("task must be given, 'reach' for example: the files do not name it")
+        if name is None:
+            hint = f"; or map it with task={{{shown(text)}: 'reach'}}, for example"
+            raise ValueError(f"{unknown_name('task', text, suite.tasks)}{hint}")
+        names[text] = name
+    return [names[text] for text in table.tasks]
+
+
+def _one_task(suite: Suite, name: str) -> str:
+    if len(names := suite.named_tasks(name)) != 1:
+        raise ValueError(f"task must be one task, {shown(name)} is a set of {len(names)}; use 'reach', for example")
+    return next(iter(names))
+
+
+def describe(
+    names: Sequence[str], table: Table, suite: Suite, behaviour: str, episodes_per_task: int | None
+) -> tuple[Demonstrations, list[tuple[int, int]]]:
+    """Return the description of a dataset of episodes from elsewhere, and the rows of each episode."""
+    count = Counter(names)
+    if episodes_per_task is None and len({*count.values()}) > 1:
+        counts = ", ".join(f"{number} of {name}" for name, number in sorted(count.items())[:5])
+        raise ValueError(f"give episodes_per_task, {min(count.values())} for example: the episodes are {counts}")
+    each = min(count.values()) if episodes_per_task is None else episodes_per_task
+    if short := [name for name, number in count.items() if number < each]:
+        raise ValueError(f"episodes_per_task must be at most {count[short[0]]}, as {short[0]!r} has, got {each}")
+    spans: dict[str, list[tuple[int, int]]] = {name: [] for name in sorted(count)}
+    for name, span in zip(names, table.spans(), strict=True):
+        spans[name].append(span)
+    infos = tuple(EpisodeInfo(name, turn, 0, 1, False, None, 0) for name in spans for turn in range(each))
+    ordered = [span for of_task in spans.values() for span in of_task[:each]]
+    config = CollectConfig(
+        tasks=tuple(spans),
+        episodes_per_task=each,
+        seed=-1,
+        max_steps=max(end - start for start, end in ordered),
+        policy=Behaviour(behaviour, "imported"),
+        layout=suite.layout,
+    )
+    task_ids = {name: task_id(name) for name in config.tasks}
+    return Demonstrations(Path(ABOUT), config, {}, task_ids, infos, dict.fromkeys(config.tasks, each)), ordered

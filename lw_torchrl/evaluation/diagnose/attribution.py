@@ -21,7 +21,7 @@ from lw_torchrl.evaluation.diagnose.states import EpisodeStates, Explanation, ex
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
 from lw_torchrl.language.tasks import task_id
-from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.parts import evaluating
 from lw_torchrl.modules.policy import plans_of
 from lw_torchrl.suites.suite import Suite, find_suite
 

@@ -18,7 +18,7 @@ from lw_torchrl.evaluation.diagnose.replacements import Scripts, attended
 from lw_torchrl.evaluation.plan_use import where_stuck
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import ConditionalPlan, Plans
-from lw_torchrl.modules.networks import evaluating
+from lw_torchrl.modules.parts import evaluating
 from lw_torchrl.modules.policy import draws, plans_of
 from lw_torchrl.transforms.qaf import plan_program
 

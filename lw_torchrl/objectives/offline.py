@@ -1,4 +1,4 @@
-"""Offline losses: the value of a state by expectile regression, and imitation weighted by advantages."""
+"""Offline losses: the value of a state by expectile regression, imitation weighted by advantages, n-step rows."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives import IQLLoss, LossModule, REDQLoss, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 
-from lw_torchrl._util.checks import Positive, Probability, Scale, check_value, typed
+from lw_torchrl._util.checks import Positive, Probability, Scale, typed
 from lw_torchrl._util.devices import check_finite
 from lw_torchrl._util.keys import read
-from lw_torchrl.modules.networks import evaluating
-from lw_torchrl.objectives.reduction import Reduction, clear_references, priority_weight, set_reduction
+from lw_torchrl.modules.parts import evaluating
+
+Reduction = Literal["none", "mean", "sum"]
 
 
 class ExpectileValueLoss(LossModule):
-    """Learns the value V of a state by expectile regression, without a value of actions.
+    """Loss of a state value V by expectile regression, without a value of actions.
 
-    The loss of a row is |τ - 1(u < 0)|·u². u is the target less V, and the target is the reward plus the discounted
+    The loss of a row is |τ - 1(u < 0)|·u², where u is the target minus V. The target is the reward plus the discounted
     value, by the target network, of the next state (n steps ahead where the rows have ``steps_to_next_obs``). With an
     expectile above one half, V follows the better rows. :class:`AdvantageWeightedLoss` imitates rows by u.
 
@@ -90,39 +91,40 @@ class ExpectileValueLoss(LossModule):
         self,
         value_network: TensorDictModuleBase,
         *,
-        expectile: float = 0.7,
+        expectile: Probability = 0.7,
         delay_value: bool = True,
         reduction: Reduction | None = None,
     ) -> None:
         super().__init__()
-        set_reduction(self, reduction)
-        self.expectile = check_value("expectile", expectile, Probability)
+        if reduction not in (None, self.reduction):  # checkpoints describe only what differs from the class
+            self.reduction = reduction
+        self.expectile = expectile
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        own, keys = self.value_network.in_keys, self.tensor_keys
-        following = [*own, keys.reward, keys.done, keys.terminated]
-        return list(dict.fromkeys([*own, *(unravel_key(("next", key)) for key in following)]))
+        inputs, keys = self.value_network.in_keys, self.tensor_keys
+        following = [*inputs, keys.reward, keys.done, keys.terminated]
+        return list(dict.fromkeys([*inputs, *(unravel_key(("next", key)) for key in following)]))
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> ExpectileValueLoss:
         """Set the estimator of the targets, and return the loss.
 
         Args:
-            value_type: an estimator, its class, or ``ValueEstimators.TD0``, which None stands for. Others need rows in
-                the order of time and raise :class:`NotImplementedError`.
+            value_type: an estimator, its class, or ``ValueEstimators.TD0``; None for the last. Others need rows in the
+                order of time and raise :class:`NotImplementedError`.
             **hyperparams: ``gamma``, the discount of a step, by default 0.99.
         """
         value_type = self.default_value_estimator if value_type is None else value_type
         if not isinstance(value_type, (str, ValueEstimators)):
             return super().make_value_estimator(value_type, **hyperparams)
         keys = {name: getattr(self.tensor_keys, name) for name in self._value_estimator_default_keys}
-        known = {"supported": (ValueEstimators.TD0,), "tensor_keys": keys, "value_network": None}
-        dispatch_value_estimator(self, value_type, **known, **hyperparams)
+        options = {"supported": (ValueEstimators.TD0,), "tensor_keys": keys, "value_network": None}
+        dispatch_value_estimator(self, value_type, **options, **hyperparams)
         return self
 
     def train(self, mode: bool = True) -> ExpectileValueLoss:
-        """Set the mode of the network too."""
+        """Set the mode of the network too, which the loss does not hold as a submodule."""
         self.value_network.train(mode)
         return super().train(mode)
 
@@ -131,21 +133,19 @@ class ExpectileValueLoss(LossModule):
         """Return the losses, and write ``td_error``."""
         target = self._target(tensordict)
         values = self._values(tensordict, self.value_network_params)
-        error = target - values
+        error = target - values  # (B, E)
         weight = torch.where(error < 0, 1.0 - self.expectile, self.expectile)
         tensordict.set(self.tensor_keys.priority, error.detach().square().amax(-1))
-        by_row = (weight * error.square()).sum(-1)
-        loss = self._reduce_loss(by_row, tensordict, weights=priority_weight(self, tensordict))
+        by_row, weights = (weight * error.square()).sum(-1), self._maybe_get_priority_weight(tensordict)
+        loss = self._reduce_loss(by_row, tensordict, weights=weights)
         losses = TensorDict(loss_value=loss, value=values.detach().mean())
-        clear_references(tensordict, losses, self.value_network_params, self.target_value_network_params)
+        self._clear_weakrefs(tensordict, losses, "value_network_params", "target_value_network_params")
         return losses
 
     @torch.no_grad()
     def advantage(self, tensordict: TensorDictBase) -> Tensor:
-        """Return each row's advantage, (B, 1) float32: the target less the mean value.
-
-        Both are of the target network in eval mode.
-        """
+        """Return each row's advantage, (B, 1) float32: the target minus the mean value, by the target network in eval
+        mode."""
         with evaluating(self.value_network):
             value = self._values(tensordict, self.target_value_network_params).mean(-1, keepdim=True)
             return self._target(tensordict) - value
@@ -160,18 +160,21 @@ class ExpectileValueLoss(LossModule):
         """Return the value of each member, (B, E)."""
         network, keys = self.value_network, self.tensor_keys
         key = keys.values if unravel_key(keys.values) in network.out_keys else keys.value
+        # An ensemble also writes its minimum, from which its members could not learn by themselves.
         is_ensemble = len(getattr(network, "heads", ())) > 1
         if unravel_key(key) not in network.out_keys or (is_ensemble and key != keys.values):
-            what = f"lack {keys.value!r} or, of an ensemble, {keys.values!r}: name them by loss.set_keys(value=...)"
-            raise ValueError(f"the value network writes {network.out_keys}, which {what}")
+            needed = keys.values if is_ensemble else keys.value
+            raise ValueError(
+                f"value_network must write {needed!r}, it writes {network.out_keys}; use loss.set_keys(...)"
+            )
         with params.to_module(network, preserve_module_state=False):
-            # The whole rows: features also read the angle of RandomYaw, and the attention qaf_plan.
+            # in_keys are not all that a network reads: features also read RandomYaw's angle, the attention qaf_plan.
             (values,) = read(network(tensordict.copy()), [key])
         return values
 
 
 class AdvantageWeightedLoss(LossModule):
-    """Imitates a batch's actions with weights exp(β·A), at most ``max_weight``, where A is a row's advantage.
+    """Imitation loss with weights exp(β·A), at most ``max_weight``, where A is a row's advantage.
 
     Reads what the actor reads, ``action`` (B, 4) float32, and ``advantage`` (B, 1) float32, which
     :meth:`ExpectileValueLoss.advantage` returns and :func:`standardize_by_task` makes comparable. Returns
@@ -224,16 +227,15 @@ class AdvantageWeightedLoss(LossModule):
         self,
         actor_network: TensorDictModuleBase,
         *,
-        beta: float = 1.0,
-        max_weight: float = 20.0,
+        beta: Scale = 1.0,
+        max_weight: Positive = 20.0,
         loss_function: Literal["l2", "l1", "smooth_l1", "log_prob"] = "l2",
         reduction: Reduction | None = None,
     ) -> None:
         super().__init__()
-        set_reduction(self, reduction)
-        self.beta = check_value("beta", beta, Scale)
-        self.max_weight = check_value("max_weight", max_weight, Positive)
-        self.loss_function = loss_function
+        if reduction not in (None, self.reduction):  # checkpoints describe only what differs from the class
+            self.reduction = reduction
+        self.beta, self.max_weight, self.loss_function = beta, max_weight, loss_function
         self.convert_to_functional(actor_network, "actor_network")
 
     @property
@@ -242,7 +244,7 @@ class AdvantageWeightedLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the loss; the input stays as it is."""
+        """Return the loss; the input is not changed."""
         action, advantage = read(tensordict, [self.tensor_keys.action, self.tensor_keys.advantage])
         if advantage.shape != (*tensordict.batch_size, 1) or advantage.dtype != action.dtype:
             got = f"shape {tuple(advantage.shape)} in {advantage.dtype}"
@@ -258,16 +260,16 @@ class AdvantageWeightedLoss(LossModule):
             weight_clipped=(logs > most).to(weights.dtype).mean(),
             ESS=weights.sum().square() / weights.square().sum() / weights.numel(),
         )
-        clear_references(tensordict, losses, self.actor_network_params)
+        self._clear_weakrefs(tensordict, losses, "actor_network_params")
         return losses
 
     def _distance(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         """Return the distance of each row, (B,)."""
-        seen = tensordict.exclude(self.tensor_keys.action)
+        inputs = tensordict.exclude(self.tensor_keys.action)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             if self.loss_function == "log_prob":
-                return -self.actor_network.get_dist(seen).log_prob(action)
-            (predicted,) = read(self.actor_network(seen), [self.tensor_keys.action])
+                return -self.actor_network.get_dist(inputs).log_prob(action)
+            (predicted,) = read(self.actor_network(inputs), [self.tensor_keys.action])
         return distance_loss(predicted, action, self.loss_function).mean(-1)
 
 
@@ -304,3 +306,39 @@ def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
         if own.max() > own.min():  # otherwise only the rounding of the mean would be left
             standardized[rows] = ((own - own.mean()) / own.std(correction=0)).to(advantage.dtype)
     return standardized
+
+
+@typed
+def with_n_steps(loss: LossModule, batch: TensorDictBase) -> TensorDictBase:
+    """Make a loss's value estimator read n-step rows: ``loss(with_n_steps(loss, batch))``.
+
+    TorchRL's :class:`~torchrl.objectives.IQLLoss` and :class:`~torchrl.objectives.REDQLoss` only pass ``next`` to the
+    estimator, so this copies ``steps_to_next_obs`` there. Other losses and rows are left alone.
+
+    Args:
+        loss: any loss; call ``make_value_estimator`` before.
+        batch: rows of a buffer, with ``steps_to_next_obs`` (B,) int64.
+
+    Returns:
+        ``batch``, with ``("next", "steps_to_next_obs")`` (B,) int64 if the loss needs it.
+
+    Example:
+        >>> import lw_torchrl as lw, torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.objectives import IQLLoss
+        >>> plans = lw.load_plans("MT10")
+        >>> actor = lw.PlanConditionedActor(plans).stochastic("tanh_normal")
+        >>> loss = IQLLoss(actor, lw.PlanConditionedQValue(plans), lw.PlanConditionedValue(plans))
+        >>> loss.make_value_estimator(gamma=0.99)
+        >>> batch = TensorDict(steps_to_next_obs=torch.tensor([5, 2]), next=TensorDict(), batch_size=[2])
+        >>> with_n_steps(loss, batch)["next", "steps_to_next_obs"].tolist()
+        [5, 2]
+
+    Source: Sutton, Barto, "Reinforcement Learning", section 7.1.
+    """
+    steps = batch.get("steps_to_next_obs", None)
+    if steps is None or not isinstance(loss, (IQLLoss, REDQLoss)):
+        return batch
+    key = ("next", "steps_to_next_obs")
+    loss.value_estimator.set_keys(steps_to_next_obs=key)
+    return batch.set(key, steps)

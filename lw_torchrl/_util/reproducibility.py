@@ -1,0 +1,52 @@
+"""What results depend on: the random numbers of an episode, and the versions of packages."""
+
+import warnings
+from collections.abc import Iterable, Mapping
+from hashlib import blake2b
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from lw_torchrl import __version__
+from lw_torchrl._util.checks import Natural, check_value, shown
+from lw_torchrl.language.tasks import Task, get_task
+
+SIMULATORS: tuple[str, ...] = ("metaworld", "mujoco")  # of the physics of episodes
+LIBRARIES: tuple[str, ...] = ("lw_torchrl", "numpy", "tensordict", "torch", "torchrl")  # of the last bits of results
+
+
+def episode_hash(purpose: str, task: str | Task, seed: int, episode: int) -> int:
+    """Return a stable number in [0, 2**63), different for each purpose, task, seed and episode."""
+    # The suite of a name such as "desk/push" need not be installed.
+    name = task if isinstance(task, str) and "/" in task else get_task(task).name
+    text = f"lw_torchrl/{purpose}/{name}/{check_value('seed', seed, int)}/{check_value('episode', episode, Natural)}"
+    return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little") >> 1
+
+
+def episode_generator(purpose: str, task: str | Task, seed: int, episode: int) -> np.random.Generator:
+    """Return a new generator of random numbers for one purpose in an episode."""
+    return np.random.Generator(np.random.Philox(episode_hash(purpose, task, seed, episode)))
+
+
+def package_versions() -> dict[str, str]:
+    """Return the versions of the packages that results depend on, by name; ours is that of the running code."""
+    others = sorted({*SIMULATORS, *LIBRARIES} - {"lw_torchrl"})
+    return {"lw_torchrl": __version__, **{name: version(name) for name in others}}
+
+
+def version_changes(recorded: Any, names: Iterable[str]) -> list[str]:
+    """Return the packages whose installed version is not the recorded one: "mujoco 3.2.0, now 3.3.0"."""
+    before, now = recorded if isinstance(recorded, Mapping) else {}, package_versions()
+    pairs = [(name, before.get(name), now[name]) for name in names]
+    return [f"{name} {shown(was)[1:-1]}, now {is_}" for name, was, is_ in pairs if isinstance(was, str) and was != is_]
+
+
+def warn_of_other_versions(path: object, recorded: Any, names: Iterable[str] = LIBRARIES) -> None:
+    """Warn that a training which began under other versions will not continue bit for bit."""
+    if changes := version_changes(recorded, names):
+        warnings.warn(
+            f"checkpoint: {str(path)!r} was written under other versions ({'; '.join(changes)}): training continues, "
+            "but results will not be bit-identical to an uninterrupted run; install these versions for that",
+            stacklevel=4,
+        )

@@ -1,0 +1,291 @@
+"""Building blocks of policies: multilayer perceptrons, parts, and sequences whose named parts can be replaced."""
+
+from __future__ import annotations
+
+import copy
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, ClassVar, TypeVar
+
+import torch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.data import Bounded, Composite
+from torchrl.modules import MLP as TorchRLMLP
+
+from lw_torchrl._util.checks import Count, Natural, check_value
+from lw_torchrl._util.keys import Keys, any_arguments, as_keys, check_apart, last_name
+from lw_torchrl.language.layout import Layout
+from lw_torchrl.language.plans import AnyPlans
+
+Module = TypeVar("Module", bound=nn.Module)
+Width = Count | Sequence[Count]
+
+# --- networks ------------------------------------------------------------------------------------------------------
+
+
+class MLP(TorchRLMLP):
+    """TorchRL's MLP with ReLU, whose input width is that of the first input. Several inputs are concatenated.
+
+    A sequence of widths gives the hidden layers and replaces ``depth``.
+    """
+
+    def __init__(self, out_features: int, *, width: Width = 256, depth: int = 3, layer_norm: bool = False) -> None:
+        check_value("depth", depth, Natural)
+        for cells in width if isinstance(width, Sequence) else [width]:  # beartype checks one item of a sequence only
+            check_value("width", cells, Count)
+        widths = list(width) if isinstance(width, Sequence) else [width] * depth
+        super().__init__(
+            out_features=out_features,
+            num_cells=widths,
+            activation_class=nn.ReLU,
+            norm_class=nn.LayerNorm if layer_norm else None,
+            norm_kwargs=[{"normalized_shape": cells} for cells in widths] if layer_norm else None,
+        )
+
+
+@torch.no_grad()
+def materialize(module: nn.Module, *inputs: Tensor) -> None:
+    """Give a module's lazy layers their shapes by a forward pass, if it has lazy layers."""
+    if any(isinstance(parameter, nn.parameter.UninitializedParameter) for parameter in module.parameters()):
+        with evaluating(module):
+            module(*inputs)
+
+
+@torch.no_grad()
+def probe(module: nn.Module, example: Tensor) -> Any:
+    """Return a module's output for an example, moved to its device, without drawing from the global generator."""
+    weight = next(module.parameters(), None)
+    with evaluating(module), torch.random.fork_rng(devices=[]):
+        return module(example if weight is None else example.to(weight.device))
+
+
+@contextmanager
+def evaluating(network: nn.Module) -> Iterator[None]:
+    """Put a network into eval mode within the block; afterwards each of its modules is in its own mode again."""
+    modes = [(module, module.training) for module in network.modules()]
+    network.eval()
+    try:
+        yield
+    finally:
+        for module, mode in modes:
+            module.training = mode
+
+
+def in_mode_of(own: nn.Module, other: Module) -> Module:
+    """Return the other module in train or eval mode as ``own`` is; the modules that both share keep their modes."""
+    other.training = own.training
+    return other
+
+
+# --- parts ---------------------------------------------------------------------------------------------------------
+
+
+class Part(TensorDictModuleBase):
+    """Base of the parts of a policy. ``reads`` and ``writes`` are the default names of its keys."""
+
+    _options: ClassVar[Sequence[str]] = ()  # arguments of the constructor, which are attributes of the same names
+
+    def __init__(
+        self, reads: Sequence[str], writes: Sequence[str], in_keys: Keys | None, out_keys: Keys | None
+    ) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = as_keys("in_keys", in_keys, reads), as_keys("out_keys", out_keys, writes)
+        check_apart(self.in_keys, self.out_keys)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The keyword arguments that rebuild it."""
+        options = {name: getattr(self, name) for name in self._options}
+        return {**options, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
+
+
+class RenamedInputs(TensorDictModuleBase):
+    """Base of modules that hold TensorDict modules, which read the new names that are assigned to ``in_keys``.
+
+    Another module that shares parts with this one keeps reading the names that it read.
+    """
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """What is read. New names can be assigned, in the same order."""
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, keys: Keys) -> None:
+        before = self.__dict__.get("_in_keys")
+        if before is not None:  # not in the constructor, where the parts read these names already
+            keys = as_keys("in_keys", keys, list(map(str, before)))
+            check_apart(keys, self.out_keys_source)
+            renamed = dict(zip(before, keys, strict=True))
+            _rename_parts(self, renamed, {})
+        self._in_keys = list(keys)
+
+
+# Two policies may share a part, and each must keep the names that it reads. So renaming copies the module objects, but
+# not their weights.
+
+
+def _reading(module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any], in_order: bool) -> Any:
+    """Return a module on the same weights that reads renamed keys; ``copies`` are those made so far."""
+    if not isinstance(module, (TensorDictModuleBase, nn.ModuleDict, nn.ModuleList)):
+        return module
+    if module not in copies:
+        other = copies[module] = copy.copy(module)
+        _rename_parts(other, renamed, copies, in_order)
+        if isinstance(module, TensorDictModuleBase):
+            other.__dict__["_in_keys"] = [renamed.get(key, key) for key in module.in_keys]
+    return copies[module]
+
+
+def _rename_parts(
+    module: nn.Module, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any], in_order: bool = False
+) -> None:
+    """Replace a module's parts by copies that read renamed keys.
+
+    Parts that run ``in_order`` read a key that an earlier part writes by its old name.
+    """
+    in_sequence, remaining, parts = isinstance(module, TensorDictSequential), renamed, {}
+    for name, part in module._modules.items():
+        parts[name] = _reading(part, remaining, copies, in_sequence)
+        if in_order:
+            remaining = {key: new for key, new in remaining.items() if key not in part.out_keys}
+    # ProbabilisticTensorDictSequential also keeps its deterministic part in an attribute, outside of _modules.
+    hidden = {name: part for name, part in vars(module).items() if isinstance(part, TensorDictModuleBase)}
+    module.__dict__.update({name: _reading(part, renamed, copies, False) for name, part in hidden.items()})
+    module.__dict__["_modules"] = parts
+
+
+class NamedParts(RenamedInputs, TensorDictSequential):
+    """A sequence of named parts: ``actor.decoder`` is a part, and ``actor.decoder = network`` replaces it."""
+
+    @any_arguments
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        return super().forward(*args, **kwargs)
+
+    def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
+        """Return a module as the part ``name``: a plain module reads and writes the keys of the part before it."""
+        before = self.module[name]
+        if not isinstance(module, TensorDictModuleBase):
+            return TensorDictModule(module, in_keys=before.in_keys[:1], out_keys=before.out_keys)
+        if missing := [key for key in before.out_keys_source if key not in module.out_keys_source]:
+            raise ValueError(f"{name} must write {before.out_keys_source}, which later parts read; it lacks {missing}")
+        return module
+
+    def __getattr__(self, name: str) -> Any:
+        parts = self.__dict__.get("_modules", {}).get("module") or {}
+        return parts[name] if name in parts else super().__getattr__(name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        parts = self.__dict__.get("_modules", {}).get("module") or {}
+        if name not in parts:
+            # A misspelt part would be a new attribute that nothing uses. Users' subclasses may have more modules.
+            if parts and isinstance(value, nn.Module) and type(self).__module__.startswith("lw_torchrl."):
+                own = f"{type(self).__name__} has the parts {', '.join(parts)}"
+                raise AttributeError(f"{own}, and no {name}; a part holds its own modules: actor.mixer.encoder")
+            super().__setattr__(name, value)
+            return
+        if not isinstance(value, nn.Module):
+            raise TypeError(f"{name} must be a module, got {value!r:.80}")
+        part = self.as_part(name, value)
+        check_same_plans({**parts, name: part})
+        parts[name] = part
+        self.plans, self.tasks, self.layout = trunk_attributes(self)
+        self._update_keys()
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """What is written. Parts have their own ``out_keys``: assign theirs, or give them to the constructor."""
+        return self._out_keys_apparent
+
+    @out_keys.setter
+    def out_keys(self, keys: Keys) -> None:
+        if list(keys) != self._complete_out_keys:
+            raise ValueError(
+                f"out_keys of a {type(self).__name__} cannot be assigned, got {list(keys)}; give out_keys= to its "
+                "constructor, or use select_out_keys to write fewer"
+            )
+        self._out_keys = self._out_keys_apparent = list(keys)
+
+    def _update_keys(self) -> None:
+        self._in_keys, out_keys = self._compute_in_and_out_keys(list(self.module.values()))
+        self._out_keys = self._out_keys_apparent = self._complete_out_keys = out_keys
+
+
+def action_spec(key: NestedKey, layout: Layout) -> Composite:
+    """Return the specification of actions of a layout, (A,) float32 in [-1, 1]."""
+    spec = Composite()
+    spec[key] = Bounded(-1.0, 1.0, (layout.action_size,))
+    return spec
+
+
+# --- plans and keys of parts ---------------------------------------------------------------------------------------
+
+
+def check_same_plans(parts: Mapping[str, nn.Module]) -> None:
+    """Raise :class:`ValueError` unless all parts follow the same plans."""
+    followed = [(name, plans) for name, part in parts.items() if (plans := _plans_inside(part)) is not None]
+    for name, plans in followed[1:]:
+        if plans is not followed[0][1] and plans != followed[0][1]:
+            raise ValueError(f"{followed[0][0]} and {name} must follow the same plans; give both the same Plans")
+
+
+def _plans_inside(part: nn.Module) -> Any:
+    """Return the plans of a part, or of its own parts, such as features that are concatenated; else None."""
+    return next((plans for each in part.modules() if (plans := getattr(each, "plans", None)) is not None), None)
+
+
+def follow(part: Any, plans: AnyPlans) -> Any:
+    """Return a part that follows other plans, with the same networks; a part without plans is returned itself.
+
+    Raises:
+        TypeError: the part follows plans, and has no method ``with_plans``.
+    """
+    if hasattr(part, "with_plans"):
+        return part.with_plans(plans)
+    if isinstance(part, nn.Module) and _plans_inside(part) is None:
+        return part
+    if type(part) is not TensorDictSequential:
+        raise TypeError(f"{type(part).__name__} cannot follow other plans: give it a method with_plans(plans)")
+    parts = {name: follow(each, plans) for name, each in part.module._modules.items()}
+    named = isinstance(part.module, nn.ModuleDict)
+    other = TensorDictSequential(OrderedDict(parts)) if named else TensorDictSequential(*parts.values())
+    return in_mode_of(part, other)
+
+
+def _named_parts(trunk: TensorDictSequential) -> list[Any]:
+    if not isinstance(trunk.module, nn.ModuleDict) or len(trunk.module) < 2:
+        raise ValueError("trunk must have at least two named parts: TensorDictSequential(OrderedDict(mixer=..., ...))")
+    return list(trunk.module.values())
+
+
+def trunk_attributes(trunk: TensorDictSequential) -> tuple[Any, Any, Layout]:
+    """Return ``plans``, ``tasks`` and ``layout`` of a trunk's first part with a layout; the first two may be None."""
+    part = next((part for part in _named_parts(trunk) if hasattr(part, "layout")), None)
+    if part is None:
+        raise ValueError("trunk must have a part with a layout: PlanAttention, SkillMixer, TaskLatent or features")
+    return getattr(part, "plans", None), getattr(part, "tasks", None), part.layout
+
+
+def encoding_width(trunk: TensorDictSequential) -> int | None:
+    """Return D + F, the size of the trunk's latent and features together; None if its parts do not state it."""
+    latent, features = _named_parts(trunk)[-2:]
+    size, width = getattr(latent, "latent_size", None), getattr(features, "width", None)
+    return None if size is None or width is None else size + width
+
+
+def encoding_keys(trunk: TensorDictSequential) -> list[NestedKey]:
+    """Return the keys of the trunk's latent and of its features, which its last two parts write."""
+    return [written_key(part) for part in _named_parts(trunk)[-2:]]
+
+
+def written_key(part: TensorDictModuleBase) -> NestedKey:
+    """Return the key that a part writes; if it writes several, the one that is named ``features``."""
+    keys: list[NestedKey] = list(part.out_keys_source)
+    named = keys if len(keys) == 1 else [key for key in keys if last_name(key) == "features"]
+    if len(named) != 1:
+        kind = type(part).__name__
+        raise ValueError(f"features must write one key, or one of them named 'features'; {kind} writes {keys}")
+    return named[0]

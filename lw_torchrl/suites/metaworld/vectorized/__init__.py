@@ -1,1 +1,0 @@
-"""The fast engine: Meta-World bit for bit, at nearly the speed of its physics."""
