@@ -24,7 +24,7 @@ Keys = Sequence[NestedKey]
 def _key(given: Any) -> NestedKey | None:
     """Return a key; None if it is not one. A list is a nested key too, since JSON has no tuples."""
     given = tuple(given) if isinstance(given, list) else given
-    return unravel_key(given) if checker(NestedKey)(given) and given else None  # type: ignore[no-any-return]
+    return unravel_key(given) if checker(NestedKey)(given) and given else None
 
 
 def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[str]) -> list[NestedKey]:

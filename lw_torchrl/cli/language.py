@@ -16,8 +16,7 @@ from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Columns, Maybe, Output, Row
 from lw_torchrl.language.nearest import nearest_skill
 from lw_torchrl.language.objects import GRIPPER
-from lw_torchrl.language.plan_text import PLAN_LIMIT
-from lw_torchrl.language.plans import check_plan
+from lw_torchrl.language.plan_files import PLAN_LIMIT, check_plan
 from lw_torchrl.language.skills import ScriptedSkill, skills_for
 from lw_torchrl.language.tasks import MT10, Task
 

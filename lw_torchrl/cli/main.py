@@ -46,7 +46,7 @@ imports your Python module, for example one that registers a suite or a policy c
 Exit status: 0: done; 1: a bug, with a traceback; 2: an error that you can fix
 (LW_TORCHRL_TRACEBACK=1 adds the traceback); 130: stopped by Ctrl-C; 141: broken pipe."""
 _USER_ERRORS = (ValueError, OSError, ImportError, RuntimeError)
-_RANGES = (
+_RANGES: tuple[tuple[Any, str], ...] = (
     (Count, "at least 1"), (Natural, "at least 0"), (Scale, "at least 0"), (Positive, "above 0"),
     (Probability, "from 0 to 1"),
 )  # fmt: skip
@@ -111,7 +111,7 @@ def _check_ranges(command: Any) -> None:
             _check_ranges(value)
         validators = [*_validators(hint)]
         for allowed, text in _RANGES:
-            if allowed.__metadata__[0] in validators:  # type: ignore[attr-defined]
+            if get_args(allowed)[1] in validators:
                 for number in value if isinstance(value, tuple) else [] if value is None else [value]:
                     if not is_bearable(number, allowed):
                         raise ValueError(f"--{name.replace('_', '-')} must be {text}, got {number}")

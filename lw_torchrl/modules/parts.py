@@ -151,7 +151,7 @@ def _rename_parts(
     for name, part in module._modules.items():
         parts[name] = _reading(part, remaining, copies, in_sequence)
         if in_order:
-            remaining = {key: new for key, new in remaining.items() if key not in part.out_keys}
+            remaining = {key: new for key, new in remaining.items() if key not in getattr(part, "out_keys", ())}
     # ProbabilisticTensorDictSequential also keeps its deterministic part in an attribute, outside of _modules.
     hidden = {name: part for name, part in vars(module).items() if isinstance(part, TensorDictModuleBase)}
     module.__dict__.update({name: _reading(part, renamed, copies, False) for name, part in hidden.items()})

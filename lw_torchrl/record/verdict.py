@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure
 from lw_torchrl.evaluation.diagnose.sentences import replaced_text
 from lw_torchrl.language.layout import Layout
-from lw_torchrl.language.plan_text import one_line
+from lw_torchrl.language.plans import one_line
 from lw_torchrl.record.entities import FALSE, STEEL, Color, changes, rr, step_color
 from lw_torchrl.record.recorded_episode import NO_STEP, Ghost, RecordedEpisode
 

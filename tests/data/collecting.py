@@ -1,20 +1,38 @@
-"""Small datasets and policies for the tests of collecting, the bytes of a folder, and a stop in the midst of it."""
+"""Small datasets and policies for the tests of this folder, and helpers on their files."""
 
 from __future__ import annotations
 
 import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
 
+import numpy as np
 import torch
+from tensordict import TensorDict
 
 import lw_torchrl as lw
+from lw_torchrl._util.reproducibility import package_versions
 from lw_torchrl.data import collect_demonstrations
 from lw_torchrl.data.collect import EpisodeFiles
-from lw_torchrl.data.dataset import describe_episode, load_rows, read_metadata
+from lw_torchrl.data.dataset import (
+    COLUMNS,
+    DATA,
+    CollectConfig,
+    Demonstrations,
+    describe_episode,
+    load_rows,
+    read_metadata,
+    write_metadata,
+    write_rows,
+)
+from lw_torchrl.language.tasks import task_id
 
 TASKS = ("push", "reach")
 NOISE = (0.0, 0.3)
 STEPS, EPISODES, SEED = 14, 3, 5
 PLANS = lw.load_plans("MT10")
+ODD = np.array([0.0, -0.0, 1e-45, -1e-38, 3.4e38, np.pi, 1 / 3], dtype=np.float32)  # numbers that lose bits easily
 
 
 def collect(root, tasks=TASKS, **changed):
@@ -28,19 +46,19 @@ def tree(root):
 
 
 def restate_checksums(root):
-    """Make the rows of a dataset, whatever was done to them, the ones that its metadata speak of."""
-    found = read_metadata(root)
-    rows = load_rows(found)
-    parts = [(one, rows[one.start : one.start + one.length]) for one in found.episodes]
-    stated = json.loads((root / "metadata.json").read_text())
-    stated["episodes"]["checksum"] = [
-        describe_episode(one.task, one.episode, one.start, part).checksum for one, part in parts
+    """Write the checksums of the present rows to a dataset's metadata."""
+    dataset = read_metadata(root)
+    rows = load_rows(dataset)
+    metadata = json.loads((root / "metadata.json").read_text())
+    metadata["episodes"]["checksum"] = [
+        describe_episode(info.task, info.episode, info.start, rows[info.start : info.start + info.length]).checksum
+        for info in dataset.episodes
     ]
-    (root / "metadata.json").write_text(json.dumps(stated))
+    (root / "metadata.json").write_text(json.dumps(metadata))
 
 
 def interrupt_after(monkeypatch, episodes):
-    """Stop collecting, as Ctrl-C does, after so many episodes have been put away."""
+    """Interrupt collecting, as Ctrl-C does, when ``episodes`` episodes have been written."""
     put, left = EpisodeFiles.put, [episodes]
 
     def stopping(self, *args):
@@ -53,7 +71,7 @@ def interrupt_after(monkeypatch, episodes):
 
 
 def trained(kind="plan", seed=0, squash=True, **options):
-    """A tiny policy; of other weights for another seed."""
+    """Return a tiny policy, with other weights for another seed."""
     torch.manual_seed(seed)
     options["decoder"] = lw.modules.MLPDecoder(width=8, depth=1, squash=squash)
     if kind == "plan":
@@ -61,5 +79,52 @@ def trained(kind="plan", seed=0, squash=True, **options):
     return lw.DescriptorConditionedActor(("push", "reach"), **options)
 
 
-def same_rows(one, other):
-    return (load_rows(one) == load_rows(other)).all()
+def same_rows(left, right):
+    return (load_rows(left) == load_rows(right)).all()
+
+
+class Evil:
+    """An object that makes a folder when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = str(path)
+
+    def __reduce__(self):
+        return os.mkdir, (self.path,)
+
+
+def random_dataset(root: Path, lengths: Sequence[Sequence[int]], seed: int = 0) -> Demonstrations:
+    """Write a dataset of random numbers: a task for each list of episode lengths."""
+    tasks = ("drawer-open", "push", "reach")[: len(lengths)]
+    draws = np.random.default_rng(seed)
+
+    def numbers(*shape: int) -> torch.Tensor:
+        values = draws.standard_normal(shape).astype(np.float32)
+        odd = draws.random(shape) < 0.1
+        values[odd] = draws.choice(ODD, odd.sum())
+        return torch.from_numpy(values)
+
+    infos, parts = [], []
+    for task, of_task in zip(tasks, lengths, strict=True):
+        for episode, steps in enumerate(of_task):
+            states, ends = numbers(steps + 1, 39), torch.zeros(steps, 1, dtype=torch.bool)
+            ends[-1] = True
+            success = torch.from_numpy(draws.random((steps, 1)) < 0.2)
+            rows = TensorDict({}, [steps])
+            for key, (shape, _) in COLUMNS.items():
+                rows.set(key, numbers(steps, *shape))
+            number = torch.full((steps,), task_id(task))
+            rows.update({"observation": states[:-1], "task_id": number, "episode": torch.full_like(number, episode)})
+            rows.set("action", rows.get("action").clamp(-1, 1)).set(("next", "observation"), states[1:])
+            rows.set(("next", "task_id"), number).set(("collector", "traj_ids"), torch.full_like(number, len(infos)))
+            rows.set(("next", "reward_sparse"), success.float()).set(("next", "success"), success)
+            rows.set(("next", "done"), ends).set(("next", "truncated"), ends).set(("next", "terminated"), ends & False)
+            start = infos[-1].start + infos[-1].length if infos else 0
+            infos.append(describe_episode(task, episode, start, rows))
+            parts.append(rows)
+    config = CollectConfig(tasks, len(lengths[0]), seed, max_steps=max(map(max, lengths)))
+    write_rows(root / DATA, parts, config.layout)
+    numbers_of = {task: task_id(task) for task in tasks}
+    attempts = dict.fromkeys(tasks, len(lengths[0]))
+    write_metadata(Demonstrations(root, config, package_versions(), numbers_of, tuple(infos), attempts))
+    return read_metadata(root)

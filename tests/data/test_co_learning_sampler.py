@@ -1,4 +1,4 @@
-"""CoLearningSampler: exact counts in any ratio, passes without repetition, states that go on as they were."""
+"""CoLearningSampler: exact counts in any ratio, passes without repetition, states that resume exactly."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ seeds = st.integers(0, 2**31)
 
 
 def smallest(base, fraction):
-    """The least batch size whose shares are whole numbers, counted up."""
+    """Return the smallest batch size whose shares are whole numbers, by counting."""
     size = 1
     while (size * fraction).denominator > 1 or (size * (1 - fraction) / base).denominator > 1:
         size += 1
@@ -41,7 +41,7 @@ def make_rows(base, target, shuffled=0):
 
 
 def with_episodes(*episodes):
-    """Rows of (task_id, length) episodes."""
+    """Return rows of (task_id, length) episodes."""
     task = torch.cat([torch.full((length,), task) for task, length in episodes])
     ids = torch.cat([torch.full((length,), 10 + 3 * number) for number, (_, length) in enumerate(episodes)])
     rows = TensorDict({"task_id": task, "row": torch.arange(len(task))}, [len(task)])
@@ -58,7 +58,7 @@ def make_replay(rows, batch_size, sampler=None, seed=0):
 
 
 def joined(*parts):
-    """The rows of several datasets, as load_demonstrations joins them."""
+    """Join the rows of several datasets as load_demonstrations does."""
     return torch.cat([part.set("dataset", torch.full(part.shape, number)) for number, part in enumerate(parts)])
 
 
@@ -68,9 +68,7 @@ def drawn(replay, number):
 
 @settings(max_examples=50, deadline=None)
 @given(base_sizes, target_size, fractions, multiples, seeds)
-def test_every_batch_has_exactly_the_fraction_of_the_target_and_equal_numbers_of_the_rest(
-    base, target, fraction, multiple, seed
-):
+def test_batches_have_exactly_the_targets_fraction(base, target, fraction, multiple, seed):
     size = multiple * smallest(len(base), fraction)
     sampler = CoLearningSampler(TARGET, target_fraction=float(fraction) if seed % 2 else fraction)
     replay = make_replay(make_rows(base, target), size, sampler, seed)
@@ -80,30 +78,30 @@ def test_every_batch_has_exactly_the_fraction_of_the_target_and_equal_numbers_of
         assert batch["is_target"].shape == batch["task_id"].shape == (size,)
         assert int(batch["is_target"].sum()) == size * fraction
         assert torch.equal(batch["is_target"], batch["task_id"] == task_id(TARGET))
-        tasks, found = batch["task_id"][~batch["is_target"]].unique(return_counts=True)
+        tasks, counts = batch["task_id"][~batch["is_target"]].unique(return_counts=True)
         assert tasks.tolist() == [OTHERS[4 * i] for i in range(len(base))]
-        assert found.tolist() == [size * (1 - fraction) / len(base)] * len(base)
+        assert counts.tolist() == [size * (1 - fraction) / len(base)] * len(base)
 
 
 @settings(max_examples=30, deadline=None)
 @given(base_sizes, target_size, fractions, seeds)
-def test_target_and_each_base_task_come_once_before_any_row_comes_again(base, target, fraction, seed):
+def test_every_row_of_a_task_comes_once_before_any_comes_again(base, target, fraction, seed):
     rows = make_rows(base, target)
     sampler = CoLearningSampler(TARGET, target_fraction=fraction)
     replay = make_replay(rows, smallest(len(base), fraction), sampler, seed)
     batches = [replay.sample() for _ in range(10)]
     for task in rows["task_id"].unique():
         everything = sorted(rows["row"][rows["task_id"] == task].tolist())
-        mine = torch.cat([batch["row"][batch["task_id"] == task] for batch in batches]).tolist()
-        for start in range(0, len(mine), len(everything)):
-            piece = mine[start : start + len(everything)]
+        of_task = torch.cat([batch["row"][batch["task_id"] == task] for batch in batches]).tolist()
+        for start in range(0, len(of_task), len(everything)):
+            piece = of_task[start : start + len(everything)]
             assert len(set(piece)) == len(piece)
-            assert sorted(piece) == everything or start + len(everything) > len(mine)
+            assert sorted(piece) == everything or start + len(everything) > len(of_task)
 
 
 @settings(max_examples=30, deadline=None)
 @given(base_sizes, target_size, fractions, st.integers(1, 300))
-def test_a_batch_that_cannot_be_exact_is_refused_with_the_nearest_that_can(base, target, fraction, size):
+def test_with_exact_other_batch_sizes_are_errors_with_the_nearest(base, target, fraction, size):
     unit = smallest(len(base), fraction)
     sampler = CoLearningSampler(TARGET, target_fraction=fraction, exact=True)
     replay = make_replay(make_rows(base, target), None, sampler)
@@ -111,7 +109,7 @@ def test_a_batch_that_cannot_be_exact_is_refused_with_the_nearest_that_can(base,
         assert len(replay.sample(size)) == size
         return
     near = [n for n in (size // unit * unit, size // unit * unit + unit) if n]
-    with pytest.raises(ValueError, match=f"batch_size must be a multiple of {unit}, .* got {size};") as caught:
+    with pytest.raises(ValueError, match=f"batch_size must be a multiple of {unit},") as caught:
         replay.sample(size)
     assert str(caught.value).endswith("the nearest are " + " and ".join(map(str, near)))
     assert len(replay.sample(near[-1])) == near[-1]
@@ -119,7 +117,7 @@ def test_a_batch_that_cannot_be_exact_is_refused_with_the_nearest_that_can(base,
 
 @settings(max_examples=25, deadline=None)
 @given(base_sizes, target_size, seeds, st.integers(0, 6))
-def test_a_state_saved_anywhere_in_an_epoch_gives_the_same_batches_again(base, target, seed, before):
+def test_a_restored_state_gives_the_same_batches(base, target, seed, before):
     rows, size = make_rows(base, target), lcm(2, 2 * len(base))
     replay = make_replay(rows, size, seed=seed)
     drawn(replay, before)
@@ -133,21 +131,18 @@ def test_a_state_saved_anywhere_in_an_epoch_gives_the_same_batches_again(base, t
 
 @pytest.mark.parametrize(
     ("other", "name"),
-    [
-        (CoLearningSampler("reach"), "target, reach"),
-        (CoLearningSampler(TARGET, target_fraction=0.25), "target_fraction, 1/4"),
-    ],
+    [(CoLearningSampler("reach"), "target"), (CoLearningSampler(TARGET, target_fraction=0.25), "target_fraction")],
 )
-def test_the_state_of_another_target_or_ratio_is_refused(other, name):
+def test_the_state_of_another_target_or_ratio_is_an_error(other, name):
     replay = make_replay(make_rows([3, 3], 3), 4)
     drawn(replay, 1)
-    with pytest.raises(ValueError, match=f"state_dict must be of the same {name}"):
+    with pytest.raises(ValueError, match=f"state_dict has another {name}"):
         other.load_state_dict(replay.sampler.state_dict())
 
 
 @settings(max_examples=20, deadline=None)
 @given(base_sizes, target_size, fractions, seeds)
-def test_it_ran_out_whenever_the_pass_that_takes_most_batches_ends(base, target, fraction, seed):
+def test_ran_out_is_true_at_the_end_of_the_longest_pass(base, target, fraction, seed):
     size = smallest(len(base), fraction)
     replay = make_replay(make_rows(base, target), size, CoLearningSampler(TARGET, target_fraction=fraction), seed)
     shares = [int(size * fraction)] + [int(size * (1 - fraction)) // len(base)] * len(base)
@@ -158,7 +153,7 @@ def test_it_ran_out_whenever_the_pass_that_takes_most_batches_ends(base, target,
         assert replay.sampler.ran_out == (batch // longest > (batch - 1) // longest)
 
 
-def test_of_joined_datasets_a_named_target_is_the_last_ones():
+def test_the_target_of_joined_datasets_is_in_the_last_one():
     base = with_episodes((1, 4), (task_id(TARGET), 4), (2, 4))
     target = with_episodes((task_id(TARGET), 3)).apply(lambda column: column + 0)
     target["row"] += 100
@@ -183,52 +178,48 @@ def test_shares_are_rounded_and_later_batches_make_up_for_it(base, target, fract
 
 
 @pytest.mark.parametrize("name", [TARGET, "stack-blocks", "suite/stack-blocks"])
-def test_the_target_is_named_by_a_name_an_id_or_a_task(name):
+def test_the_target_is_a_name_an_id_or_a_task(name):
     task = Task(name, "Stack.", (NamedObject(GRIPPER, (0, 1, 2)), NamedObject("block", (4, 5, 6))))
     rows = TensorDict({"task_id": torch.tensor([1] * 4 + [task_id(name)] * 2), "row": torch.arange(6)}, [6])
     for target in (name, task_id(name), task):
         assert make_replay(rows, 4, CoLearningSampler(target)).sample()["is_target"].sum() == 2
-    for target in (None, True, 2.0):
-        with pytest.raises(TypeError, match="target must be a task's name, a Task or a task's id, got"):
-            CoLearningSampler(target)
 
 
-def test_wrong_options_are_named():
-    with pytest.raises(ValueError, match="the storage has no row of 'coffee-pusj'; its tasks are"):
-        make_replay(make_rows([2], 2), 4, CoLearningSampler("coffee-pusj")).sample()
-    with pytest.raises(ValueError, match=r"whole numbers up to 10000, .* nearest is 10/81"):
-        CoLearningSampler(TARGET, target_fraction=0.123456789)
+@pytest.mark.parametrize("fraction", [0, 1.0, -0.5, 0.123456789])
+def test_a_wrong_fraction_is_an_error(fraction):
+    with pytest.raises(ValueError, match="target_fraction"):
+        CoLearningSampler(TARGET, target_fraction=fraction)
 
 
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
         (with_episodes((1, 3), (2, 3)), f"no row of '{TARGET}'; its tasks are {MT50[1]}, {MT50[2]}"),
-        (with_episodes((task_id(TARGET), 3)), "no row of any other task, so there are no base tasks"),
+        (with_episodes((task_id(TARGET), 3)), "no row of any other task"),
     ],
 )
-def test_a_storage_that_does_not_fit_is_refused(rows, message):
+def test_rows_without_target_or_base_tasks_are_errors(rows, message):
     with pytest.raises(ValueError, match=message):
         make_replay(rows, 8, CoLearningSampler(TARGET)).sample()
 
 
 @settings(max_examples=25, deadline=None)
 @given(base_sizes, target_size, fractions, seeds)
-def test_row_weights_are_how_often_rows_come(base, target, fraction, seed):
+def test_row_weights_are_frequencies_of_rows(base, target, fraction, seed):
     rows = make_rows(base, target, shuffled=seed)
     size = smallest(len(base), fraction)
     replay = make_replay(rows, size, CoLearningSampler(TARGET, target_fraction=fraction), seed)
-    batches = lcm(*base, target)  # after which every row has come equally often within its group
-    found = torch.zeros(len(rows))
+    batches = lcm(*base, target)  # then every row of a group has come equally often
+    counts = torch.zeros(len(rows))
     for _ in range(min(batches, 20)):
-        found.index_add_(0, replay.sample()["row"], torch.ones(size))
+        counts.index_add_(0, replay.sample()["row"], torch.ones(size))
     weights = replay.sampler.row_weights(replay.storage)
     assert weights.sum().item() == pytest.approx(1.0)
     if batches <= 20:
-        torch.testing.assert_close(weights, found / found.sum())
+        torch.testing.assert_close(weights, counts / counts.sum())
 
 
-def test_a_row_that_is_left_out_has_no_weight():
+def test_rows_that_are_left_out_have_no_weight():
     parts = with_episodes((3, 4), (task_id(TARGET), 2), (7, 4)), with_episodes((task_id(TARGET), 2))
     sampler = CoLearningSampler(TARGET)
     replay = make_replay(joined(*parts), 4, sampler)

@@ -1,4 +1,4 @@
-"""Demonstrations: what they hold, and the arguments of collecting them."""
+"""collect_demonstrations: the content of a dataset, and which episodes it holds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import metaworld
 import numpy as np
 import pytest
 import torch
-from collecting import EPISODES, NOISE, SEED, STEPS, TASKS, collect
+from collecting import EPISODES, NOISE, SEED, STEPS, TASKS, collect, interrupt_after, tree
 
 import lw_torchrl as lw
 from lw_torchrl.data import CollectConfig
@@ -23,20 +23,7 @@ from lw_torchrl.suites.metaworld.plain_engine import make_metaworld_env
 CONFIG = CollectConfig(TASKS, EPISODES, SEED, noise_scale=NOISE, max_steps=STEPS)
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    return collect(tmp_path_factory.mktemp("made") / "demos")
-
-
-@pytest.fixture(scope="module")
-def rows(made):
-    return load_rows(made)
-
-
-# ---- what a dataset holds
-
-
-def test_the_rows_have_the_documented_keys_shapes_and_dtypes(rows):
+def test_rows_have_the_documented_keys_shapes_and_dtypes(rows):
     total = len(TASKS) * EPISODES * STEPS
     number, flag = torch.int64, torch.bool
     expected = {
@@ -54,16 +41,16 @@ def test_the_rows_have_the_documented_keys_shapes_and_dtypes(rows):
         **{("next", key): ((total, 1), flag) for key in ("success", "done", "terminated", "truncated")},
     }
     assert rows.batch_size == (total,)
-    found = {key: (tuple(rows[key].shape), rows[key].dtype) for key in rows.keys(True, True)}
-    assert found == expected
+    actual = {key: (tuple(rows[key].shape), rows[key].dtype) for key in rows.keys(True, True)}
+    assert actual == expected
 
 
-def test_episodes_lie_one_after_another_and_end_by_truncation(made, rows):
-    assert [(e.task, e.episode) for e in made.episodes] == [(t, k) for t in TASKS for k in range(EPISODES)]
+def test_episodes_are_consecutive_and_end_by_truncation(dataset, rows):
+    assert [(e.task, e.episode) for e in dataset.episodes] == [(t, k) for t in TASKS for k in range(EPISODES)]
     ids = rows["collector", "traj_ids"].reshape(-1, STEPS)
     assert (ids == ids[:, :1]).all()
-    assert ids[:, 0].unique().numel() == len(made.episodes)
-    for number, episode in enumerate(made.episodes):
+    assert ids[:, 0].unique().numel() == len(dataset.episodes)
+    for number, episode in enumerate(dataset.episodes):
         assert (episode.start, episode.length) == (number * STEPS, STEPS)
         part = rows[episode.start : episode.start + episode.length]
         assert (part["task_id"] == MT50.index(episode.task)).all()
@@ -77,9 +64,9 @@ def test_episodes_lie_one_after_another_and_end_by_truncation(made, rows):
 
 @pytest.mark.parametrize("kind", ["sparse", "dense"])
 @pytest.mark.parametrize("task", TASKS)
-def test_both_rewards_are_those_of_an_environment_with_that_reward(made, rows, task, kind):
+def test_both_rewards_equal_the_environments(dataset, rows, task, kind):
     env = LanguageWorldEnv(task, num_envs=EPISODES, seed=SEED, max_steps=STEPS, reward=kind)
-    first = next(episode.start for episode in made.episodes if episode.task == task)
+    first = next(episode.start for episode in dataset.episodes if episode.task == task)
     part = rows[first : first + EPISODES * STEPS].reshape(EPISODES, STEPS)
     state = env.reset()
     assert torch.equal(state["episode"], part["episode"][:, 0])
@@ -90,36 +77,34 @@ def test_both_rewards_are_those_of_an_environment_with_that_reward(made, rows, t
     env.close()
 
 
-def test_the_metadata_say_how_it_was_made(made, tmp_path):
-    assert made.config == CONFIG
-    assert made.num_steps == len(TASKS) * EPISODES * STEPS
-    found = json.loads((made.root / "metadata.json").read_text())
-    assert found["config"] == CONFIG.to_json()
-    assert found["config"]["seed"] == SEED
+def test_metadata_record_configuration_and_versions(dataset):
+    assert dataset.config == CONFIG
+    assert dataset.num_steps == len(TASKS) * EPISODES * STEPS
+    metadata = json.loads((dataset.root / "metadata.json").read_text())
+    assert metadata["config"] == CONFIG.to_json()
     packages = ("metaworld", "mujoco", "numpy", "tensordict", "torch", "torchrl")
-    assert found["versions"] == {name: version(name) for name in packages} | {"lw_torchrl": lw.__version__}
-    assert read_metadata(made.root) == made
-    assert found["task_ids"] == made.task_ids == {task: MT50.index(task) for task in TASKS}
-    assert not (made.root / ".partial").exists()
+    assert metadata["versions"] == {name: version(name) for name in packages} | {"lw_torchrl": lw.__version__}
+    assert read_metadata(dataset.root) == dataset
+    assert metadata["task_ids"] == dataset.task_ids == {task: MT50.index(task) for task in TASKS}
+    assert not (dataset.root / ".partial").exists()
 
 
-def test_success_is_recorded_episode_by_episode(tmp_path):
-    made = collect(tmp_path / "demos", "reach", max_steps=50, episodes_per_task=4, noise_scale=0.0, seed=0)
-    rows = load_rows(made)
-    for episode in made.episodes:
-        hits = rows["next", "success"][episode.start : episode.start + episode.length].flatten().nonzero().flatten()
-        assert episode.success == (len(hits) > 0)
-        assert episode.first_success == (int(hits[0]) + 1 if len(hits) else None)
-    rate = sum(e.success for e in made.episodes) / 4
-    assert 0 < rate < 1, "the test wants successes and failures"
-    assert made.success_rate == {"reach": rate}
+def test_success_is_recorded_for_each_episode(tmp_path):
+    dataset = collect(tmp_path / "demos", "reach", max_steps=50, episodes_per_task=4, noise_scale=0.0, seed=0)
+    rows = load_rows(dataset)
+    for episode in dataset.episodes:
+        successes = (
+            rows["next", "success"][episode.start : episode.start + episode.length].flatten().nonzero().flatten()
+        )
+        assert episode.success == (len(successes) > 0)
+        assert episode.first_success == (int(successes[0]) + 1 if len(successes) else None)
+    rate = sum(e.success for e in dataset.episodes) / 4
+    assert 0 < rate < 1, "the test needs successes and failures"
+    assert dataset.success_rate == {"reach": rate}
 
 
-# ---- actions
-
-
-def test_the_executed_action_is_the_experts_plus_the_episodes_own_noise_clipped(made, rows):
-    for episode in made.episodes:
+def test_executed_action_is_the_experts_plus_noise_clipped(dataset, rows):
+    for episode in dataset.episodes:
         part = rows[episode.start : episode.start + STEPS]
         scale = NOISE[episode.episode % len(NOISE)]
         noise = action_noise(episode.task, SEED, episode.episode, STEPS) * np.float32([scale] * 3 + [scale * 0.2])
@@ -130,35 +115,35 @@ def test_the_executed_action_is_the_experts_plus_the_episodes_own_noise_clipped(
         assert part["expert_action"].abs().max() <= 1
 
 
-def test_held_noise_keeps_each_draw(tmp_path):
-    made = collect(tmp_path / "demos", "reach", episodes_per_task=2, noise_scale=0.05, noise_hold=4, seed=2)
-    rows = load_rows(made)
+def test_noise_is_constant_for_noise_hold_steps(tmp_path):
+    dataset = collect(tmp_path / "demos", "reach", episodes_per_task=2, noise_scale=0.05, noise_hold=4, seed=2)
+    rows = load_rows(dataset)
     draws = action_noise("reach", 2, 1, 4) * np.float32([0.05, 0.05, 0.05, 0.01])
     part = rows[STEPS:]
     expected = (part["expert_action"] + torch.from_numpy(draws.repeat(4, 0)[:STEPS])).clamp(-1, 1)
     assert torch.equal(part["action"], expected)
 
 
-def test_the_expert_action_is_what_the_expert_wants_in_the_stored_state(rows):
-    wanted = ExpertActor(TASKS)(rows.select("observation", "task_id").clone())["action"]
-    assert torch.equal(wanted, rows["expert_action"])
+def test_expert_action_is_the_experts_in_the_stored_state(rows):
+    action = ExpertActor(TASKS)(rows.select("observation", "task_id").clone())["action"]
+    assert torch.equal(action, rows["expert_action"])
 
 
 @pytest.mark.filterwarnings("ignore:Constant.s. may be too high")
 @pytest.mark.parametrize("task", TASKS)
-def test_the_unclipped_action_is_what_meta_worlds_own_script_asks_for(rows, task):
+def test_unclipped_action_is_that_of_metaworlds_script(rows, task):
     script = metaworld.policies.ENV_POLICY_MAP[f"{task}-v3"]()
     part = rows[rows["task_id"] == MT50.index(task)]
-    asked = [script.get_action(observation.astype(np.float64)) for observation in part["observation"].numpy()]
-    assert np.array_equal(part["unclipped_action"].numpy(), np.stack(asked).astype(np.float32))
+    actions = [script.get_action(observation.astype(np.float64)) for observation in part["observation"].numpy()]
+    assert np.array_equal(part["unclipped_action"].numpy(), np.stack(actions).astype(np.float32))
     assert torch.equal(part["unclipped_action"].clamp(-1, 1), part["expert_action"])
-    assert rows["unclipped_action"].abs().max() > 1, "the test wants an action that is clipped"
+    assert rows["unclipped_action"].abs().max() > 1, "the test needs an action that is clipped"
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_replayed_in_meta_worlds_own_environment_the_actions_give_the_observations(made, rows, task):
+def test_stored_actions_reproduce_the_observations_in_metaworld(dataset, rows, task):
     env = make_metaworld_env(task)
-    for episode in (e for e in made.episodes if e.task == task):
+    for episode in (e for e in dataset.episodes if e.task == task):
         part = rows[episode.start : episode.start + STEPS]
         env.seed(episode_seed(task, SEED, episode.episode))
         observation, _ = env.reset()
@@ -170,18 +155,53 @@ def test_replayed_in_meta_worlds_own_environment_the_actions_give_the_observatio
     env.close()
 
 
-# ---- arguments
+@pytest.mark.parametrize("num_envs", [2, 5, 9])
+def test_num_envs_does_not_change_the_dataset(dataset, tmp_path, num_envs):
+    collect(tmp_path / "demos", num_envs=num_envs)
+    assert tree(tmp_path / "demos") == tree(dataset.root)
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        (dict(tasks="raech"), "reach"),
-        (dict(episodes_per_task=0), "episodes_per_task must be at least 1, got 0"),
-        (dict(noise_scale=-0.1), "noise_scale must be finite and at least 0, got -0.1"),
-        (dict(num_envs=1), "num_envs must be at least the number of tasks, 2, got 1"),
-    ],
-)
-def test_wrong_arguments_are_named(tmp_path, changed, message):
-    with pytest.raises(ValueError, match=message):
-        collect(tmp_path / "demos", **changed)
+def test_a_tasks_rows_do_not_depend_on_other_tasks(rows, tmp_path):
+    alone = load_rows(collect(tmp_path / "demos", "reach")).exclude("collector")
+    together = rows[rows["task_id"] == MT50.index("reach")].exclude("collector")
+    assert (alone == together).all()
+
+
+REDRAW = dict(tasks="reach", episodes_per_task=3, max_steps=50, noise_scale=(0.4,))
+
+
+@pytest.fixture(scope="module")
+def redrawn(tmp_path_factory):
+    return collect(tmp_path_factory.mktemp("redrawn") / "demos", redraw_failures=True, **REDRAW)
+
+
+def test_redrawing_keeps_only_the_first_successes(redrawn, tmp_path):
+    attempts = redrawn.attempts["reach"]
+    everything = collect(tmp_path / "demos", **{**REDRAW, "episodes_per_task": attempts})
+    successes = [e.episode for e in everything.episodes if e.success]
+    assert len(successes) < attempts, "the test needs a failure"
+    assert [e.episode for e in redrawn.episodes] == successes
+    assert redrawn.success_rate == {"reach": 1.0}
+    all_rows, kept_rows = load_rows(everything), load_rows(redrawn)
+    expected = all_rows[torch.isin(all_rows["episode"], torch.tensor(successes))].exclude("collector")
+    assert (kept_rows.exclude("collector") == expected).all()
+
+
+@pytest.mark.parametrize("num_envs", [1, 4])
+def test_redrawing_does_not_depend_on_num_envs(redrawn, tmp_path, num_envs):
+    collect(tmp_path / "demos", redraw_failures=True, num_envs=num_envs, **REDRAW)
+    assert tree(tmp_path / "demos") == tree(redrawn.root)
+
+
+def test_redrawing_resumes_after_an_interruption(redrawn, tmp_path, monkeypatch):
+    interrupt_after(monkeypatch, 2)
+    with pytest.raises(KeyboardInterrupt):
+        collect(tmp_path / "demos", redraw_failures=True, num_envs=1, **REDRAW)
+    monkeypatch.undo()
+    collect(tmp_path / "demos", redraw_failures=True, **REDRAW)
+    assert tree(tmp_path / "demos") == tree(redrawn.root)
+
+
+def test_redrawing_stops_if_nothing_succeeds(tmp_path):
+    with pytest.raises(RuntimeError, match=r"'reach'.*noise_scale"):
+        collect(tmp_path / "demos", "reach", episodes_per_task=1, max_steps=1, redraw_failures=True)

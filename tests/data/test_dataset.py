@@ -1,35 +1,30 @@
-"""A dataset's folder: errors for unfinished and damaged ones, files that stay as they are, pickles that never run."""
+"""A dataset on disk: errors for unfinished and damaged ones, files that never change, pickles that never run."""
 
 from __future__ import annotations
 
+import copy
 import json
 import os
+import pickle
 import shutil
 
 import numpy as np
 import pytest
-from collecting import EPISODES, STEPS, TASKS, collect, tree
+import torch
+import torch.multiprocessing as mp
+from collecting import EPISODES, STEPS, TASKS, Evil, collect, tree
 from tensordict import NonTensorData, TensorDict
+from torchrl.data import SliceSampler
 
-from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay
-from lw_torchrl.data.dataset import COLUMNS, FORMAT, FORMAT_VERSION, load_rows, read_metadata
+from lw_torchrl.data import DatasetError, LanguageWorldExperienceReplay, TaskBalancedSampler
+from lw_torchrl.data import dataset as module
+from lw_torchrl.data.dataset import COLUMNS, FORMAT, FORMAT_VERSION, MappedColumn, load_rows, read_metadata
 
 ALL = [(task, episode) for task in TASKS for episode in range(EPISODES)]
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    return collect(tmp_path_factory.mktemp("made") / "demos")
-
-
-@pytest.fixture
-def root(made, tmp_path):
-    """A copy to damage."""
-    return shutil.copytree(made.root, tmp_path / "demos")
-
-
-def refuse(root, message):
-    """Expect an error that names the folder, and no change on disk."""
+def check_error(root, message):
+    """Check that opening raises an error that names the folder, and that no file changes."""
     before = tree(root)
     with pytest.raises(DatasetError, match=message) as caught:
         LanguageWorldExperienceReplay(root)
@@ -44,36 +39,36 @@ def edit(root, change):
     path.write_text(json.dumps(metadata))
 
 
-def test_the_description_reads_back(made):
-    again = read_metadata(made.root)
-    assert again == made
+def test_metadata_are_read_as_they_were_written(dataset):
+    again = read_metadata(dataset.root)
+    assert again == dataset
     assert again.attempts == dict.fromkeys(TASKS, EPISODES)
     assert load_rows(again).batch_size == (len(ALL) * STEPS,)
 
 
-def test_tensordict_reads_the_rows_and_would_have_written_the_same(made, tmp_path):
-    rows = TensorDict.load_memmap(made.root / "data")
-    assert (rows == load_rows(made)).all()
+def test_tensordict_reads_the_rows_and_writes_the_same_files(dataset, tmp_path):
+    rows = TensorDict.load_memmap(dataset.root / "data")
+    assert (rows == load_rows(dataset)).all()
     rows.clone().memmap(tmp_path / "again")
-    assert tree(tmp_path / "again") == tree(made.root / "data")
+    assert tree(tmp_path / "again") == tree(dataset.root / "data")
 
 
 def test_a_missing_folder_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"root: no dataset folder .*nowhere.*collect_demonstrations"):
+    with pytest.raises(FileNotFoundError, match=r"root: .*nowhere.*collect_demonstrations"):
         LanguageWorldExperienceReplay(tmp_path / "nowhere")
 
 
-def test_unfinished_and_other_folders(root):
-    (root / "metadata.json").unlink()
-    refuse(root, "is not a dataset: it has no metadata.json")
-    (root / ".partial").mkdir()
-    refuse(root, "unfinished; the same collect_demonstrations resumes it")
+def test_unfinished_and_other_folders_are_errors(damaged_root):
+    (damaged_root / "metadata.json").unlink()
+    check_error(damaged_root, "is not a dataset")
+    (damaged_root / ".partial").mkdir()
+    check_error(damaged_root, "unfinished")
 
 
 @pytest.mark.parametrize(("format", "number"), [(FORMAT, FORMAT_VERSION + 1), ("minari", FORMAT_VERSION)])
-def test_another_format_or_version_is_named(root, format, number):
-    edit(root, lambda metadata: metadata.update(format=format, version=number))
-    refuse(root, f"format {format!r} version {number}.*reads {FORMAT!r} version {FORMAT_VERSION}")
+def test_another_format_or_version_is_an_error(damaged_root, format, number):
+    edit(damaged_root, lambda metadata: metadata.update(format=format, version=number))
+    check_error(damaged_root, f"format {format!r} version {number}.*reads {FORMAT!r} version {FORMAT_VERSION}")
 
 
 @pytest.mark.parametrize(
@@ -86,91 +81,202 @@ def test_another_format_or_version_is_named(root, format, number):
         lambda metadata: metadata["episodes"]["length"].__setitem__(0, STEPS - 1),
     ],
 )
-def test_damaged_metadata_are_named(root, change):
-    edit(root, change)
-    refuse(root, "metadata.json' are damaged .*; delete the folder and collect the dataset again")
+def test_damaged_metadata_are_an_error(damaged_root, change):
+    edit(damaged_root, change)
+    check_error(damaged_root, "metadata.json' are damaged .*; delete the folder")
 
 
 @pytest.mark.parametrize("damage", ["missing", "truncated", "longer", "empty"])
-def test_a_column_of_another_size_is_named(root, damage):
-    path = root / "data" / "next" / "observation.memmap"
+def test_a_column_of_another_size_is_an_error(damaged_root, damage):
+    path = damaged_root / "data" / "next" / "observation.memmap"
     content = path.read_bytes()
     path.unlink()
     if damage != "missing":
         path.write_bytes({"truncated": content[:-8], "longer": content + bytes(8), "empty": b""}[damage])
-    refuse(root, "the rows in .* are damaged")
+    check_error(damaged_root, "the rows in .* are damaged")
 
 
 @pytest.mark.parametrize("name", ["/".join(key) for key in COLUMNS])
-def test_no_bit_of_a_column_changes_unnoticed(root, name):
-    path, drawn = root / "data" / f"{name}.memmap", np.random.default_rng(sum(name.encode()))
+def test_every_changed_bit_of_a_column_is_found(damaged_root, name):
+    path, draws = damaged_root / "data" / f"{name}.memmap", np.random.default_rng(sum(name.encode()))
     content = path.read_bytes()
-    for at in {0, len(content) - 1, *drawn.integers(len(content), size=4).tolist()}:
+    for at in {0, len(content) - 1, *draws.integers(len(content), size=4).tolist()}:
         changed = bytearray(content)
-        changed[at] ^= 1 << int(drawn.integers(8))
+        changed[at] ^= 1 << int(draws.integers(8))
         path.write_bytes(changed)
         task, episode = ALL[at // (len(content) // len(ALL))]
-        with pytest.raises(DatasetError, match=f"episode {episode} of {task!r} differs from its checksum; delete"):
-            LanguageWorldExperienceReplay(root, label="executed", n_steps=2, gamma=0.9)
+        with pytest.raises(DatasetError, match=f"episode {episode} of {task!r} differs from its checksum"):
+            LanguageWorldExperienceReplay(damaged_root, label="executed", n_steps=2, gamma=0.9)
     with pytest.raises(DatasetError, match="differs from its checksum"):
-        collect(root)
-    assert len(LanguageWorldExperienceReplay(root, check=False)) == len(ALL) * STEPS
+        collect(damaged_root)
+    assert len(LanguageWorldExperienceReplay(damaged_root, check=False)) == len(ALL) * STEPS
     path.write_bytes(content)
-    LanguageWorldExperienceReplay(root).verify()
+    LanguageWorldExperienceReplay(damaged_root).verify()
 
 
-def test_only_the_shown_episodes_are_checked(root):
-    path = root / "data" / "action.memmap"
+def test_only_the_selected_episodes_are_checked(damaged_root):
+    path = damaged_root / "data" / "action.memmap"
     path.write_bytes(b"\1\2\3\4" + path.read_bytes()[4:])
-    LanguageWorldExperienceReplay(root, episodes={"push": [1, 2], "reach": 1}).verify()
+    LanguageWorldExperienceReplay(damaged_root, episodes={"push": [1, 2], "reach": 1}).verify()
     with pytest.raises(DatasetError, match="0 of 'push'"):
-        LanguageWorldExperienceReplay([root], episodes=[{"push": 1}])
+        LanguageWorldExperienceReplay([damaged_root], episodes=[{"push": 1}])
 
 
-def test_an_unchanged_dataset_is_read_once_in_a_process(root, monkeypatch):
-    read, real = [], memory_map._is_whole
-    monkeypatch.setattr(memory_map, "_is_whole", lambda info, rows: read.append(info.episode) or real(info, rows))
+def test_checksums_are_compared_once_while_the_files_do_not_change(damaged_root, monkeypatch):
+    checked, real = [], module._is_whole
+    monkeypatch.setattr(module, "_is_whole", lambda info, rows: checked.append(info.episode) or real(info, rows))
     for _ in range(3):
-        LanguageWorldExperienceReplay(root, label="executed").verify()
-    assert len(read) == len(ALL)
-    os.utime(root / "data" / "action.memmap", ns=(0, 0))
-    LanguageWorldExperienceReplay(root, episodes={"push": [1]})
-    assert len(read) == len(ALL) + 1
+        LanguageWorldExperienceReplay(damaged_root, label="executed").verify()
+    assert len(checked) == len(ALL)
+    os.utime(damaged_root / "data" / "action.memmap", ns=(0, 0))
+    LanguageWorldExperienceReplay(damaged_root, episodes={"push": [1]})
+    assert len(checked) == len(ALL) + 1
 
 
-def test_a_state_is_not_restored_over_damaged_rows(root, tmp_path):
-    LanguageWorldExperienceReplay(root, batch_size=8).dumps(tmp_path / "saved")
-    path = root / "data" / "action.memmap"
+def test_a_state_is_not_restored_over_damaged_rows(damaged_root, tmp_path):
+    LanguageWorldExperienceReplay(damaged_root, batch_size=8).dumps(tmp_path / "saved")
+    path = damaged_root / "data" / "action.memmap"
     path.write_bytes(b"\1\2\3\4" + path.read_bytes()[4:])
     with pytest.raises(DatasetError, match="differs from its checksum"):
-        LanguageWorldExperienceReplay(root, check=False).load_state_dict({})
+        LanguageWorldExperienceReplay(damaged_root, check=False).load_state_dict({})
 
 
-class Evil:
-    """Makes a folder when it is unpickled."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return (os.mkdir, (self.path,))
-
-
-def test_a_pickle_among_the_rows_is_never_executed(root, tmp_path):
+def test_a_pickle_among_the_rows_is_never_executed(damaged_root, tmp_path):
     marker = tmp_path / "executed"
-    rows = TensorDict.load_memmap(root / "data").clone()
-    rows["note"] = NonTensorData(Evil(str(marker)), batch_size=rows.batch_size)
-    shutil.rmtree(root / "data")
-    rows.memmap(root / "data")
-    assert list((root / "data").rglob("*.pickle")), "the test needs a pickle"
-    assert "note" not in LanguageWorldExperienceReplay(root)[:]
+    rows = TensorDict.load_memmap(damaged_root / "data").clone()
+    rows["note"] = NonTensorData(Evil(marker), batch_size=rows.batch_size)
+    shutil.rmtree(damaged_root / "data")
+    rows.memmap(damaged_root / "data")
+    assert list((damaged_root / "data").rglob("*.pickle")), "the test needs a pickle"
+    assert "note" not in LanguageWorldExperienceReplay(damaged_root)[:]
     assert not marker.exists()
-    TensorDict.load_memmap(root / "data", allow_pickle=True)["note"]
+    TensorDict.load_memmap(damaged_root / "data", allow_pickle=True)["note"]
     assert marker.exists(), "the pickle would have been executed"
 
 
-def test_an_action_that_is_not_finite_is_refused(root):
-    path = root / "data" / "expert_action.memmap"
+def test_an_action_that_is_not_finite_is_an_error(damaged_root):
+    path = damaged_root / "data" / "expert_action.memmap"
     path.write_bytes(np.full(path.stat().st_size // 4, np.nan, dtype=np.float32).tobytes())
-    with pytest.raises(DatasetError, match="holds an action that is NaN or infinite, for label='expert'"):
-        LanguageWorldExperienceReplay(root, check=False)
+    with pytest.raises(DatasetError, match="action that is NaN or infinite"):
+        LanguageWorldExperienceReplay(damaged_root, check=False)
+
+
+# ---- the rows of a buffer are read-only
+
+KINDS = {
+    "expert": {},
+    "unclipped": dict(label="unclipped"),
+    "executed": dict(label="executed", reward="dense"),
+    "cut": dict(label="executed", after_success=3),
+    "chosen": dict(episodes=2),
+    "n steps": dict(label="executed", n_steps=3, gamma=0.9),
+}
+
+
+def open_replay(root, kind="expert", **options):
+    defaults = dict(batch_size=8, generator=torch.Generator().manual_seed(0))
+    return LanguageWorldExperienceReplay(root, **{**defaults, **KINDS[kind], **options})
+
+
+WAYS = {
+    "all": lambda replay: replay[:],
+    "a row": lambda replay: replay[3],
+    "rows": lambda replay: replay[torch.tensor([1, 5])],
+    "a batch": lambda replay: replay.sample(),
+    "iteration": lambda replay: next(iter(replay)),
+    "the storage, all": lambda replay: replay.storage[:],
+    "a column": lambda replay: replay.storage[:].select("observation"),
+}
+
+
+@pytest.mark.filterwarnings("ignore:Got conflicting batch_sizes")
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("way", WAYS)
+def test_writes_to_rows_stay_in_memory(dataset, kind, way):
+    before = tree(dataset.root)
+    rows = WAYS[way](open_replay(dataset.root, kind))
+    for _, leaf in rows.items(True, True):
+        leaf.fill_(1)
+    rows.zero_()
+    assert all((leaf == 0).all() for leaf in rows.values(True, True))
+    assert tree(dataset.root) == before
+    assert open_replay(dataset.root, kind)[:]["observation"].any(), "another buffer shows the files"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_assigning_rows_is_an_error(dataset, kind):
+    replay, before = open_replay(dataset.root, kind), tree(dataset.root)
+    rows, row = replay[:], replay[0]
+    for index in (0, slice(None), "observation", [0, 1], torch.tensor([2]), (0,)):
+        with pytest.raises(RuntimeError, match="read-only"):
+            replay[index] = row
+    storage = replay.storage
+    for write in (
+        lambda: storage.set(0, row),
+        lambda: storage.set(slice(None), rows, set_cursor=False),
+        lambda: storage.__setitem__(0, row),
+        lambda: replay.extend(rows),
+        lambda: replay.add(row),
+        replay.empty,
+        storage._empty,
+    ):
+        with pytest.raises(RuntimeError, match=r"read-only|doesn't allow writing"):
+            write()
+    patch = dict(index=torch.tensor([0]), generation=torch.tensor([0]), patch={"observation": torch.zeros(1, 39)})
+    with pytest.raises(RuntimeError):
+        replay.update_if_present(**patch)
+    assert tree(dataset.root) == before
+    assert (replay[:] == rows).all()
+
+
+def _sum(replay, queue):
+    """Read the buffer in another process, and write to the rows."""
+    rows = replay[:]
+    total = float(rows["observation"].double().sum()), float(replay.sample()["action"].double().sum())
+    rows.zero_()
+    queue.put((*total, [type(leaf).__name__ for leaf in replay.storage[:].values(True, True)]))
+
+
+@pytest.mark.parametrize("kind", ["expert", "executed"])
+@pytest.mark.parametrize("start", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
+def test_other_processes_map_the_files_again(dataset, kind, start):
+    before = tree(dataset.root)
+    replay = open_replay(dataset.root, kind, generator=None)  # TorchRL 0.14.1 cannot spawn a buffer with a generator
+    context = mp.get_context(start)
+    queue = context.Queue()
+    process = context.Process(target=_sum, args=(replay, queue))
+    process.start()
+    total, batch, kinds = queue.get(timeout=60)
+    process.join()
+    assert process.exitcode == 0
+    assert total == float(replay[:]["observation"].double().sum())
+    assert batch != 0.0
+    assert "MappedColumn" in kinds
+    assert tree(dataset.root) == before
+
+
+@pytest.mark.parametrize("kind", ["expert", "executed"])
+def test_a_copy_of_a_buffer_is_small_and_maps_the_same_files(dataset, kind, tmp_path, monkeypatch):
+    replay = open_replay(dataset.root, kind, sampler=TaskBalancedSampler())
+    packed = pickle.dumps(replay)
+    assert len(packed) < 20_000
+    monkeypatch.chdir(tmp_path)
+    for again in (pickle.loads(packed), copy.deepcopy(replay)):
+        assert (again[:] == replay[:]).all()
+        before = tree(dataset.root)
+        again[:].zero_()
+        assert tree(dataset.root) == before
+
+
+def test_operations_on_columns_give_plain_tensors(dataset):
+    column = load_rows(dataset)["observation"]
+    assert type(column) is MappedColumn
+    for result in (column + 1, column[3], column[1:4], column.index_select(0, torch.tensor([1])), column.double()):
+        assert type(result) is torch.Tensor
+    assert column[2:4].data_ptr() == column.data_ptr() + 2 * 39 * 4
+
+
+def test_slices_of_a_whole_dataset_are_not_copied(dataset):
+    replay = open_replay(dataset.root, sampler=SliceSampler(slice_len=4, traj_key=("collector", "traj_ids")))
+    assert replay[:]["observation"].data_ptr() == replay[0:1]["observation"].data_ptr()
+    assert len(replay.sample()) == 8

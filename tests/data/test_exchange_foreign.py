@@ -1,4 +1,4 @@
-"""Other people's demonstrations as datasets: columns by their usual names, and warnings for what is missing."""
+"""Imports of datasets from elsewhere: columns by their usual names, and warnings for missing ones."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ DRAWS = np.random.default_rng(0)
 STATES = DRAWS.standard_normal((9, 39))
 ACTIONS = DRAWS.uniform(-1, 1, (9, 4)).astype(np.float32)
 LENGTHS = (4, 2, 3)
-WORDS = ("push-v3", "reach-v2-goal-observable", lw.TASKS["push"].description)
+TASK_TEXTS = ("push-v3", "reach-v2-goal-observable", lw.TASKS["push"].description)
 
 
-def lerobot(folder, words=WORDS, version="v2.1", **changed):
+def lerobot(folder, tasks=TASK_TEXTS, version="v2.1", **changed):
     """A LeRobot dataset of three episodes: push, reach, push; version 2 has a file for each."""
     columns = {"observation.environment_state": list(STATES), "observation.state": list(STATES[:, :4])}
     columns |= {"action": list(ACTIONS), "next.success": [False] * 8 + [True]}
@@ -33,7 +33,7 @@ def lerobot(folder, words=WORDS, version="v2.1", **changed):
     (folder / "data" / "chunk-000").mkdir(parents=True)
     info = {"codebase_version": version, "total_frames": 9, "features": {}}
     (folder / "meta" / "info.json").write_text(json.dumps(info))
-    tasks = [{"task_index": number, "task": text} for number, text in enumerate(words)]
+    tasks = [{"task_index": number, "task": text} for number, text in enumerate(tasks)]
     if version.startswith("v2"):
         (folder / "meta" / "tasks.jsonl").write_text("\n".join(map(json.dumps, tasks)))
         for number, start in enumerate((0, 4, 6)):
@@ -51,10 +51,13 @@ def imported(source, out, warned, **options):
 
 
 @pytest.mark.parametrize("version", ["v2.0", "v2.1", "v3.0"])
-def test_lerobots_datasets(tmp_path, version):
+def test_lerobot_datasets_are_imported(tmp_path, version):
     lacks = r"lacks the observation after the last.*; a dense reward"
     made = imported(lerobot(tmp_path / "theirs", version=version), tmp_path / "out", lacks)
-    assert [(one.task, one.length, one.success) for one in made.episodes] == [("push", 4, False), ("reach", 2, False)]
+    assert [(info.task, info.length, info.success) for info in made.episodes] == [
+        ("push", 4, False),
+        ("reach", 2, False),
+    ]
     assert (made.config.behaviour, made.config.seed, made.config.max_steps) == ("imported", -1, 4)
     rows = load_rows(made)
     np.testing.assert_array_equal(rows["observation"], STATES[:6].astype(np.float32))
@@ -72,19 +75,19 @@ def test_lerobots_datasets(tmp_path, version):
     assert "NaN" not in (out / "meta" / "stats.json").read_text()
 
 
-def test_tasks_in_their_words_and_numbers_of_episodes(tmp_path):
-    source = lerobot(tmp_path / "theirs", words=("shove", "reach", "shove"))
-    with pytest.raises(ValueError, match=r"task must be one of .*, got 'shove'.*; or map it with task="):
+def test_tasks_are_mapped_and_episodes_counted(tmp_path):
+    source = lerobot(tmp_path / "theirs", tasks=("shove", "reach", "shove"))
+    with pytest.raises(ValueError, match=r"task .* 'shove'.*; or map it"):
         lw.import_dataset(source, tmp_path / "out")
-    words = {"shove": "push"}
-    with pytest.raises(ValueError, match=r"give episodes_per_task, 1 for example: it holds 2 of push, 1 of reach"):
-        lw.import_dataset(source, tmp_path / "out", task=words)
-    with pytest.raises(ValueError, match="episodes_per_task must be at most 1, as 'reach' has, got 2"):
-        lw.import_dataset(source, tmp_path / "out", task=words, episodes_per_task=2)
-    with pytest.raises(ValueError, match="task must be one task, 'MT10' is a set of 10"):
+    mapping = {"shove": "push"}
+    with pytest.raises(ValueError, match=r"episodes_per_task, .* 2 of push, 1 of reach"):
+        lw.import_dataset(source, tmp_path / "out", task=mapping)
+    with pytest.raises(ValueError, match="episodes_per_task must be at most 1"):
+        lw.import_dataset(source, tmp_path / "out", task=mapping, episodes_per_task=2)
+    with pytest.raises(ValueError, match="task must be one task"):
         lw.import_dataset(source, tmp_path / "out", task="MT10")
     made = imported(source, tmp_path / "out", "lacks", task="push", episodes_per_task=3, behaviour="friend")
-    assert [one.length for one in made.episodes] == [*LENGTHS]
+    assert [info.length for info in made.episodes] == [*LENGTHS]
     assert (made.success_rate, made.config.behaviour) == ({"push": 1 / 3}, "friend")
 
 
@@ -98,23 +101,23 @@ def test_actions_beyond_one_are_clipped(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"action": None}, "needs a column action of 4 numbers, as 'metaworld' has; observation.*state has 4"),
-        ({"observation.environment_state": None}, "needs a column observation of 39 .*observation.state has 4"),
-        ({"action": [[0.0] * 4] * 8 + [[float("nan")] * 4]}, "action must hold finite numbers"),
-        ({"action": [[0.0] * 4] * 8 + [None]}, "action must hold equally many numbers in each row"),
-        ({"action": [[0.0] * 4] * 8 + [[0.0] * 3]}, "action must hold equally many numbers in each row"),
-        ({"next.success": [0.0] * 8 + [0.3]}, "next.success must hold booleans, or 0 and 1, found 0.3"),
-        ({"task_index": [0, 0, 0, 1, 1, 1, 2, 2, 2]}, "task_index must be the same in all rows of an episode"),
+        ({"action": None}, "needs a column action of 4 numbers"),
+        ({"observation.environment_state": None}, r"needs a column observation of 39 .* observation.state \(4\)"),
+        ({"action": [[0.0] * 4] * 8 + [[float("nan")] * 4]}, "action holds NaN"),
+        ({"action": [[0.0] * 4] * 8 + [None]}, "action must hold equally many numbers"),
+        ({"action": [[0.0] * 4] * 8 + [[0.0] * 3]}, "action must hold equally many numbers"),
+        ({"next.success": [0.0] * 8 + [0.3]}, "next.success must hold booleans"),
+        ({"task_index": [0, 0, 0, 1, 1, 1, 2, 2, 2]}, "task_index must be the same"),
     ],
 )
-def test_what_cannot_be_imported_is_named(tmp_path, changed, message):
+def test_unsuitable_columns_are_errors(tmp_path, changed, message):
     source = lerobot(tmp_path / "theirs", version="v3.0", **changed)
     with pytest.raises(ExchangeError, match=f"theirs': .*{message}"):
         lw.import_dataset(source, tmp_path / "out", episodes_per_task=1)
-    assert [one.name for one in tmp_path.iterdir()] == ["theirs"]
+    assert [path.name for path in tmp_path.iterdir()] == ["theirs"]
 
 
-def test_unused_columns_and_the_order_of_rows_do_not_matter(tmp_path):
+def test_unused_columns_and_the_order_of_rows_change_nothing(tmp_path):
     more = {"subtask_index": [None, *range(8)], "tags": [[1], []] * 4 + [[2]], "comment": ["a"] * 8 + [None]}
     made = imported(lerobot(tmp_path / "a", version="v3.0", **more), tmp_path / "out", "lacks")
     shuffled = lerobot(tmp_path / "b", version="v3.0")
@@ -126,7 +129,7 @@ def test_unused_columns_and_the_order_of_rows_do_not_matter(tmp_path):
 
 
 def robomimic(path, names=("demo_0",), rows=9, attributes=(), group_attributes=()):
-    """A file in robomimic's layout, of the same episode under each name, numbered by its reward."""
+    """Write a file in robomimic's layout: the same episode under each name, numbered by its reward."""
     h5py = pytest.importorskip("h5py")
     with h5py.File(path, "w") as file:
         file.create_group("data").attrs.update(dict(attributes))
@@ -148,7 +151,7 @@ def robomimic(path, names=("demo_0",), rows=9, attributes=(), group_attributes=(
         {"problem_info": json.dumps({"language_instruction": "push"}), "env_args": json.dumps({"env_name": "Libero"})},
     ],
 )
-def test_robomimics_and_liberos_hdf5(tmp_path, name, attributes):
+def test_hdf5_of_robomimic_and_libero_is_imported(tmp_path, name, attributes):
     source = robomimic(tmp_path / "a.hdf5", [name], attributes=attributes)
     made = imported(source, tmp_path / "out", "lacks the observation after the last .*; success")
     rows = load_rows(made)
@@ -157,13 +160,13 @@ def test_robomimics_and_liberos_hdf5(tmp_path, name, attributes):
     np.testing.assert_array_equal(rows["action"], ACTIONS)
 
 
-def test_robomimics_observation_after_the_last_action(tmp_path):
+def test_robomimic_may_hold_the_observation_after_the_last_action(tmp_path):
     made = imported(robomimic(tmp_path / "a.hdf5", rows=10), tmp_path / "out", "lacks success", task="push")
     after = np.resize(STATES, (10, 39))[1:]
     np.testing.assert_array_equal(load_rows(made)["next", "observation"], after.astype(np.float32))
 
 
-def test_robomimics_episodes_are_in_the_order_of_their_numbers(tmp_path):
+def test_robomimic_episodes_are_sorted_by_number(tmp_path):
     for file, first in (("part-10.hdf5", 11), ("part-2.hdf5", 0)):
         robomimic(tmp_path / file, [f"demo_{number}" for number in range(first, first + 11)])
     made = imported(tmp_path, tmp_path / "out", "lacks", task="push", episodes_per_task=12)
@@ -171,18 +174,18 @@ def test_robomimics_episodes_are_in_the_order_of_their_numbers(tmp_path):
     assert rewards == [*range(2, 13), 2]
 
 
-def test_other_hdf5_is_named(tmp_path):
+def test_other_hdf5_is_an_error_with_the_path(tmp_path):
     h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "flat.hdf5", "w") as file:
         file["observations"] = STATES
-    with pytest.raises(ExchangeError, match=r"flat.hdf5 has no group data/demo_0"):
+    with pytest.raises(ExchangeError, match=r"flat\.hdf5 has no group"):
         lw.import_dataset(tmp_path / "flat.hdf5", tmp_path / "out")
     (tmp_path / "broken.hdf5").write_bytes(b"no rows at all")
-    with pytest.raises(ExchangeError, match=r"broken.hdf5' is damaged"):
+    with pytest.raises(ExchangeError, match=r"broken\.hdf5'"):
         lw.import_dataset(tmp_path / "broken.hdf5", tmp_path / "out")
 
 
-def test_minaris_datasets(tmp_path, monkeypatch):
+def test_minari_datasets_are_imported(tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
     from gymnasium.spaces import Box
     from minari.data_collector import EpisodeBuffer

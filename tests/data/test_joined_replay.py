@@ -1,4 +1,4 @@
-"""The replay buffer over several datasets and chosen episodes: which rows, and which label."""
+"""The replay buffer over several datasets and chosen episodes: rows, labels, descriptions."""
 
 from __future__ import annotations
 
@@ -6,49 +6,36 @@ import json
 
 import pytest
 import torch
+from collecting import collect
 
-from lw_torchrl.data import (
-    CoLearningSampler,
-    JoinedDemonstrations,
-    LanguageWorldExperienceReplay,
-    collect_demonstrations,
-)
+import lw_torchrl as lw
+from lw_torchrl.data import CoLearningSampler, JoinedDemonstrations, LanguageWorldExperienceReplay
 from lw_torchrl.data.dataset import load_rows
-from lw_torchrl.language.plan_files import load_plans
-from lw_torchrl.language.tasks import task_id
-from lw_torchrl.modules import PlanConditionedActor
 from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
-from lw_torchrl.transforms import QAFTransform
 
 STEPS = 50
+PLANS = lw.load_plans("MT10")
 
 
 @pytest.fixture(scope="module")
 def base(tmp_path_factory):
     """Two demonstrations each of button-press-topdown, push and reach."""
-    return collect_demonstrations(
-        ["reach", "push", "button-press-topdown"],
-        episodes_per_task=2,
-        root=tmp_path_factory.mktemp("made") / "base",
-        max_steps=STEPS,
-        noise_scale=(0, 0.3),
-        progress=False,
-    )
+    tasks = ["reach", "push", "button-press-topdown"]
+    root = tmp_path_factory.mktemp("made") / "base"
+    return collect(root, tasks, episodes_per_task=2, seed=0, max_steps=STEPS, noise_scale=(0, 0.3))
 
 
 @pytest.fixture(scope="module")
 def target(tmp_path_factory):
-    """Four of reach, on another seed."""
+    """Four demonstrations of reach, with another seed."""
     root = tmp_path_factory.mktemp("made") / "target"
-    made = collect_demonstrations(
-        "reach", episodes_per_task=4, root=root, max_steps=STEPS, seed=1, noise_scale=(0, 0.2), progress=False
-    )
-    assert {e.success for e in made.episodes} == {True, False}, "the tests want successes and failures"
-    return made
+    dataset = collect(root, "reach", episodes_per_task=4, seed=1, max_steps=STEPS, noise_scale=(0, 0.2))
+    assert {e.success for e in dataset.episodes} == {True, False}, "the tests need successes and failures"
+    return dataset
 
 
 def expected_rows(part, episodes, after=None):
-    """The rows of a dataset's episodes, by a loop over steps."""
+    """Return the rows of a dataset's episodes and their ends, by a loop over steps."""
     rows, kept, ends = load_rows(part), [], []
     for number, episode in enumerate(part.episodes):
         if (episode.task, episode.episode) not in episodes:
@@ -69,7 +56,7 @@ def everything(part):
 
 @pytest.mark.parametrize("label", ["expert", "unclipped", "executed"])
 @pytest.mark.parametrize("after", [None, 0, 5, 20])
-def test_labels_and_dropped_steps_are_those_of_each_dataset(base, target, label, after):
+def test_rows_are_those_of_each_dataset(base, target, label, after):
     replay = LanguageWorldExperienceReplay(
         [base.root, target.root], episodes=[None, {"reach": [1, 3]}], label=label, after_success=after
     )
@@ -87,16 +74,16 @@ def test_labels_and_dropped_steps_are_those_of_each_dataset(base, target, label,
     expected["behaviour"] = torch.zeros(len(expected), dtype=torch.int64)
     expected["dataset"] = torch.tensor([0] * len(first) + [1] * len(second))
     expected["is_demonstration"] = torch.ones(len(expected), dtype=torch.bool)
-    found = replay[:]
+    rows = replay[:]
     assert len(replay) == len(expected)
     assert replay.behaviours == ("noisy",)
-    assert set(found.keys(True, True)) == set(expected.keys(True, True))
-    assert (found == expected).all()
-    assert found.device == LanguageWorldExperienceReplay(base.root)[:].device
+    assert set(rows.keys(True, True)) == set(expected.keys(True, True))
+    assert (rows == expected).all()
+    assert rows.device == LanguageWorldExperienceReplay(base.root)[:].device
 
 
 @pytest.mark.parametrize(
-    ("choice", "wanted"),
+    ("choice", "episodes"),
     [
         (1, [("button-press-topdown", 0), ("push", 0), ("reach", 0)]),
         ({"reach": 1}, [("reach", 0)]),
@@ -104,92 +91,89 @@ def test_labels_and_dropped_steps_are_those_of_each_dataset(base, target, label,
         ({"reach": (1, 0)}, [("reach", 0), ("reach", 1)]),
     ],
 )
-def test_episodes_are_chosen_from_one_dataset(base, choice, wanted):
+def test_episodes_are_chosen_from_one_dataset(base, choice, episodes):
     replay = LanguageWorldExperienceReplay(base.root, episodes=choice, label="executed")
-    assert [(e.task, e.episode) for e in replay.demonstrations.episodes] == wanted
-    assert (
-        replay[:].exclude("behaviour", "is_demonstration", ("next", "reward")) == expected_rows(base, wanted)[0]
-    ).all()
-    assert replay.tasks == tuple(sorted({task for task, _ in wanted}))
-    assert replay.demonstrations.num_steps == len(replay) == STEPS * len(wanted)
+    assert [(e.task, e.episode) for e in replay.demonstrations.episodes] == episodes
+    rows = replay[:].exclude("behaviour", "is_demonstration", ("next", "reward"))
+    assert (rows == expected_rows(base, episodes)[0]).all()
+    assert replay.tasks == tuple(sorted({task for task, _ in episodes}))
+    assert replay.demonstrations.num_steps == len(replay) == STEPS * len(episodes)
     assert replay.data_path_root == base.root
     (part,) = replay.demonstrations.parts
     assert part.success_rate.keys() == set(replay.tasks)
 
 
-def test_one_demonstration_beside_the_base_tasks(base, target):
+def test_one_demonstration_mixes_with_the_base_tasks(base, target):
     """The paper's one-shot minibatch, where the target is a base task."""
     replay = LanguageWorldExperienceReplay(
         [base.root, target.root],
         episodes=[None, {"reach": [1]}],
         batch_size=40,
         sampler=CoLearningSampler("reach"),
-        transform=QAFTransform(load_plans("MT10")),
+        transform=lw.QAFTransform(PLANS),
         after_success=20,
     )
     demonstration, _ = expected_rows(target, [("reach", 1)], 20)
-    seen = []
+    batches = []
     for _ in range(20):
         batch = replay.sample()
         assert batch["task_id"].unique(return_counts=True)[1].tolist() == [10, 10, 20]
-        assert torch.equal(batch["is_target"], batch["task_id"] == task_id("reach"))
+        assert torch.equal(batch["is_target"], batch["task_id"] == lw.task_id("reach"))
         assert batch["qaf"].shape[0] == 40
-        seen.append(batch[batch["is_target"]])
-    seen = torch.cat(seen)
+        batches.append(batch[batch["is_target"]])
+    seen = torch.cat(batches)
     assert seen["episode"].unique().tolist() == [1]
     assert seen["collector", "traj_ids"].unique().tolist() == [6 + 1]
     assert torch.equal(seen["observation"].unique(dim=0), demonstration["observation"].unique(dim=0))
 
 
-def test_a_policy_trains_on_joined_data_and_a_checkpoint_knows_the_episodes(base, target, tmp_path):
-    plans = load_plans("MT10")
-
+def test_a_checkpoint_resumes_only_with_the_same_episodes(base, target, tmp_path):
     def trainer(number):
         replay = LanguageWorldExperienceReplay(
             [base.root, target.root],
             episodes=[None, {"reach": [number]}],
             sampler=CoLearningSampler("reach"),
-            transform=QAFTransform(plans),
+            transform=lw.QAFTransform(PLANS),
         )
         config = BehavioralCloningConfig(steps=3, batch_size=8)
-        actor = PlanConditionedActor(plans)
+        actor = lw.PlanConditionedActor(PLANS)
         return BehavioralCloningTrainer(actor, replay, config, checkpoint=tmp_path / "one.safetensors", progress=False)
 
     assert trainer(1).train() < 2
     assert trainer(1).steps == 3
-    with pytest.raises(ValueError, match="its data differs in episodes"):
+    with pytest.raises(ValueError, match="episodes"):
         trainer(2)
 
 
-def test_it_describes_its_parts(base, target):
+def test_the_description_names_datasets_and_episodes(base, target):
     replay = LanguageWorldExperienceReplay([base.root, str(target.root)], episodes=[1, {"reach": [2, 0]}])
-    found = replay.demonstrations
-    assert isinstance(found, JoinedDemonstrations)
-    assert [part.root for part in found.parts] == list(replay.roots) == [base.root, target.root]
-    assert found.config.episodes == ({"button-press-topdown": [0], "push": [0], "reach": [0]}, {"reach": [0, 2]})
-    assert json.loads(json.dumps(found.config.to_json()))["parts"][0] == base.config.to_json()
+    joined = replay.demonstrations
+    assert isinstance(joined, JoinedDemonstrations)
+    assert [part.root for part in joined.parts] == list(replay.roots) == [base.root, target.root]
+    assert joined.config.episodes == ({"button-press-topdown": [0], "push": [0], "reach": [0]}, {"reach": [0, 2]})
+    assert json.loads(json.dumps(joined.config.to_json()))["parts"][0] == base.config.to_json()
     for path in ("data_path_root", "data_path"):
-        with pytest.raises(ValueError, match="joins 2 datasets; see its roots"):
+        with pytest.raises(ValueError, match="joins 2 datasets"):
             getattr(replay, path)
 
 
 @pytest.mark.parametrize(
     ("choice", "message"),
     [
-        ({"pusj": 1}, "episodes: task must be one of .* got 'pusj'; did you mean 'push'"),
-        ({"push": 3}, r"episodes\['push'\]: the dataset has 2 episodes of 'push', got 3"),
-        ({"push": [0, 7]}, r"episodes\['push'\]: the dataset holds the episodes 0, 1, got 7"),
-        ({"push": []}, r"episodes\['push'\] must name at least one episode"),
+        ({"pusj": 1}, r"episodes: task .* did you mean 'push'"),
+        ({"push": 3}, r"episodes\['push'\].* 2 episodes"),
+        ({"push": [0, 7]}, r"episodes\['push'\].* got \[7\]"),
+        ({"push": []}, r"episodes\['push'\]"),
     ],
 )
-def test_wrong_choices_are_named(base, choice, message):
+def test_wrong_choices_of_episodes_are_errors(base, choice, message):
     with pytest.raises(ValueError, match=message):
         LanguageWorldExperienceReplay(base.root, episodes=choice)
 
 
-def test_choices_for_several_folders_are_a_list(base, target):
+def test_several_folders_need_a_list_of_choices(base, target):
     for episodes in ([None], {"push": 1}, 1):
-        with pytest.raises(ValueError, match="episodes must be a list with one choice for each of the 2 folders"):
+        with pytest.raises(ValueError, match="episodes must be a list of 2 choices"):
             LanguageWorldExperienceReplay([base.root, target.root], episodes=episodes)
-    with pytest.raises(ValueError, match=r"episodes\[1\]: task must be one of 'reach', got 'push'"):
+    with pytest.raises(ValueError, match=r"episodes\[1\]: task"):
         LanguageWorldExperienceReplay([base.root, target.root], episodes=[None, {"push": 1}])

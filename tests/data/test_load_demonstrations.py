@@ -1,10 +1,10 @@
-"""load_demonstrations: rows for TorchRL's own buffers, which refuse nothing that TorchRL's tools ask for."""
+"""load_demonstrations: rows for TorchRL's own buffers and tools."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from collecting import collect, tree
+from collecting import tree
 from tensordict import TensorDict
 from torch.utils.data import DataLoader
 from torchrl.data import (
@@ -23,10 +23,9 @@ from lw_torchrl.data import ROLLOUT
 from lw_torchrl.data.dataset import MappedColumn
 
 
-@pytest.fixture(scope="module")
-def roots(tmp_path_factory):
-    root = tmp_path_factory.mktemp("made")
-    return [collect(root / "a").root, collect(root / "b", seed=6).root]
+@pytest.fixture
+def roots(dataset, other_dataset):
+    return [dataset.root, other_dataset.root]
 
 
 def open_replay(roots, **options):
@@ -52,20 +51,7 @@ def test_several_folders_are_concatenated(roots):
     assert len(ids.unique_consecutive()) == len(ids.unique()) == sum(len(p["episode"].unique()) * 2 for p in parts)
 
 
-@pytest.mark.parametrize("damage", ["a byte", "shorter", "no metadata"])
-def test_a_damaged_or_unfinished_dataset_is_refused(tmp_path, damage):
-    root = collect(tmp_path / "demos").root
-    path = root / "data" / "action.memmap"
-    content = path.read_bytes()
-    if damage == "no metadata":
-        (root / "metadata.json").unlink()
-    else:
-        path.write_bytes(content[:-4] if damage == "shorter" else bytes([content[0] ^ 1]) + content[1:])
-    with pytest.raises(lw.data.DatasetError, match="is not a dataset" if damage == "no metadata" else "damaged"):
-        lw.load_demonstrations(root)
-
-
-def test_torchrls_buffer_balances_tasks_and_mixes_a_target(roots):
+def test_rows_work_in_torchrls_own_buffer(roots):
     rows = lw.load_demonstrations(roots, episodes=[None, {"push": 1}])
     for sampler in (lw.TaskBalancedSampler(), lw.CoLearningSampler("push")):
         batch = TensorDictReplayBuffer(storage=TensorStorage(rows), sampler=sampler, batch_size=8).sample()
@@ -73,10 +59,10 @@ def test_torchrls_buffer_balances_tasks_and_mixes_a_target(roots):
     assert batch["dataset"][batch["is_target"]].unique().tolist() == [1]
 
 
-def test_a_loader_takes_the_rows(roots):
+def test_rows_work_in_a_data_loader(roots):
     rows = lw.load_demonstrations(roots[0])
-    (seen,) = DataLoader(rows, batch_size=len(rows), shuffle=True, collate_fn=lambda batch: batch)
-    assert torch.equal(seen["observation"].sort(0).values, rows["observation"].sort(0).values)
+    (batch,) = DataLoader(rows, batch_size=len(rows), shuffle=True, collate_fn=lambda batch: batch)
+    assert torch.equal(batch["observation"].sort(0).values, rows["observation"].sort(0).values)
     assert len(next(iter(DataLoader(rows, batch_size=4, collate_fn=lambda batch: batch)))) == 4
 
 
@@ -84,7 +70,7 @@ def double(batch):
     return batch.set("twice", 2 * batch["action"])
 
 
-def test_a_transform_is_any_function_and_a_sampler_a_factory(roots):
+def test_transforms_may_be_functions_and_samplers_factories(roots):
     appended = open_replay(roots)
     appended.append_transform(double)
     for replay in (open_replay(roots, transform=double), open_replay(roots, transform=double, sampler=RandomSampler)):
@@ -98,12 +84,12 @@ def test_a_transform_is_any_function_and_a_sampler_a_factory(roots):
 
 
 @pytest.mark.filterwarnings("ignore:Got conflicting batch_sizes")
-def test_torchrls_tools_draw_odd_batches_from_a_balanced_buffer(roots):
+def test_torchrls_tools_draw_batches_of_any_size(roots):
     replay = open_replay(roots, sampler=lw.TaskBalancedSampler())
     assert replay.sample(1).shape == (1,)
     filled = prefill_replay_buffer(TensorDictReplayBuffer(storage=LazyTensorStorage(200)), replay, n_samples=51)
     assert len(filled) == 51
-    with pytest.raises(ValueError, match="batch_size must be a multiple of 2, the number of tasks, got 1; the nearest"):
+    with pytest.raises(ValueError, match="batch_size"):
         open_replay(roots, sampler=lw.TaskBalancedSampler(exact=True)).sample(1)
 
 
@@ -137,10 +123,10 @@ def test_rows_join_with_rollouts_of_the_environment(roots, rollout, n_steps):
     assert hook.sample(rows).shape == (8,)
 
 
-def test_chosen_keys_are_all_there_is(roots):
+def test_rows_have_only_the_chosen_keys(roots):
     rows = lw.load_demonstrations(roots, keys=["action", "is_demonstration"])
     assert set(rows.keys(True, True)) == {"action", "is_demonstration"}
-    with pytest.raises(ValueError, match=r"keys must be one of .* got 'next/reward'"):
+    with pytest.raises(ValueError, match=r"keys .* got 'next/reward'"):
         lw.load_demonstrations(roots, keys=[("next", "reward")])
-    with pytest.raises(ValueError, match="keys='rollout' need label='executed', got 'expert'"):
+    with pytest.raises(ValueError, match="keys='rollout' need label"):
         lw.load_demonstrations(roots, keys="rollout")

@@ -1,4 +1,4 @@
-"""n steps ahead: TorchRL's own numbers, flags that belong to the observation beside them, no episode crossed."""
+"""n_step_returns: TorchRL's own numbers, flags of the same row as the observation, and no step across episodes."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from torchrl.objectives.value import TD0Estimator
 from lw_torchrl.data import LanguageWorldExperienceReplay, collect_demonstrations, n_step_returns
 
 
-def own_rows(lengths):
-    """Trajectories of these lengths, one after another."""
+def make_rows(lengths):
+    """Return trajectories of these lengths, one after another."""
     total = sum(lengths)
     observation = torch.arange(total, dtype=torch.float32)[:, None] + torch.zeros(total, 2)
     ids = torch.repeat_interleave(torch.tensor(lengths))
@@ -33,11 +33,11 @@ steps = st.integers(2, 7)
 gammas = st.sampled_from([0.5, 0.97, 1.0])
 
 
-def torchrls(rows, n_steps, gamma, flags=()):
-    """What TorchRL's MultiStep makes of trajectories, each (T,) rows, by itself."""
+def torchrls(rows, n_steps, gamma):
+    """Return TorchRL's n-step returns of trajectories, each (T,) rows."""
     oracle = MultiStep(gamma, n_steps)
-    oracle.done_keys = flags  # or else done and terminated would stay those of the first step
-    return torch.cat([oracle(one.unsqueeze(0))[0] for one in rows])
+    oracle.done_keys = ()  # otherwise done and terminated would stay those of the first step
+    return torch.cat([oracle(trajectory.unsqueeze(0))[0] for trajectory in rows])
 
 
 def trajectories(rows):
@@ -46,38 +46,38 @@ def trajectories(rows):
     return [rows[a:b] for a, b in pairwise(cuts)]
 
 
-def check(found, expected):
+def check(actual, expected):
     for key in (*(("next", key) for key in ("observation", "done", "terminated", "truncated")), "steps_to_next_obs"):
-        assert torch.equal(found[key], expected[key]), key
-    torch.testing.assert_close(found["next", "reward"], expected["next", "reward"], rtol=5e-7, atol=1e-6)
+        assert torch.equal(actual[key], expected[key]), key
+    torch.testing.assert_close(actual["next", "reward"], expected["next", "reward"], rtol=5e-7, atol=1e-6)
     for key in ("observation", "action"):
-        assert torch.equal(found[key], expected[key])
+        assert torch.equal(actual[key], expected[key])
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.integers(1, 9), min_size=1, max_size=5), steps, gammas)
-def test_they_are_torchrls(lengths, n_steps, gamma):
-    rows = own_rows(lengths)
+def test_n_step_returns_equal_torchrls(lengths, n_steps, gamma):
+    rows = make_rows(lengths)
     check(n_step_returns(rows, n_steps, gamma), torchrls(trajectories(rows), n_steps, gamma))
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(1, 4), st.integers(1, 9), steps, st.integers(0, 99))
-def test_a_collectors_batch_is_cut_at_its_end(envs, time, n_steps, seed):
+def test_a_batch_of_a_collector_is_cut_at_its_end(envs, time, n_steps, seed):
     """(N, T) rows, with and without the ids of trajectories."""
     ends = torch.rand(envs, time, generator=torch.Generator().manual_seed(seed)) < 0.3
-    rows = own_rows([time] * envs).reshape(envs, time)
+    rows = make_rows([time] * envs).reshape(envs, time)
     rows["next", "done"] = ends.unsqueeze(-1)
     rows["collector", "traj_ids"] = torch.arange(envs)[:, None] * time + ends.cumsum(1) - ends.long()
-    found = n_step_returns(rows, n_steps, 0.9)
-    assert found.shape == rows.shape
-    check(found.reshape(-1), torchrls([one for row in rows for one in trajectories(row)], n_steps, 0.9))
-    assert (n_step_returns(rows.exclude("collector"), n_steps, 0.9) == found.exclude("collector")).all()
+    ahead = n_step_returns(rows, n_steps, 0.9)
+    assert ahead.shape == rows.shape
+    check(ahead.reshape(-1), torchrls([trajectory for row in rows for trajectory in trajectories(row)], n_steps, 0.9))
+    assert (n_step_returns(rows.exclude("collector"), n_steps, 0.9) == ahead.exclude("collector")).all()
 
 
-def test_torchrls_own_flags_would_bootstrap_from_the_end():
-    """Why done and terminated go with the observation, and why TorchRL's transform is refused."""
-    rows = own_rows([4])
+def test_torchrls_flags_would_bootstrap_from_the_end():
+    """Show why done and terminated follow the observation, and why TorchRL's transform is an error."""
+    rows = make_rows([4])
     rows["next", "terminated"][-1], rows["next", "truncated"][-1] = True, False
     theirs = MultiStep(0.9, 3)(rows.unsqueeze(0))[0]
     assert torch.equal(theirs["next", "observation"][1], rows["next", "observation"][3])
@@ -87,12 +87,12 @@ def test_torchrls_own_flags_would_bootstrap_from_the_end():
 
 
 def test_a_value_estimator_discounts_by_the_steps():
-    rows = own_rows([5])
-    found = n_step_returns(rows, 3, 0.9)
+    rows = make_rows([5])
+    ahead = n_step_returns(rows, 3, 0.9)
     value = ValueOperator(torch.nn.Linear(2, 1), in_keys=["observation"])
-    target = TD0Estimator(gamma=0.9, value_network=value).value_estimate(found)
-    after = value.module(found["next", "observation"])
-    expected = found["next", "reward"] + 0.9 ** torch.tensor([[3.0], [3.0], [3.0], [2.0], [1.0]]) * after
+    target = TD0Estimator(gamma=0.9, value_network=value).value_estimate(ahead)
+    after = value.module(ahead["next", "observation"])
+    expected = ahead["next", "reward"] + 0.9 ** torch.tensor([[3.0], [3.0], [3.0], [2.0], [1.0]]) * after
     torch.testing.assert_close(target, expected.detach())
 
 
@@ -104,19 +104,17 @@ def root(tmp_path_factory):
 
 
 @pytest.mark.parametrize("after", [None, 4])
-def test_of_a_dataset_they_end_with_the_episode_and_where_it_is_cut(root, after):
+def test_n_steps_of_a_dataset_end_with_the_episode(root, after):
     options = dict(label="executed", reward="dense", after_success=after)
     plain = LanguageWorldExperienceReplay(root, **options)[:]
-    found = LanguageWorldExperienceReplay(root, n_steps=5, gamma=0.99, **options)[:]
-    check(found, torchrls(trajectories(plain), 5, 0.99))
-    assert found["next", "done"].sum() == 15
-    assert torch.equal(found["task_id"], found["next", "task_id"])
+    ahead = LanguageWorldExperienceReplay(root, n_steps=5, gamma=0.99, **options)[:]
+    check(ahead, torchrls(trajectories(plain), 5, 0.99))
+    assert ahead["next", "done"].sum() == 15
+    assert torch.equal(ahead["task_id"], ahead["next", "task_id"])
 
 
 def test_n_steps_need_a_discount_and_executed_actions(root):
     with pytest.raises(ValueError, match="n_steps=3 needs gamma"):
         LanguageWorldExperienceReplay(root, label="executed", n_steps=3)
-    with pytest.raises(
-        ValueError, match="n_steps, terminate_on_success and keys='rollout' need label='executed', got 'expert'"
-    ):
+    with pytest.raises(ValueError, match=r"n_steps, .* need label='executed'"):
         LanguageWorldExperienceReplay(root, n_steps=3, gamma=0.9)

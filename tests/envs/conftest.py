@@ -1,4 +1,4 @@
-"""The environment that the tests of its steps share, on each engine."""
+"""The environment that several test files step, on each engine."""
 
 from __future__ import annotations
 
@@ -21,5 +21,5 @@ def env(request) -> Iterator[lw.LanguageWorldEnv]:
 
 @pytest.fixture(scope="module", params=["plain", "transformed"])
 def any_env(request, env, plans) -> lw.LanguageWorldEnv | TransformedEnv:
-    """The same environment, as it is and under a QAFTransform."""
+    """The same environment, plain and with a QAFTransform."""
     return env if request.param == "plain" else TransformedEnv(env, lw.QAFTransform({t: plans[t] for t in FEW}))

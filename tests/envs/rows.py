@@ -1,4 +1,4 @@
-"""Six rows of three tasks, and what the tests of LanguageWorldEnv do with them."""
+"""Six rows of three tasks, and helpers that step them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STATE = ("observation", "task_id", "episode", "success", "fault")
 
 
 def actions_of(task: int, episode: int, steps: int) -> Tensor:
-    """(steps, 4) float32 in [-1, 1], random, of one episode."""
+    """Return random actions for one episode, (steps, 4) float32 in [-1, 1]."""
     return torch.from_numpy(np.random.default_rng([task, episode]).uniform(-1, 1, (steps, 4)).astype(np.float32))
 
 
@@ -25,29 +25,29 @@ def row_actions(state: TensorDictBase, step: int) -> Tensor:
 
 
 def advance(env, state: TensorDictBase, action: Tensor, **more: Tensor) -> TensorDictBase:
-    """The state after ``action``; the caller's tensors stay as they are."""
+    """Return the state after ``action``; the caller's tensors do not change."""
     return env.step(state.select(*STATE).update({"action": action.clone(), **more}))["next"]
 
 
 def trajectories(env, steps: int, state: TensorDictBase | None = None) -> dict[tuple[int, int], dict[str, Tensor]]:
-    """(task_id, episode) to what each of its steps gave, the reset first, when every episode has its own actions."""
+    """Run every episode with its own actions; return (task_id, episode) to its observations, successes and rewards."""
     state = env.reset() if state is None else state
     states = [state.select(*STATE)]
     for step in range(steps):
         state = advance(env, state, row_actions(state, step))
         states.append(state.select(*STATE, "reward", "done"))
-    found = {}
+    episodes = {}
     for row, key in enumerate(zip(state["task_id"].tolist(), state["episode"].tolist(), strict=True)):
-        found[key] = {
+        episodes[key] = {
             "observation": torch.stack([s["observation"][row] for s in states]),
             "success": torch.stack([s["success"][row] for s in states]),
             "reward": torch.stack([s["reward"][row] for s in states[1:]]),
         }
-    return found
+    return episodes
 
 
 def same(left: TensorDictBase | dict, right: TensorDictBase | dict, rows=slice(None)) -> bool:
-    """Whether two states, or what two episodes gave, agree in every bit."""
+    """Return whether two states, or two episodes of :func:`trajectories`, agree in every bit."""
     keys = left.keys() & right.keys()
     assert "observation" in keys
     return all(torch.equal(left[key][rows], right[key][rows]) for key in keys)

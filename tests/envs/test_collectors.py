@@ -1,4 +1,4 @@
-"""Collectors with a policy of plans: its new weights reach every worker, and one that is resumed goes on."""
+"""Collectors and evaluators with an actor: new weights reach every worker, and resuming continues."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from pathlib import Path
 import pytest
 import torch
 from speed import first_fast
-from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.collectors import Collector, Evaluator, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import AsyncEnvPool
 from worker_envs import make_actor, make_push_reach, make_single, numbered
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:No explicit `?device", "ignore:This process .* is multi-threaded, use of fork:DeprecationWarning"
 )
-ROWS, STEPS = 2, 5  # of an environment of a worker, and of its episodes
+ROWS, STEPS = 2, 5  # rows of a worker's environment, and steps of its episodes
 KINDS = {
     "one": (Collector, make_push_reach, {"auto_register_policy_transforms": False}),
     "sync": (MultiSyncCollector, numbered(make_push_reach, 2), {"cat_results": "stack"}),
@@ -32,8 +32,8 @@ KINDS = {
 def ray_started():
     import ray
 
-    found_here = {"env_vars": {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}}
-    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR", runtime_env=found_here)
+    environment = {"env_vars": {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}}
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR", runtime_env=environment)
     try:
         yield
     finally:
@@ -41,7 +41,7 @@ def ray_started():
 
 
 def make_collector(kind, actor, batches=None):
-    """Which ends after so many ``batches``."""
+    """Return a collector that ends after ``batches`` batches."""
     if kind == "ray":
         from torchrl.collectors.distributed import RayCollector
 
@@ -53,7 +53,7 @@ def make_collector(kind, actor, batches=None):
             collector_kwargs={"auto_register_policy_transforms": False},
             remote_configs={"num_cpus": 1, "num_gpus": 0, "memory": 2**28},
         )
-        collector.update_policy_weights_()  # the first ones
+        collector.update_policy_weights_()  # a RayCollector starts without weights
         return collector
     cls, makers, options = KINDS[kind]
     workers = len(makers) if isinstance(makers, list) else 1
@@ -67,18 +67,18 @@ def episodes(batch) -> set[tuple[int, int]]:
 
 
 @pytest.mark.parametrize("kind", first_fast(KINDS))
-def test_workers_get_new_weights_and_differ(kind):
+def test_workers_get_new_weights_and_different_episodes(kind):
     actor = make_actor()
     collector = make_collector(kind, actor)
     batches = iter(collector)
     first = next(batches).clone()
     assert first["action_log_prob"].isfinite().all()
-    assert len(episodes(first)) == first.numel() // STEPS, "no episode twice"
+    assert len(episodes(first)) == first.numel() // STEPS, "no episode may come twice"
     with torch.no_grad():
         for p in actor.module["decoder"].parameters():
             p.zero_()
     collector.update_policy_weights_()
-    for _ in range(4):  # what was under way was done with the old ones
+    for _ in range(4):  # batches that had begun use the old weights
         last = next(batches)
     assert not last["loc"].any()
     assert first["loc"].any()
@@ -87,10 +87,10 @@ def test_workers_get_new_weights_and_differ(kind):
 
 
 def collect_until_killed(kind, file):
-    """Never ends; after each batch, ``file`` holds the collector's state and the episodes so far, whole.
+    """Collect without an end; after each batch, write the collector's state and the episodes so far to ``file``.
 
-    A worker of a MultiAsyncCollector that is asked for its state while it collects waits for ever: TorchRL 0.14 drops
-    its batch, and the order to go on with it. Its state is taken when the last batch has come.
+    The state of a MultiAsyncCollector is saved only after the last batch: TorchRL 0.14 hangs if a worker collects
+    meanwhile, because it drops the batch and the order to continue.
     """
     with ray_started() if kind == "ray" else nullcontext():
         collector = make_collector(kind, make_actor(), batches=2 if kind == "async" else None)
@@ -109,7 +109,7 @@ def collect_until_killed(kind, file):
 
 
 def kill_after_two_batches(kind, file):
-    """What it left behind: a state of a collector, and the episodes that it had given by then."""
+    """Kill a collecting process; return the state that it saved, and the episodes until then."""
     program = f"import test_collectors; test_collectors.collect_until_killed({kind!r}, {str(file)!r})"
     paths = {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path]), "OMP_NUM_THREADS": "1"}
     process = subprocess.Popen(
@@ -129,14 +129,14 @@ def kill_after_two_batches(kind, file):
 
 
 @pytest.mark.parametrize("kind", ["one", *(pytest.param(k, marks=pytest.mark.slow) for k in ("sync", "async", "ray"))])
-def test_one_that_was_killed_goes_on_with_the_next_episodes(kind, tmp_path):
+def test_a_killed_collector_resumes_with_the_next_episodes(kind, tmp_path):
     if kind == "ray":
         pytest.importorskip("ray")
     state, seen = kill_after_two_batches(kind, tmp_path / "state.pt")
     with ray_started() if kind == "ray" else nullcontext():
         collector = make_collector(kind, make_actor())
         collector.load_state_dict(state)
-        if kind == "ray":  # which has no reset of its own
+        if kind == "ray":  # a RayCollector has no reset
             import ray
 
             ray.get([remote.reset.remote() for remote in collector.remote_collectors])
@@ -147,12 +147,12 @@ def test_one_that_was_killed_goes_on_with_the_next_episodes(kind, tmp_path):
         collector.shutdown()
     assert len(after) >= ROWS * 2
     assert not seen & after
-    if kind == "one":  # the one that had just begun is lost
+    if kind == "one":  # the episode that had just begun is lost
         assert min(number for _, number in after) == max(number for _, number in seen) + 2
 
 
 @pytest.mark.slow
-def test_a_pool_of_processes_with_a_policy():
+def test_a_pool_of_processes_runs_an_actor():
     pool = AsyncEnvPool(numbered(make_single, 2), backend="multiprocessing", exchange="queue")
     with torch.no_grad():
         data = pool.rollout(4, make_actor())
@@ -162,22 +162,70 @@ def test_a_pool_of_processes_with_a_policy():
 
 
 @pytest.mark.slow
-def test_ray():
+def test_ray_gets_new_weights_and_different_episodes():
     pytest.importorskip("ray")
     with ray_started():
         actor = make_actor()
         collector = make_collector("ray", actor)
-        found, locs = [], []
+        seen, locs = [], []
         for batch in collector:
-            found.append(episodes(batch))
+            seen.append(episodes(batch))
             locs.append(batch["loc"].abs().sum().item())
-            if len(found) == 4:
+            if len(seen) == 4:
                 break
             with torch.no_grad():
                 for p in actor.module["decoder"].parameters():
                     p.zero_()
             collector.update_policy_weights_()
-        assert len(set().union(*found)) == sum(map(len, found)), "no episode twice"
+        assert len(set().union(*seen)) == sum(map(len, seen)), "no episode may come twice"
         assert locs[0] > 0
         assert locs[-1] == 0
         collector.shutdown()
+
+
+# ---- TorchRL's Evaluator
+
+
+def make_policy(env=None):
+    return make_actor()
+
+
+def summarize(rollout):
+    steps = rollout["next", "reward"].shape[1]
+    return {
+        "episodes": [*zip(rollout["task_id"][:, 0].tolist(), rollout["episode"][:, 0].tolist(), strict=True)],
+        "steps": steps,
+        "moved": rollout["action"].abs().sum().item(),
+    }
+
+
+@pytest.mark.filterwarnings("ignore:Nested TransformedEnvs")  # it wraps the environment
+@pytest.mark.parametrize("backend", ["thread", pytest.param("process", marks=pytest.mark.slow)])
+def test_an_evaluator_runs_whole_episodes_with_the_given_weights(backend):
+    options = {"num_trajectories": 4, "max_steps": 5, "frames_per_batch": 10, "metrics_fn": summarize}
+    actor = make_actor()
+    if backend == "thread":
+        evaluator = Evaluator(
+            make_push_reach(),
+            make_actor(),
+            collector_kwargs={"auto_register_policy_transforms": False, "traj_format": "padded"},
+            **options,
+        )
+    else:
+        options |= {"policy_factory": make_policy, "backend": backend, "collector_kwargs": {"traj_format": "padded"}}
+        evaluator = Evaluator(make_push_reach, **options)
+    first = evaluator.evaluate(actor)
+    with torch.no_grad():
+        for p in actor.parameters():
+            p.zero_()
+    assert evaluator.trigger_eval(actor)
+    second = evaluator.wait(120)
+    evaluator.shutdown()
+    for metrics in (first, second):
+        assert metrics["eval/num_episodes"] == 4
+        assert metrics["eval/steps"] == metrics["eval/episode_length"] == 5
+        assert len({task for task, _ in metrics["eval/episodes"]}) == 2
+        assert len(set(metrics["eval/episodes"])) == 4
+    assert first["eval/moved"] > 0
+    assert second["eval/moved"] == 0
+    assert not set(first["eval/episodes"]) & set(second["eval/episodes"]), "unlike lw.evaluate"

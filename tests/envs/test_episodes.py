@@ -1,4 +1,4 @@
-"""run_episodes runs exactly the episodes asked for, and gives the same on any number of rows."""
+"""run_episodes: exactly the requested episodes, and the same results on any number of rows."""
 
 from __future__ import annotations
 
@@ -46,21 +46,21 @@ def transformed_env(num_envs: int, max_steps: int = STEPS) -> TransformedEnv:
 
 
 def wavy(tensordict: TensorDictBase) -> TensorDictBase:
-    """A policy that treats every number alone, so that it cannot tell how many rows there are."""
+    """Act by an element-wise function, whose result cannot depend on the number of rows."""
     return tensordict.set("action", (tensordict["observation"][..., :4] * 37).sin())
 
 
 @pytest.fixture(scope="module")
 def network() -> Callable[[TensorDictBase], TensorDictBase]:
-    """A small network, whose matrix products feel how many rows there are."""
+    """A small network, whose matrix products depend on the number of rows in the last bits."""
     torch.manual_seed(0)
     layers = nn.Sequential(nn.Linear(39, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU(), nn.Linear(256, 4), nn.Tanh())
     return TensorDictModule(layers, in_keys=["observation"], out_keys=["action"])
 
 
 @cache
-def alone(task: str, episode: int) -> TensorDictBase:
-    """One episode under ``wavy``, stepped by hand in an environment of one row."""
+def expected_steps(task: str, episode: int) -> TensorDictBase:
+    """Run an episode with ``wavy`` in an environment of one row."""
     env = lw.LanguageWorldEnv(task, seed=SEED, max_steps=STEPS, reward="dense")
     state = env.reset(episode=episode)
     steps = []
@@ -72,27 +72,27 @@ def alone(task: str, episode: int) -> TensorDictBase:
 
 
 def run(env, policy, episodes, **options) -> dict[tuple[str, int], TensorDictBase]:
-    """(task, episode) to the recorded steps; an episode that comes twice is an error."""
+    """Return (task, episode) to the recorded steps; no episode may come twice."""
     options.setdefault("keys", KEYS)
-    found: dict[tuple[str, int], TensorDictBase] = {}
+    recorded: dict[tuple[str, int], TensorDictBase] = {}
     with torch.no_grad():
         for task, episode, steps in run_episodes(env, policy, episodes, **options):
-            assert (task, episode) not in found
-            found[task, episode] = steps
-    return found
+            assert (task, episode) not in recorded
+            recorded[task, episode] = steps
+    return recorded
 
 
-def asked(episodes: dict[str, list[int]]) -> set[tuple[str, int]]:
+def pairs(episodes: dict[str, list[int]]) -> set[tuple[str, int]]:
     return {(task, episode) for task, listed in episodes.items() for episode in listed}
 
 
 def same(left: TensorDictBase, right: TensorDictBase) -> bool:
-    """Whether two recordings have the same keys and agree in every bit."""
+    """Return whether two recordings have the same keys and agree in every bit."""
     keys = set(left.keys(True, True))
     return keys == set(right.keys(True, True)) and all(torch.equal(left[key], right[key]) for key in keys)
 
 
-# --- exactly the episodes asked for --------------------------------------------------------------------------------
+# ---- the requested episodes
 
 LISTS = st.lists(st.integers(0, 12), unique=True, max_size=5)
 
@@ -103,20 +103,20 @@ LISTS = st.lists(st.integers(0, 12), unique=True, max_size=5)
     make=st.sampled_from([plain_env, transformed_env]),
 )
 @settings(max_examples=25, deadline=None)
-def test_each_listed_episode_comes_once_and_is_itself(episodes, num_envs, make):
-    """Whatever ran before on the same environment."""
-    found = run(make(num_envs), wavy, episodes)
-    assert found.keys() == asked(episodes)
-    for (task, episode), steps in found.items():
+def test_each_listed_episode_comes_once_and_is_reproducible(episodes, num_envs, make):
+    """It does not matter what ran before in the same environment."""
+    recorded = run(make(num_envs), wavy, episodes)
+    assert recorded.keys() == pairs(episodes)
+    for (task, episode), steps in recorded.items():
         assert steps.batch_size == (STEPS,)
-        assert same(steps, alone(task, episode)), (task, episode)
+        assert same(steps, expected_steps(task, episode)), (task, episode)
         assert steps["task_id"].unique().tolist() == [lw.task_id(task)]
         assert steps["episode"].unique().tolist() == [episode]
 
 
 @pytest.mark.parametrize("make", [plain_env, transformed_env])
-def test_episodes_of_different_lengths_keep_their_names(make):
-    """Rows that end early take the next episode, not the one that the row's own count would give."""
+def test_episodes_of_different_lengths_keep_their_index(make):
+    """A row that ends early starts the next listed episode, not the next one of the row's counter."""
     env, ending = make(3), {("push", 7): 2, ("reach", 4): 5, ("reach", 1): 1}
     names = {(lw.task_id(task), episode): length for (task, episode), length in ending.items()}
     clock: dict[tuple[int, int], int] = {}
@@ -133,34 +133,34 @@ def test_episodes_of_different_lengths_keep_their_names(make):
     episodes = {"push": [7, 0, 9, 3], "reach": [4, 1, 11, 2, 6]}
     keys = [*KEYS, ("next", "fault")]
     with pytest.warns(UserWarning, match="its action is NaN"):
-        found = run(env, policy, episodes, keys=keys)
-    assert found.keys() == asked(episodes)
-    for key, steps in found.items():
+        recorded = run(env, policy, episodes, keys=keys)
+    assert recorded.keys() == pairs(episodes)
+    for key, steps in recorded.items():
         length = ending.get(key, STEPS)
         assert steps.batch_size == (length,)
         assert steps["next", "fault"].any().item() == (key in ending)
-        expected = alone(*key)[:length]
+        expected = expected_steps(*key)[:length]
         assert torch.equal(steps["observation"], expected["observation"])
 
 
-def test_the_policy_is_told_which_rows_count():
-    seen = []
+def test_the_policy_reads_the_mask_of_active_rows():
+    masks = []
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         assert tensordict.batch_size == (5,)
-        seen.append(tensordict["_step"].clone())
+        masks.append(tensordict["_step"].clone())
         wavy(tensordict)
         tensordict["action"][~tensordict["_step"]] = float("nan")
         return tensordict
 
-    found = run(plain_env(5), policy, {"push": [3], "reach": [0, 1, 2]})
-    assert found.keys() == {("push", 3), ("reach", 0), ("reach", 1), ("reach", 2)}
-    assert all(same(steps, alone(*key)) for key, steps in found.items())
-    assert len(seen) == 2 * STEPS, "three episodes on two rows"
-    assert [mask.sum().item() for mask in seen] == [3] * STEPS + [1] * STEPS
+    recorded = run(plain_env(5), policy, {"push": [3], "reach": [0, 1, 2]})
+    assert recorded.keys() == {("push", 3), ("reach", 0), ("reach", 1), ("reach", 2)}
+    assert all(same(steps, expected_steps(*key)) for key, steps in recorded.items())
+    assert len(masks) == 2 * STEPS, "three episodes on two rows"
+    assert [mask.sum().item() for mask in masks] == [3] * STEPS + [1] * STEPS
 
 
-def test_what_is_recorded_is_the_callers():
+def test_recorded_steps_do_not_change_later():
     env = plain_env(2)
     episodes = run_episodes(env, wavy, {"push": [0, 1], "reach": [0]}, keys=["observation", ("next", "success")])
     with torch.no_grad():
@@ -170,38 +170,38 @@ def test_what_is_recorded_is_the_callers():
         rest = list(episodes)
     assert same(first.steps, kept)
     assert set(kept.keys(True, True)) == {"observation", ("next", "success")}
-    assert {(found.task, found.episode) for found in [first, *rest]} == {("push", 0), ("push", 1), ("reach", 0)}
+    assert {(each.task, each.episode) for each in [first, *rest]} == {("push", 0), ("push", 1), ("reach", 0)}
 
 
-def test_a_run_that_is_left_half_way_leaves_no_trace():
+def test_an_abandoned_run_does_not_change_the_next_one():
     env = transformed_env(3)
     with torch.no_grad():
         episodes = run_episodes(env, wavy, {"push": [5, 6], "reach": [5, 6, 7]}, keys=KEYS)
         next(episodes)
         episodes.close()
-    found = run(env, wavy, {"push": [1], "reach": [2]})
-    assert all(same(steps, alone(*key)) for key, steps in found.items())
+    recorded = run(env, wavy, {"push": [1], "reach": [2]})
+    assert all(same(steps, expected_steps(*key)) for key, steps in recorded.items())
 
 
-# --- on any number of rows -----------------------------------------------------------------------------------------
+# ---- any number of rows
 
 
 @pytest.mark.parametrize("make", [plain_env, transformed_env])
-def test_the_number_of_rows_changes_nothing(network, make):
-    """With a network, in blocks, under noise, over many steps: bit for bit."""
+def test_results_do_not_depend_on_the_number_of_rows(network, make):
+    """Bit for bit, with a network in blocks, noise, and many steps."""
     episodes = {"push": [0, 4, 2], "reach": [6, 1, 3, 5]}
     keys = [*KEYS, "clean", *(["qaf"] if make is transformed_env else [])]
     options = {"noise": lambda number: (0.3, 0.2, 0.1, 0.05 * number), "clean_action": "clean", "keys": keys}
     runs = [run(make(rows, 60), in_blocks(network), episodes, **options) for rows in (2, 5, 7)]
-    assert runs[0].keys() == asked(episodes)
+    assert runs[0].keys() == pairs(episodes)
     for other in runs[1:]:
         assert other.keys() == runs[0].keys()
         assert all(same(runs[0][key], other[key]) for key in other)
     again = run(make(5, 60), in_blocks(network), {"reach": [5]}, **options)
-    assert same(again["reach", 5], runs[0]["reach", 5]), "nor do the other episodes"
+    assert same(again["reach", 5], runs[0]["reach", 5]), "other episodes must not matter either"
 
 
-def test_blocks_give_what_the_policy_gives(network):
+def test_blocks_give_the_policys_results(network):
     torch.manual_seed(1)
     states = TensorDict({"observation": torch.randn(200, 39), "row": torch.arange(200)}, [200])
     whole = in_blocks(network)(states.clone())
@@ -217,20 +217,20 @@ def test_blocks_give_what_the_policy_gives(network):
     assert torch.equal(in_blocks(network)(states[order].clone())["action"], whole["action"][order])
 
 
-# --- noise ---------------------------------------------------------------------------------------------------------
+# ---- noise
 
 
 @pytest.mark.parametrize("hold", [1, 3])
-def test_the_noise_is_the_episodes_own(hold):
+def test_noise_depends_only_on_the_episode(hold):
     episodes = {"push": [2, 7], "reach": [0]}
 
     def scale(number: int) -> tuple[float, ...]:
         return (0.1 * number, 0.5, 0.0, 2.0)
 
     keys = [*KEYS, "clean"]
-    found = run(plain_env(3), wavy, episodes, noise=scale, noise_hold=hold, clean_action="clean", keys=keys)
+    recorded = run(plain_env(3), wavy, episodes, noise=scale, noise_hold=hold, clean_action="clean", keys=keys)
     clipped = 0
-    for (task, episode), steps in found.items():
+    for (task, episode), steps in recorded.items():
         noise = torch.from_numpy(action_noise(task, SEED, episode, STEPS, hold) * np.float32(scale(episode)))
         expected = (wavy(steps.select("observation"))["action"] + noise).clamp(-1, 1)
         assert torch.equal(steps["clean"], wavy(steps.select("observation"))["action"])
@@ -241,29 +241,29 @@ def test_the_noise_is_the_episodes_own(hold):
     assert clipped > 0
     quiet = run(plain_env(3), wavy, episodes, clean_action="clean", keys=keys)
     assert all(torch.equal(steps["action"], steps["clean"]) for steps in quiet.values())
-    assert all(same(steps.exclude("clean"), alone(*key)) for key, steps in quiet.items())
+    assert all(same(steps.exclude("clean"), expected_steps(*key)) for key, steps in quiet.items())
 
 
 def test_noise_leaves_the_clean_action_unclipped():
-    """An actor that asks for too much: its own wish is what ``clean_action`` keeps."""
+    """``clean_action`` holds the policy's action, even out of range."""
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set("action", torch.full((2, 4), 1.5))
 
-    found = run(
+    recorded = run(
         plain_env(2), policy, {"reach": [0]}, noise=lambda _: (0.1,) * 4, clean_action="clean", keys=["clean", "action"]
     )
-    steps = found["reach", 0]
+    steps = recorded["reach", 0]
     assert (steps["clean"] == 1.5).all()
     assert (steps["action"] <= 1).all()
 
 
-# --- stopping early ------------------------------------------------------------------------------------------------
+# ---- stopping early
 
 
 @pytest.mark.parametrize("after", first_fast([0, 7]))
 @pytest.mark.parametrize("make", [plain_env, transformed_env])
-def test_stopping_after_success_gives_the_same_success(make, after):
+def test_stopping_after_success_does_not_change_success(make, after):
     length = 110
     episodes = {"push": [3, 0, 8], "reach": [5, 2, 0, 7, 1]}
     keys = ["observation", "action", ("next", "success")]
@@ -280,7 +280,7 @@ def test_stopping_after_success_gives_the_same_success(make, after):
         )
         for stop in (None, after)
     }
-    assert runs[after].keys() == runs[None].keys() == asked(episodes)
+    assert runs[after].keys() == runs[None].keys() == pairs(episodes)
     lengths = []
     for key, whole in runs[None].items():
         assert whole.batch_size == (length,)
@@ -293,30 +293,30 @@ def test_stopping_after_success_gives_the_same_success(make, after):
         assert same(short, whole[: len(short)])
     assert len(set(lengths)) > 3, "episodes of different lengths"
     assert min(lengths) < length
-    total = len(asked(episodes)) * length
+    total = len(pairs(episodes)) * length
     assert sum(progress[after]) == sum(progress[None]) == total
     assert len(progress[after]) < len(progress[None])
 
 
-# --- bad input -----------------------------------------------------------------------------------------------------
+# ---- errors
 
 
-def test_a_task_that_the_environment_lacks_is_named():
-    with pytest.raises(ValueError, match="episodes names drawer-open, sweep, which env does not have"):
+def test_an_unknown_task_is_an_error():
+    with pytest.raises(ValueError, match=r"episodes: .* drawer-open, sweep"):
         run(plain_env(2), wavy, {"sweep": [0], "reach": [1], "drawer-open": []})
 
 
-def test_a_nan_raises_where_the_environment_is_strict():
+def test_a_nan_is_an_error_in_a_strict_environment():
     env = lw.LanguageWorldEnv("reach", strict=True)
     with pytest.raises(ValueError, match="action must hold numbers: row 0"):
         run(env, lambda td: td.set("action", torch.full((1, 4), float("nan"))), {"reach": [0]})
     env.close()
 
 
-def test_blocks_are_as_small_as_a_module_asks():
+def test_a_module_may_ask_for_smaller_blocks():
     sizes = []
 
-    class Sees(torch.nn.Module):
+    class Counts(torch.nn.Module):
         rows_at_once = 4
 
         def forward(self, tensordict):
@@ -324,7 +324,7 @@ def test_blocks_are_as_small_as_a_module_asks():
             return tensordict.set("seen", tensordict.get("observation") + 1)
 
     states = TensorDict(observation=torch.rand(10, 3), batch_size=10)
-    found = in_blocks(torch.nn.Sequential(Sees()))(states)
+    result = in_blocks(torch.nn.Sequential(Counts()))(states)
     assert sizes == [4, 4, 4]
-    assert found is states
-    assert torch.equal(found["seen"], states["observation"] + 1)
+    assert result is states
+    assert torch.equal(result["seen"], states["observation"] + 1)

@@ -1,4 +1,4 @@
-"""LanguageWorldEnv against its contract and against Meta-World's own environments."""
+"""LanguageWorldEnv: its specs and seeds, compared with Meta-World's own environments."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_the_same_seed_gives_the_same_trajectories(any_env):
     for _ in range(2):
         any_env.set_seed(5)
         runs.append(trajectories(any_env, STEPS) | trajectories(any_env, STEPS))
-    assert len(runs[0]) == 12, "two episodes a row"
+    assert len(runs[0]) == 12, "two episodes in each row"
     assert runs[0].keys() == runs[1].keys()
     assert all(same(runs[0][key], runs[1][key]) for key in runs[0])
 
@@ -76,18 +76,18 @@ def test_the_same_seed_gives_the_same_trajectories(any_env):
 @pytest.mark.parametrize(
     ("tasks", "num_envs"), [(["reach"], 4), (["reach", "push"], 2), (["push", "sweep", "reach", "assembly"], 9)]
 )
-def test_neither_other_rows_nor_other_tasks_show(env, tasks, num_envs):
+def test_results_depend_neither_on_other_rows_nor_on_other_tasks(env, tasks, num_envs):
     env.set_seed(5)
     expected = trajectories(env, STEPS) | trajectories(env, STEPS)
     other = lw.LanguageWorldEnv(tasks, num_envs=num_envs, seed=5, reward="dense")
-    got = trajectories(other, STEPS) | trajectories(other, STEPS)
+    actual = trajectories(other, STEPS) | trajectories(other, STEPS)
     other.close()
-    shared = expected.keys() & got.keys()
+    shared = expected.keys() & actual.keys()
     assert len(shared) >= 4
-    assert all(same(expected[key], got[key]) for key in shared)
+    assert all(same(expected[key], actual[key]) for key in shared)
 
 
-def test_episodes_are_dealt_by_row_and_reset():
+def test_episodes_are_numbered_by_row_and_reset():
     """The m-th reset of the r-th of a task's R rows is episode m·R + r."""
     env = lw.LanguageWorldEnv(["reach", "push", "door-open"], num_envs=7, seed=0)
     assert env.row_tasks == ("door-open", "push", "reach", "door-open", "push", "reach", "door-open")
@@ -102,11 +102,11 @@ def test_episodes_are_dealt_by_row_and_reset():
         state = env.reset(state.clone().set("_reset", mask))
     assert max(resets) > min(resets)
     env.set_seed(0)
-    assert env.reset()["episode"].tolist() == rank, "set_seed starts again at episode 0"
+    assert env.reset()["episode"].tolist() == rank, "set_seed must begin at episode 0"
     env.close()
 
 
-def test_seeds_and_episodes_matter(env):
+def test_goals_differ_for_each_seed_and_episode(env):
     first = {}
     for seed in (0, 1, 2, 2**40):
         env.set_seed(seed)
@@ -117,18 +117,18 @@ def test_seeds_and_episodes_matter(env):
                 first[key] = tuple(state["observation"][row, 36:39].tolist())
     assert len(first) == 4 * 3 * 4
     by_task = {task: [goal for (_, t, _), goal in first.items() if t == task] for _, task, _ in first}
-    assert all(len(set(goals)) == 16 for goals in by_task.values()), "different seeds and episodes, different goals"
+    assert all(len(set(goals)) == 16 for goals in by_task.values())
 
 
-def test_the_seed_of_the_constructor_is_the_seed():
-    made = lw.LanguageWorldEnv("reach", seed=11)
-    first = made.reset()["observation"]
-    made.set_seed(0)
-    zero = made.reset()["observation"]
-    made.set_seed(11)
-    assert torch.equal(made.reset()["observation"], first)
+def test_seed_of_the_constructor_equals_set_seed():
+    env = lw.LanguageWorldEnv("reach", seed=11)
+    first = env.reset()["observation"]
+    env.set_seed(0)
+    zero = env.reset()["observation"]
+    env.set_seed(11)
+    assert torch.equal(env.reset()["observation"], first)
     assert not torch.equal(zero, first)
-    made.close()
+    env.close()
     default, negative = lw.LanguageWorldEnv("reach"), lw.LanguageWorldEnv("reach", seed=-11)
     assert default.seed == 0
     assert torch.equal(default.reset()["observation"], zero)
@@ -137,8 +137,8 @@ def test_the_seed_of_the_constructor_is_the_seed():
     negative.close()
 
 
-def test_every_task_starts_and_moves_as_metaworlds_own(mt50, metaworld_env):
-    """After a history on its row, each task's episode is the one of a fresh Meta-World environment."""
+def test_every_task_starts_and_moves_as_in_metaworld(mt50, metaworld_env):
+    """After other episodes in its row, each task's episode equals that of a fresh Meta-World environment."""
     mt50.set_seed(3)
     mt50.rollout(7)
     mt50.reset(TensorDict({"_reset": torch.arange(50) % 3 == 0}, [50]))
@@ -176,8 +176,8 @@ def test_every_task_starts_and_moves_as_metaworlds_own(mt50, metaworld_env):
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("scale", first_fast([1.0, 3.0]))
-def test_eighty_steps_and_dense_reward_are_metaworlds_own(metaworld_env, scale, engine):
-    """Also with actions out of range, which Meta-World clips by itself."""
+def test_eighty_steps_and_dense_rewards_equal_metaworlds(metaworld_env, scale, engine):
+    """Also with actions out of range, which Meta-World clips."""
     tasks = ["button-press-topdown", "coffee-pull", "drawer-open", "handle-press", "pick-place", "stick-push"]
     env = lw.LanguageWorldEnv(tasks, seed=2, reward="dense", engine=engine)
     expert = lw.ExpertActor(tasks)
@@ -190,7 +190,7 @@ def test_eighty_steps_and_dense_reward_are_metaworlds_own(metaworld_env, scale, 
     generator = torch.Generator().manual_seed(0)
     for _ in range(80):
         noise = torch.randn(6, 4, generator=generator) * 0.2 * scale
-        # The gripper's effort enters some rewards as it is asked for, so it stays in range.
+        # Some of Meta-World's rewards use the gripper's effort before it is clipped, so it stays in range.
         action = expert(state.select("observation", "task_id"))["action"] * scale + noise
         action[:, 3].clamp_(-1, 1)
         state = advance(env, state, action)
@@ -201,7 +201,7 @@ def test_eighty_steps_and_dense_reward_are_metaworlds_own(metaworld_env, scale, 
             if scale == 1.0 and (action[row].abs() <= 1).all():
                 assert state["reward"][row].item() == np.float32(reward)
             successes += bool(info["success"])
-    assert successes > 10, "the comparison of successes says little if nothing succeeds"
+    assert successes > 10, "the test needs successes"
     env.close()
 
 
@@ -214,6 +214,6 @@ def test_sparse_reward_is_the_success(engine):
     assert torch.equal(reward, success.float())
     assert success.any(1).all()
     assert not success.all()
-    assert not rollout["next", "terminated"].any(), "success ends nothing"
+    assert not rollout["next", "terminated"].any(), "success must not end an episode"
     assert not rollout["next", "done"].any()
     env.close()

@@ -1,4 +1,4 @@
-"""render: what cameras see of the rows, with TorchRL's recorder; nothing in the simulation moves."""
+"""render: pictures of the rows and TorchRL's recorder; rendering does not change the simulation."""
 
 import os
 import subprocess
@@ -41,28 +41,28 @@ def both_engines():
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_both_engines_show_the_same(both_engines, camera):
-    seen = [env.render(camera=camera, height=60, width=80) for env in both_engines]
-    assert seen[0].shape == (2, 60, 80, 3)
-    assert seen[0].dtype == torch.uint8
-    assert torch.equal(*seen)
-    assert seen[0].float().std() > 10  # there is something to see
+def test_both_engines_render_the_same(both_engines, camera):
+    pictures = [env.render(camera=camera, height=60, width=80) for env in both_engines]
+    assert pictures[0].shape == (2, 60, 80, 3)
+    assert pictures[0].dtype == torch.uint8
+    assert torch.equal(*pictures)
+    assert pictures[0].float().std() > 10  # not a single colour
 
 
-def test_a_row_is_seen_with_its_own_scene():
-    """Rows of one model differ in where a reset has put bodies and sites."""
+def test_each_row_is_rendered_with_its_own_scene():
+    """Rows of one model differ in the places of bodies and sites after a reset."""
     env = opened(tasks=["drawer-open"], num_envs=3)
     pictures = env.render(height=60, width=80)
     assert not torch.equal(pictures[0], pictures[1])
-    alone = lw.LanguageWorldEnv("drawer-open", seed=3)
-    alone.reset(episode=1)
-    assert torch.equal(alone.render(height=60, width=80)[0], pictures[1])
+    single = lw.LanguageWorldEnv("drawer-open", seed=3)
+    single.reset(episode=1)
+    assert torch.equal(single.render(height=60, width=80)[0], pictures[1])
     env.close()
-    alone.close()
+    single.close()
 
 
-def test_the_robot_is_upright():
-    """Sawyer is red: from the side its base is below its hand, and the floor is at the bottom."""
+def test_pictures_are_upright():
+    """The grey sky is at the top of the pictures."""
     env = opened(tasks=["reach"])
     for camera in ("corner", "corner2", "corner3", "behindGripper"):
         picture = env.render(camera=camera, height=120, width=160)[0].float()
@@ -72,37 +72,37 @@ def test_the_robot_is_upright():
     env.close()
 
 
-def test_pictures_change_nothing():
-    def states(look):
+def test_rendering_does_not_change_the_simulation():
+    def states(render):
         env = opened()
-        found = []
+        observations = []
         generator = torch.Generator().manual_seed(0)
         state = env.reset()
         for _ in range(8):
-            if look:
+            if render:
                 env.render(height=32, width=32)
             state["action"] = torch.rand(2, 4, generator=generator) * 2 - 1
             state = env.step(state)["next"]
-            found.append(state["observation"])
+            observations.append(state["observation"])
         env.close()
-        return torch.stack(found)
+        return torch.stack(observations)
 
-    assert torch.equal(states(look=True), states(look=False))
+    assert torch.equal(states(render=True), states(render=False))
 
 
-def test_sizes_may_alternate_and_two_environments_stand_side_by_side():
+def test_sizes_may_alternate_and_two_environments_may_render():
     first, second = opened(), opened(tasks=["push"])
     small, other = first.render(height=24, width=32), second.render(height=24, width=32)
     large = first.render(height=700, width=900)
     assert large.shape == (2, 700, 900, 3)
-    assert large.float().std(dim=(1, 2, 3)).min() > 10  # of more than one model, and larger than MuJoCo's own buffer
+    assert large.float().std(dim=(1, 2, 3)).min() > 10  # two models, and more pixels than MuJoCo's own buffer
     assert torch.equal(first.render(height=24, width=32), small)
     first.close()
     assert torch.equal(second.render(height=24, width=32), other)
     second.close()
 
 
-def test_a_single_environment_and_torchrls_video(tmp_path):
+def test_torchrls_video_recorder_records_a_single_environment(tmp_path):
     recorder = VideoRecorder(CSVLogger("seen", log_dir=str(tmp_path), video_format="pt"), tag="pixels", skip=1)
     env = TransformedEnv(
         lw.LanguageWorldEnv("reach", batch_size=(), max_steps=6),
@@ -116,7 +116,7 @@ def test_a_single_environment_and_torchrls_video(tmp_path):
     env.close()
 
 
-def test_pixels_of_all_rows_are_a_key_like_any():
+def test_torchrls_pixel_transform_renders_all_rows():
     env = TransformedEnv(lw.LanguageWorldEnv(["reach", "push"]), PixelRenderTransform(height=24, width=32))
     check_env_specs(env)
     rollout = env.rollout(3)
@@ -126,7 +126,7 @@ def test_pixels_of_all_rows_are_a_key_like_any():
     env.close()
 
 
-def test_there_is_nothing_to_see_before_a_reset_or_after_the_end():
+def test_rendering_before_a_reset_or_after_close_is_an_error():
     env = lw.LanguageWorldEnv("reach")
     with pytest.raises(RuntimeError, match="before a reset"):
         env.render()
@@ -136,7 +136,7 @@ def test_there_is_nothing_to_see_before_a_reset_or_after_the_end():
         env.render()
 
 
-def test_an_engine_of_ones_own_need_not_draw():
+def test_a_custom_engine_needs_no_render():
     class Still:
         def __init__(self, tasks, **_):
             self.n = len(tasks)
@@ -154,7 +154,7 @@ def test_an_engine_of_ones_own_need_not_draw():
     env.close()
 
 
-_SHOW = """
+_RENDER = """
 import lw_torchrl as lw
 env = lw.LanguageWorldEnv("reach")
 env.reset()
@@ -166,7 +166,7 @@ env.close()
 """
 
 
-def test_one_thread_takes_pictures_and_then_another():
+def test_two_threads_may_render_in_turn():
     env = opened()
     with ThreadPoolExecutor(2) as pool:
         here = env.render(height=24, width=32)
@@ -201,13 +201,13 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-def test_a_process_forked_after_a_picture_is_told_and_does_not_hang():
+def test_rendering_in_a_process_forked_after_rendering_is_an_error():
     done = subprocess.run([sys.executable, "-c", _FORK], capture_output=True, text=True, check=True)
-    assert "forked from one that rendered" in done.stdout
+    assert "forked from one that took pictures" in done.stdout
     assert done.stdout.endswith("closed\n")
 
 
-def test_pixels_are_of_one_episode_once_the_specs_are_known():
+def test_reading_the_spec_first_keeps_pixels_in_one_episode():
     pixels = PixelRenderTransform(height=24, width=32)
     env = TransformedEnv(lw.LanguageWorldEnv(["reach", "push"], num_threads=1), pixels)
     assert env.observation_spec["pixels"].shape == (2, 24, 32, 3)
@@ -217,28 +217,28 @@ def test_pixels_are_of_one_episode_once_the_specs_are_known():
 
 
 @pytest.mark.slow
-def test_an_environment_left_open_ends_in_silence():
+def test_an_open_environment_ends_without_output():
     done = subprocess.run(
-        [sys.executable, "-c", _SHOW.replace("env.close()", "")], capture_output=True, text=True, check=True
+        [sys.executable, "-c", _RENDER.replace("env.close()", "")], capture_output=True, text=True, check=True
     )
     assert not done.stderr
 
 
 @pytest.mark.parametrize("backend", first_fast(["glfw", "disable"]))
-def test_without_open_gl_the_error_says_what_to_install(backend):
+def test_the_error_without_opengl_names_what_to_install(backend):
     environment = {**os.environ, "MUJOCO_GL": backend}
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         environment.pop(name, None)
-    done = subprocess.run([sys.executable, "-c", _SHOW], env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", _RENDER], env=environment, capture_output=True, text=True, check=True)
     assert f"MUJOCO_GL={backend}" in done.stdout
     assert "MUJOCO_GL=egl" in done.stdout
     assert "Traceback" not in done.stderr
 
 
 @pytest.mark.slow
-def test_a_library_may_ask_for_egl_after_mujoco_was_imported():
-    asking_late = "import mujoco, os\nos.environ['MUJOCO_GL'] = 'egl'  # as robosuite does\n" + _SHOW
+def test_mujoco_gl_may_be_set_after_mujoco_is_imported():
+    program = "import mujoco, os\nos.environ['MUJOCO_GL'] = 'egl'  # as robosuite does\n" + _RENDER
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
-    done = subprocess.run([sys.executable, "-c", asking_late], env=environment, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
     assert "camera images need OpenGL" not in done.stdout + done.stderr
     assert not done.returncode

@@ -1,4 +1,4 @@
-"""Asking for episodes: a reset goes by its own count or by ``episode=``, and never by a tensordict's output."""
+"""Episodes of a reset: the next ones, or those of ``episode=``, never those in a tensordict."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ BATCHED = {
 }
 
 
-# --- outputs are no requests ---------------------------------------------------------------------------------------
+# ---- the next episodes
 
 
-def test_a_loop_of_ones_own_goes_from_episode_to_episode(any_env):
+def test_resets_in_a_loop_start_the_next_episodes(any_env):
     any_env.set_seed(3)
     state, seen = any_env.reset(), []
     for _ in range(3):
@@ -45,14 +45,14 @@ def test_a_loop_of_ones_own_goes_from_episode_to_episode(any_env):
     assert seen == [[0, 0, 0, 1, 1, 1], [2, 2, 2, 3, 3, 3], [4, 4, 4, 5, 5, 5]]
 
 
-def test_a_partial_reset_goes_on_too(any_env):
+def test_a_partial_reset_starts_the_next_episode(any_env):
     any_env.set_seed(3)
     state = any_env.reset()
     state = any_env.reset(state.clone().set("_reset", ~others(1)))
     assert state["episode"].tolist() == [0, 2, 0, 1, 1, 1]
 
 
-def test_a_rollout_from_a_state_goes_on_too(any_env):
+def test_a_rollout_from_a_state_starts_the_next_episodes(any_env):
     any_env.set_seed(3)
     last = any_env.rollout(STEPS)[:, -1]["next"]
     further = any_env.rollout(2, auto_reset=False, tensordict=last.exclude("reward"))
@@ -63,7 +63,7 @@ def test_a_rollout_from_a_state_goes_on_too(any_env):
 @pytest.mark.filterwarnings("ignore:No explicit `?device")
 @pytest.mark.parametrize("name", BATCHED)
 @pytest.mark.slow
-def test_batched_environments_go_on_and_may_be_asked(name):
+def test_batched_environments_start_next_or_requested_episodes(name):
     env = BATCHED[name]()
     env.set_seed(3)
     rollout = env.rollout(7, break_when_any_done=False)
@@ -76,16 +76,16 @@ def test_batched_environments_go_on_and_may_be_asked(name):
         mask = torch.tensor([[True, True], [False, False]]).unsqueeze(-1)
         partial = env.reset(following.clone().set("_reset", mask))
         assert (partial["episode"] == following["episode"]).tolist() == [[False, False], [True, True]]
-    asked = env.reset(list_of_kwargs=[{"episode": 5}, {"episode": torch.tensor([8, 9])}])
-    assert asked["episode"].tolist() == [[5, 5], [8, 9]]
+    requested = env.reset(list_of_kwargs=[{"episode": 5}, {"episode": torch.tensor([8, 9])}])
+    assert requested["episode"].tolist() == [[5, 5], [8, 9]]
     assert (env.reset(episode=4)["episode"] == 4).all()
     env.close()
 
 
-# --- asking --------------------------------------------------------------------------------------------------------
+# ---- requested episodes
 
 
-def test_a_reset_may_ask_for_its_episodes(any_env):
+def test_a_reset_starts_the_requested_episodes(any_env):
     any_env.set_seed(3)
     first, second = any_env.reset(), any_env.reset()
     assert second["episode"].tolist() == [2, 2, 2, 3, 3, 3]
@@ -94,7 +94,7 @@ def test_a_reset_may_ask_for_its_episodes(any_env):
     assert named["episode"].tolist() == [2, 0, 2, 0, 2, 9]
     for row, source, origin in [(0, second, 0), (1, first, 1), (2, second, 2), (3, first, 0), (4, second, 1)]:
         assert torch.equal(named["observation"][row], source["observation"][origin])
-    assert any_env.reset()["episode"].tolist() == [2, 2, 2, 3, 3, 3], "it counts as a reset"
+    assert any_env.reset()["episode"].tolist() == [2, 2, 2, 3, 3, 3], "a requested episode counts as a reset"
     state = any_env.reset()
     partial = any_env.reset(state.clone().set("_reset", ~others(1)), episode=9)
     assert partial["episode"].tolist() == [4, 9, 4, 5, 5, 5]
@@ -102,69 +102,69 @@ def test_a_reset_may_ask_for_its_episodes(any_env):
     assert same(partial, state, others(1))
 
 
-def test_an_episode_asked_for_is_the_same_trajectory(any_env):
+def test_a_requested_episode_has_the_same_trajectory(any_env):
     any_env.set_seed(3)
     expected = trajectories(any_env, STEPS) | trajectories(any_env, STEPS)
     any_env.set_seed(3)
-    got = trajectories(any_env, STEPS, any_env.reset(episode=torch.tensor([3, 1, 0, 2, 2, 1])))
-    assert len(got) == ROWS
-    assert all(same(expected[key], got[key]) for key in got)
+    actual = trajectories(any_env, STEPS, any_env.reset(episode=torch.tensor([3, 1, 0, 2, 2, 1])))
+    assert len(actual) == ROWS
+    assert all(same(expected[key], actual[key]) for key in actual)
 
 
 @pytest.mark.parametrize(
-    ("episode", "error", "message"),
+    "episode",
     [
-        (torch.tensor([0, 1, 2, -3, 0, 0]), ValueError, "episode must be at least 0, got -3"),
-        (-1, ValueError, "episode must be at least 0, got -1"),
-        (2**63, ValueError, r"episode must be below 2\*\*63, got 9223372036854775808"),
-        (torch.zeros(ROWS), ValueError, r"episode must be an integer, or int64 of shape \(6,\).*got torch.float32"),
-        (torch.zeros(ROWS, 2, dtype=torch.int64), ValueError, r"episode must be .*\(6,\).* got .*\(6, 2\)"),
-        (torch.zeros(5, dtype=torch.int64), ValueError, r"episode must be .*\(6,\).* got .*\(5,\)"),
-        (torch.ones(ROWS, dtype=torch.bool), ValueError, "episode must be .* got torch.bool"),
-        (1.0, TypeError, "episode must be an integer, got 1.0"),
-        (True, TypeError, "episode must be an integer, got True"),
-        ([0] * ROWS, TypeError, "episode must be an integer, got"),
+        torch.tensor([0, 1, 2, -3, 0, 0]),
+        -1,
+        2**63,
+        torch.zeros(ROWS),
+        torch.zeros(ROWS, 2, dtype=torch.int64),
+        torch.zeros(5, dtype=torch.int64),
+        torch.ones(ROWS, dtype=torch.bool),
+        1.0,
+        True,
+        [0] * ROWS,
     ],
     ids=str,
 )
-def test_a_wrong_episode_is_named(any_env, episode, error, message):
+def test_a_wrong_episode_is_an_error(any_env, episode):
     any_env.set_seed(0)
     state = any_env.reset()
-    with pytest.raises(error, match=message):
+    with pytest.raises((TypeError, ValueError), match="episode"):
         any_env.reset(episode=episode)
-    assert any_env.reset()["episode"].tolist() == [2, 2, 2, 3, 3, 3], "it did not count"
+    assert any_env.reset()["episode"].tolist() == [2, 2, 2, 3, 3, 3], "the error must not count as a reset"
     assert state["episode"].tolist() == [0, 0, 0, 1, 1, 1]
 
 
-def test_a_misspelt_request_is_an_error(any_env):
+def test_a_misspelt_argument_is_an_error(any_env):
     with pytest.raises(TypeError, match="episodes"):
         any_env.reset(episodes=3)
 
 
 @pytest.mark.parametrize("mask", [torch.tensor([1, 0]), torch.tensor([1.0, 0.0]), torch.ones(2, 2, dtype=torch.bool)])
-def test_a_mask_is_of_bools_one_a_row(mask):
+def test_a_wrong_mask_is_an_error(mask):
     env = make_env()
     state = env.reset()
-    with pytest.raises(ValueError, match="_reset must be bool of shape"):
+    with pytest.raises(ValueError, match="_reset"):
         env.reset(TensorDict({"_reset": mask}, [2]))
     action = torch.zeros(2, 4)
-    with pytest.raises(ValueError, match="_step must be bool of shape"):
+    with pytest.raises(ValueError, match="_step"):
         env.step(state.clone().set("action", action).set("_step", mask))
     for _ in range(3):
         state = env.step(state.set("action", action))["next"]
-    assert state["truncated"].all(), "the refused step did not count"
+    assert state["truncated"].all(), "the wrong step must not count"
     assert env.reset()["episode"].tolist() == [1, 1]
     env.close()
 
 
 @pytest.mark.parametrize("seed", [-1, 2**70, 0])
 def test_the_seed_is_any_integer(seed):
-    env, made = make_env(), lw.LanguageWorldEnv(["push", "reach"], num_envs=2, seed=seed, num_threads=1)
+    env, other = make_env(), lw.LanguageWorldEnv(["push", "reach"], num_envs=2, seed=seed, num_threads=1)
     following = env.set_seed(seed)
     assert (env.seed, env.set_seed(seed, static_seed=True)) == (seed, seed)
-    assert torch.equal(env.reset()["observation"], made.reset()["observation"])
+    assert torch.equal(env.reset()["observation"], other.reset()["observation"])
     assert 0 <= following < 2**32
     if seed == 0:
-        assert following == 795726461, "as TorchRL's own environments say"
+        assert following == 795726461, "the same as TorchRL's environments return"
     env.close()
-    made.close()
+    other.close()

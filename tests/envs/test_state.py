@@ -1,4 +1,4 @@
-"""An environment's state is its seed and episode counters: what loads it goes on with the next episodes."""
+"""state_dict holds seed and episode counters: an environment that loads it continues with the next episodes."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ MAKERS = {
 }
 
 
-def expected_and_got(make, seed: int) -> tuple[list, list]:
-    """What comes after two resets, in the environment itself, and in another that took its state."""
+def expected_and_actual(make, seed: int) -> tuple[list, list]:
+    """Return the third reset of an environment, and of another one that loaded its state before."""
     env, other = make(), make(seed)
     for _ in range(2):
         env.rollout(2)
@@ -59,17 +59,17 @@ def expected_and_got(make, seed: int) -> tuple[list, list]:
     state = torch.load(buffered(env.state_dict()), weights_only=True)
     expected = env.reset()
     other.load_state_dict(state)
-    got = other.reset()
+    loaded = other.reset()
     still = torch.zeros(*env.batch_size, 4)
-    moved = [e.step(td.clone().set("action", still))["next"] for e, td in ((env, expected), (other, got))]
+    moved = [e.step(td.clone().set("action", still))["next"] for e, td in ((env, expected), (other, loaded))]
     assert torch.equal(moved[0]["observation"], moved[1]["observation"])
     env.close()
     other.close()
-    return [expected["episode"], expected["observation"]], [got["episode"], got["observation"]]
+    return [expected["episode"], expected["observation"]], [loaded["episode"], loaded["observation"]]
 
 
 def buffered(state: dict):
-    """Saved as a user would."""
+    """Save a state as a user does."""
     file = io.BytesIO()
     torch.save(state, file)
     file.seek(0)
@@ -77,17 +77,17 @@ def buffered(state: dict):
 
 
 @pytest.mark.parametrize("name", first_fast(MAKERS, 2))
-def test_what_loads_the_state_goes_on(name):
-    expected, got = expected_and_got(MAKERS[name], seed=77)
+def test_loading_a_state_continues_with_the_next_episodes(name):
+    expected, actual = expected_and_actual(MAKERS[name], seed=77)
     assert expected[0].min() >= 2, "the third episodes"
-    assert all(torch.equal(left, right) for left, right in zip(expected, got, strict=True))
+    assert all(torch.equal(left, right) for left, right in zip(expected, actual, strict=True))
 
 
-def test_the_episodes_that_ran_are_over():
+def test_loading_a_state_ends_all_episodes():
     env = make_env()
     state = env.reset()
     env.load_state_dict(env.state_dict())
-    with pytest.raises(RuntimeError, match=r"rows \[0, 1, 2\] .* not since close or load_state_dict: reset them"):
+    with pytest.raises(RuntimeError, match=r"rows \[0, 1, 2\]"):
         env.step(state.set("action", torch.zeros(3, 4)))
     assert env.reset()["episode"].tolist() == [2, 1, 3]
     env.close()
@@ -98,7 +98,7 @@ def policy() -> TensorDictModule:
 
 
 @pytest.mark.parametrize("name", ["transformed", "EnvState", "serial", "outside"])
-def test_a_resumed_collector_goes_on(name):
+def test_a_resumed_collector_continues_with_the_next_episodes(name):
     def collector() -> Collector:
         return Collector(
             MAKERS[name](), policy(), frames_per_batch=6 * 5, total_frames=-1, auto_register_policy_transforms=False
@@ -120,8 +120,8 @@ def test_a_resumed_collector_goes_on(name):
     assert not seen & after
 
 
-def test_a_collector_goes_on_after_a_reset_with_a_policy_of_plans():
-    """It zeroes what the environment gave it."""
+def test_a_collector_continues_after_a_reset():
+    """Its reset sets the environment's tensors to zero."""
     actor = lw.PlanConditionedActor(lw.load_plans("MT10"))
     collector = Collector(
         make_transformed(), actor, frames_per_batch=15, total_frames=-1, auto_register_policy_transforms=False
@@ -132,7 +132,7 @@ def test_a_collector_goes_on_after_a_reset_with_a_policy_of_plans():
     collector.shutdown()
 
 
-def test_nothing_that_is_given_is_kept():
+def test_resets_return_fresh_tensors():
     env = make_transformed()
     first, second = env.reset(), env.reset()
     for key in first.keys(True, True):
@@ -140,17 +140,17 @@ def test_nothing_that_is_given_is_kept():
     env.close()
 
 
-def test_a_collector_of_a_plain_environment_says_that_it_saves_nothing():
+def test_a_collector_of_a_plain_environment_saves_no_state():
     first = Collector(make_env(), policy(), frames_per_batch=3, total_frames=-1, auto_register_policy_transforms=False)
     saved = first.state_dict()
-    with pytest.raises(ValueError, match=r"state_dict is empty: a Collector saves .* only in a TransformedEnv"):
+    with pytest.raises(ValueError, match="state_dict is empty"):
         first.load_state_dict(saved)
     saved["env_state_dict"] = first.env.state_dict()
     first.load_state_dict(saved)
     first.shutdown()
 
 
-def test_an_env_creator_changes_nothing():
+def test_an_env_creator_uses_no_episode():
     plain = make_transformed()
     expected = plain.reset()["episode"]
     plain.close()
@@ -159,43 +159,36 @@ def test_an_env_creator_changes_nothing():
     env.close()
 
 
-@pytest.mark.parametrize(
-    ("other", "message"),
-    [
-        (lambda: lw.LanguageWorldEnv(TASKS, num_envs=4, num_threads=1), "other rows, 4: push, reach, push, reach"),
-        (lambda: lw.LanguageWorldEnv(["push", "sweep"], num_envs=3, num_threads=1), "other rows, 3: push, sweep, push"),
-    ],
-    ids=["rows", "tasks"],
-)
-def test_a_state_of_other_rows_is_refused(other, message):
-    env, foreign = make_env(), other()
+@pytest.mark.parametrize(("tasks", "num_envs"), [(TASKS, 4), (["push", "sweep"], 3)])
+def test_a_state_of_other_rows_is_an_error(tasks, num_envs):
+    env, foreign = make_env(), lw.LanguageWorldEnv(tasks, num_envs=num_envs, num_threads=1)
     env.reset()
-    with pytest.raises(ValueError, match=f"state_dict is of an environment with {message}"):
+    with pytest.raises(ValueError, match=f"state_dict .* other rows: {num_envs} rows"):
         env.load_state_dict(foreign.state_dict())
-    assert (env.seed, env.reset()["episode"].tolist()) == (5, [2, 1, 3]), "nothing was taken"
+    assert (env.seed, env.reset()["episode"].tolist()) == (5, [2, 1, 3]), "the state must not change"
     env.close()
     foreign.close()
 
 
-def test_it_is_a_modules_state_like_any_other():
+def test_an_environment_may_be_a_part_of_a_module():
     class Agent(nn.Module):
         def __init__(self, env: EnvBase) -> None:
             super().__init__()
             self.env, self.layer = env, nn.Linear(2, 2)
 
-    one, two = Agent(make_env()), Agent(make_env(6))
-    one.env.reset()
-    assert set(one.state_dict()) == {"env._extra_state", "layer.weight", "layer.bias"}
-    assert not list(one.env.parameters())
-    two.load_state_dict(one.state_dict())
-    assert (two.env.seed, two.env.reset()["episode"].tolist()) == (5, [2, 1, 3])
-    one.env.load_state_dict({}, strict=False)
-    assert one.env.reset()["episode"].tolist() == [2, 1, 3], "nothing was asked of it"
-    one.env.close()
-    two.env.close()
+    first, second = Agent(make_env()), Agent(make_env(6))
+    first.env.reset()
+    assert set(first.state_dict()) == {"env._extra_state", "layer.weight", "layer.bias"}
+    assert not list(first.env.parameters())
+    second.load_state_dict(first.state_dict())
+    assert (second.env.seed, second.env.reset()["episode"].tolist()) == (5, [2, 1, 3])
+    first.env.load_state_dict({}, strict=False)
+    assert first.env.reset()["episode"].tolist() == [2, 1, 3], "without a state nothing changes"
+    first.env.close()
+    second.env.close()
 
 
-def test_on_a_replay_buffer_there_is_no_environment():
+def test_a_transform_of_a_buffer_has_no_environments_state():
     transform = lw.QAFTransform(lw.load_plans("MT10"))
     state = transform.state_dict()
     transform.load_state_dict(state)
@@ -205,7 +198,7 @@ def test_on_a_replay_buffer_there_is_no_environment():
     env.close()
 
 
-def test_a_closed_batch_says_that_its_state_is_gone():
+def test_the_state_of_a_closed_batch_warns():
     env = MAKERS["outside"]()
     env.reset()
     env.close()
@@ -215,9 +208,9 @@ def test_a_closed_batch_says_that_its_state_is_gone():
 
 @pytest.mark.parametrize("copier", [copy.copy, copy.deepcopy, pickle.dumps], ids=lambda f: f.__name__)
 @pytest.mark.parametrize("make", [make_env, make_transformed])
-def test_neither_a_copy_nor_a_pickle(copier, make):
+def test_copies_and_pickles_are_errors(copier, make):
     env = make()
     if not (copier is copy.copy and make is make_transformed):
-        with pytest.raises(TypeError, match="can be neither pickled nor copied: pass a function that makes it"):
+        with pytest.raises(TypeError, match="neither pickled nor copied"):
             copier(env)
     env.close()

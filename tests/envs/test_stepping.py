@@ -14,7 +14,7 @@ from torchrl.trainers import LogValidationReward
 import lw_torchrl as lw
 
 
-def test_partial_resets_touch_only_their_rows(any_env):
+def test_partial_resets_change_only_their_rows(any_env):
     any_env.set_seed(4)
     reference = trajectories(any_env, STEPS)
     any_env.set_seed(4)
@@ -34,10 +34,10 @@ def test_partial_resets_touch_only_their_rows(any_env):
         clock += 1
         for row in torch.nonzero(~mask).flatten().tolist():
             assert torch.equal(state["observation"][row], reference[keys[row]]["observation"][clock[row]])
-    assert state["done"].flatten().tolist() == (~mask).tolist(), "rows that were reset have their own clock"
+    assert state["done"].flatten().tolist() == (~mask).tolist(), "rows that were reset count their own steps"
 
 
-def test_a_reset_mask_without_rows_does_nothing(env):
+def test_an_empty_reset_mask_changes_nothing(env):
     env.set_seed(0)
     state = env.rand_step(env.reset())["next"]
     again = env.reset(state.clone().set("_reset", torch.zeros(ROWS, dtype=torch.bool)))
@@ -45,8 +45,8 @@ def test_a_reset_mask_without_rows_does_nothing(env):
 
 
 @pytest.mark.parametrize("shape", [(ROWS,), (ROWS, 1)], ids=str)
-def test_a_step_mask_leaves_rows_where_they_are(any_env, shape):
-    """Rows that pause, with garbage for an action, do as rows that do not."""
+def test_rows_outside_a_step_mask_do_not_move(any_env, shape):
+    """Rows that pause, even with NaN actions, run as rows that do not."""
     any_env.set_seed(6)
     reference = trajectories(any_env, STEPS)
     any_env.set_seed(6)
@@ -76,7 +76,7 @@ def test_a_step_mask_leaves_rows_where_they_are(any_env, shape):
     assert rested > 50
 
 
-def test_a_step_mask_without_rows_does_nothing(any_env):
+def test_an_empty_step_mask_changes_nothing(any_env):
     any_env.set_seed(0)
     state = any_env.reset()
     idle = advance(any_env, state, torch.ones(ROWS, 4), _step=torch.zeros(ROWS, dtype=torch.bool))
@@ -86,7 +86,7 @@ def test_a_step_mask_without_rows_does_nothing(any_env):
     assert same(moved, advance(any_env, any_env.reset(), torch.ones(ROWS, 4)))
 
 
-def test_an_episode_ends_by_truncation_alone(any_env):
+def test_an_episode_ends_only_by_truncation(any_env):
     any_env.set_seed(0)
     rollout = any_env.rollout(3 * STEPS)
     assert rollout.batch_size == (ROWS, STEPS)
@@ -103,7 +103,7 @@ def test_an_episode_ends_by_truncation_alone(any_env):
     ids=str,
 )
 def test_the_length_of_an_episode(options, length):
-    """500 steps, or more: Meta-World's own limit does not come first."""
+    """Meta-World's own limit of 500 steps does not apply to max_steps=510."""
     env = lw.LanguageWorldEnv("reach", **options)
     rollout = env.rollout(600, lambda td: td.set("action", torch.zeros(1, 4)))
     assert rollout.batch_size == (1, length)
@@ -114,7 +114,7 @@ def test_the_length_of_an_episode(options, length):
 def test_a_row_that_has_ended_must_be_reset(any_env):
     any_env.set_seed(0)
     state = any_env.rollout(STEPS)[:, -1]["next"]
-    with pytest.raises(RuntimeError, match=r"rows \[0, 1, 2, 3, 4\] have ended or were never reset"):
+    with pytest.raises(RuntimeError, match=r"rows \[0, 1, 2, 3, 4\]"):
         advance(any_env, state, torch.zeros(ROWS, 4))
     mask = ~others(2)
     state = any_env.reset(state.clone().set("_reset", mask))
@@ -134,20 +134,19 @@ def test_a_closed_environment_must_be_reset_and_continues_with_the_next_episodes
     env.close()
     env.close()
     assert env.is_closed
-    with pytest.raises(RuntimeError, match=r"rows \[0, 1\] have ended .* or not since close "):
+    with pytest.raises(RuntimeError, match=r"rows \[0, 1\]"):
         env.step(state.set("action", action))
     other.reset()
-    found, expected = (
-        made.rollout(4, lambda td: td.set("action", action), break_when_any_done=False) for made in (env, other)
-    )
+    policy = lambda td: td.set("action", action)  # noqa: E731
+    reopened, expected = (each.rollout(4, policy, break_when_any_done=False) for each in (env, other))
     assert not env.is_closed
-    assert (found == expected).all()
-    assert found["episode"][:, 0].tolist() == [1, 1]
+    assert (reopened == expected).all()
+    assert reopened["episode"][:, 0].tolist() == [1, 1]
     env.close()
     other.close()
 
 
-def test_torchrl_validates_with_one_environment_again_and_again():
+def test_torchrl_validates_repeatedly_with_one_environment():
     """``LogValidationReward`` closes its environment after each validation."""
     plans = lw.load_plans("MT10")
     env = TransformedEnv(lw.LanguageWorldEnv("reach", max_steps=5), lw.QAFTransform(plans))
@@ -164,14 +163,14 @@ def test_torchrl_validates_with_one_environment_again_and_again():
         assert env.base_env.is_closed
 
 
-def test_a_row_that_was_never_reset_must_be():
+def test_a_step_before_the_first_reset_is_an_error():
     env = lw.LanguageWorldEnv(["reach", "push"])
-    with pytest.raises(RuntimeError, match=r"rows \[0, 1\] have ended or were never reset"):
+    with pytest.raises(RuntimeError, match=r"rows \[0, 1\]"):
         env.step(TensorDict({"action": torch.zeros(2, 4)}, [2]))
     env.close()
 
 
-def test_rollouts_go_on_over_the_end_of_episodes(any_env):
+def test_rollouts_continue_after_the_end_of_episodes(any_env):
     any_env.set_seed(8)
     steps = 2 * STEPS + 5
     rollout = any_env.rollout(steps, break_when_any_done=False)
@@ -191,7 +190,7 @@ def test_rollouts_go_on_over_the_end_of_episodes(any_env):
         assert torch.equal(any_env.reset()["observation"], rollout["observation"][:, episode * STEPS])
 
 
-def test_later_steps_overwrite_nothing(any_env):
+def test_later_steps_do_not_change_earlier_states(any_env):
     any_env.set_seed(0)
     states = [any_env.reset()]
     copies = [states[0].clone()]
@@ -207,7 +206,7 @@ def test_later_steps_overwrite_nothing(any_env):
     assert len(set(memory)) == len(memory)
 
 
-def test_writing_to_a_state_does_not_reach_the_environment(env):
+def test_writes_to_a_state_do_not_change_the_environment(env):
     env.set_seed(0)
     state = env.rand_step(env.reset())["next"]
     kept = state.clone()
@@ -217,7 +216,7 @@ def test_writing_to_a_state_does_not_reach_the_environment(env):
     assert same(kept.select(*STATE), resting)
 
 
-def test_a_rollout_is_its_steps(any_env):
+def test_a_rollout_equals_its_steps(any_env):
     any_env.set_seed(9)
     torch.manual_seed(0)
     rollout = any_env.rollout(STEPS)
@@ -230,9 +229,9 @@ def test_a_rollout_is_its_steps(any_env):
 
 
 @pytest.mark.parametrize("transformed", [False, True])
-def test_a_collector_runs(plans, transformed):
-    made = lw.LanguageWorldEnv(FEW, num_envs=ROWS, seed=9, max_steps=STEPS)
-    env = TransformedEnv(made, lw.QAFTransform(plans)) if transformed else made
+def test_a_collector_collects_the_same_as_a_rollout(plans, transformed):
+    base = lw.LanguageWorldEnv(FEW, num_envs=ROWS, seed=9, max_steps=STEPS)
+    env = TransformedEnv(base, lw.QAFTransform(plans)) if transformed else base
     policy = row_policy()
     expected = env.rollout(20, policy, break_when_any_done=False)
     env.set_seed(9)
@@ -244,7 +243,7 @@ def test_a_collector_runs(plans, transformed):
         assert torch.equal(batches[key], expected[key]), key
     assert batches["next", "done"].sum() == ROWS
     assert batches["collector", "traj_ids"].unique().numel() == 2 * ROWS
-    assert made.is_closed, "the collector closes what it ran"
+    assert base.is_closed, "the collector must close its environment"
 
 
 def test_a_collector_gives_whole_episodes():
@@ -263,7 +262,7 @@ def test_a_collector_gives_whole_episodes():
 
 
 def row_policy():
-    """A policy that hangs on the observation alone."""
+    """Return a policy that depends only on the observation."""
 
     def policy(tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set("action", (tensordict["observation"][:, :4] * 37).sin())

@@ -1,10 +1,12 @@
-"""Numbered workers run different episodes: those that one environment of all their rows would."""
+"""Numbered workers run the episodes of one environment with all their rows; forked processes and threads."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import sys
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import pytest
@@ -22,7 +24,7 @@ pytestmark = pytest.mark.filterwarnings(
 
 
 def four_rows() -> torch.Tensor:
-    """(2, 4): the first two episodes of one environment of four rows, and their first observations."""
+    """Return the first observations of two resets of an environment with four rows, (2, 4, 39)."""
     env = make_env(num_envs=4)
     states = [env.reset() for _ in range(2)]
     env.close()
@@ -38,7 +40,7 @@ BATCHED = {
 
 @pytest.mark.parametrize("make", [make_env, make_transformed])
 @pytest.mark.parametrize("name", first_fast(BATCHED, 2))
-def test_a_batch_of_environments_runs_what_one_large_one_would(name, make):
+def test_a_batch_of_environments_runs_the_episodes_of_a_large_one(name, make):
     env = BATCHED[name](numbered(make, 2))
     states = [env.reset() for _ in range(2)]
     env.close()
@@ -47,26 +49,26 @@ def test_a_batch_of_environments_runs_what_one_large_one_would(name, make):
     assert torch.equal(torch.stack([state["observation"].flatten(0, 1) for state in states]), four_rows())
 
 
-def test_workers_within_workers():
+def test_workers_in_workers_run_different_episodes():
     for of, batch in ((3, SerialEnv), (2, partial(ParallelEnv, mp_start_method="fork"))):
         env = batch(of, [partial(make_serial, worker=(w, of)) for w in range(of)])
         assert env.reset()["episode"].flatten().tolist() == list(range(4 * of))
         env.close()
 
 
-def test_an_env_creator_in_workers():
+def test_env_creators_may_be_numbered():
     env = SerialEnv(2, [EnvCreator(make_transformed, {"worker": (w, 2)}) for w in range(2)])
     assert env.reset()["episode"].tolist() == [[0, 1], [2, 3]]
     env.close()
 
 
-def test_without_a_number_workers_run_the_same_episodes():
+def test_unnumbered_workers_run_the_same_episodes():
     env = SerialEnv(2, make_env)
     assert env.reset()["episode"].tolist() == [[0, 1], [0, 1]]
     env.close()
 
 
-def test_a_set_seed_still_gives_each_worker_its_own():
+def test_workers_differ_after_set_seed():
     env = SerialEnv(2, numbered(make_env, 2))
     env.set_seed(0)
     first = env.reset()["observation"]
@@ -84,24 +86,24 @@ def collected(kind, makers, **options) -> list[torch.Tensor]:
 
 
 @pytest.mark.slow
-def test_collectors_in_processes_differ_and_repeat_themselves():
+def test_collecting_processes_differ_and_are_reproducible():
     makers = numbered(make_env, 2)
     runs = [collected(MultiSyncCollector, makers, cat_results="stack") for _ in range(2)]
-    assert all(torch.equal(left, right) for left, right in zip(*runs, strict=True)), "the seed says it all"
+    assert all(torch.equal(left, right) for left, right in zip(*runs, strict=True))
     episodes, goals = torch.cat(runs[0]).unbind(-1)
     assert sorted(episodes.unique().tolist()) == list(range(16))
     assert goals.unique().numel() == 16
 
 
 @pytest.mark.slow
-def test_a_pool_of_processes():
+def test_a_pool_of_processes_runs_different_episodes():
     makers = numbered(make_env, 2, num_envs=1)
     pool = AsyncEnvPool(makers, backend="multiprocessing", exchange="queue")
     assert pool.reset()["episode"].flatten().tolist() == [0, 1]
     pool.close()
 
 
-def test_environments_know_their_number():
+def test_numbered_environments_run_different_episodes():
     envs = [make_env(worker=(w, 3)) for w in range(3)]
     assert [env.reset()["episode"].tolist() for env in envs] == [[0, 1], [2, 3], [4, 5]]
     assert [env.reset()["episode"].tolist() for env in envs] == [[6, 7], [8, 9], [10, 11]]
@@ -112,19 +114,19 @@ def test_environments_know_their_number():
         env.close()
 
 
-def test_rows_of_several_tasks_are_counted_each():
+def test_each_task_counts_its_own_rows():
     env = lw.LanguageWorldEnv(["push", "reach"], num_envs=3, worker=(1, 2), num_threads=1)
     assert env.reset()["episode"].tolist() == [2, 1, 3]
     assert env.reset()["episode"].tolist() == [6, 3, 7]
     env.close()
 
 
-# --- processes -----------------------------------------------------------------------------------------------------
+# ---- forked processes
 
 
-def in_a_fork(env, state, what: str, channel) -> None:
+def in_a_fork(env, state, action: str, channel) -> None:
     try:
-        channel.send((env.reset() if what == "reset" else env.step(state))["episode"].tolist())
+        channel.send((env.reset() if action == "reset" else env.step(state))["episode"].tolist())
     except RuntimeError as error:
         channel.send(str(error))
     channel.close()
@@ -132,17 +134,50 @@ def in_a_fork(env, state, what: str, channel) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="fork")
-@pytest.mark.parametrize("what", ["reset", "step"])
+@pytest.mark.parametrize("action", ["reset", "step"])
 @pytest.mark.parametrize("make", [make_env, make_transformed])
-def test_a_forked_child_is_told_to_make_its_own(make, what):
+def test_use_in_a_forked_process_is_an_error(make, action):
     env = make()
     state = still(env.reset())
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe()
-    child = context.Process(target=in_a_fork, args=(env, state, what, theirs))
+    child = context.Process(target=in_a_fork, args=(env, state, action, theirs))
     child.start()
-    assert ours.poll(30), "it hangs"
-    assert "make the environment in this process" in ours.recv()
+    assert ours.poll(30), "the child hangs"
+    assert "forked after the environment was made" in ours.recv()
     child.join()
-    assert not env.step(state)["next", "fault"].any(), "the parent goes on"
+    assert not env.step(state)["next", "fault"].any()
     env.close()
+
+
+# ---- threads
+
+
+def test_environments_in_threads_give_the_same_rollouts():
+    def rollout(task):
+        env = lw.LanguageWorldEnv(task, seed=3, num_threads=1)
+        steps = env.rollout(20, lw.ExpertActor(task))
+        env.close()
+        return steps
+
+    tasks = ["reach", "push", "reach"]
+    expected = [rollout(task) for task in tasks]
+    with ThreadPoolExecutor(3) as threads:
+        rollouts = list(threads.map(rollout, tasks))
+    assert all((left == right).all() for left, right in zip(expected, rollouts, strict=True))
+
+
+def test_experts_in_threads_do_not_change_pythons_warnings():
+    state = lw.LanguageWorldEnv("reach", num_envs=4).reset()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        before = list(warnings.filters)
+
+        def act(_):
+            expert = lw.ExpertActor("reach")
+            for _ in range(200):
+                expert(state.copy())
+
+        with ThreadPoolExecutor(3) as threads:
+            list(threads.map(act, range(3)))
+        assert warnings.filters == before

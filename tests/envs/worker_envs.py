@@ -23,7 +23,7 @@ def make_serial(worker=(0, 1)) -> SerialEnv:
 
 
 def numbered(make, of, worker=(0, 1), **options):
-    """A factory for each of some workers, which may be workers of a worker themselves."""
+    """Return a factory for each of ``of`` workers, which may run in a worker themselves."""
     rank, outer = worker
     return [partial(make, worker=(rank * of + w, of * outer), **options) for w in range(of)]
 

@@ -1,0 +1,33 @@
+"""Datasets that several test files read."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+from collecting import collect
+
+from lw_torchrl.data.dataset import load_rows
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory):
+    """Three episodes each of push and reach, every second one with noise."""
+    return collect(tmp_path_factory.mktemp("dataset") / "demos")
+
+
+@pytest.fixture(scope="session")
+def other_dataset(tmp_path_factory):
+    """As many rows, of another seed."""
+    return collect(tmp_path_factory.mktemp("other_dataset") / "demos", seed=6)
+
+
+@pytest.fixture(scope="session")
+def rows(dataset):
+    return load_rows(dataset)
+
+
+@pytest.fixture
+def damaged_root(dataset, tmp_path):
+    """A copy of the dataset to damage."""
+    return shutil.copytree(dataset.root, tmp_path / "demos")

@@ -1,0 +1,389 @@
+"""Policies that collect datasets: scripted skills with wrong segments, random actions, trained policies, functions."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from collecting import PLANS, SEED, STEPS, collect, interrupt_after, same_rows, trained, tree
+from commands import fails
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import lw_torchrl as lw
+from lw_torchrl._util.reproducibility import episode_generator
+from lw_torchrl.data import BEHAVIOURS, Behaviour, CollectConfig, DatasetError
+from lw_torchrl.data.collection_policy import SegmentActor, policy_fingerprint, segment_plans
+from lw_torchrl.data.dataset import load_rows, read_metadata
+from lw_torchrl.envs.episodes import run_episodes
+from lw_torchrl.language.skill_program import SkillProgram
+from lw_torchrl.language.tasks import task_id
+from lw_torchrl.modules.policy import with_plans
+from lw_torchrl.training import BehavioralCloningConfig, BehavioralCloningTrainer
+from lw_torchrl.training.checkpoint import demonstrated_tasks, demonstration_seeds
+
+OTHERS = [name for name in BEHAVIOURS if name != "expert"]
+
+
+# ---- behaviours of segments
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory):
+    """A dataset of each behaviour, by name."""
+    root = tmp_path_factory.mktemp("behaviours")
+    return {name: collect(root / name, policy=name) for name in OTHERS}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_rows_depend_neither_on_num_envs_nor_on_other_tasks(datasets, name, tmp_path):
+    assert same_rows(datasets[name], collect(tmp_path / "narrow", policy=name, num_envs=2))
+    alone = collect(tmp_path / "alone", policy=name, tasks="reach", num_envs=1)
+    rows = load_rows(datasets[name])
+    together = rows[rows["task_id"] == task_id("reach")].exclude("collector")
+    assert (together == load_rows(alone).exclude("collector")).all()
+
+
+@pytest.mark.parametrize("name", ["spoilt-30", "random"])
+def test_interruptions_do_not_change_the_dataset(datasets, name, tmp_path, monkeypatch):
+    root = tmp_path / "stopped"
+    for episodes in (1, 2):
+        with monkeypatch.context() as patch:
+            interrupt_after(patch, episodes)
+            with pytest.raises(KeyboardInterrupt):
+                collect(root, policy=name, num_envs=2)
+    assert tree(collect(root, policy=name, num_envs=3).root) == tree(datasets[name].root)
+
+
+def test_metadata_describe_the_behaviour(datasets):
+    for name, dataset in datasets.items():
+        config = read_metadata(dataset.root).config
+        assert config.behaviour == name
+        assert config.policy.acts == BEHAVIOURS[name]
+        assert config.policy.fingerprint == segment_plans(("push", "reach")).fingerprint
+        assert CollectConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
+
+
+def segments(flags):
+    """Return the lengths of the runs of equal rows of (T, ...)."""
+    changes = (flags[1:] != flags[:-1]).reshape(len(flags) - 1, -1).any(-1).nonzero().flatten() + 1
+    return torch.diff(torch.cat([torch.tensor([0]), changes, torch.tensor([len(flags)])])).tolist()
+
+
+def acting(behaviour, tasks=("reach",), max_steps=500):
+    return SegmentActor(behaviour, segment_plans(tasks), SEED, max_steps)
+
+
+@given(
+    right=st.floats(0.0, 1.0),
+    otherwise=st.sampled_from(["skill", "action"]),
+    shortest=st.integers(1, 30),
+    more=st.integers(0, 30),
+    episode=st.integers(0, 2**40),
+)
+@settings(max_examples=30, deadline=None)
+def test_segments_have_the_given_lengths_and_probability(right, otherwise, shortest, more, episode):
+    behaviour = Behaviour("any", right=right, otherwise=otherwise, shortest=shortest, longest=shortest + more)
+    actor = acting(behaviour)
+    actor._begin(1)
+    actor._draw(0, task_id("reach"), episode)
+    lengths = segments(actor._random_action[0])
+    assert sum(lengths) == 500
+    assert all(shortest <= length <= shortest + more for length in lengths[:-1])
+    assert lengths[-1] <= shortest + more
+    assert actor._random_action.abs().max() <= 1
+    starts = torch.tensor([0, *lengths[:-1]]).cumsum(0)
+    for start, length in zip(starts.tolist(), lengths, strict=True):
+        for drawn in (actor._right, actor._skill):
+            assert len(drawn[0, start : start + length].unique()) == 1
+    draws = episode_generator("segments", "reach", SEED, episode)  # the order of the draws is part of the data
+    assert lengths[0] == draws.integers(shortest, shortest + more + 1, -(-500 // shortest))[0]
+
+
+@pytest.mark.parametrize(("name", "right"), [("spoilt-60", 0.6), ("spoilt-30", 0.3), ("wrong", 0.0), ("scripted", 1.0)])
+def test_the_share_of_right_segments(name, right):
+    actor = acting(BEHAVIOURS[name])
+    actor._begin(1)
+    shares = []
+    for episode in range(300):
+        actor._draw(0, task_id("reach"), episode)
+        shares.append(actor._right[0].double().mean())
+    mean = torch.stack(shares).mean()
+    assert abs(mean - right) < 0.02
+    assert (mean == right) or 0 < right < 1
+
+
+def recorded(actor, tasks):
+    """Return the actions and observations of two episodes of each task, of 40 steps."""
+    env = lw.LanguageWorldEnv(tasks, num_envs=4, seed=SEED, max_steps=40)
+    env = TransformedEnv(env, lw.QAFTransform(segment_plans(tasks)))
+    episodes = run_episodes(env, actor, {task: range(2) for task in tasks}, keys=["action", "observation"])
+    steps = {(episode.task, episode.episode): episode.steps for episode in episodes}
+    env.close()
+    return steps
+
+
+def test_scripted_acts_as_the_scripted_skill_actor(tmp_path):
+    tasks = ("button-press-topdown", "reach")
+    expected = recorded(lw.ScriptedSkillActor(segment_plans(tasks)), tasks)
+    dataset = collect(tmp_path / "demos", tasks=tasks, policy="scripted", noise_scale=0.0, max_steps=40)
+    rows = load_rows(dataset)
+    for info in dataset.episodes:
+        if info.episode < 2:
+            span = slice(info.start, info.start + info.length)
+            assert torch.equal(rows["action"][span], expected[info.task, info.episode]["action"])
+            assert torch.equal(rows["observation"][span], expected[info.task, info.episode]["observation"])
+
+
+def test_wrong_acts_by_skills_of_the_plan(tmp_path):
+    """Each action is that of a skill of the plan in the same state."""
+    dataset = collect(tmp_path / "demos", tasks="push", policy="wrong", noise_scale=0.0, max_steps=60)
+    rows, plan = load_rows(dataset), segment_plans(["push"])["push"]
+    actions = SkillProgram({plan.definition: [step.skill for step in plan.steps]})(
+        rows["observation"].clone(), rows["task_id"].clone()
+    )
+    assert (actions == rows["unclipped_action"].unsqueeze(1)).all(-1).any(-1).all()
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "message"),
+    [
+        ("expert", "scripted", r"policy.kind \('expert', now 'segments'\), policy.name \('expert', now 'scripted'\)"),
+        ("scripted", "expert", r"policy.name \('scripted', now 'expert'\)"),
+        ("spoilt-30", "spoilt-60", r"policy.name \('spoilt-30', now 'spoilt-60'\), policy.right \(0.3, now 0.6\)"),
+    ],
+)
+def test_another_behaviour_is_an_error_with_the_difference(tmp_path, was, now, message):
+    dataset = collect(tmp_path / "demos", tasks="reach", episodes_per_task=1, policy=was)
+    before = tree(dataset.root)
+    with pytest.raises(DatasetError, match=message):
+        collect(dataset.root, tasks="reach", episodes_per_task=1, policy=now)
+    assert tree(dataset.root) == before
+
+
+def test_redrawing_works_with_other_policies(tmp_path, monkeypatch):
+    options = dict(tasks="reach", policy="wrong", redraw_failures=True, episodes_per_task=2, max_steps=31)
+    dataset = collect(tmp_path / "a", noise_scale=0.0, **options)
+    assert all(episode.success for episode in dataset.episodes)
+    assert dataset.attempts["reach"] > 2, "the test needs failures"
+    assert tree(collect(tmp_path / "b", noise_scale=0.0, num_envs=1, **options).root) == tree(dataset.root)
+    monkeypatch.setattr("lw_torchrl.data.collect._MAX_ATTEMPTS", 3)
+    with pytest.raises(RuntimeError, match=r"only 0 of 3 .*redraw_failures=False"):
+        collect(tmp_path / "c", tasks="push", policy="random", redraw_failures=True, episodes_per_task=1)
+
+
+@pytest.mark.parametrize("label", ["expert", "unclipped"])
+def test_labels_of_the_expert_are_an_error_for_other_policies(datasets, label):
+    with pytest.raises(ValueError, match=f"label='{label}' .* 'random'"):
+        lw.LanguageWorldExperienceReplay(datasets["random"].root, label=label)
+
+
+def test_the_column_behaviour_is_the_labels_rank(datasets):
+    names = ("wrong", "scripted", "random")
+    replay = lw.LanguageWorldExperienceReplay([datasets[name].root for name in names], label="executed")
+    assert replay.behaviours == ("random", "scripted", "wrong")
+    size = datasets["wrong"].num_steps
+    assert replay[:]["behaviour"].tolist() == [2] * size + [1] * size + [0] * size
+
+
+def test_one_label_for_two_behaviours_is_an_error(tmp_path, datasets):
+    first = collect(tmp_path / "one", policy=trained(), behaviour="tiny")
+    second = collect(tmp_path / "other", policy=trained(seed=1), behaviour="tiny")
+    with pytest.raises(ValueError, match="'tiny' names different behaviours"):
+        lw.LanguageWorldExperienceReplay([first.root, second.root], label="executed")
+    metadata = json.loads((second.root / "metadata.json").read_text())
+    metadata["config"]["policy"]["name"] = "second"
+    (second.root / "metadata.json").write_text(json.dumps(metadata))
+    both = lw.LanguageWorldExperienceReplay([first.root, second.root], label="executed")
+    assert both.behaviours == ("second", "tiny")
+    alone = collect(tmp_path / "reach", tasks="reach", policy="scripted")  # other plans, the same behaviour
+    lw.LanguageWorldExperienceReplay([datasets["scripted"].root, alone.root], label="executed")
+
+
+def test_a_checkpoint_records_seeds_and_tasks_of_its_demonstrations(tmp_path, datasets, capsys):
+    tiny = collect(tmp_path / "tiny", tasks="reach", policy=trained(), behaviour="tiny", seed=77)
+    roots = [datasets["spoilt-60"].root, tiny.root]
+    for number, (root, seeds, tasks) in enumerate(
+        [(roots, {SEED, 77}, {"push", "reach"}), (roots[0], {SEED}, {"push", "reach"}), (roots[1], {77}, {"reach"})]
+    ):
+        replay = lw.LanguageWorldExperienceReplay(
+            root, label="executed", sampler=lw.TaskBalancedSampler(), transform=lw.QAFTransform(PLANS)
+        )
+        path = tmp_path / f"{number}.safetensors"
+        config = BehavioralCloningConfig(steps=1, batch_size=8)
+        BehavioralCloningTrainer(trained(), replay, config, checkpoint=path, progress=False).train()
+        assert demonstration_seeds(path) == seeds
+        assert demonstrated_tasks(path) == tasks
+        for seed in seeds:
+            assert "is the seed of the demonstrations" in fails(capsys, "evaluate", path, "--seed", seed)
+
+
+# ---- trained policies, modules and functions
+
+
+@pytest.mark.parametrize("kind", ["plan", "description"])
+def test_a_policy_acts_as_in_an_evaluation(tmp_path, kind):
+    actor = trained(kind).train()
+    options = dict(noise_scale=0.1, gripper_noise_factor=1.0, noise_hold=1)
+    dataset = collect(tmp_path / "demos", policy=actor, behaviour="tiny", num_envs=3, **options)
+    assert actor.training, "its mode does not change"
+    result = lw.evaluate(
+        actor,
+        tasks=("push", "reach"),
+        episodes_per_task=3,
+        seed=SEED,
+        noise_scale=0.1,
+        max_steps=STEPS,
+        record_actions=True,
+        progress=False,
+    )
+    rows = load_rows(dataset)
+    for info, episode in zip(dataset.episodes, result.episodes, strict=True):
+        assert (info.task, info.episode) == (episode.task, episode.episode)
+        assert torch.equal(rows["action"][info.start : info.start + info.length], episode.actions)
+    assert dataset.config.behaviour == "tiny"
+
+
+def test_a_policy_with_a_distribution_acts_without_exploring(tmp_path):
+    actor = trained().stochastic("tanh_normal").train()
+    dataset = collect(tmp_path / "one", policy=actor, behaviour="tiny")
+    torch.manual_seed(99)
+    assert tree(collect(tmp_path / "other", policy=actor, behaviour="tiny", num_envs=2).root) == tree(dataset.root)
+    still = collect(tmp_path / "still", policy=actor, behaviour="tiny", noise_scale=0.0)
+    state = TensorDict({"observation": load_rows(still)["observation"][:64].clone()}, [64])
+    state["task_id"] = load_rows(still)["task_id"][:64].clone()
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        actor.eval()(lw.QAFTransform(PLANS)(state))
+    assert torch.allclose(state["action"], load_rows(still)["action"][:64], atol=1e-5)
+
+
+def test_only_the_same_policy_resumes_an_interrupted_collection(tmp_path, monkeypatch):
+    root, actor = tmp_path / "demos", trained()
+    whole = collect(tmp_path / "whole", policy=actor, behaviour="tiny")
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, 2)
+        with pytest.raises(KeyboardInterrupt):
+            collect(root, policy=actor, behaviour="tiny", num_envs=2)
+    before = tree(root)
+    for other in (trained(seed=1), trained(squash=False)):
+        with pytest.raises(DatasetError, match=r"policy.fingerprint"):
+            collect(root, policy=other, behaviour="tiny")
+    with torch.no_grad():
+        next(actor.parameters()).add_(1e-3)
+    with pytest.raises(DatasetError, match=r"policy.fingerprint"):
+        collect(root, policy=actor, behaviour="tiny")
+    with torch.no_grad():
+        next(actor.parameters()).copy_(next(trained().parameters()))
+    with pytest.raises(DatasetError, match=r"policy.name"):
+        collect(root, policy=actor, behaviour="other")
+    assert tree(root) == before
+    assert tree(collect(root, policy=actor, behaviour="tiny").root) == tree(whole.root)
+
+
+def nan(policy):
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter.fill_(torch.nan)
+    return policy
+
+
+class Odd(TensorDictModuleBase):
+    """A policy with a wrong action."""
+
+    def __init__(self, wrong):
+        super().__init__()
+        self.wrong = wrong
+        self.in_keys, self.out_keys = ["observation"], ["deed" if wrong == "key" else "action"]
+
+    def forward(self, tensordict):
+        dtype = torch.float64 if self.wrong == "dtype" else torch.float32
+        action = tensordict["observation"][..., : 3 if self.wrong == "shape" else 4].to(dtype)
+        return tensordict.set(self.out_keys[0], action)
+
+
+RANDOM = lw.ScriptedSkillActor(PLANS, "random")
+
+
+@pytest.mark.parametrize(
+    ("policy", "options", "error", "message"),
+    [
+        (trained(), dict(behaviour=None), ValueError, "behaviour must name the policy"),
+        (trained(), dict(behaviour="noisy"), ValueError, "'noisy' is reserved"),
+        ("random", dict(behaviour="expert"), ValueError, "'expert' is reserved"),
+        (Behaviour("wrong", right=0.9), dict(behaviour=None), ValueError, "'wrong' is reserved"),
+        (Behaviour("mine", "policy"), {}, ValueError, "give the policy itself"),
+        ("raondm", {}, ValueError, "policy must be one of 'expert'.*did you mean 'random'"),
+        (lambda state: state, {}, ValueError, "must write 'action'"),
+        (lambda state: state, dict(behaviour=None), ValueError, "behaviour must name the policy"),
+        (trained("description"), dict(tasks=("push", "drawer-open")), ValueError, "tasks must be .* drawer-open"),
+        (nan(trained()), {}, ValueError, "NaN"),
+        (Odd("key"), {}, ValueError, "must write 'action'"),
+        (lambda state: state["observation"], {}, TypeError, "policy must return the TensorDict"),
+        (Odd("dtype"), {}, ValueError, "must be float32"),
+        (Odd("shape"), {}, ValueError, r"must be float32 of shape \(2, 4\), got torch.float32 of shape \(2, 3\)"),
+        (RANDOM, {}, ValueError, "policy: this ScriptedSkillActor"),
+        (lw.modules.ActorEnsemble([RANDOM]), {}, ValueError, "policy: this ActorEnsemble"),
+    ],
+)
+def test_wrong_policies_are_errors(tmp_path, policy, options, error, message):
+    with pytest.raises(error, match=message):
+        collect(tmp_path / "demos", policy=policy, num_envs=2, **{"behaviour": "mine", **options})
+    assert not (tmp_path / "demos" / "metadata.json").exists()
+
+
+def test_a_module_and_a_function_collect_the_same_rows(tmp_path):
+    """A TensorDictModule of any network, a function, and a module with plans, which reads their truth."""
+
+    class Scaled(torch.nn.Module):  # without sums of products, whose last bit may depend on the number of rows
+        def __init__(self):
+            super().__init__()
+            self.weight = torch.nn.Parameter(torch.tensor([1.0, -2.0, 3.0, 0.5]))
+
+        def forward(self, observation):
+            return (observation[..., :4] * self.weight).clamp(-1.0, 1.0)
+
+    network = Scaled()
+    module = TensorDictModule(network, in_keys=["observation"], out_keys=["action"])
+
+    def function(tensordict):
+        return tensordict.set("action", network(tensordict["observation"]))
+
+    by_module = collect(tmp_path / "module", policy=module, behaviour="mine")
+    assert same_rows(by_module, collect(tmp_path / "function", policy=function, behaviour="mine", num_envs=2))
+    rows = load_rows(by_module)
+    torch.testing.assert_close(rows["unclipped_action"], network(rows["observation"]).detach())
+    assert by_module.config.policy.fingerprint == policy_fingerprint(module)
+    assert read_metadata(tmp_path / "function").config.policy == Behaviour("mine", "policy")
+    network.weight.data *= 2
+    with pytest.raises(DatasetError, match="another configuration"):
+        collect(tmp_path / "module", policy=module, behaviour="mine")
+
+    class Planned(TensorDictModule):
+        plans = PLANS
+
+    act = lambda observation, qaf: observation[..., :4].tanh() * qaf[..., :1]  # noqa: E731
+    planned = Planned(act, in_keys=["observation", "qaf"], out_keys=["action"])
+    dataset = collect(tmp_path / "planned", policy=planned, behaviour="planned")
+    rows = lw.QAFTransform(PLANS)(load_rows(dataset).select("observation", "task_id", "expert_action").clone())
+    torch.testing.assert_close(rows["expert_action"], rows["observation"][:, :4].tanh() * rows["qaf"][:, :1])
+
+
+def test_a_fingerprint_depends_on_all_parts_of_a_policy():
+    base = policy_fingerprint(trained())
+    assert policy_fingerprint(trained()) == base
+    others = [
+        trained(seed=1),
+        trained(squash=False),
+        trained(features=lw.modules.ObservationFeatures("raw")),
+        trained("description"),
+        with_plans(trained(), {**PLANS, "reach": lw.ConditionalPlan("reach", PLANS["reach"].steps[:1])}),
+        trained(text_encoder=lambda texts: torch.randn(len(texts), 384, generator=torch.Generator())),
+        trained().bfloat16(),
+    ]
+    fingerprints = [base, *map(policy_fingerprint, others)]
+    assert len(set(fingerprints)) == len(fingerprints)
