@@ -221,6 +221,7 @@ def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) ->
     stalled = stall_step(seen, stuck, scripts.plans.layout)
     blames, evidence = {}, {"states": float(length)}
 
+    # Wrong answers; those that changed the chosen step matter most.
     wrong = seen.given != seen.truth
     share = evidence["answers_wrong"] = float(wrong.any(-1).float().mean())
     if share:
@@ -233,6 +234,7 @@ def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) ->
         answers = WrongAnswers(column, condition, int(here.sum()), length, int(here.argmax()))
         blames["query"] = Blame(column, int(matter[:, column].int().argmax()), answers)
 
+    # The plan: states in which no condition holds, or in which the reference requests another action.
     none = ~seen.truth.any(-1)
     evidence["no_condition_late"] = float(none[-late:].float().mean())
     if reference is None or seen.task not in reference.plans:
@@ -254,6 +256,7 @@ def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) ->
         finding = PlanDeparts(step, plan.steps[step].skill, requested, states, of, bool(recent), uncovers)
         blames["plan"] = Blame(step, at, finding)
 
+    # The step in which the episode ended.
     evidence["in_step_late"] = float((seen.active == stuck)[-late:].float().mean())
     if scripts.known[seen.task][stuck]:
         last = seen.steps[-1:]
