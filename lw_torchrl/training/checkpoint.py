@@ -1,4 +1,4 @@
-"""Files of policies, query evaluators and trainings: one .safetensors file each, with a description as JSON."""
+"""Files of policies, query evaluators and training states: one .safetensors file each, with a description as JSON."""
 
 from __future__ import annotations
 

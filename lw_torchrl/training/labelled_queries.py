@@ -198,7 +198,7 @@ def _check_pictures(rows: TensorDictBase, layout: Layout) -> None:
     same_episode = rows.get(("collector", "traj_ids"))[1:] == rows.get(("collector", "traj_ids"))[:-1]
     for row in (moved & same_episode).nonzero().flatten().tolist():
         if torch.equal(pixels[row], pixels[row + 1]):
-            raise ValueError("every must be the number of steps between pictures: one stays while the hand moves")
+            raise ValueError("every must be the number of steps between pictures: a picture stays while the hand moves")
 
 
 def _draw_tasks(held_out: int | tuple[str, ...], names: Sequence[str], generator: torch.Generator) -> tuple[str, ...]:

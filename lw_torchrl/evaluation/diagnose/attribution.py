@@ -121,8 +121,8 @@ def attribute_failures(
     names = sorted({task for task, _, _ in failed})
     own_suite = find_suite(names, suite)
     table = (own_suite.skills or load_skills()) if skills is None else skills
-    given = {} if reference is None else as_plans(reference, "reference")
-    trusted = {task: plan for task, plan in given.items() if task in names}
+    all_trusted = {} if reference is None else as_plans(reference, "reference")
+    trusted = {task: plan for task, plan in all_trusted.items() if task in names}
     seen = [states_of(task, k, steps, answered, _answers(steps, actor)) for task, k, steps in failed]
     scripts, trusted_scripts = Scripts(answered, table), Scripts(Plans(trusted), table) if trusted else None
     explained = [(states, explain(states, scripts, trusted_scripts)) for states in seen]

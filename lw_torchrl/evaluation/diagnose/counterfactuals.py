@@ -188,7 +188,7 @@ class Counterfactuals:
             self._run("perception", misled, self.actor, self.plans, evaluator)
         true = with_true_answers(self.actor)
         can_answer = evaluator is not None or true is not self.actor
-        wrong = [states.which for states in seen if can_answer and bool((states.given != states.truth).any())]
+        wrong = [states.which for states in seen if can_answer and bool((states.answers != states.truth).any())]
         self._run("query", wrong, true, self.plans)
         left = self._unfixed(every, "perception", "query")
         with_reference = [which for which in left if self.reference is not None and which[0] in self.reference]
