@@ -142,6 +142,7 @@ def evaluate(
     config |= {"stop_at_success": stop_at_success, "reward": reward}
     failures = None
     if attribute and answered is not None:
+        # Episodes finish in an order that depends on the number of environments.
         failed.sort(key=lambda episode: episode[:2])
         parts: dict[str, Any] = {"actor": actor, "reference": reference, "evaluator": evaluator}
         failures = tuple(attribute_failures(failed, answered, **parts, **env_options, **run))
