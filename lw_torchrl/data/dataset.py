@@ -30,7 +30,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._util.checks import Count, Scale, check_value, typed_fields
+from lw_torchrl._util.checks import Count, Scale, typed_fields
 from lw_torchrl._util.files import AnyPath, flush, read_json, write_json
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.collection_policy import EXPERT, NOISY, Behaviour, check_own_label
@@ -56,7 +56,7 @@ class CollectConfig:
     tasks: tuple[str, ...]
     episodes_per_task: Count
     seed: int
-    noise_scale: tuple[float, ...] = (0.0,)
+    noise_scale: tuple[Scale, ...] = (0.0,)
     noise_hold: Count = 1
     gripper_noise_factor: Scale = 0.2
     redraw_failures: bool = False
@@ -74,11 +74,10 @@ class CollectConfig:
             tasks = tuple(sorted(self.tasks))
             if not tasks or not all(task.startswith(f"{self.layout.name}/") for task in tasks):
                 raise ValueError(f"tasks must be named '{self.layout.name}/...', got {short(self.tasks)}")
-        # beartype looks at only one item of a tuple.
-        noise_scale = tuple(check_value("noise_scale", scale, Scale) for scale in self.noise_scale)
-        numbers = {name: value.item() for name, value in vars(self).items() if isinstance(value, np.generic)}
-        for name, value in {"tasks": tasks, "noise_scale": noise_scale, **numbers}.items():
-            object.__setattr__(self, name, value)
+        # JSON needs Python's numbers.
+        noise_scale = tuple(scale.item() if isinstance(scale, np.generic) else scale for scale in self.noise_scale)
+        object.__setattr__(self, "tasks", tasks)
+        object.__setattr__(self, "noise_scale", noise_scale)
 
     def to_json(self) -> dict[str, Any]:
         """Return the configuration as JSON, without ``policy`` for the expert and ``layout`` for Meta-World's."""

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import torch
 from tensordict import NestedKey, TensorDict
 
-from lw_torchrl._util.checks import Count, Natural, Probability, check_value, typed, unknown_name
+from lw_torchrl._util.checks import Count, Natural, Probability, typed, unknown_name
 from lw_torchrl._util.devices import check_device, finite
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl.data.dataset import (
@@ -116,7 +116,7 @@ def _folders_and_choices(
     """Return the folders, and the choice of episodes in each."""
     if isinstance(root, (str, os.PathLike)):
         return [root], [episodes]
-    folders = [check_value("root", folder, AnyPath) for folder in root]
+    folders = list(root)
     is_repeated = episodes is None and len({Path(folder).resolve() for folder in folders}) < len(folders)
     if not folders or is_repeated:
         raise ValueError(f"root must be a folder, or a list that names each folder once, got {folders}")

@@ -103,7 +103,7 @@ def choose_episodes(dataset: Demonstrations, choice: EpisodeChoice, argument: st
         if task not in existing:
             raise unknown_name(f"{argument}: task", task, existing)
         of_task, place = existing[task], f"{argument}[{task!r}]"
-        if isinstance(wanted, Sequence) and not isinstance(wanted, str):
+        if isinstance(wanted, Sequence):
             numbers = list(wanted)
         elif check_value(place, wanted, Count) > len(of_task):
             raise ValueError(f"{place}: the dataset has {len(of_task)} episodes of {task!r}, got {wanted}")

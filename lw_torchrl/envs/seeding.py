@@ -56,7 +56,7 @@ class EpisodeCounter:
     def start_again(self, seed: int | None) -> None:
         """Begin at the first episode, of another seed if one is given."""
         if seed is not None:
-            self.seed = int(seed)
+            self.seed = seed
         self.resets[:] = 0
 
     def next(self, rows: Rows) -> Episodes:
