@@ -28,17 +28,7 @@ from lw_torchrl._util.progress import Progress
 from lw_torchrl._util.reproducibility import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import dataset
 from lw_torchrl.data.collection_policy import Behaviour, SegmentActor, behaviour_of, segment_plans
-from lw_torchrl.data.dataset import (
-    COLUMNS,
-    TRAJECTORY,
-    CollectConfig,
-    DatasetError,
-    Demonstrations,
-    describe_episode,
-    verify,
-    write_metadata,
-    write_rows,
-)
+from lw_torchrl.data.dataset import COLUMNS, TRAJECTORY, CollectConfig, DatasetError, Demonstrations
 from lw_torchrl.envs.episodes import policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.language.plans import Plans
@@ -234,18 +224,18 @@ def _assemble(
             rows = files.get(task, episode)
             rows.set(TRAJECTORY, torch.full(rows.batch_size, number))
             start = infos[-1].start + infos[-1].length if infos else 0
-            infos.append(describe_episode(task, episode, start, rows))
+            infos.append(dataset.describe_episode(task, episode, start, rows))
             yield rows
 
     building = files.folder / "rows"
     for old in (building, root / dataset.DATA):
         shutil.rmtree(old, ignore_errors=True)
-    write_rows(building, episodes(), config.layout)
+    dataset.write_rows(building, episodes(), config.layout)
     os.replace(building, root / dataset.DATA)
     flush(root)
     attempts = {task: max(kept[task]) + 1 for task in config.tasks}
     task_ids = {task: task_id(task) for task in config.tasks}
-    write_metadata(Demonstrations(root, config, versions, task_ids, tuple(infos), attempts))
+    dataset.write_metadata(Demonstrations(root, config, versions, task_ids, tuple(infos), attempts))
 
 
 def _finished(root: Path, config: CollectConfig) -> Demonstrations | None:
@@ -254,7 +244,7 @@ def _finished(root: Path, config: CollectConfig) -> Demonstrations | None:
         return None
     demonstrations = dataset.read_metadata(root)
     _check_same(demonstrations.config, config, root)
-    verify(demonstrations, demonstrations.episodes)
+    dataset.verify(demonstrations, demonstrations.episodes)
     return demonstrations
 
 

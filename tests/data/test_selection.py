@@ -50,17 +50,15 @@ filters = st.builds(
     least_return=st.sampled_from([None, -5, 0.0, 0.5]),
     best=st.sampled_from([None, 0.01, 0.25, 0.5, 1.0]),
     behaviours=st.sampled_from([None, ("expert",), ("expert", "random"), ("wrong",)]),
-    else_best=st.sampled_from([None, 0.3, 1.0]),
 )
 
 
-def oracle(parts, returns, success, least_return, best, behaviours, else_best):
+def oracle(parts, returns, success, least_return, best, behaviours):
     """Return the kept (part, number) pairs, computed in another way."""
-    kept, everything = [], []
+    kept = []
     for place, part in enumerate(parts):
         for number, episode in enumerate(part.episodes):
             total, rows = returns[place][number].tolist()
-            everything.append((episode.task, -total, rows, place, number))
             if success is not None and episode.success != success:
                 continue
             if least_return is not None and total < least_return:
@@ -71,12 +69,9 @@ def oracle(parts, returns, success, least_return, best, behaviours, else_best):
     chosen = set()
     for task in TASKS:
         of_task = sorted(row for row in kept if row[0] == task)
-        share = best
         if not of_task:
-            if else_best is None:
-                return None
-            of_task, share = sorted(row for row in everything if row[0] == task), else_best
-        size = len(of_task) if share is None else max(1, round(share * len(of_task)))
+            return None
+        size = len(of_task) if best is None else max(1, round(best * len(of_task)))
         chosen |= {row[3:] for row in of_task[:size]}
     return chosen
 
@@ -100,15 +95,6 @@ def test_filters_keep_what_the_oracle_keeps(described, options):
     assert [part.config for part in left] == [part.config for part in parts]
     for place, (part, before) in enumerate(zip(left, parts, strict=True)):
         assert part.episodes == tuple(e for n, e in enumerate(before.episodes) if (place, n) in expected)
-
-
-def test_at_equal_returns_the_shorter_and_then_the_earlier_episode_is_best():
-    config = CollectConfig(("reach",), 4, 0)
-    episodes = tuple(EpisodeInfo("reach", n, 0, 9, True, 1, 0) for n in range(4))
-    part = Demonstrations(Path(), config, {}, {}, episodes, {})
-    returns = torch.tensor([[1.0, 9], [2.0, 9], [2.0, 5], [1.0, 9]], dtype=torch.float64)
-    kept = [EpisodeFilter(best=b).choose([part], [returns])[0].episodes for b in (0.25, 0.5, 0.75, 1.0)]
-    assert [[e.episode for e in episodes] for episodes in kept] == [[2], [1, 2], [0, 1, 2], [0, 1, 2, 3]]
 
 
 @pytest.fixture(scope="module")

@@ -19,17 +19,7 @@ from lw_torchrl._util.files import replacing_folder
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data import dataset
 from lw_torchrl.data.collection_policy import Behaviour
-from lw_torchrl.data.dataset import (
-    TRAJECTORY,
-    CollectConfig,
-    DatasetError,
-    Demonstrations,
-    EpisodeInfo,
-    describe_episode,
-    load_rows,
-    verify,
-    write_rows,
-)
+from lw_torchrl.data.dataset import TRAJECTORY, CollectConfig, DatasetError, Demonstrations, EpisodeInfo
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.suites.suite import Suite
@@ -114,8 +104,8 @@ class Table:
 
 def table_of(demonstrations: Demonstrations, metadata: Mapping[str, Any], suite: Suite, plans: Plans | None) -> Table:
     """Return a dataset's rows, compared with their checksums, and the truth of its tasks' conditions."""
-    verify(demonstrations, demonstrations.episodes)
-    rows, tasks = load_rows(demonstrations), demonstrations.config.tasks
+    dataset.verify(demonstrations, demonstrations.episodes)
+    rows, tasks = dataset.load_rows(demonstrations), demonstrations.config.tasks
     columns: dict[str, Array] = {name: np.asarray(rows.get(key)) for name, key in KEYS.items()}
     columns |= {name: column[:, 0] for name, column in columns.items() if name not in WIDE}
     planned = {name: plans[name] for name in tasks if plans is not None and name in plans}
@@ -173,12 +163,12 @@ def write_dataset(
                 rows.set("episode", torch.full_like(task, info.episode))
                 rows.set(TRAJECTORY, torch.full_like(task, number))
                 first = infos[-1].start + infos[-1].length if infos else 0
-                infos.append(describe_episode(info.task, info.episode, first, rows))
+                infos.append(dataset.describe_episode(info.task, info.episode, first, rows))
                 yield rows
                 bar.update(end - start)
 
     with replacing_folder(out) as folder:
-        write_rows(folder / dataset.DATA, episodes(), description.config.layout)
+        dataset.write_rows(folder / dataset.DATA, episodes(), description.config.layout)
         if exported_as and tuple(infos) != description.episodes:
             raise ExchangeError(f"source: {str(exported_as)!r} is damaged: its rows differ from their checksums")
         dataset.write_metadata(replace(description, root=folder, episodes=tuple(infos)))
