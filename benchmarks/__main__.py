@@ -48,18 +48,18 @@ FORMAT_VERSION = 1
 
 @dataclass(frozen=True)
 class Arguments:
-    """Measure what lw_torchrl costs, each figure against a rival in the same run. docs/performance.md explains them."""
+    """Measure speed and memory of lw_torchrl against alternatives in the same run; see docs/performance.md."""
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()
     """Benchmarks to run, all by default; see docs/performance.md for their names."""
     quick: bool = False
-    """A little of everything: shows that it runs, its figures mean nothing."""
+    """Run a small version to see that it works; the numbers mean nothing."""
     compiled: Annotated[bool, tyro.conf.arg(name="compile")] = False
-    """Measure torch.compile too."""
+    """Also measure torch.compile."""
     out: Path = Path("runs/benchmarks")
     """Folder for results.json and table.md."""
     markdown: bool = False
-    """Run nothing: print the table of the results in the folder as Markdown."""
+    """Print the table of the results in the folder as Markdown, and run nothing."""
 
 
 def _machine() -> dict[str, Any]:
@@ -85,7 +85,7 @@ def _machine() -> dict[str, Any]:
 
 
 def _run(name: str, settings: Settings) -> dict[str, Any]:
-    """One benchmark; what goes wrong in it is reported, and stops nothing else."""
+    """Run one benchmark; report an error instead of raising it, so that the others run."""
     start = perf_counter()
     result: dict[str, Any] = {"status": "done", "message": "", "rows": []}
     try:
@@ -107,7 +107,7 @@ def _rows(report: dict[str, Any]) -> list[Row]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run benchmarks; returns 1 if one failed, never because one was slow."""
+    """Run benchmarks; return 1 if one failed. Slow ones do not count as failed."""
     args = tyro.cli(Arguments, args=arguments, prog="python -m benchmarks")
     results = args.out / "results.json"
     if args.markdown:

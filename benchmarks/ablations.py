@@ -1,4 +1,4 @@
-"""python -m benchmarks.ablations: what each ingredient of a recipe gives, by training without it."""
+"""python -m benchmarks.ablations: measure what each ingredient of a recipe gains, by training without it."""
 
 from __future__ import annotations
 
@@ -100,26 +100,26 @@ PATCHES: Mapping[str, Callable[[], AbstractContextManager[Any]]] = MappingProxyT
         ),
     }
 )
-"""What no option leaves out."""
+"""Ingredients that no option removes."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Train PCBC with one ingredient of the recipe changed at a time. Stopped and started again it carries on.
+    """Train PCBC with one ingredient of the recipe changed at a time.
 
-    A seed of one change takes 3 to 8 minutes few-shot, 3 zero-shot.
+    If the command is stopped, run it again to resume. A seed of one change takes 3 to 8 minutes few-shot, 3 zero-shot.
     """
 
     setting: Setting = "few-shot"
-    """Which recipe."""
+    """Recipe to change."""
     seeds: tuple[int, ...] = (0,)
-    """Of demonstrations, weights and minibatches."""
+    """Random seeds of demonstrations, weights and minibatches."""
     steps: int | None = None
-    """Minibatches, of the recipe and of each change; None for the recipe's."""
+    """Number of minibatches of each training; by default the recipe's."""
     episodes: int = 20
-    """Evaluated for each task."""
+    """Number of evaluation episodes per task."""
     out: Path = Path("runs/reproduce")
-    """The experiments' folder: datasets and runs that `python -m benchmarks.paper` left there are used."""
+    """Folder of the experiments; reuses datasets and runs of `python -m benchmarks.paper` there."""
 
 
 def main(arguments: Arguments) -> None:

@@ -1,4 +1,5 @@
-"""python -m benchmarks.across_robots POLICIES: policies of Meta-World with Fetch, without one demonstration there."""
+"""python -m benchmarks.across_robots POLICIES: evaluate Meta-World's policies on a Fetch robot, without demonstrations
+there."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ from lw_torchrl.modules import TransferredActor, plans_of
 from lw_torchrl.suites import load_suite
 
 TASKS = {"fetch/reach": "reach", "fetch/push": "push", "fetch/pick-and-place": "pick-place"}
-"""Fetch's tasks, and those of MT10 that ask for the same."""
+"""Fetch's tasks and the corresponding tasks of MT10."""
 METHODS = ("pcbc", "dc", "one-hot")
 
 
@@ -35,19 +36,19 @@ class Arguments:
     """
 
     policies: tyro.conf.Positional[Path]
-    """The folder strong of `python -m benchmarks.paper zero-shot`."""
+    """Folder `strong` of `python -m benchmarks.paper zero-shot`."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Of the trainings."""
+    """Seeds of the trained policies."""
     methods: tuple[str, ...] = METHODS
-    """Of pcbc, dc and one-hot."""
+    """Methods to evaluate: pcbc, dc, one-hot."""
     episodes: int = 50
-    """Of each task."""
+    """Number of episodes per task."""
     seed: int = 3000
-    """Of the episodes."""
+    """Random seed of the episodes."""
     max_steps: int = 250
-    """Of an episode; success at any of them counts."""
+    """Steps of an episode; success at any step counts."""
     speed: float = 1.5
-    """Times the metres a step of Meta-World."""
+    """Scale factor on the metres that Meta-World's hand moves in a step."""
     out: Path = Path("runs/across_robots")
     """Folder for results.json and table.md."""
 

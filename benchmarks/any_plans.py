@@ -1,4 +1,5 @@
-"""python -m benchmarks.any_plans POLICIES: zero-shot policies under plans from anyone, and without any."""
+"""python -m benchmarks.any_plans POLICIES: evaluate zero-shot policies with plans by different authors, and without
+plans."""
 
 from __future__ import annotations
 
@@ -31,9 +32,9 @@ DEVELOPMENT = (
     "door-unlock", "faucet-open", "hand-insert", "handle-press-side", "handle-pull-side", "peg-unplug-side",
     "pick-place-wall", "plate-slide-back", "plate-slide-side", "push-wall", "shelf-place", "stick-pull", "sweep",
 )  # fmt: skip
-"""The tasks outside MT10 on which rules and recipes were chosen."""
+"""Development tasks outside MT10, on which rules and recipes were chosen."""
 TEST = tuple(task for task in lw.MT50 if task not in DEVELOPMENT and task not in lw.MT10)
-"""The other twenty."""
+"""Test tasks: the other twenty."""
 PARAPHRASES = 10  # of each plan
 OURS, NATURAL = lw.load_plans("MT50", skills="MT10"), lw.load_plans("MT50")
 Rows = Literal[
@@ -52,23 +53,23 @@ class Arguments:
     """
 
     policies: tyro.conf.Positional[Path]
-    """The folder strong of `python -m benchmarks.paper zero-shot`; "no-roles" is beside it."""
+    """Folder `strong` of `python -m benchmarks.paper zero-shot`, beside which there is the folder `no-roles`."""
     rows: tuple[Rows, ...] = ("default", "ours", "natural", "palm2", "dc", "one-hot")
-    """Which plans."""
+    """Plans to evaluate."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
-    """Of the trainings."""
+    """Seeds of the trained policies."""
     episodes: int = 20
-    """Of each task, on seed 10000 + that of the training."""
+    """Number of episodes per task, with seed 10000 + the training's."""
     palm2: Path | None = None
-    """PaLM 2's plans, a .json file of pairs; for "palm2"."""
+    """PaLM 2's plans, a .json file of pairs; required for "palm2"."""
     answers: Path | None = None
-    """Answers of models, a .jsonl file; for "models"."""
+    """Answers of language models, a .jsonl file; required for "models"."""
     evaluator: Path | None = None
-    """What answers conditions in the place of the simulator, of `lw-torchrl train-evaluator`; for "evaluator"."""
+    """Learned query evaluator, from `lw-torchrl train-evaluator`; required for "evaluator"."""
     tasks: tuple[str, ...] = (*DEVELOPMENT, *TEST)
-    """Which of the 40."""
+    """Tasks to evaluate, of the 40."""
     out: Path = Path("runs/any_plans")
-    """Folder for results.json and table.md; what is there is not done again."""
+    """Folder for results.json and table.md; existing results are not computed again."""
 
 
 def main(arguments: Arguments) -> None:

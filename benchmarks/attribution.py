@@ -1,4 +1,4 @@
-"""python -m benchmarks.attribution --policy FILE: the causes of a policy's own failures, which nobody planted."""
+"""python -m benchmarks.attribution --policy FILE: diagnose the real failures of a policy."""
 
 from __future__ import annotations
 
@@ -18,23 +18,22 @@ from lw_torchrl.evaluation import plot_failures
 
 @dataclass(frozen=True)
 class Arguments:
-    """Print the causes of a policy's failures, and some of them to look at."""
+    """Print the causes of a policy's failures, and some failures as examples."""
 
     policy: Path
-    """Its file."""
+    """File of the policy."""
     tasks: tuple[str, ...] = ()
-    """Of the policy's; if none is named, those of MT10 and the development tasks: failures in test tasks are not looked
-    at."""
+    """Tasks, of the policy's; by default MT10 and the development tasks, so that failures in test tasks stay unseen."""
     episodes: int = 20
-    """Of each task."""
+    """Number of episodes per task."""
     seed: int = 2000
-    """Of the episodes."""
+    """Random seed of the episodes."""
     max_steps: int = 500
     """Steps of an episode."""
     reference: str = "MT50"
     """Trusted plans: MT10, MT50, a file or a folder."""
     look_at: int = 10
-    """So many failures are listed for the eye."""
+    """Number of failures to list."""
     out: Path = Path("runs/attribution")
     """Folder for the results and the figure."""
 

@@ -1,4 +1,4 @@
-"""python -m benchmarks.demonstrations: success by the number of demonstrations a task, with plans and without."""
+"""python -m benchmarks.demonstrations: measure success by the number of demonstrations, with plans and without."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ class Arguments:
     """
 
     settings: tuple[str, ...] = ("zero-shot", "few-shot")
-    """Of zero-shot and few-shot."""
+    """Settings: zero-shot, few-shot."""
     methods: tuple[str, ...] = ("pcbc", "dc")
-    """Of pcbc, dc and one-hot."""
+    """Methods: pcbc, dc, one-hot."""
     numbers: tuple[int, ...] = (1, 2, 5, 10, 100)
-    """Of demonstrations a task."""
+    """Numbers of demonstrations per task."""
     seeds: tuple[int, ...] = (0,)
-    """Of demonstrations, weights and minibatches."""
+    """Random seeds of demonstrations, weights and minibatches."""
     episodes: int = 20
-    """Evaluated of each task."""
+    """Number of evaluation episodes per task."""
     out: Path = Path("runs/demonstrations")
     """Folder for the runs, results.json, table.md and figure.png."""
 

@@ -1,4 +1,5 @@
-"""python -m benchmarks.evaluators: what a learned query evaluator in a policy costs, and what tuning it gives."""
+"""python -m benchmarks.evaluators: measure what a learned query evaluator in a policy loses, and what tuning it
+gains."""
 
 from __future__ import annotations
 
@@ -27,29 +28,29 @@ WHO = ("expert", "scripted", "spoilt-30", "random")
 
 @dataclass(frozen=True)
 class Arguments:
-    """Few-shot policies of MT10, with the query answering function, with evaluators in its place, and tuned with them.
-    Stopped and started again it carries on.
+    """Train few-shot policies of MT10 and evaluate them with exact answers, with learned evaluators, and tuned with
+    these. If the command is stopped, run it again to resume.
     """
 
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Of demonstrations, labelled states, weights and minibatches, all of them."""
+    """Random seeds of demonstrations, labelled states, weights and minibatches."""
     labels: tuple[float, ...] = (1.0, 0.01)
-    """Shares of the labelled states that evaluators are trained on."""
+    """Fractions of the labelled states to train evaluators on."""
     tasks: tuple[str, ...] = lw.MT10
     steps: int = 6000
-    """Minibatches of an evaluator."""
+    """Number of minibatches of an evaluator's training."""
     tuning_steps: int = 2000
-    """Minibatches of the tuning."""
+    """Number of minibatches of the tuning."""
     tuning_rate: float = 3e-4
-    """The tuning's learning rate at the start."""
+    """Initial learning rate of the tuning."""
     anchors: tuple[float, ...] = (0.0, 0.1)
-    """Weights of `qaf_anchor` in the tuning, each by itself."""
+    """Weights of `qaf_anchor` in the tuning, one tuning for each."""
     episodes: int = 20
-    """Of each task, evaluated."""
+    """Number of evaluation episodes per task."""
     evaluation_seed: int = 1000
-    """Of these; none that demonstrations or labels were made with."""
+    """Random seed of the evaluation (not one that demonstrations or labels used)."""
     quick: bool = False
-    """Two tasks, few steps, one seed: it runs, its figures mean nothing."""
+    """Run two tasks, few steps and one seed to see that it works; the numbers mean nothing."""
     out: Path = Path("runs/evaluators")
 
 

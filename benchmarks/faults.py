@@ -28,11 +28,11 @@ BUILT_ON = (
     *("button-press-topdown", "drawer-open", "push", "plate-slide-back", "plate-slide-side", "handle-press-side"),
     *("door-close", "button-press-wall", "peg-unplug-side", "sweep", "hand-insert"),
 )
-"""The tasks that causes and margins were chosen on."""
+"""Tasks on which causes and margins were chosen."""
 TASKS = ("pick-place", "coffee-pull", "window-open", "faucet-open", "dial-turn")
 RECORDED = ("observation", "task_id", "qaf", "skill_weights")
 HARMLESS = ("not reproducible", "perception", "policy", "undecided")
-"""The causes that blame no part of the policy, its plan or its answers."""
+"""Causes that blame neither the policy nor its plan nor its answers."""
 
 
 @dataclass
@@ -177,7 +177,7 @@ KINDS = {
     "two": "a planted one named",
     "motion": "named right",
 }
-"""Kinds of faults, and what counts as right."""
+"""Kinds of faults and the causes that count as right."""
 FAULTS: Mapping[str, Fault] = {**INSIDE, **OUTSIDE, **TWO, **MOTION}
 
 
@@ -186,20 +186,20 @@ class Arguments:
     """Plant faults and see what is said of them. Stopped and started again it carries on."""
 
     seed: int = 6000
-    """Of the episodes."""
+    """Random seed of the episodes."""
     tasks: tuple[str, ...] = TASKS
     faults: tuple[str, ...] = tuple(FAULTS)
     policies: tuple[str, ...] = ("scripted", "learned")
-    """Who acts: the scripted skills, and a policy trained on what they did."""
+    """Actors: scripted skills, and a policy trained on their episodes."""
     episodes: int = 4
-    """Of each task and fault, and of each step that the fault is in."""
+    """Number of episodes per task and fault, and per faulty step."""
     at_most: int = 16
-    """Failures of a fault that are attributed, of the tasks in turn."""
+    """Number of failures of each fault to diagnose, spread over the tasks."""
     max_steps: int = 150
     learned: Path | None = None
-    """File of the learned policy; by default it is trained, once, in the folder out."""
+    """File of the learned policy; by default it is trained once, in the folder --out."""
     out: Path = Path("runs/faults")
-    """Folder for the results of each unit, the policy and the tables."""
+    """Folder for the results, the policy and the tables."""
 
 
 def failures_of(fault: Fault, policy: str, args: Arguments, learned: Any, reference: lw.Plans) -> Iterator[Any]:

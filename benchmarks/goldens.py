@@ -28,9 +28,9 @@ DATA = Path(__file__).parent / "data" / "goldens"
 OWN_WORDS = Path(__file__).parent / "data" / "own_words.json"
 MAX_ACTION_DIFFERENCE = 1e-6
 MAX_SUCCESS_DIFFERENCE = 0.01
-"""Mean success may differ by this much: other processors round differently, and contact amplifies that."""
+"""Tolerance of the mean success: other processors round differently, and contact amplifies that."""
 MAX_DEMO_DIFFERENCE = 0.05
-"""The demo trains, and training need not be bit-identical; its seeds spread from 0.960 to 1.000."""
+"""Tolerance of the demo, which trains: training need not be bit-identical, and its seeds spread from 0.960 to 1.000."""
 MAX_FAULT_DIFFERENCE = 0.02
 STATES_PER_TASK = 40
 

@@ -23,34 +23,34 @@ from lw_torchrl.evaluation.result import wilson_interval
 
 @dataclass(frozen=True)
 class Arguments:
-    """An evaluator of pictures for two tasks; few-shot policies with it in the query answering function's place, and
-    tuned with it. The decoder keeps the state's features. Stopped and started again it carries on.
+    """Train an evaluator on images for two tasks, and evaluate few-shot policies with it, before and after tuning.
+    The decoder keeps the state's features. If the command is stopped, run it again to resume.
     """
 
     policy: tuple[Path, ...] = ()
-    """Few-shot policies of MT10, such as benchmarks.evaluators leaves, one for each seed; none for scripted skills
-    alone."""
+    """Few-shot policies of MT10, one per seed, for example from benchmarks.evaluators; without, only scripted
+    skills."""
     tasks: tuple[str, ...] = ("button-press-topdown", "drawer-open")
     cameras: tuple[str, ...] = ("corner", "corner3")
     size: int = 64
-    """Pixels of a picture's height and width."""
+    """Height and width of an image, pixels."""
     every: int = 5
-    """Steps from one picture to the next, when states are drawn and when the evaluator acts."""
+    """Steps between images, in the data and when the evaluator acts."""
     behaviours: tuple[int, ...] = (30, 30, 30, 15)
-    """Episodes of a task that are drawn, by experts, scripted skills, the same spoilt, and chance."""
+    """Number of rendered episodes per task: of experts, scripted skills, noisy scripted skills and random actions."""
     max_steps: int = 150
-    """Of an episode that is drawn."""
+    """Steps of a rendered episode."""
     steps: int = 4000
-    """Minibatches of the evaluator."""
+    """Number of minibatches of the evaluator's training."""
     tuning_steps: int = 500
-    """Minibatches, of 64, of the tuning."""
+    """Number of minibatches of 64 rows in the tuning."""
     seed: int = 0
-    """Of the states, the demonstrations, the evaluator and the tuning."""
+    """Random seeds of states, demonstrations, evaluator and tuning."""
     episodes: int = 20
-    """Of each task, evaluated."""
+    """Number of evaluation episodes per task."""
     evaluation_seed: int = 1000
     quick: bool = False
-    """Few steps and episodes: it runs, its figures mean nothing."""
+    """Run few steps and episodes to see that it works; the numbers mean nothing."""
     out: Path = Path("runs/images")
 
     @property

@@ -25,15 +25,15 @@ class Arguments:
     """Ask a model for ten paraphrases of each skill. Ours are by SmolLM2, a model of 135 million weights."""
 
     base_url: str = "http://127.0.0.1:8000/v1"
-    """Of a server that speaks OpenAI's protocol."""
+    """Address of a server with OpenAI's protocol."""
     model: str = "smollm2-135m"
-    """As the server calls it."""
+    """Name of the model on the server."""
     number: int = 10
-    """Of paraphrases of each skill."""
+    """Number of paraphrases per skill."""
     temperature: float = 0.8
-    """Of the draws, seeds 0 and up."""
+    """Largest number of draws, with seeds from 0."""
     out: Path = Path(__file__).parent / "data" / "paraphrases.json"
-    """Skill to its paraphrases; what is there is not asked again."""
+    """File of paraphrases by skill; existing ones are kept."""
 
 
 def main(arguments: Arguments) -> None:

@@ -311,7 +311,7 @@ class Arguments:
     seed: int = 1000
     """Random seed of initial states, goals and the choice among true steps."""
     choose: Literal["random", "first"] = "random"
-    """Which of several true steps acts: a random one, as in the paper, or the first."""
+    """Step that acts if several are true: a random one, as in the paper, or the first."""
     noise: float = 0.0
     """Standard deviation of the noise on the executed action."""
     max_steps: int = 500

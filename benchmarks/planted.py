@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.envs import Transform
 
 import lw_torchrl as lw
-from lw_torchrl.evaluation.diagnose.scripts import attended
+from lw_torchrl.evaluation.diagnose.replacements import attended
 from lw_torchrl.language.skills import ScriptedSkill
 from lw_torchrl.language.task_index import PlanTables
 from lw_torchrl.transforms.qaf import plan_program

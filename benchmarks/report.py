@@ -1,4 +1,4 @@
-"""What a benchmark gives, and how it is timed and printed."""
+"""Results of benchmarks: how they are timed and printed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tqdm.auto import tqdm
 
 @dataclass(frozen=True)
 class Settings:
-    """What every benchmark is told.
+    """Options of all benchmarks.
 
     Attributes:
         quick: measure a little of everything: the code runs, the figures mean nothing.
@@ -27,7 +27,7 @@ class Settings:
     folder: Path
 
     def pick(self, full: int, quick: int) -> int:
-        """The number for a full run, or for a quick one."""
+        """Return the number for a full run, or for a quick one."""
         return quick if self.quick else full
 
 

@@ -1,4 +1,4 @@
-"""python -m benchmarks.truth: success against how seldom the conditions are answered, and against wrong answers."""
+"""python -m benchmarks.truth: measure success with rare or wrong answers to conditions."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CLOSE = 0.05
-"""What success may be lost for an evaluator still to be useful."""
+"""Loss of success up to which an evaluator is useful."""
 
 
 class Cell(NamedTuple):
-    """How the conditions are answered."""
+    """How conditions are answered."""
 
     kind: str
-    """"every" so many steps, or each answer's "flip" with this probability."""
+    """"every": steps between answers; "flip": probability that an answer is wrong."""
     value: float
 
     @property
     def exact(self) -> bool:
-        """Whether they are answered as they are without anything."""
+        """Whether all answers are exact."""
         return self == ("every", 1) or self == ("flip", 0)
 
     @property
@@ -57,34 +57,34 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class Arguments:
-    """Evaluate policies whose conditions are answered now and then, or wrongly. Stopped and started again it carries
-    on. All see the same episodes, with the same noise.
+    """Evaluate policies with rare or wrong answers to conditions, all in the same episodes with the same noise.
+    If the command is stopped, run it again to resume.
     """
 
     policy: tuple[Path, ...] = ()
-    """Policies' files; those of one kind, of several training seeds say, are one curve."""
+    """Files of policies; policies of one kind, such as several training seeds, make one curve."""
     scripted: bool = True
-    """Evaluate scripted skills too."""
+    """Also evaluate scripted skills."""
     plans: str = "MT50"
-    """Of the scripted skills: MT10, MT50, a file or a folder."""
+    """Plans of the scripted skills: MT10, MT50, a file or a folder."""
     tasks: tuple[str, ...] = lw.MT10
-    """Tasks; of a policy, those that it knows."""
+    """Tasks; by default those of the policy."""
     every: tuple[int, ...] = (1, 2, 5, 10, 25, 50)
-    """Steps from one answer to the next."""
+    """Numbers of steps between answers."""
     flip: tuple[float, ...] = (0.0, 0.01, 0.05, 0.1, 0.2)
-    """Probability that an answer is flipped, in each step anew."""
+    """Probabilities that an answer is wrong, drawn at each step."""
     episodes: int = 20
-    """Of each task and seed."""
+    """Number of episodes per task and seed."""
     seeds: tuple[int, ...] = (2000,)
-    """Of the episodes; none that demonstrations were collected with."""
+    """Random seed of the episodes (not one that demonstrations used)."""
     max_steps: int = 500
     """Steps of an episode."""
     noise: float = 0.1
     """Standard deviation of the action noise."""
     quick: bool = False
-    """Two tasks, two short episodes, two points a curve: it runs, its figures mean nothing."""
+    """Run two tasks, two short episodes and two points to see that it works; the numbers mean nothing."""
     out: Path = Path("runs/truth")
-    """Folder for the result of each unit, table.md and truth.png."""
+    """Folder for the results, table.md and truth.png."""
 
     @property
     def cells(self) -> list[Cell]:

@@ -12,7 +12,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import lw_torchrl as lw
 from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.formats.structured import write_structured
+from lw_torchrl.planners.prompts import write_structured
 
 PLANS = lw.load_plans("MT50")
 

@@ -27,7 +27,7 @@ FIELDS = {"name", "ours", "unit", "rival", "theirs", "ratio", "spread", "target"
 
 
 @pytest.mark.slow
-def test_a_quick_run_writes_a_table_and_json(tmp_path):
+def test_quick_run_writes_a_table_and_json(tmp_path):
     command = [sys.executable, "-m", "benchmarks", "samplers", "queries", "overhead", "--quick", "--out", str(tmp_path)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
@@ -56,7 +56,7 @@ def test_a_quick_run_writes_a_table_and_json(tmp_path):
     assert again.stdout == table
 
 
-def test_a_benchmark_that_fails_is_reported_and_the_others_go_on(tmp_path, monkeypatch):
+def test_failing_benchmark_is_reported_and_the_others_continue(tmp_path, monkeypatch):
     def fail(settings):
         raise RuntimeError("no luck")
 
@@ -72,35 +72,35 @@ def test_a_benchmark_that_fails_is_reported_and_the_others_go_on(tmp_path, monke
     assert results["good"]["rows"][0]["met"] is True
 
 
-def test_an_unknown_name_is_refused(tmp_path, capsys):
+def test_unknown_benchmark_is_an_error(tmp_path, capsys):
     assert cli.main(["stepz", "--out", str(tmp_path)]) == 2
     assert "no benchmark stepz; there are steps" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("limit", "met"), [(1.9, True), (2.1, False), (None, None)])
-def test_a_ratio_is_the_median_of_the_rounds(limit, met):
+def test_ratio_is_the_median_of_the_rounds(limit, met):
     row = compare("x", [1.0, 2.0, 1.0], "y", [2.0, 4.0, 9.0], unit="ms", scale=1e3, at_least=limit)
     assert (row.ours, row.theirs, row.ratio, row.met) == (1000.0, 4000.0, 2.0, met)
 
 
-def test_a_share_is_of_the_whole():
+def test_share_is_part_of_the_whole():
     row = part_of("x", [1.0], "y", [4.0], unit="s", scale=1.0, at_most=0.3)
     assert row == Row("x", 1.0, "s", "y", 4.0, 0.25, (0.25, 0.25), "share ≤ 0.3", True)
 
 
 @pytest.mark.parametrize(("limit", "met"), [(1.3, True), (1.2, False)])
-def test_what_does_more_may_take_so_many_times_as_long(limit, met):
+def test_factor_limits_how_much_longer_a_row_may_take(limit, met):
     row = times_as_long("x", [5.0], "y", [4.0], unit="s", scale=1.0, at_most=limit)
     assert row == Row("x", 5.0, "s", "y", 4.0, 1.25, (1.25, 1.25), f"ratio ≤ {limit:g}", met)
 
 
-def test_every_benchmark_is_explained():
+def test_docs_explain_every_benchmark():
     page = (ROOT / "docs" / "performance.md").read_text("utf-8")
     assert [name for name in cli.BENCHMARKS if f"`{name}`" not in page] == []
 
 
 @pytest.mark.parametrize("setting", ["few-shot", "zero-shot"])
-def test_each_ablation_changes_one_ingredient_and_has_a_folder_of_its_own(setting):
+def test_each_ablation_changes_one_ingredient_and_has_its_own_folder(setting):
     full, presets = vars(ablations.FULL[setting]), ablations.ABLATIONS[setting]
     for change, preset in presets.items():
         different = {key for key, value in vars(preset).items() if value != full[key]} - {"name"}
@@ -109,7 +109,7 @@ def test_each_ablation_changes_one_ingredient_and_has_a_folder_of_its_own(settin
     assert len(set(names)) == len(names)
 
 
-def test_patches_leave_out_what_they_say_and_are_undone():
+def test_patches_are_applied_and_undone():
     plans = lw.canonical_plans(lw.load_plans("MT50", skills="MT10"))
     usual, tasks = RoleFeatures(plans), ("door-open", "drawer-open", "push", "window-open")
     at = torch.tensor([usual.tables.index.row(task) for task in tasks])
@@ -130,7 +130,7 @@ def test_patches_leave_out_what_they_say_and_are_undone():
 
 @pytest.mark.parametrize("setting", ["few-shot", "zero-shot"])
 @pytest.mark.slow
-def test_ablations_write_a_table_of_what_was_run(setting, monkeypatch, tmp_path, capsys):
+def test_ablations_write_a_table_of_their_runs(setting, monkeypatch, tmp_path, capsys):
     seen = []
 
     def run(unit, plans, out):
@@ -148,7 +148,7 @@ def test_ablations_write_a_table_of_what_was_run(setting, monkeypatch, tmp_path,
     assert table in capsys.readouterr().out
 
 
-def test_truth_writes_a_table_and_a_figure_and_carries_on(tmp_path, monkeypatch, capsys):
+def test_truth_writes_a_table_and_a_figure_and_resumes(tmp_path, monkeypatch, capsys):
     plans = lw.Plans({task: lw.load_plans("MT10")[task] for task in ("push", "reach")})
     file = tmp_path / "untrained.safetensors"
     lw.save_actor(lw.PlanConditionedActor(plans), file)
@@ -171,7 +171,7 @@ def test_truth_writes_a_table_and_a_figure_and_carries_on(tmp_path, monkeypatch,
     assert (tmp_path / "table.md").read_text("utf-8") == table
 
 
-def test_truth_says_what_an_evaluator_must_reach():
+def test_truth_reports_the_accuracy_that_an_evaluator_needs():
     cells = [truth.Cell("every", k) for k in (1, 2, 5, 10)] + [truth.Cell("flip", 0.1)]
     found = truth.Found()
     for cell, rate in zip(cells, (0.9, 0.9, 0.85, 0.6, 0.5), strict=True):
@@ -188,14 +188,14 @@ def test_truth_says_what_an_evaluator_must_reach():
     assert hits.shape == (20, 1)
 
 
-def test_truth_refuses_a_policy_that_reads_no_answers(tmp_path):
+def test_truth_needs_a_policy_that_reads_answers(tmp_path):
     lw.save_actor(lw.DescriptorConditionedActor(["reach"]), tmp_path / "dc.safetensors")
     with pytest.raises(SystemExit, match=r"dc\.safetensors does not read qaf"):
         truth.main(truth.Arguments(policy=(tmp_path / "dc.safetensors",), out=tmp_path))
 
 
 @pytest.mark.slow
-def test_planted_faults_are_counted_and_a_second_run_reads_the_first(tmp_path, monkeypatch, capsys):
+def test_planted_faults_are_counted_and_read_again(tmp_path, monkeypatch, capsys):
     args = faults.Arguments(
         tasks=("drawer-open",), faults=("missing step",), policies=("scripted",), episodes=1, out=tmp_path
     )
@@ -206,7 +206,7 @@ def test_planted_faults_are_counted_and_a_second_run_reads_the_first(tmp_path, m
     assert "inside, scripted: named right 3 of 3, 1.000" in capsys.readouterr().out
 
 
-def test_outside_the_list_no_sound_part_is_right():
+def test_faults_outside_the_list_have_no_right_part():
     late = faults.FAULTS["view 15 steps late"]
     assert [faults.is_right(late, {"cause": cause}) for cause in ("perception", "undecided", "skill")] == [
         True,
@@ -217,7 +217,7 @@ def test_outside_the_list_no_sound_part_is_right():
     assert [faults.is_right(missing, {"cause": cause}) for cause in ("plan", "undecided")] == [True, False]
 
 
-def test_points_of_shapes_are_where_fingers_fit_or_where_a_hand_pushes():
+def test_points_are_where_fingers_fit_or_a_hand_pushes():
     tasks = find_points(["push", "plate-slide-side", "dial-turn"], episodes=1)
     points = {name: {one.name: one.offset for one in task.objects if one.ours} for name, task in tasks.items()}
     assert points["push"]["puck grip"] == pytest.approx((0.0, 0.0, PADS - 0.015), abs=2e-3)

@@ -55,7 +55,7 @@ def _elsewhere(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if examples(name)])
-def test_the_examples_of_the_docstrings_run(name):
+def test_examples_of_docstrings_run(name):
     runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)
     report = []
     for test in examples(name):
@@ -64,11 +64,11 @@ def test_the_examples_of_the_docstrings_run(name):
     assert runner.summarize(verbose=False).failed == 0, "".join(report)
 
 
-def test_the_docstrings_have_examples():
+def test_docstrings_have_examples():
     assert sum(len(examples(name)) > 0 for name in MODULES) >= 10
 
 
-def test_every_public_class_says_what_it_is():
+def test_every_public_class_has_a_docstring():
     rooms = [importlib.import_module(f"lw_torchrl.{room}") for room in lw_torchrl._ROOMS]
     named = [(name, getattr(room, name)) for room in (lw_torchrl, *rooms) for name in getattr(room, "__all__", ())]
     classes = {name: found for name, found in named if inspect.isclass(found)}
@@ -86,7 +86,7 @@ def test_every_public_class_says_what_it_is():
     ],
     ids=lambda page: page.name,
 )
-def test_the_blocks_of_a_page_run_one_after_another(page):
+def test_code_of_a_page_runs(page):
     namespace = {"__name__": "__main__"}
     for line, kind, code in blocks(page):
         if "PixelRenderTransform" in code and why_no_pictures():
@@ -102,7 +102,7 @@ def test_the_blocks_of_a_page_run_one_after_another(page):
             exec(compile("\n" * line + code, str(page), "exec"), namespace)
 
 
-def test_the_readme_shows_python():
+def test_readme_shows_python():
     assert any(blocks(ROOT / "README.md"))
 
 
@@ -114,7 +114,7 @@ def anchors(page):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_a_pages_links_lead_somewhere(page):
+def test_links_of_pages_lead_somewhere(page):
     text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
     for target, anchor in re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]+))?\)", text):
         if "://" not in target and not target.startswith("mailto:"):
@@ -123,7 +123,7 @@ def test_a_pages_links_lead_somewhere(page):
             assert not anchor or there.suffix != ".md" or anchor in anchors(there), f"{target}#{anchor}"
 
 
-def test_the_files_that_the_design_names_exist():
+def test_files_that_pages_name_exist():
     named = re.findall(r"`([a-z_/]+(?:\.py|\.toml|/))`", (ROOT / "docs" / "design.md").read_text("utf-8"))
     tops = [ROOT / name for name in ("lw_torchrl", "benchmarks", "examples", "tests", "docs")]
     paths = [path for top in tops for path in (top, *top.rglob("*"))]
@@ -132,7 +132,7 @@ def test_the_files_that_the_design_names_exist():
     assert not [name for name in named if not any(path.endswith(f"/{name}") for path in there)]
 
 
-def test_every_page_has_a_place_in_the_site():
+def test_every_page_is_in_the_site():
     told = (ROOT / "mkdocs.yml").read_text("utf-8")
     listed = re.findall(r"^ +- (?:.+: )?(\S+\.md)$", told[told.index("\nnav:") :], re.MULTILINE)
     lost = {page.name for page in (ROOT / "docs").glob("*.md")} - set(listed)
@@ -154,7 +154,7 @@ class Page(HTMLParser):
 
 
 @pytest.mark.slow
-def test_the_site_is_built_without_a_warning_and_its_links_lead_somewhere(tmp_path):
+def test_site_is_built_without_warnings_and_its_links_lead_somewhere(tmp_path):
     pytest.importorskip("mkdocs")
     site = tmp_path / "site"
     done = subprocess.run(
@@ -180,7 +180,7 @@ def test_the_site_is_built_without_a_warning_and_its_links_lead_somewhere(tmp_pa
     assert lost == []
 
 
-def test_blocks_are_found_numbered_and_skipped(tmp_path):
+def test_code_blocks_are_found_numbered_and_skipped(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(
         "words\n```python\na = 1\n```\n<!-- no-run -->\n```python\nb = 2\n```\n- item\n\n  ```python\n  c = 3\n  ```\n"

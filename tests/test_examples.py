@@ -38,14 +38,14 @@ def names(path):
 @pytest.mark.parametrize(
     "path", sorted([*EXAMPLES.glob("*.py"), *EXAMPLES.glob("online/*.py")]), ids=lambda path: path.name
 )
-def test_an_example_is_one_page(path):
+def test_examples_are_at_most_one_page(path):
     lines = path.read_text("utf-8").splitlines()
     longer = {"offline": 120, "rerun": 120, "suite": 155}
     assert len(lines) <= (170 if path.parent.name == "online" else longer.get(path.name.partition("_")[0], 80))
     assert max(map(len, lines)) <= 120
 
 
-def test_train_bc_is_composed_by_hand():
+def test_train_bc_uses_no_trainer():
     found = names(TRAIN_BC)
     assert {"BCLoss", "PlanConditionedActor", "LanguageWorldExperienceReplay", "QAFTransform"} <= found
     assert not any("Trainer" in name or "trainers" in name for name in found)
@@ -68,7 +68,7 @@ def run(path, folder, *options):
 
 
 @pytest.mark.slow
-def test_somebody_else_s_environment_trains(tmp_path):
+def test_other_environments_train(tmp_path):
     pytest.importorskip("gymnasium_robotics")
     done = run("any_environment.py", tmp_path, "--frames", 500)
     assert "500 steps, the last episode's reward" in done.stdout
@@ -76,7 +76,7 @@ def test_somebody_else_s_environment_trains(tmp_path):
 
 
 @pytest.mark.slow
-def test_plain_pytorch_trains_on_what_was_exported(tmp_path):
+def test_plain_pytorch_trains_on_an_exported_dataset(tmp_path):
     done = run("plain_pytorch.py", tmp_path, "--steps", 500, "--demonstrations", 1, "--episodes", 1)
     assert "step   500  loss" in done.stdout
     assert "drawer-open" in done.stdout
@@ -100,7 +100,7 @@ def test_ppo_runs(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["td3_with_demonstrations", "sac_with_demonstrations", "expert_iteration"])
-def test_a_policy_trains_online(tmp_path, name):
+def test_policy_trains_online(tmp_path, name):
     """On an easy task, so that the few steps hold successes to learn from."""
     task = ["--task", "button-press-topdown", "--cloning-steps", 150, "--max-steps", 100]
     training = ["--frames", 2_000, "--learning-starts", 500, "--utd", 0.05, "--episodes", 2, "--out", "out"]
@@ -113,7 +113,7 @@ def test_a_policy_trains_online(tmp_path, name):
 
 
 @pytest.mark.slow
-def test_a_training_is_recorded(tmp_path):
+def test_training_is_recorded(tmp_path):
     options = ["--steps", 20, "--demonstrations", 1, "--rollouts", 2, "--length", 30]
     done = run("rerun_training.py", tmp_path, *options)
     assert [line.split()[1] for line in done.stdout.splitlines() if line.startswith("step ")] == ["10", "20"]
@@ -124,7 +124,7 @@ def test_a_training_is_recorded(tmp_path):
 
 
 @pytest.mark.slow
-def test_co_learning_runs_on_ones_own_data(tmp_path):
+def test_co_learning_runs_on_custom_data(tmp_path):
     done = run("co_learning.py", tmp_path, "--steps", 20, "--demonstrations", 1, "--episodes", 1)
     assert "the target's rows 50" in done.stdout
     for task in ("window-open", "drawer-open", "door-open"):
@@ -144,7 +144,7 @@ def test_offline_rl_runs(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_policy_is_exported(tmp_path):
+def test_policy_is_exported(tmp_path):
     lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10")), tmp_path / "policy.safetensors")
     done = run("export_policy.py", tmp_path, "policy.safetensors", "policy.pt2")
     assert done.stdout.count("at most 0.0e+00 away") == 3
@@ -152,7 +152,7 @@ def test_a_policy_is_exported(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_trainer_of_torchrls_runs(tmp_path):
+def test_torchrls_trainer_runs(tmp_path):
     done = run("torchrl_trainer.py", tmp_path, "--updates", 3, "--rows", 4, "--horizon", 25)
     assert len(done.stdout.split("update:")[1].splitlines()[0].split()) == 3
     logged = tmp_path / "runs" / "torchrl_trainer" / "ppo" / "scalars"
@@ -163,7 +163,7 @@ def test_a_trainer_of_torchrls_runs(tmp_path):
 
 
 @pytest.mark.slow
-def test_experience_comes_from_ray(tmp_path):
+def test_ray_collects_experience(tmp_path):
     pytest.importorskip("ray")
     done = run("collect_on_ray.py", tmp_path, "--workers", 2, "--batches", 4)
     assert "batch 3: 200 steps" in done.stdout
@@ -186,17 +186,17 @@ def shown(path):
     return [kind for output in outputs for kind in output.get("data", [output["output_type"]])], str(outputs)
 
 
-def test_the_tour_is_kept_with_what_it_shows():
+def test_tour_is_stored_with_its_outputs():
     kinds, text = shown(TOUR)
     assert kinds.count("image/png") == 4
     assert "error" not in kinds
-    assert "WebPage" in text
+    assert "lw-torchrl view" in text
     assert "stderr" not in text
     assert TOUR.stat().st_size < 300_000
 
 
 @pytest.mark.slow
-def test_the_tour_runs_from_top_to_bottom(tmp_path):
+def test_tour_runs_from_top_to_bottom(tmp_path):
     pytest.importorskip("nbclient")
     script = EXAMPLES.parent / "docs" / "hooks" / "tour.py"
     done = subprocess.run(

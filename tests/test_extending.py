@@ -146,7 +146,7 @@ def small(plans):
 
 
 @pytest.mark.parametrize("kind", ["plan", "learned", "evaluator"])
-def test_it_is_trained_saved_loaded_evaluated_and_recorded(kind, plans, replay, tmp_path, monkeypatch):
+def test_extensions_are_trained_saved_loaded_evaluated_and_recorded(kind, plans, replay, tmp_path, monkeypatch):
     monkeypatch.setitem(METHODS, "learned", lambda plans, **options: LearnedTaskActor([*plans], **options))
     path = tmp_path / "policy.safetensors"
     actor = trained(made(kind, plans), replay, path)
@@ -166,14 +166,14 @@ def test_it_is_trained_saved_loaded_evaluated_and_recorded(kind, plans, replay, 
         assert "qaf" not in actor.in_keys
 
 
-def test_a_relation_that_is_not_there_is_told_of(plans, tmp_path, monkeypatch):
+def test_missing_relation_is_named(plans, tmp_path, monkeypatch):
     lw.save_actor(small(plans), tmp_path / "policy.safetensors")
     monkeypatch.delitem(RELATIONS, "beside")
     with pytest.raises(ValueError, match=r"'beside'.*; import the module that registers your relations first"):
         lw.load_actor(tmp_path / "policy.safetensors", text_encoder=letters)
 
 
-def test_an_own_task_travels_with_its_policy(plans, tmp_path):
+def test_custom_task_is_saved_with_its_policy(plans, tmp_path):
     lw.save_actor(small(plans), tmp_path / "policy.safetensors")
     loaded = lw.load_actor(tmp_path / "policy.safetensors", text_encoder=letters)
     assert loaded.plans.fingerprint == plans.fingerprint
@@ -185,7 +185,7 @@ def test_an_own_task_travels_with_its_policy(plans, tmp_path):
     assert lw.load_actor(tmp_path / "dc.safetensors", text_encoder=letters).tasks == ("touch-the-block",)
 
 
-def test_a_foreign_module_acts_and_trains_too(plans, replay):
+def test_other_modules_act_and_train(plans, replay):
     torch.manual_seed(0)
     module = TensorDictModule(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
     lw.BehavioralCloningTrainer(

@@ -49,7 +49,7 @@ def tables(monkeypatch):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_the_page_shows_the_example_and_its_commands(path):
+def test_page_shows_the_example_and_its_commands(path):
     text = (ROOT / "docs" / "extending.md").read_text("utf-8")
     shown = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL)]
     code = path.read_text("utf-8").partition('"""\n\n')[2]
@@ -59,7 +59,7 @@ def test_the_page_shows_the_example_and_its_commands(path):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_the_commands_of_an_example_run(path, tables, tmp_path, monkeypatch, capsys):
+def test_commands_of_examples_run(path, tables, tmp_path, monkeypatch, capsys):
     for file in FOLDER.iterdir():
         if file.is_file():
             shutil.copy(file, tmp_path)

@@ -36,7 +36,7 @@ def names(folder):
 # ---- whole files
 
 
-def test_the_content_is_on_the_disk_before_it_takes_the_name(tmp_path, monkeypatch):
+def test_content_is_synced_before_the_rename(tmp_path, monkeypatch):
     calls = []
     real_sync, real_replace = os.fsync, os.replace
 
@@ -62,7 +62,7 @@ def test_the_content_is_on_the_disk_before_it_takes_the_name(tmp_path, monkeypat
     assert target.read_text() == "newer"
 
 
-def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path):
+def test_error_leaves_only_the_old_file(tmp_path):
     target = tmp_path / "a.json"
     write_json(target, {"x": 1})
     with pytest.raises(ValueError, match="surrogates"):
@@ -100,7 +100,7 @@ _files.write_text(target, "new" * 1000)
 """
 
 
-def test_killed_at_any_moment_the_file_is_the_old_or_the_new(tmp_path):
+def test_killed_write_leaves_the_old_or_the_new_file(tmp_path):
     target, seen = tmp_path / "a.txt", set()
     for stop in range(20):
         target.write_text("old")
@@ -124,13 +124,13 @@ def test_threads_that_write_one_file_leave_a_whole_one(tmp_path):
     assert names(tmp_path) == ["a.txt"]
 
 
-def test_a_file_has_the_permissions_of_any_new_file(tmp_path):
+def test_file_has_the_permissions_of_new_files(tmp_path):
     (tmp_path / "other").touch()
     write_text(tmp_path / "a.txt", "")
     assert (tmp_path / "a.txt").stat().st_mode == (tmp_path / "other").stat().st_mode
 
 
-def test_a_folder_appears_whole_or_not_at_all(tmp_path):
+def test_folder_appears_whole_or_not_at_all(tmp_path):
     out = tmp_path / "out"
     with pytest.raises(ValueError, match="surrogates"), replacing_folder(out) as folder:
         (folder / "half").write_text("half\ud800", encoding="utf-8")
@@ -147,7 +147,7 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path):
 
 
 @pytest.mark.parametrize("folder", [False, True])
-def test_one_writer_at_a_time(tmp_path, holding, folder):
+def test_second_writer_raises_or_waits(tmp_path, holding, folder):
     place = tmp_path / "runs" / "mine.txt"
     release = holding(place, folder=folder)
     other = "folder" if folder else "file"
@@ -161,14 +161,14 @@ def test_one_writer_at_a_time(tmp_path, holding, folder):
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
-def test_a_killed_process_releases_its_lock(tmp_path, holding):
+def test_killed_process_releases_its_lock(tmp_path, holding):
     holding(tmp_path / "a.txt").__self__.kill()
     with locked(tmp_path / "a.txt", "out"):
         assert names(tmp_path) == [".a.txt.lock"]
     assert names(tmp_path) == []
 
 
-def test_threads_that_wait_enter_one_at_a_time(tmp_path):
+def test_waiting_threads_enter_one_at_a_time(tmp_path):
     inside, most = [], []
 
     def work(number):
@@ -187,7 +187,7 @@ def test_threads_that_wait_enter_one_at_a_time(tmp_path):
 # ---- reading
 
 
-def test_text_has_one_kind_of_line_end_and_no_byte_order_mark(tmp_path):
+def test_text_has_plain_line_ends_and_no_byte_order_mark(tmp_path):
     (tmp_path / "a.txt").write_bytes("\ufeffä\r\nb\rc\n".encode())
     assert read_text(tmp_path / "a.txt", OwnError) == "ä\nb\nc\n"
     with pytest.raises(FileNotFoundError):
@@ -200,7 +200,7 @@ def test_text_has_one_kind_of_line_end_and_no_byte_order_mark(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["a = ", "[a]\n[a]", "a = " + "[" * 50_000])
-def test_toml_that_cannot_be_parsed(tmp_path, text):
+def test_toml_errors_name_the_file(tmp_path, text):
     (tmp_path / "tasks.toml").write_text(text)
     with pytest.raises(OwnError, match=r"tasks\.toml: "):
         read_toml(tmp_path / "tasks.toml", OwnError)
@@ -218,7 +218,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_json_that_cannot_be_read(tmp_path, name):
+def test_wrong_json_raises(tmp_path, name):
     path = tmp_path / "a.json"
     path.write_bytes(BAD[name][0])
     with pytest.raises(ValueError, match=BAD[name][1]) as caught:
@@ -227,7 +227,7 @@ def test_json_that_cannot_be_read(tmp_path, name):
     assert len(str(caught.value)) < 500
 
 
-def test_json_that_was_written_reads_back(tmp_path):
+def test_written_json_is_read_back(tmp_path):
     value = {"a": [1, 2.5, -0.0, None, True, "ü\u2028"], "b": {"c": 10**400}}
     write_json(tmp_path / "a.json", value)
     assert read_json(tmp_path / "a.json", "it") == value

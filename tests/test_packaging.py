@@ -63,11 +63,11 @@ def built(kept, tmp_path_factory) -> tuple[set[str], set[str], Path]:
         return sources, set(archive.namelist()), wheel
 
 
-def test_the_source_distribution_is_the_repository(kept, built):
+def test_source_distribution_has_the_repositorys_files(kept, built):
     assert [name for name in kept if name not in built[0]] == []
 
 
-def test_the_wheel_is_the_package_with_its_data(kept, built):
+def test_wheel_has_the_package_and_its_data(kept, built):
     package = [name for name in kept if name.startswith("lw_torchrl/")]
     assert [name for name in package if name not in built[1]] == []
     assert "lw_torchrl/py.typed" in built[1]
@@ -75,7 +75,7 @@ def test_the_wheel_is_the_package_with_its_data(kept, built):
 
 
 @pytest.mark.slow
-def test_the_wheel_works_outside_the_checkout(built, tmp_path):
+def test_wheel_works_outside_the_checkout(built, tmp_path):
     place, elsewhere = tmp_path / "installed", tmp_path / "elsewhere"
     elsewhere.mkdir()
     with zipfile.ZipFile(built[2]) as archive:
@@ -114,7 +114,7 @@ def extras(text: str) -> set[str]:
     return {one for found in re.findall(r"lw_torchrl\[([a-z,-]+)\]|extra `?\[([a-z]+)\]", text) for one in found if one}
 
 
-def test_extras_have_one_name_in_errors_and_pages():
+def test_extras_have_the_same_names_in_errors_and_pages():
     stated = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
     readme = (ROOT / "README.md").read_text("utf-8")
     listed = re.findall(r"^\| `([a-z]+)` \|", readme, re.MULTILINE)
@@ -126,7 +126,7 @@ def test_extras_have_one_name_in_errors_and_pages():
 
 
 @pytest.mark.slow
-def test_mypy_finds_a_user_s_mistakes_outside_the_checkout(tmp_path):
+def test_mypy_finds_mistakes_outside_the_checkout(tmp_path):
     """The package is found as it is installed, with ``make setup`` as a path. Overrides with names of their own, as the
     docs show them, are no mistakes."""
     planted = {}

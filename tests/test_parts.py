@@ -37,7 +37,7 @@ def run(source, folder):
 
 
 @pytest.mark.parametrize("path", PARTS, ids=lambda path: path.stem)
-def test_a_program_has_at_most_15_lines_and_imports_only_public_names(path):
+def test_programs_have_at_most_15_lines_and_use_public_names(path):
     lines = "\n".join(ast.unparse(statement) for statement in code(path)).splitlines()
     written = [line for line in path.read_text("utf-8").splitlines()[1:] if line.strip()]
     assert max(len(lines), len(written)) <= 15
@@ -48,11 +48,11 @@ def test_a_program_has_at_most_15_lines_and_imports_only_public_names(path):
 
 
 @pytest.mark.parametrize("path", PARTS, ids=lambda path: path.stem)
-def test_a_program_runs_in_an_empty_folder(path, tmp_path):
+def test_programs_run_in_an_empty_folder(path, tmp_path):
     assert PRINTS[path.stem] in run(path.read_text("utf-8"), tmp_path)
 
 
-def test_a_custom_decoder_is_loaded_in_a_new_process(tmp_path):
+def test_custom_decoder_is_loaded_in_a_new_process(tmp_path):
     path = next(path for path in PARTS if path.stem == "custom_decoder")
     run(path.read_text("utf-8"), tmp_path)
     loads = [ast.unparse(statement) for statement in code(path) if "save_actor(" not in ast.unparse(statement)]

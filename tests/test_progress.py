@@ -28,7 +28,7 @@ def clock(monkeypatch):
     return wait
 
 
-def test_off_a_terminal_a_line_every_30_seconds(capsys, clock):
+def test_without_a_terminal_a_line_appears_every_30_seconds(capsys, clock):
     with Progress("training", 8000, "step", initial=500) as progress:
         progress.note(loss="0.012")
         for _ in range(3000):
@@ -42,7 +42,7 @@ def test_off_a_terminal_a_line_every_30_seconds(capsys, clock):
     assert "\r" not in "".join(lines)
 
 
-def test_work_done_again_and_work_not_begun(capsys, clock):
+def test_repeated_work_and_work_that_has_not_begun(capsys, clock):
     with Progress("collecting", 1000, "step", initial=400) as progress:
         clock(31)
         progress.update(0)
@@ -57,7 +57,7 @@ def test_work_done_again_and_work_not_begun(capsys, clock):
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_nothing_is_shown_of_short_work(monkeypatch, terminal):
+def test_short_work_shows_nothing(monkeypatch, terminal):
     stream = Terminal() if terminal else io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
     with Progress("evaluating", 10, "step") as progress:
@@ -66,7 +66,7 @@ def test_nothing_is_shown_of_short_work(monkeypatch, terminal):
     assert stream.getvalue() == ""
 
 
-def test_on_a_terminal_a_bar(monkeypatch):
+def test_terminal_shows_a_bar(monkeypatch):
     monkeypatch.setattr(sys, "stderr", stream := Terminal())
     monkeypatch.setattr(_progress, "DELAY", 0.0)
     with Progress("training", 4, "step", initial=1) as progress:
@@ -80,7 +80,7 @@ def test_on_a_terminal_a_bar(monkeypatch):
 
 
 @pytest.mark.parametrize("stream", [None, "a terminal"])
-def test_nothing_where_it_is_off_or_there_is_no_stream(monkeypatch, clock, stream):
+def test_nothing_is_shown_if_switched_off_or_without_stderr(monkeypatch, clock, stream):
     monkeypatch.setattr(sys, "stderr", shown := None if stream is None else Terminal())
     with Progress("training", 4, "step", show=stream is None) as progress:
         clock(100)

@@ -94,7 +94,7 @@ def test_wrong_value_raises_an_error_that_names_the_argument_and_leaves_no_file(
     assert sorted(folder.rglob("*")) == files
 
 
-def test_a_folder_that_comes_twice_is_refused(calls, tmp_path):
+def test_same_folder_twice_raises(calls, tmp_path):
     root = calls["add_pictures"]["root"]
     link = tmp_path / "link"
     link.symlink_to(root)

@@ -1,1 +1,1 @@
-"""Tools that serve all folders: argument checks, files, keys, devices, progress, registries, seeds."""
+"""Helpers for all folders: argument checks, files, tensordict keys, devices, progress, registries, seeds, versions."""

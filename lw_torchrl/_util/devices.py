@@ -1,4 +1,4 @@
-"""How networks run: on which device, with which random numbers, and on how many rows at once."""
+"""Devices: their names, checks of tensors that do not wait for them, seeds, and networks in blocks of rows."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -14,21 +14,21 @@ from torch._subclasses.fake_tensor import FakeTensor
 
 from lw_torchrl._util.checks import shown, unknown_name
 
-_ASSERTING = {"cuda"}  # where torch._assert_async waits for nobody
+_ASSERTING = {"cuda"}  # devices on which torch._assert_async checks without waiting
 
 
 def plain(*tensors: Tensor) -> bool:
-    """Whether the tensors are plain numbers: not while compiled or exported, nor inside a ``torch.func`` transform."""
+    """Return whether the tensors hold numbers: not while compiling or exporting, nor in a ``torch.func`` transform."""
     if torch.compiler.is_compiling():
         return False
-    for tensor in tensors:  # noqa: SIM110 - in every call, and a generator takes twice as long
+    for tensor in tensors:  # noqa: SIM110 - called at every step, and a generator takes twice as long
         if is_functorch_wrapped_tensor(tensor) or isinstance(tensor, FakeTensor):
             return False
     return True
 
 
 def waits(*tensors: Tensor) -> bool:
-    """Whether reading the tensors' numbers would wait for a device that can check them itself."""
+    """Return whether reading the tensors would wait for a device that can check them itself."""
     for tensor in tensors:  # noqa: SIM110 - as above
         if not tensor.is_cpu and tensor.device.type in _ASSERTING:
             return True
@@ -36,12 +36,12 @@ def waits(*tensors: Tensor) -> bool:
 
 
 def readable(*tensors: Tensor) -> bool:
-    """Whether Python may read the tensors' numbers: they are :func:`plain`, and none is on a CUDA device."""
+    """Return whether Python may read the tensors: they are :func:`plain`, and none is on a CUDA device."""
     return plain(*tensors) and not waits(*tensors)
 
 
 def asserted(*tensors: Tensor) -> bool:
-    """Whether ``torch._assert_async`` checks the tensors: compiled, or on a CUDA device, but not inside ``vmap``."""
+    """Return whether ``torch._assert_async`` can check the tensors: compiled or on a CUDA device, not in ``vmap``."""
     if not torch.compiler.is_compiling():
         return waits(*tensors) and plain(*tensors)
     for tensor in tensors:  # noqa: SIM110 - as above
@@ -51,7 +51,7 @@ def asserted(*tensors: Tensor) -> bool:
 
 
 def check_values(holds: Callable[[Tensor], Tensor], tensor: Tensor, problem: str) -> None:
-    """Raise :class:`ValueError` unless ``holds(tensor)``, () bool; compiled or on a GPU, a RuntimeError later."""
+    """Raise :class:`ValueError` unless ``holds(tensor)``, () bool; if compiled or on a GPU, a later RuntimeError."""
     if asserted(tensor):
         torch._assert_async(holds(tensor), problem)
     elif readable(tensor) and not holds(tensor):
@@ -59,12 +59,13 @@ def check_values(holds: Callable[[Tensor], Tensor], tensor: Tensor, problem: str
 
 
 def finite(tensor: Tensor) -> bool:
-    """Whether all numbers are; the sum is fast, but may overflow."""
+    """Return whether all numbers are finite."""
+    # The sum is faster than isfinite(), but may overflow.
     return math.isfinite(tensor.sum().item()) or bool(tensor.isfinite().all())
 
 
 def check_finite(argument: str, tensor: Tensor) -> None:
-    """:func:`check_values` of a tensor whose numbers must be finite."""
+    """Raise as :func:`check_values` unless all numbers of a tensor are finite."""
     if not (readable(tensor) and finite(tensor)):
         problem = f"{argument} must hold finite numbers, got NaN or infinity"
         check_values(lambda values: values.isfinite().all(), tensor, problem)
@@ -72,37 +73,38 @@ def check_finite(argument: str, tensor: Tensor) -> None:
 
 _NAMES = ("cpu", "cuda", "cuda:0", "mps", "auto")
 CPU = torch.device("cpu")
-BLOCK = 64  # rows that networks run on at once
+BLOCK = 64  # rows on which networks run at once
 
 
 def check_device(argument: str, given: Any) -> torch.device:
-    """The device that is meant, with its number: a :class:`torch.device`, a kind that PyTorch knows, such as "cuda",
-    with or without a number, or "auto" for this machine's accelerator, or the CPU where it has none. A name of no
-    device, or of none in this machine, is a :class:`ValueError`, anything else a :class:`TypeError`."""
+    """Return a device with its number. ``given`` is a :class:`torch.device`, a name that PyTorch knows, such as "cuda"
+    or "cuda:0", or "auto" for this machine's accelerator, or the CPU without one. Raise :class:`ValueError` for a
+    device that does not exist or is not in this machine, and :class:`TypeError` for another object."""
     if not isinstance(given, (str, torch.device)):
         raise TypeError(f"{argument} must be a device's name, got {shown(given)}")
     accelerator = torch.accelerator.current_accelerator(check_available=True)
-    there = ["cpu"]
+    available = ["cpu"]
     if accelerator is not None:
         kind = accelerator.type
-        there += [kind, *(f"{kind}:{number}" for number in range(torch.accelerator.device_count()))]
+        available += [kind, *(f"{kind}:{number}" for number in range(torch.accelerator.device_count()))]
     if given == "auto":
-        given = there[1] if len(there) > 1 else "cpu"
+        given = available[1] if len(available) > 1 else "cpu"
     try:
         device = torch.device(given)
     except RuntimeError:
         raise unknown_name(argument, given, _NAMES) from None
     if device.type == "cpu":
         return CPU
-    if str(device) not in there:
-        known, none = ", ".join(map(repr, [*there, "auto"])), f"this build of PyTorch, has no {device.type.upper()}"
-        lack = "" if device.type in there else f": this machine, or {none}"
-        raise ValueError(f"{argument} must be one of {known} here, got {str(device)!r}{lack}")
+    if str(device) not in available:
+        known = ", ".join(map(repr, [*available, "auto"]))
+        absent = f"this machine, or this build of PyTorch, has no {device.type.upper()}"
+        reason = "" if device.type in available else f": {absent}"
+        raise ValueError(f"{argument} must be one of {known} here, got {str(device)!r}{reason}")
     return torch.empty(0, device=device).device
 
 
 def device_of(module: Any) -> torch.device:
-    """The device of a module's first parameter, or else buffer; the CPU for whatever has neither."""
+    """Return the device of a module's first parameter or buffer; the CPU for anything without them."""
     if not isinstance(module, torch.nn.Module):
         return CPU
     first = next(chain(module.parameters(), module.buffers()), None)
@@ -110,13 +112,13 @@ def device_of(module: Any) -> torch.device:
 
 
 def place(module: Any, device: str | torch.device | None) -> torch.device:
-    """Move a module to a device; None leaves it where it is. Returns its device."""
+    """Move a module to a device, unless that is None, and return the module's device."""
     if device is None:
         return device_of(module)
-    found = check_device("device", device)
+    checked = check_device("device", device)
     if isinstance(module, torch.nn.Module):
-        module.to(found)
-    return found
+        module.to(checked)
+    return checked
 
 
 @contextmanager
@@ -127,13 +129,13 @@ def seeded(device: torch.device, seed: int) -> Iterator[None]:
         torch.default_generator.manual_seed(seed)
         if others:
             module = torch.get_device_module(device.type)
-            generators = getattr(module, "default_generators", None)  # one for each; manual_seed is of the current one
+            generators = getattr(module, "default_generators", None)  # manual_seed would seed the current device only
             (module if generators is None else generators[device.index]).manual_seed(seed)
         yield
 
 
 def in_blocks(policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[TensorDictBase], TensorDictBase]:
-    """``policy`` on blocks of one size: an action then depends on its row alone, bit for bit."""
+    """Return ``policy`` run on blocks of one size, so that an action depends only on its row, bit for bit."""
     modules = policy.modules() if isinstance(policy, torch.nn.Module) else [policy]
     size = min(getattr(module, "rows_at_once", BLOCK) for module in modules)
 

@@ -38,43 +38,31 @@ def absent_policy(path: AnyPath, writer: str = "train") -> str:
 
 
 @contextmanager
-def _naming(target: Path) -> Iterator[None]:
-    """Add the file to disk errors: the error of a full disk does not name it."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno is not None and error.filename is None:
-            error.filename = str(target)
-        raise
-
-
-@contextmanager
 def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` to write to; it takes the name when the block ends without an error.
+    """Yield a temporary path to write to, which is renamed to ``path`` when the block ends without an error.
 
-    If the process is killed, ``path`` is the old or the new file, whole. If the machine stops, that holds only with
-    ``sync``, which waits some 10 ms for the disk.
+    If the process is killed, ``path`` is the whole old or the whole new file. If the machine stops, that holds only
+    with ``sync``, which takes some 10 ms.
     """
-    target = Path(os.path.realpath(path))  # a link stays, and its target is replaced
+    target = Path(os.path.realpath(path))  # keeps a link and replaces the file to which it points
     target.parent.mkdir(parents=True, exist_ok=True)
-    if sync:  # a folder of many small files, which are not synced, would be listed for each of them
+    if sync:  # else listing a folder with many small files would take long
         _remove_abandoned(target)
-    # The suffix stays, because writers choose the format by it.
+    # Writers choose the format by the suffix.
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(8)}.tmp{target.suffix}")
     try:
-        with _naming(target):
-            yield temporary
-            if sync:
-                flush(temporary)
-            os.replace(temporary, target)
-            if sync:
-                flush(target.parent)
+        yield temporary
+        if sync:
+            flush(temporary)
+        os.replace(temporary, target)
+        if sync:
+            flush(target.parent)
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def _remove_abandoned(target: Path) -> None:
-    """Remove the temporary files that killed processes left beside a file."""
+    """Remove temporary files of killed processes."""
     for left in target.parent.glob(f".{glob.escape(target.stem)}.*.tmp{target.suffix}"):
         with suppress(OSError):
             if time.time() - left.stat().st_mtime > _ABANDONED:
@@ -83,28 +71,27 @@ def _remove_abandoned(target: Path) -> None:
 
 @contextmanager
 def replacing_folder(path: AnyPath) -> Iterator[Path]:
-    """Yield a temporary folder beside ``path``, which takes its name when the block ends; ``path`` is new or empty."""
+    """Yield a temporary folder, which is renamed to ``path``, new or empty, when the block ends."""
     target = Path(path).absolute()
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
     temporary.mkdir(parents=True)
     try:
-        with _naming(target):
-            yield temporary
-            for written in [*temporary.rglob("*"), temporary]:
-                flush(written)
-            os.replace(temporary, target)
-            flush(target.parent)
+        yield temporary
+        for written in [*temporary.rglob("*"), temporary]:
+            flush(written)
+        os.replace(temporary, target)
+        flush(target.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
 def flush(path: Path) -> None:
-    """Wait until a file's content, or a folder's list of names, is on the disk."""
+    """Wait until the content of a file or folder is on the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # a file system that cannot
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # some file systems cannot sync
             raise
     finally:
         os.close(handle)
@@ -122,8 +109,8 @@ def locked(
 ) -> Iterator[None]:
     """Lock a file or a folder against other threads and processes while the block writes to it.
 
-    A killed process releases its lock. Without ``wait``, raise ``error``, which names the ``argument``, if ``who``
-    holds the lock for longer than a second.
+    A killed process releases its lock. Without ``wait``, raise ``error``, which names the ``argument``, if another
+    ``who`` keeps the lock for more than a second.
     """
     from filelock import FileLock, Timeout
 

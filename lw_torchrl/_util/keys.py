@@ -1,4 +1,4 @@
-"""Keys of tensordicts as arguments, and modules that are called with a tensordict or with tensors."""
+"""Keys of tensordicts as arguments, and modules that accept a tensordict or tensors."""
 
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -24,34 +24,33 @@ Keys = Sequence[NestedKey]
 def _key(given: Any) -> NestedKey | None:
     """Return a key; None if it is not one. A list is a nested key too, since JSON has no tuples."""
     given = tuple(given) if isinstance(given, list) else given
-    return unravel_key(given) if checker(NestedKey)(given) and given else None  # type: ignore[no-any-return]
+    return unravel_key(given) if checker(NestedKey)(given) and given else None
 
 
 def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[str]) -> list[NestedKey]:
-    """Return the keys ``given``, as many as the default ones and in their order; None for the default.
+    """Return keys that replace the default ones, in their order; None means the default ones.
 
-    Raise :class:`ValueError` for another number of keys, a repeated key, or an object that is not a key.
+    Raises :class:`ValueError` for another number of keys, a repeated key, or an object that is not a key.
     """
     if given is None:
         return list(default)
     is_list = isinstance(given, Sequence) and not isinstance(given, str)
-    keys = [key for one in given if (key := _key(one)) is not None] if is_list else []
+    keys = [key for item in given if (key := _key(item)) is not None] if is_list else []
     if not is_list or len({*keys}) != len(default) or len(given) != len(default):
-        wanted = f"a list of {len(default)}, in this order: {', '.join(default)}"
-        raise ValueError(f"{argument} must be {wanted}; got {given!r}")
+        raise ValueError(f"{argument} must be {len(default)} different keys, for {', '.join(default)}; got {given!r}")
     return keys
 
 
 def check_key(argument: str, given: Any) -> None:
     """Raise :class:`TypeError` unless ``given`` is a key of a tensordict."""
     if isinstance(given, list) or _key(given) is None:
-        raise TypeError(f"{argument} must be a key, a string or a tuple of strings, got {given!r}")
+        raise TypeError(f"{argument} must be a key (a string or a tuple of strings), got {given!r}")
 
 
 def check_apart(in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> None:
-    """Raise :class:`ValueError` if a module would write over what it reads."""
+    """Raise :class:`ValueError` if a module would overwrite its inputs."""
     if both := [key for key in out_keys if key in in_keys]:
-        raise ValueError(f"out_keys must not be among in_keys, {list(in_keys)}: {both} would be written over")
+        raise ValueError(f"out_keys must differ from in_keys, {list(in_keys)}: {both} would be overwritten")
 
 
 def key_beside(key: NestedKey, ending: str) -> NestedKey:
@@ -65,23 +64,23 @@ def last_name(key: NestedKey) -> str:
 
 
 def read(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> list[Tensor]:
-    """Return the tensors of ``keys``; a :class:`ValueError` names those that are missing."""
-    found = [tensordict.get(key, None) for key in keys]
-    if any(one is None for one in found):
+    """Return the tensors of ``keys``; raise :class:`ValueError` with the missing keys."""
+    tensors = [tensordict.get(key, None) for key in keys]
+    if any(tensor is None for tensor in tensors):
         raise missing_keys(tensordict.keys(True, True), *map(str, keys))
-    return found
+    return tensors
 
 
 def write(tensordict: TensorDictBase, module: TensorDictModuleBase, values: Sequence[Tensor]) -> TensorDictBase:
-    """Write a tensor for each of the module's keys; ``select_out_keys`` removes those that it did not select."""
+    """Write a tensor to each of the module's keys; TensorDict's ``select_out_keys`` removes some afterwards."""
     for key, value in zip(module.out_keys_source, values, strict=True):
         tensordict.set(key, value)
     return tensordict
 
 
 def dispatched(forward: Callable[[Any, TensorDictBase], TensorDictBase]) -> Callable[..., Any]:
-    """Let a module's ``forward`` be called with a tensordict, or with the tensors of ``in_keys``, by position or by
-    name, as ``torch.export`` does. Under ``set_skip_existing(True)`` it does nothing if all ``out_keys`` are there."""
+    """Decorate a module's ``forward`` to accept a tensordict, or the tensors of ``in_keys`` by position or by name, as
+    ``torch.export`` passes them. Under ``set_skip_existing(True)`` it does nothing if all ``out_keys`` exist."""
 
     @wraps(forward)
     def run(self: TensorDictModuleBase, tensordict: TensorDictBase) -> TensorDictBase:
@@ -89,8 +88,8 @@ def dispatched(forward: Callable[[Any, TensorDictBase], TensorDictBase]) -> Call
             return tensordict
         return forward(self, tensordict)
 
-    called: Any = dispatch(auto_batch_size=False)(run)  # of one tensor (B, F), all dimensions would be the batch
-    return any_arguments(called)
+    # An automatic batch size would take all dimensions of a single tensor (B, F).
+    return any_arguments(dispatch(auto_batch_size=False)(run))
 
 
 def any_arguments(forward: Any) -> Any:
@@ -103,10 +102,10 @@ _ANY = Parameter("args", Parameter.VAR_POSITIONAL), Parameter("kwargs", Paramete
 
 
 def row_mask(tensordict: TensorDictBase | None, key: str, n: int) -> np.ndarray:
-    """Return the rows of a mask such as "_reset", (n,) bool; all if there is none."""
+    """Return a mask of rows such as "_reset", (n,) bool; all rows without one."""
     mask = None if tensordict is None else tensordict.get(key, None)
     if mask is None:
         return np.ones(n, dtype=bool)
     if mask.dtype != torch.bool or mask.numel() != n:
-        raise ValueError(f"{key} must be bool of shape ({n},) or ({n}, 1), got {mask.dtype} of {tuple(mask.shape)}")
+        raise ValueError(f"{key} must be bool of shape ({n},) or ({n}, 1), got {mask.dtype}, {tuple(mask.shape)}")
     return mask.reshape(n).cpu().numpy()

@@ -1,4 +1,4 @@
-"""How far a long piece of work is: a bar on a terminal and in a notebook, else a line of text every 30 seconds."""
+"""Progress of long work: a bar on a terminal or in a notebook, otherwise a line of text every 30 seconds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def _duration(seconds: float) -> str:
 
 
 class Progress:
-    """Shows on the standard error how far work is; ``initial`` units of ``total`` were done before."""
+    """Progress on stderr; ``initial`` of ``total`` units were done before."""
 
     def __init__(self, what: str, total: int, unit: str, *, initial: int = 0, show: bool = True) -> None:
         self.what, self.total, self.unit, self.initial = what, total, unit, initial
@@ -49,13 +49,13 @@ class Progress:
             print(f"{self.what}: {self.done}/{self.total} {self.unit}s{left}{self.notes}", file=sys.stderr, flush=True)
 
     def set_done(self, units: int) -> None:
-        """Set how many units are done; fewer than before where some must be done again."""
+        """Set the number of finished units, which falls if some must be repeated."""
         self.done = units
         if self._bar is not None:
             self._bar.n = units
 
     def note(self, **notes: str) -> None:
-        """Show more beside it, ``loss="0.012"`` for example."""
+        """Show notes too, for example ``loss="0.012"``."""
         self.notes = "".join(f", {name} {value}" for name, value in notes.items())
         if self._bar is not None:
             self._bar.set_postfix(notes, refresh=False)

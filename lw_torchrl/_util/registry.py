@@ -1,4 +1,4 @@
-"""Registry: objects by name, to which users and installed packages add their own."""
+"""Registry: objects by name, to which users and installed packages can add."""
 
 import re
 from collections import UserDict
@@ -44,19 +44,19 @@ class ReadOnlyDict(Mapping[str, Entry]):
 
 
 class Registry(UserDict[str, Entry]):
-    """A mapping from names to objects of one kind: those we ship, those you add, and those of installed packages.
+    """A mapping from names to objects of one kind: ours, yours, and those of installed packages.
 
-    ``REGISTRY["mine"] = entry`` adds an entry and ``del`` removes it. A string "module:object" is imported when its
-    name is first looked up. Installed packages' names are listed too; a package is imported at its first look-up.
+    ``REGISTRY["mine"] = entry`` adds an entry and ``del`` removes it. A string "module:object", or the entry point of
+    an installed package, is imported at its first use.
 
     Args:
-        kind: what errors call an entry, "method".
-        group: the group of entry points, "lw_torchrl.methods".
-        entries: what we ship.
-        check: from a name and an object to the entry; raises if the object is of the wrong kind.
+        kind: the word for an entry in errors, such as "method".
+        group: the group of entry points, such as "lw_torchrl.methods".
+        entries: our entries.
+        check: a function from a name and an object to the entry; it raises for an object of the wrong kind.
 
     Raises:
-        KeyError: the name is unknown; the message lists the nearest names.
+        KeyError: the name is unknown; the message has the nearest names.
         ImportError: an entry cannot be imported or is of the wrong kind; the message names its package.
 
     Example:
@@ -105,13 +105,13 @@ class Registry(UserDict[str, Entry]):
             return self.check(name, entry)
         except Exception as error:  # a plugin may fail in any way
             if place.startswith("lw_torchrl."):
-                raise  # our own modules say which extra to install
-            failed = f"{self.kind} {name!r} is {place}{package}, which cannot be loaded"
-            raise ImportError(f"{failed} ({type(error).__name__}: {error})") from error
+                raise  # errors of our own modules name the extra to install
+            reason = f"{type(error).__name__}: {error}"
+            raise ImportError(f"{self.kind} {name!r}, {place}{package}, cannot be loaded ({reason})") from error
 
 
 def is_function(name: str, entry: Any) -> Callable[..., Any]:
-    """Check a function, or a class that is called."""
+    """Return a function or class; raise :class:`TypeError` for another object."""
     if not callable(entry):
         raise TypeError(f"{name!r} must be a function, got {entry!r:.80}")
     return entry

@@ -1,4 +1,4 @@
-"""Which cameras and sizes pictures have, and an error that names a missing rendering library, which MuJoCo loads."""
+"""Names of cameras, sizes of images, and an error that names a missing rendering library."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -15,7 +15,7 @@ _LARGEST = 4096  # pixels along a side
 
 
 def check_picture(camera: str, height: int, width: int) -> None:
-    """Raise :class:`ValueError` for an unknown camera or a size that no picture has."""
+    """Raise :class:`ValueError` for an unknown camera or a size of an image outside 1 to 4096."""
     check_choice("camera", camera, CAMERAS)
     for name, size in (("height", height), ("width", width)):
         if check_value(name, size, Count) > _LARGEST:
@@ -23,7 +23,7 @@ def check_picture(camera: str, height: int, width: int) -> None:
 
 
 def check_cameras(cameras: str | Sequence[str], height: int, width: int) -> tuple[str, ...]:
-    """The cameras' names; :class:`ValueError` for an unknown one, a repeated one, none, or a wrong size."""
+    """Return the names of cameras; raise :class:`ValueError` for an unknown or repeated one, none, or a wrong size."""
     names = (cameras,) if isinstance(cameras, str) else tuple(cameras)
     if not names or len({*names}) < len(names):
         raise ValueError(f"cameras must be different names, at least one, got {cameras!r}")
@@ -34,7 +34,7 @@ def check_cameras(cameras: str | Sequence[str], height: int, width: int) -> tupl
 
 @contextmanager
 def naming_absent_renderer() -> Iterator[None]:
-    """Turn MuJoCo's obscure AttributeError into one that names the missing library that MUJOCO_GL asks for."""
+    """Turn MuJoCo's AttributeError into an ImportError that names the missing library of MUJOCO_GL."""
     try:
         yield
     except AttributeError as error:

@@ -18,26 +18,20 @@ from lw_torchrl._util.files import AnyPath, parse_json, replacing
 from lw_torchrl._util.reproducibility import package_versions
 
 SUFFIX = ".safetensors"
-_METADATA = "lw_torchrl"  # the metadata of a .safetensors file are texts by name; under this name is our JSON
+_METADATA = "lw_torchrl"  # the name of our JSON in the file's metadata
 _CHECKSUM = "crc32"
-_STATE = "state/"  # begins the names of a state's tensors
+_STATE = "state/"  # the prefix of the names of a state's tensors
 
 
 def write_tensors(
     path: AnyPath, description: Mapping[str, Any], tensors: Mapping[str, Tensor], state: Any = None
 ) -> None:
-    """Write tensors and their description, whole or not at all.
-
-    Args:
-        path: the file.
-        description: as JSON; the ``versions`` of packages are added.
-        tensors: by name.
-        state: nested numbers, texts and tensors, which :func:`pop_state` restores.
-    """
+    """Write tensors by name and their description as JSON, to which ``versions`` of packages are added. ``state``,
+    nested numbers, strings and tensors, is restored by :func:`pop_state`."""
     tensors, described = dict(tensors), {"versions": package_versions(), **description}
     if state is not None:
         described["state"] = _split(state, tensors)
-    parse_json(_text(described).encode())  # raises if two names are the same text
+    parse_json(_text(described).encode())  # raises for names that JSON cannot tell apart, such as 1 and "1"
     copies = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     described[_CHECKSUM] = _checksum(described, copies)
     content = save(copies, metadata={_METADATA: _text(described)})
@@ -61,7 +55,7 @@ def read_tensors(path: AnyPath) -> tuple[dict[str, Any], dict[str, Tensor]]:
     except SafetensorError as error:
         raise ValueError(f"it is damaged or not a .safetensors file: {error}") from error
     if _checksum(description, tensors) != stored:
-        raise ValueError("it is damaged: its content does not have the checksum that was stored with it")
+        raise ValueError("it is damaged: the checksum is wrong")
     return description, tensors
 
 
@@ -79,7 +73,7 @@ def _checksum(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
 
 
 def pop_state(description: dict[str, Any], tensors: dict[str, Tensor]) -> Any:
-    """Take the state out of a file's description and tensors, and return it."""
+    """Remove the state from a file's description and tensors, and return it."""
     try:
         state = _join(description.pop("state"), tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:

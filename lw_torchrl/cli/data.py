@@ -1,4 +1,4 @@
-"""``lw-torchrl collect`` and ``data``: make, summarise and convert datasets."""
+"""``lw-torchrl collect``, ``data`` and ``info``: make, summarise and convert datasets, and describe files."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._util.checks import counted
+from lw_torchrl._util.checks import Count, Natural, Scale, counted
 from lw_torchrl.cli import options
-from lw_torchrl.cli.acting import is_object, policy_name, read_object
-from lw_torchrl.cli.options import Columns, Output, Row
+from lw_torchrl.cli.options import Columns, Flag, Maybe, Output, Row
 from lw_torchrl.language.tasks import TASKS
 
 if TYPE_CHECKING:
@@ -40,17 +39,15 @@ class Collect:
 
     tasks: options.TaskNames
     out: Path  # folder of the dataset
-    episodes: int = 10  # episodes kept for each task
-    seed: int = 0  # random seed (use a different one for evaluation)
-    noise: tuple[float, ...] = (0.0,)  # standard deviations of the execution noise, used in turn, one per episode
-    noise_hold: int = 10  # steps for which each noise value is held; longer leads the robot further off its path
-    gripper_noise: float = 0.2  # factor on the noise of the gripper; a high one makes grasps fail
-    redraw_failures: bool = False  # keep only successful episodes
+    episodes: Count = 10  # episodes kept for each task
+    seed: Natural = 0  # random seed (use a different one for evaluation)
+    noise: tuple[Scale, ...] = (0.0,)  # standard deviations of the execution noise, used in turn, one per episode
+    noise_hold: Count = 10  # steps for which each noise value is held; longer leads the robot further off its path
+    redraw_failures: Flag = False  # keep only successful episodes
     policy: options.Who = "expert"
-    behaviour: str | None = None  # label of the episodes; None for the policy's name
+    behaviour: Maybe[str] = None  # label of the episodes (default: the policy's name)
     task_file: options.TaskFile = None
     suite: options.SuiteName = None
-    num_envs: int | None = None  # environments stepped together; does not change the dataset
     device: options.Device = "cpu"
     json: options.Json = False
 
@@ -64,12 +61,11 @@ class Collect:
         behaviour = self.behaviour
         if policy not in BEHAVIOURS:
             options.use_one_thread()
-            policy = read_object(policy) if is_object(policy) else lw.load_actor(policy)
+            policy = options.read_object(policy) if options.is_object(policy) else lw.load_actor(policy)
             place(policy, self.device)
-            behaviour = behaviour or policy_name(self.policy)
-        noise = {"noise_scale": self.noise, "noise_hold": self.noise_hold, "gripper_noise_factor": self.gripper_noise}
-        run: dict[str, Any] = {"seed": self.seed, "num_envs": self.num_envs, "suite": suite, **noise}
-        run |= {"policy": policy, "behaviour": behaviour, "redraw_failures": self.redraw_failures}
+            behaviour = behaviour or options.policy_name(self.policy)
+        run: dict[str, Any] = {"seed": self.seed, "noise_scale": self.noise, "noise_hold": self.noise_hold}
+        run |= {"policy": policy, "behaviour": behaviour, "suite": suite, "redraw_failures": self.redraw_failures}
         dataset = lw.collect_demonstrations(tasks, episodes_per_task=self.episodes, root=self.out, **run)
         runs = dataset.attempts
         rates = dataset.success_rate.items()
@@ -95,7 +91,7 @@ class Show:
 
     folders: Positional[Annotated[tuple[Path, ...], options.REQUIRED, arg(metavar="FOLDERS")]]
     """datasets of `lw-torchrl collect`"""
-    check: bool = False  # also compare all rows with their checksums
+    check: Flag = False  # also compare all rows with their checksums
     json: options.Json = False
 
     def run(self) -> Output:
@@ -114,7 +110,7 @@ class Show:
         output.show("datasets", described)
         for group in ("task", "behaviour")[: len(parts)]:
             key = attrgetter(group)
-            rows = [_summary(label, [*some]) for label, some in groupby(sorted(episodes, key=key), key)]
+            rows = [_summary(label, [*members]) for label, members in groupby(sorted(episodes, key=key), key)]
             last = group == "behaviour" or len(parts) == 1
             output.table(f"{group}s", rows + [_summary("all", episodes)] * (last and not self.json), _columns(group))
         output.show("all", _summary("all", episodes))
@@ -157,17 +153,17 @@ def _columns(label: str) -> Columns:
         "success": lambda row: f"{row['success']:.2f}",
         "first success": first,
         "dense return": lambda row: f"{row['dense_return']['mean']:.1f}",
-        "quartiles": lambda row: " ".join(f"{one:.1f}" for one in row["dense_return"]["quartiles"]),
+        "quartiles": lambda row: " ".join(f"{quartile:.1f}" for quartile in row["dense_return"]["quartiles"]),
     }
 
 
 def _summary(label: str, episodes: list[_Episode]) -> dict[str, Any]:
-    first = [one.first_success for one in episodes if one.first_success is not None]
-    returns = [one.dense_return for one in episodes]
+    first = [episode.first_success for episode in episodes if episode.first_success is not None]
+    returns = [episode.dense_return for episode in episodes]
     return {
         "label": label,
         "episodes": len(episodes),
-        "steps": sum(one.length for one in episodes),
+        "steps": sum(episode.length for episode in episodes),
         "success": len(first) / len(episodes),
         "first_success": {"median": median(first), "min": min(first), "max": max(first)} if first else None,
         "dense_return": {
@@ -182,10 +178,10 @@ def _check(output: Output, parts: list[Demonstrations]) -> None:
 
     damaged = []
     for part in parts:
-        if broken := len(part.episodes) - len(whole_episodes(part, progress=True)):
-            damaged.append({"folder": part.root, "episodes": broken})
-            number = f"{broken} of {counted(len(part.episodes), 'episode')} differ from their checksums"
-            output.fault = f"{str(part.root)!r} is damaged: {number}; delete the folder and collect it again"
+        if number := len(part.episodes) - len(whole_episodes(part, progress=True)):
+            damaged.append({"folder": part.root, "episodes": number})
+            fault = f"{number} of {counted(len(part.episodes), 'episode')} differ from their checksums"
+            output.fault = f"{str(part.root)!r} is damaged: {fault}; delete the folder and collect it again"
     output.show("damaged", damaged, None if damaged else "\nchecked: all rows match their checksums")
 
 
@@ -200,7 +196,7 @@ class Export:
     to: str  # format: lerobot (version 3) or minari
     out: Path  # folder to write, new or empty
     plans: Annotated[tuple[str, ...], options.OPTIONAL] = ()
-    """plans whose conditions are stored with each row, if not the suite's"""
+    """plans whose conditions are stored with each row (default: the suite's)"""
     suite: options.SuiteName = None
     json: options.Json = False
 
@@ -223,11 +219,11 @@ class Import:
 
     source: Positional[Annotated[Path, arg(metavar="SOURCE")]]  # LeRobot or Minari folder, or robomimic HDF5 file
     out: Path  # folder of the dataset, new or empty
-    format: str | None = None  # format of the source; None recognises it by its files
-    task: str | None = None  # task of all episodes, if the source does not name it
+    format: Maybe[str] = None  # format of the source (default: recognised by its files)
+    task: Maybe[str] = None  # task of all episodes, if the source does not name it
     suite: options.SuiteName = None
     behaviour: str = "imported"  # label of the episodes
-    episodes: int | None = None  # import only the first N episodes of each task; None imports all
+    episodes: Maybe[Count] = None  # import only the first N episodes of each task
     json: options.Json = False
 
     def run(self) -> Output:
@@ -240,6 +236,40 @@ class Import:
             dataset = lw.import_dataset(self.source, self.out, suite=suite, episodes_per_task=self.episodes, **about)
         rows = [{"task": task, "success": rate} for task, rate in dataset.success_rate.items()]
         output = Output(self.json).table("tasks", rows, _SUCCESS)
-        lacking = [str(one.message) for one in caught if issubclass(one.category, MissingDataWarning)]
+        lacking = [str(item.message) for item in caught if issubclass(item.category, MissingDataWarning)]
         output.show("lacking", lacking, "\n".join(lacking) or None)
         return _show_dataset(output, dataset)
+
+
+@dataclass(kw_only=True)
+class Info:
+    """Describe a file: a policy (its model card), a dataset (as `data show` does) or a recording (its episodes).
+
+    Example: lw-torchrl info few-shot-mt50
+    """
+
+    path: Positional[Annotated[Path, arg(metavar="PATH")]]  # policy file or name, dataset folder or .rrd file
+    json: options.Json = False
+
+    def run(self) -> Output:
+        if (self.path / "metadata.json").is_file():
+            return Show(folders=(self.path,), json=self.json).run()
+        output = Output(self.json)
+        if self.path.suffix == ".rrd":
+            return _show_recording(output, self.path)
+        card = lw.evaluation.describe_policy(self.path)
+        return output.show("card", card, card)
+
+
+def _show_recording(output: Output, path: Path) -> Output:
+    """List the episodes of a recording with their numbers of steps."""
+    from rerun.chunk import RrdReader
+
+    steps: dict[str, int] = {}
+    for chunk in RrdReader(path).stream():
+        episode, _, entity = str(chunk.entity_path).strip("/").partition("/")
+        if entity == "action" and not chunk.is_static:
+            steps[episode] = steps.get(episode, 0) + len(chunk)
+    output.show("recording", path, f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+    rows = [{"episode": episode, "steps": number} for episode, number in sorted(steps.items())]
+    return output.table("episodes", rows, {"episode": "episode", "steps": "steps"})

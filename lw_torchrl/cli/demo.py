@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import lw_torchrl as lw
 from lw_torchrl.cli import options
+from lw_torchrl.cli.options import Flag, Maybe
+from lw_torchrl.envs.episodes import FinishedEpisode
+from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.tasks import MT10
 
 RECORDED = ("drawer-open", "window-open")
@@ -37,15 +41,15 @@ QUICK = DemoConfig(tasks=RECORDED, demonstrations_per_task=4, training_steps=800
 
 @dataclass(kw_only=True)
 class Demo:
-    """Train a plan-conditioned policy on MT10, evaluate it and record an episode, in some minutes on two cores.
+    """Train a plan-conditioned policy on MT10, evaluate it and record an episode, in a few minutes on two cores.
 
     If it is stopped, the same command resumes it.
 
     Example: lw-torchrl demo --quick
     """
 
-    out: Path | None = None  # folder of everything it writes; by default runs/demo, or runs/demo-quick with --quick
-    quick: bool = False  # two tasks and little training, in under a minute; its success rate means nothing
+    out: Maybe[Path] = None  # folder for all files (default: runs/demo, or runs/demo-quick with --quick)
+    quick: Flag = False  # two tasks and little training, in under a minute; its success rate means nothing
 
     def run(self) -> None:
         options.use_one_thread()
@@ -57,11 +61,11 @@ def run_demo(out: Path, config: DemoConfig) -> lw.EvaluationResult:
     """Run or resume the demo, write its files to ``out`` and print its results."""
     from lw_torchrl._util.files import locked, read_json, write_json
 
-    stated, path = json.loads(json.dumps(asdict(config))), out / "config.json"
+    described, path = json.loads(json.dumps(asdict(config))), out / "config.json"
     with locked(out, "out", folder=True):
         if not path.is_file():
-            write_json(path, stated)
-        elif read_json(path, "out: the configuration") != stated:
+            write_json(path, described)
+        elif read_json(path, "out: the configuration") != described:
             raise ValueError(f"out: {str(out)!r} holds a demo with another configuration; choose another folder")
         return _run(out, config)
 
@@ -69,7 +73,7 @@ def run_demo(out: Path, config: DemoConfig) -> lw.EvaluationResult:
 def _run(out: Path, config: DemoConfig) -> lw.EvaluationResult:
     import torch
 
-    from lw_torchrl.record.rollouts import active_skills, run_recorded, write_recording
+    from lw_torchrl.record.rollouts import run_recorded, write_recording
 
     plans = lw.load_plans("MT10")
     print(f"1/4  collecting {config.demonstrations_per_task} demonstrations per task, tasks: {len(config.tasks)}")
@@ -107,9 +111,18 @@ def _run(out: Path, config: DemoConfig) -> lw.EvaluationResult:
     print(f"\n{result.table()}\n")
     print("most attended skills, in order, up to the first success (steps):")
     for episode in episodes:
-        skills = [f"{skill} ({steps})" for skill, steps in active_skills(episode, plans[episode.task])]
+        skills = _active_skills(episode, plans[episode.task])
         shown = skills if len(skills) <= 8 else [*skills[:4], f"... {len(skills) - 7} changes ...", *skills[-3:]]
         print(f"  {episode.task}: " + " > ".join(shown))
     print(f"\nresults   {results}\nfigure    {out / 'success.png'}\npolicy    {out / 'checkpoint.safetensors'}")
     print(f"recording lw-torchrl view {out / 'rollout.rrd'}")
     return result
+
+
+def _active_skills(episode: FinishedEpisode, plan: ConditionalPlan) -> list[str]:
+    """Return the skills with the largest weight, in order up to the success, with their numbers of steps."""
+    end = episode.first_success
+    largest = episode.steps.get("skill_weights")[:end].argmax(-1).tolist()
+    holds = episode.steps.get("qaf")[:end].any(-1).tolist()
+    names = [plan.steps[i].skill if any_ else "no condition holds" for i, any_ in zip(largest, holds, strict=True)]
+    return [f"{name} ({len(list(group))})" for name, group in groupby(names)]

@@ -2,21 +2,121 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._util.checks import counted
+from lw_torchrl._util.checks import Count, Natural, Positive, Scale, counted
 from lw_torchrl._util.files import locked, write_json
 from lw_torchrl.cli import options
-from lw_torchrl.cli.acting import Acting, is_object, policy_name
-from lw_torchrl.cli.options import Output
+from lw_torchrl.cli.options import Flag, Maybe, Output
 from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import Task
 
-_TASKS = "MT10, MT50, a suite, or names of tasks; by default those of --plans or of the demonstrations"
+_PLANS = f"plans that replace the policy's own: {options.PLANS}"
+_REFERENCE = "with --attribute, trusted plans for the re-run, as for --plans"
+_TASKS = "MT10, MT50, a suite, or names of tasks (default: those of --plans or of the demonstrations)"
+
+
+@dataclass(kw_only=True)
+class Rollout:
+    """Plans, evaluator, noise and seed, as for `evaluate` and `record`."""
+
+    plans: Annotated[options.PlanSources, options.OPTIONAL, arg(help=_PLANS)] = ()
+    suite: options.SuiteName = None
+    speed: Positive = 1.0  # scale factor on the hand's displacement, for a policy trained on another robot
+    skill_file: options.SkillFile = None
+    task_file: options.TaskFile = None
+    text_encoder: options.Encoder = None
+    evaluator: options.Evaluator = None
+    seed: Natural = 1000  # random seed of initial states, goals and noise (use a different one than for demonstrations)
+    noise: Scale = 0.1  # standard deviation of the noise on the executed action
+    max_steps: Maybe[Count] = None  # steps of an episode (default: the suite's, 500 in Meta-World)
+    stop_at_success: Flag = False  # end episodes at their first success; the success rate stays the same
+    attribute: Flag = False  # re-run failed episodes to report why they failed: a query, the plan, a skill or time
+    reference: Annotated[tuple[str, ...], options.OPTIONAL, arg(metavar="SOURCES", help=_REFERENCE)] = ()
+    device: options.Device = "cpu"
+
+    def choose(self, names: tuple[str, ...]) -> list[str]:
+        """Read --suite and --task-file, and return the tasks that ``names`` stand for."""
+        options.use_one_thread()
+        self.chosen_suite = options.read_suite(self.suite, names)
+        self.known: Mapping[str, Task] = options.read_tasks(self.task_file, names, self.suite)
+        return options.select_tasks(names, self.known, self.chosen_suite) if names else []
+
+    @cached_property
+    def own_plans(self) -> Plans | None:
+        return options.read_plans(self.plans, self.known) if self.plans else None
+
+    @property
+    def trusted_plans(self) -> Plans | None:
+        return options.read_plans(self.reference, self.known) if self.reference else None
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The arguments that the library's functions for episodes share."""
+        arguments = {"seed": self.seed, "noise_scale": self.noise, "suite": self.chosen_suite, "device": self.device}
+        return arguments | ({} if self.max_steps is None else {"max_steps": self.max_steps})
+
+    def policy(self, name: str, tasks: list[str]) -> tuple[Any, Plans | None, Any]:
+        """Return a policy, the plans to show, and the evaluator in front of the policy."""
+        policy, plans = self._policy(name, tasks)
+        if self.evaluator is None:
+            return policy, plans, None
+        if (own := lw.modules.plans_of(policy)) is None:
+            raise ValueError(f"--evaluator requires a policy with plans; {name} has none")
+        evaluator = options.read_evaluator(self.evaluator, own, self.text_encoder)
+        evaluator.answers = "hard"  # the policy was trained on exact answers
+        return policy, plans, evaluator
+
+    def _policy(self, name: str, tasks: list[str]) -> tuple[Any, Plans | None]:
+        from lw_torchrl.data.collection_policy import BEHAVIOURS
+        from lw_torchrl.language.canonical import canonical_like
+        from lw_torchrl.modules.wrappers import TransferredActor
+        from lw_torchrl.training.checkpoint import demonstration_seeds
+
+        if name in BEHAVIOURS:
+            return self._behaviour(name, tasks)
+        suite, plans = self.chosen_suite, self.own_plans
+        if options.is_object(name):
+            policy = options.read_object(name)
+        elif self.seed in demonstration_seeds(name):
+            raise ValueError(f"--seed {self.seed} is the seed of the demonstrations; evaluate on a different one")
+        else:
+            policy = lw.load_actor(name, text_encoder=options.read_encoder(self.text_encoder))
+            if suite is not None and lw.modules.layout_of(policy) != suite.layout:  # a policy of another robot
+                if (plans := plans or suite.plans) is None:
+                    raise ValueError(f"suite {suite.name!r} has no plans; give some by --plans")
+                plans = canonical_like(plans, lw.modules.plans_of(policy))
+                policy, plans = TransferredActor(policy, plans, speed=self.speed), None
+        if plans is not None:
+            policy = lw.modules.with_plans(policy, canonical_like(plans, lw.modules.plans_of(policy)))
+        return policy, lw.modules.plans_of(policy)
+
+    def _behaviour(self, name: str, tasks: list[str]) -> tuple[Any, Plans | None]:
+        """Return a scripted policy and the plans to show."""
+        from lw_torchrl.data.collect import suite_expert
+        from lw_torchrl.data.collection_policy import SegmentActor, behaviour_of
+        from lw_torchrl.suites.suite import find_suite
+
+        suite = self.chosen_suite or find_suite(tasks)
+        if (plans := self.own_plans or suite.plans) is not None:
+            plans.require(tasks)
+            plans = Plans({task: plans[task] for task in tasks})
+        if name == "expert":
+            return suite_expert(suite, tasks), plans
+        if plans is None:
+            raise ValueError(f"suite {suite.name!r} has no plans for {name} to follow; give some by --plans")
+        skills = options.read_skills(self.skill_file, self.known) if self.skill_file else suite.skills
+        if name == "scripted":
+            return lw.ScriptedSkillActor(plans, skills=skills), plans
+        behaviour = behaviour_of(name, tasks, suite=suite)
+        return SegmentActor(behaviour, plans, self.seed, self.max_steps or suite.max_steps, skills=skills), plans
 
 
 @dataclass(kw_only=True)
@@ -30,40 +130,33 @@ class Evaluate:
     Example: lw-torchrl evaluate scripted --tasks MT50 --episodes 50 --noise 0
     """
 
-    policy: Positional[Annotated[str, arg(metavar="POLICY", help=f"who acts: {options.WHO}")]]
-    tasks: Annotated[tuple[str, ...], options.OPTIONAL, arg(help=_TASKS)] = ()
-    episodes: int = 20  # episodes of each task
-    num_envs: int | None = None  # environments stepped together; does not change the result
-    out: Path | None = None  # folder for results.json, success.png, rollout.rrd, failures.png and plan_use.json
+    policy: Positional[options.Who]
+    tasks: Annotated[tuple[str, ...], options.OPTIONAL, arg(metavar="TASKS", help=_TASKS)] = ()
+    episodes: Count = 20  # episodes of each task
+    out: Maybe[Path] = None  # folder for results.json, success.png, rollout.rrd, failures.png and plan_use.json
     json: options.Json = False
-    acting: OmitArgPrefixes[Acting] = field(default_factory=Acting)
+    rollout: OmitArgPrefixes[Rollout] = field(default_factory=Rollout)
 
     def run(self) -> Output:
         from lw_torchrl.data.collection_policy import BEHAVIOURS
         from lw_torchrl.training.checkpoint import demonstrated_tasks
 
-        acting = self.acting
-        tasks, suite = acting.choose(self.tasks), acting.in_suite
+        rollout = self.rollout
+        tasks, suite = rollout.choose(self.tasks), rollout.chosen_suite
         if not tasks and self.policy in BEHAVIOURS:
-            tasks = list(acting.own_plans or (lw.MT10 if suite is None else suite.plans or suite.tasks))
-        policy, plans, evaluator = acting.policy(self.policy, tasks)
+            tasks = list(rollout.own_plans or (lw.MT10 if suite is None else suite.plans or suite.tasks))
+        policy, plans, evaluator = rollout.policy(self.policy, tasks)
         if not tasks:
-            demonstrated = set() if acting.plans or is_object(self.policy) else demonstrated_tasks(self.policy)
-            tasks = _default_tasks(policy, demonstrated, suite)
+            has_demonstrations = not rollout.plans and not options.is_object(self.policy)
+            tasks = _default_tasks(policy, demonstrated_tasks(self.policy) if has_demonstrations else set(), suite)
         use = lw.evaluation.PlanUse(plans) if plans and isinstance(policy, lw.ScriptedSkillActor) else None
-        watching: dict[str, Any] = {"also_record": ["qaf", "skill_weights"], "on_episode": use} if use else {}
-        more: dict[str, Any] = {
-            "attribute": acting.attribute,
-            "reference": acting.trusted_plans,
-            "evaluator": evaluator,
-        }
-        result = lw.evaluate(
-            policy, tasks=tasks, episodes_per_task=self.episodes, stop_at_success=acting.stop_at_success,
-            num_envs=self.num_envs, **acting.run, **more, **watching,
-        )  # fmt: skip
+        more: dict[str, Any] = {"also_record": ["qaf", "skill_weights"], "on_episode": use} if use else {}
+        more |= {"attribute": rollout.attribute, "reference": rollout.trusted_plans, "evaluator": evaluator}
+        more |= {"episodes_per_task": self.episodes, "stop_at_success": rollout.stop_at_success}
+        result = lw.evaluate(policy, tasks=tasks, **rollout.arguments, **more)
         output = Output(self.json)
-        _show_use(output, result, use, plans) if use and plans else output.result(result)
-        if acting.attribute:
+        _show_plan_use(output, result, use, plans) if use and plans else output.result(result)
+        if rollout.attribute:
             failures = [failure.to_json() for failure in result.failures or ()]
             output.show("failures", failures, f"\n{result.failure_table()}")
         if self.out is not None:
@@ -76,22 +169,22 @@ class Evaluate:
         from lw_torchrl.record.rollouts import run_recorded, write_recording
         from lw_torchrl.training.checkpoint import policy_file
 
-        plans = lw.modules.plans_of(policy)
+        rollout, plans = self.rollout, lw.modules.plans_of(policy)
         origin: dict[str, Any] = {"plans": None if plans is None else plans.fingerprint}
-        for name, file in (("checkpoint", policy_file(self.policy)), ("evaluator", Path(self.acting.evaluator or ""))):
+        for name, file in (("checkpoint", policy_file(self.policy)), ("evaluator", Path(rollout.evaluator or ""))):
             origin[name] = file if file.is_file() else None
         result.save(out / "results.json", **origin)
         lw.plot_success(result, out / "success.png", title=f"{self.policy}, {self.episodes} episodes a task")
         if use is not None:
-            write_json(out / "plan_use.json", {task: one.to_json() for task, one in use.tasks().items()})
-        if self.acting.attribute:
+            write_json(out / "plan_use.json", {task: counts.to_json() for task, counts in use.tasks().items()})
+        if rollout.attribute:
             lw.evaluation.plot_failures(result, out / "failures.png", title=self.policy)
-        recorded = run_recorded(policy, result.config["tasks"][:3], evaluator=evaluator, **self.acting.run)
-        label: dict[str, Any] = {"seed": self.acting.seed, "policy": policy_name(self.policy)}
-        write_recording(out / "rollout.rrd", recorded, plans, suite=self.acting.in_suite, **label)
+        episodes = run_recorded(policy, result.config["tasks"][:3], evaluator=evaluator, **rollout.arguments)
+        labels: dict[str, Any] = {"seed": rollout.seed, "policy": options.policy_name(self.policy)}
+        write_recording(out / "rollout.rrd", episodes, plans, suite=rollout.chosen_suite, **labels)
 
 
-def _show_use(output: Output, result: lw.EvaluationResult, use: lw.evaluation.PlanUse, plans: Plans) -> None:
+def _show_plan_use(output: Output, result: lw.EvaluationResult, use: lw.evaluation.PlanUse, plans: Plans) -> None:
     """Print the result and, for each plan step, how often it was true, chosen, or the last one of a failed episode."""
     steps = {}
     for task, used in use.tasks().items():

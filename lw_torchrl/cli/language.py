@@ -1,20 +1,26 @@
-"""``lw-torchrl tasks`` and ``query``: describe tasks, and answer queries in a state."""
+"""``lw-torchrl tasks``, ``query`` and ``check``: describe tasks, answer queries, and validate your own files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._util.checks import Natural, check_value, counted
+from lw_torchrl._util.checks import Natural, counted, nearest
+from lw_torchrl._util.files import read_text, read_toml
 from lw_torchrl.cli import options
-from lw_torchrl.cli.options import Columns, Output, Row
+from lw_torchrl.cli.options import Columns, Maybe, Output, Row
+from lw_torchrl.language.nearest import nearest_skill
 from lw_torchrl.language.objects import GRIPPER
-from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.language.plan_files import PLAN_LIMIT, check_plan
+from lw_torchrl.language.skills import ScriptedSkill, skills_for
 from lw_torchrl.language.tasks import MT10, Task
+
+_SOURCE = "a .plan file, a folder of them, a .toml file of skills or tasks, or a suite, as its name or my_module:suite"
 
 
 @dataclass(kw_only=True)
@@ -25,7 +31,7 @@ class Tasks:
     """
 
     names: Positional[Annotated[tuple[str, ...], options.OPTIONAL, arg(metavar="[NAMES]")]] = ()
-    """MT10, MT50, a suite, or names of tasks (without any, all 50)"""
+    """MT10, MT50, a suite, or names of tasks (all 50 if none is given)"""
     plans: options.PlanSources = ("MT50",)
     skill_file: options.SkillFile = None
     task_file: options.TaskFile = None
@@ -37,7 +43,7 @@ class Tasks:
         output = Output(self.json)
         if len(chosen) != 1:
             columns: Columns = {"task": "task", "MT10": "mt10", "description": "description"}
-            columns = {**columns, "objects": lambda row: ", ".join(one["name"] for one in row["objects"])}
+            columns = {**columns, "objects": lambda row: ", ".join(part["name"] for part in row["objects"])}
             return output.table("tasks", list(map(_row, chosen)), columns, counted(len(chosen), "task"))
         (task,) = chosen
         plan = options.find_plans(self.plans, known).get(task.name)
@@ -46,7 +52,7 @@ class Tasks:
         queries = {query: query not in published for query in lw.supported_queries(task)}
         row = _row(task) | {"plan": None if plan is None else text}
         row["queries"] = [{"query": query, "extension": extension} for query, extension in queries.items()]
-        objects = [one["name"] + (" (extension)" if one["extension"] else "") for one in row["objects"]]
+        objects = [part["name"] + (" (extension)" if part["extension"] else "") for part in row["objects"]]
         output.show("task", row, f"{task.name}: {task.description}\n\nobjects: {', '.join(objects)}\n\n{text}\n")
         skills = [skill for skill in options.read_skills(self.skill_file, known).values() if skill.suits(task)]
         columns = {
@@ -66,7 +72,7 @@ class Tasks:
 
 
 def _row(task: Task) -> dict[str, Any]:
-    objects = [{"name": one.name, "extension": one.ours} for one in task.objects[1:]]
+    objects = [{"name": part.name, "extension": part.ours} for part in task.objects[1:]]
     return {"task": task.name, "mt10": task.name in MT10, "description": task.description, "objects": objects}
 
 
@@ -87,11 +93,11 @@ class Ask:
     """
 
     task: options.TaskName
-    text: Positional[Annotated[str | None, arg(metavar="[TEXT]")]] = None
-    """the query (without it, all supported queries that hold are listed)"""
-    step: int = 0  # number of steps that the expert does first
-    seed: int = 0  # random seed of the initial state
-    episode: int = 0  # index of the episode
+    text: Positional[Annotated[Maybe[str], arg(metavar="[TEXT]")]] = None
+    """the query (if none is given, all supported queries that hold are listed)"""
+    step: Natural = 0  # number of steps that the expert does first
+    seed: Natural = 0  # random seed of the initial state
+    episode: Natural = 0  # index of the episode
     task_file: options.TaskFile = None
     json: options.Json = False
 
@@ -106,7 +112,7 @@ class Ask:
         task, suite = known[name], find_suite(name)
         texts = lw.supported_queries(task) if self.text is None else [self.text]
         queries = [lw.parse_query(text, task) for text in texts]
-        if check_value("--step", self.step, Natural) > suite.max_steps:
+        if self.step > suite.max_steps:
             raise ValueError(f"--step must be at most {suite.max_steps}, the length of an episode, got {self.step}")
         env: EnvBase = lw.LanguageWorldEnv(name, seed=self.seed)
         expert = suite_expert(suite, (name,)) if self.step else None
@@ -124,7 +130,106 @@ class Ask:
         opening = state["observation"][0, suite.layout.opening].item()
         output.show("opening", opening, f"the gripper's opening       {opening:7.3f}\n")
         answers = [{"query": str(query), "holds": truth} for query, truth in zip(queries, truths, strict=True)]
-        lines = [one["query"] for one in answers if one["holds"]]
+        lines = [answer["query"] for answer in answers if answer["holds"]]
         if self.text is not None:
-            lines = [f"{'yes' if one['holds'] else 'no'}: {one['query']}" for one in answers]
+            lines = [f"{'yes' if answer['holds'] else 'no'}: {answer['query']}" for answer in answers]
         return output.show("queries", answers, "\n".join(lines))
+
+
+@dataclass(kw_only=True)
+class Check:
+    """Validate a file of plans, skills or tasks: report every fault with its line and the nearest allowed text.
+
+    A suite is simulated for some steps, and its axes, units, gripper and resting objects are compared with its layout.
+
+    Example: lw-torchrl check my-plans/push.plan
+
+    Example: lw-torchrl check my_module:suite
+    """
+
+    source: Positional[Annotated[str, arg(metavar="FILE", help=_SOURCE)]]
+    task: Maybe[str] = None  # task that a plan must be for
+    skill_file: options.SkillFile = None
+    task_file: options.TaskFile = None
+    json: options.Json = False
+
+    def run(self) -> Output:
+        output, file = Output(self.json), Path(self.source)
+        if not file.exists() and (":" in self.source or self.source in lw.suites.SUITES):
+            return _check_suite(output, self.source)
+        if not file.exists():
+            raise FileNotFoundError(f"no file, folder or suite {self.source!r}")
+        if file.suffix == ".toml":
+            return _check_toml(output, file, options.read_tasks(self.task_file))
+        files = sorted(file.glob("*.plan")) if file.is_dir() else [file]
+        if not files:
+            raise FileNotFoundError(f"the folder {self.source!r} holds no .plan files")
+        known = options.tasks_of_plans(file, self.task, self.task_file)
+        skills = options.read_skills(self.skill_file, known)
+        rows: list[dict[str, Any]] = []
+        for path in files:
+            plan, faults = check_plan(read_text(path, lw.PlanError, limit=PLAN_LIMIT), self.task, path.name, known)
+            steps = 0 if plan is None else len(plan.steps)
+            notes = [] if plan is None else _skill_notes(plan, skills)
+            rows.append({"file": path, "steps": steps, "faults": faults, "notes": notes})
+            verdict = counted(len(faults), "fault") if faults else f"{counted(steps, 'step')}, valid"
+            print(*faults, *(f"{path.name}: note: {note}" for note in notes), f"{path.name}: {verdict}", sep="\n")
+        if number := sum(len(row["faults"]) for row in rows):
+            output.fault = f"{counted(number, 'fault')} in {counted(len(files), 'file')}"
+        return output.show("files", rows)
+
+
+def _skill_notes(plan: lw.ConditionalPlan, skills: Mapping[str, ScriptedSkill]) -> list[str]:
+    """Name the steps that no scripted skill carries out."""
+    notes = []
+    for step in plan.steps:
+        if step.skill not in skills or not skills[step.skill].suits(plan.definition):
+            try:
+                skill, score = nearest_skill(step.skill, plan.definition, skills_for(plan.definition, skills))
+                hint = f"the nearest is {skill.text!r} ({score:.2f})"
+            except ValueError:
+                hint = "add yours by --skill-file"
+            notes.append(f"no scripted skill {step.skill!r} for {plan.task}; {hint}. Learned policies need none")
+    return notes
+
+
+def _check_toml(output: Output, file: Path, known: Mapping[str, Task]) -> Output:
+    """Validate a file of tasks, recognised by its keys, or of skills."""
+    notes: list[str] = []
+    try:
+        rows = read_toml(file, ValueError)
+        if any(isinstance(row, dict) and ("description" in row or "objects" in row) for row in rows.values()):
+            kind = "task"
+            lw.load_tasks(file)
+            for name in sorted(set(rows) - set(lw.TASKS)):
+                hint = "".join(f"; did you mean {close!r}?" for close in nearest(name, lw.TASKS, n=1))
+                notes.append(f"task {name!r} is not a task of the simulator{hint}")
+        else:
+            kind = "skill"
+            skills = lw.load_skills(file, tasks=known)
+            for text in rows:
+                if not any(skills[text].suits(task) for task in known.values()):
+                    needed = f"{skills[text].target!r} and {skills[text].moved!r}"
+                    notes.append(f"skill {text!r} suits no task: it needs {needed} (add your tasks by --task-file)")
+    except ValueError as error:
+        output.fault = str(error)
+        return output.show("files", [{"file": file, "steps": 0, "faults": [str(error)], "notes": []}])
+    row = {"file": file, f"{kind}s": len(rows), "faults": [], "notes": notes}
+    lines = [*(f"{file.name}: note: {note}" for note in notes), f"{file.name}: {counted(len(rows), kind)}, valid"]
+    return output.show("files", [row], "\n".join(lines))
+
+
+def _check_suite(output: Output, name: str) -> Output:
+    """Measure each task of a suite and compare with its layout."""
+    suite = options.read_suite(name)
+    assert suite is not None
+    rows = lw.suites.check_suite(suite)
+    width = [max(len(getattr(row, key)) for row in rows) for key in ("task", "what", "measured")]
+    lines = [
+        f"{'ok ' if row.right else 'OFF'}  {row.task:{width[0]}}  {row.what:{width[1]}}  {row.measured:{width[2]}}  "
+        f"{'' if row.right else f'expected: {row.wanted}'}".rstrip()
+        for row in rows
+    ]
+    if wrong := sum(not row.right for row in rows):
+        output.fault = f"{counted(wrong, 'number')} of suite {suite.name!r} differ from its layout"
+    return output.show("suite", [vars(row) for row in rows], "\n".join(lines))

@@ -7,12 +7,16 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext, redirect_stdout
+from dataclasses import is_dataclass
 from importlib import import_module
+from typing import Any, get_args, get_type_hints
+
+from beartype.door import is_bearable
 
 from lw_torchrl import __version__
-from lw_torchrl._util.checks import nearest
+from lw_torchrl._util.checks import Count, Natural, Positive, Probability, Scale, nearest
 
 # Name to group, class and summary. Classes are named, not imported, so that `lw-torchrl --help` loads no torch.
 COMMANDS = {
@@ -32,8 +36,8 @@ COMMANDS = {
     "plan read": ("Language", "plan:Read", "Show how a free-form plan is parsed, with a confidence score"),
     "plan repair": ("Language", "plan:Repair", "Ask a language model to repair the plans that fail"),
     "demo": ("Other", "demo:Demo", "Train, evaluate and record a policy on MT10 in a few minutes"),
-    "check": ("Other", "check:Check", "Validate a file of plans, skills or tasks, or a suite"),
-    "info": ("Other", "check:Info", "Describe a policy file, a dataset or a recording"),
+    "check": ("Other", "language:Check", "Validate a file of plans, skills or tasks, or a suite"),
+    "info": ("Other", "data:Info", "Describe a policy file, a dataset or a recording"),
 }
 _MORE = """`lw-torchrl COMMAND --help` explains a command. Every command accepts --import MODULE, which first
 imports your Python module, for example one that registers a suite or a policy class
@@ -42,6 +46,10 @@ imports your Python module, for example one that registers a suite or a policy c
 Exit status: 0: done; 1: a bug, with a traceback; 2: an error that you can fix
 (LW_TORCHRL_TRACEBACK=1 adds the traceback); 130: stopped by Ctrl-C; 141: broken pipe."""
 _USER_ERRORS = (ValueError, OSError, ImportError, RuntimeError)
+_RANGES: tuple[tuple[Any, str], ...] = (
+    (Count, "at least 1"), (Natural, "at least 0"), (Scale, "at least 0"), (Positive, "above 0"),
+    (Probability, "from 0 to 1"),
+)  # fmt: skip
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -87,11 +95,33 @@ def _run(args: list[str]) -> None:
     kind = getattr(import_module(f"lw_torchrl.cli.{module}"), attribute)
     markers = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
     command = tyro.cli(kind, prog=f"lw-torchrl {name}", args=args[1 + (" " in name) :], config=markers)
+    _check_ranges(command)
     # With --json the document is all that goes to the standard output.
     with redirect_stdout(sys.stderr) if getattr(command, "json", False) else nullcontext():
         output = command.run()
     if output is not None:
         output.finish()
+
+
+def _check_ranges(command: Any) -> None:
+    """Raise :class:`ValueError`, with the option's name, for the first number that is out of its annotation's range."""
+    for name, hint in get_type_hints(type(command), include_extras=True).items():
+        value = getattr(command, name)
+        if is_dataclass(value):
+            _check_ranges(value)
+        validators = [*_validators(hint)]
+        for allowed, text in _RANGES:
+            if get_args(allowed)[1] in validators:
+                for number in value if isinstance(value, tuple) else [] if value is None else [value]:
+                    if not is_bearable(number, allowed):
+                        raise ValueError(f"--{name.replace('_', '-')} must be {text}, got {number}")
+
+
+def _validators(hint: Any) -> Iterator[Any]:
+    """Yield the metadata of all annotated types in a type hint."""
+    yield from getattr(hint, "__metadata__", ())
+    for inner in get_args(hint)[:1] if hasattr(hint, "__metadata__") else get_args(hint):
+        yield from _validators(inner)
 
 
 def _overview(commands: dict[str, tuple[str, str, str]]) -> str:

@@ -1,4 +1,4 @@
-"""Options that several commands share, and what they name: tasks, plans, skills, suites and text encoders."""
+"""Options that several commands share, and readers of their values: tasks, plans, skills, suites and policies."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from tyro.conf import Positional, arg
 
@@ -25,7 +25,6 @@ from lw_torchrl.language.tasks import TASKS, Task, load_tasks, resolve_tasks
 
 if TYPE_CHECKING:
     from lw_torchrl.language.text import TextEncoder
-
 
 Row = Mapping[str, Any]
 Columns = Mapping[str, str | Callable[[Row], Any]]
@@ -54,7 +53,7 @@ class Output:
         self._document: dict[str, Any] = {}
 
     def show(self, key: str, value: Any, text: str | None = None) -> Output:
-        """Print ``text`` if it is given, or keep ``value`` for the document; returns itself."""
+        """Print ``text`` if it is given, or keep ``value`` for the document; return the output itself."""
         if self.as_json:
             self._document[key] = value
         elif text is not None:
@@ -65,8 +64,7 @@ class Output:
         """Print rows as a table, or keep them for the document."""
         if self.as_json:
             return self.show(key, [dict(row) for row in rows])
-        cells = [[_cell(row[of] if isinstance(of, str) else of(row)) for of in columns.values()] for row in rows]
-        _print_table(title, [*columns], cells)
+        _print_table(title, [*columns], [[_cell(row, of) for of in columns.values()] for row in rows])
         return self
 
     def result(self, result: lw.EvaluationResult, **more: Mapping[str, Any]) -> Output:
@@ -93,17 +91,18 @@ class Output:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers that are not finite become null, paths become strings."""
+    """Replace numbers that are not finite by None, and other objects by their text, for JSON."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
+        return {str(key): _plain(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(one) for one in value]
+        return [_plain(inner) for inner in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, (str, int)) else str(value)
 
 
-def _cell(value: Any) -> str:
+def _cell(row: Row, column: str | Callable[[Row], Any]) -> str:
+    value = row[column] if isinstance(column, str) else column(row)
     return "" if value is None or value is False else "yes" if value is True else str(value)
 
 
@@ -140,25 +139,28 @@ _EVALUATOR = (
     "evaluator class, or an evaluator in Python, as my_module:evaluator"
 )
 
-# tyro would print "(default: )" for tuples
-OPTIONAL, REQUIRED = arg(help_behavior_hint="(optional)"), arg(help_behavior_hint="(required)")
+# Instead of tyro's "(default: )", "(default: None)" and "(default: False)".
+OPTIONAL, REQUIRED = arg(help_behavior_hint=""), arg(help_behavior_hint="(required)")
+T = TypeVar("T")
+Maybe = Annotated[T | None, OPTIONAL]
+Flag = Annotated[bool, OPTIONAL]
 TaskName = Positional[Annotated[str, arg(metavar="TASK", help="name of a task")]]
 TaskNames = Positional[Annotated[tuple[str, ...], REQUIRED, arg(metavar="TASKS", help=_TASKS)]]
-Who = Annotated[str, arg(help=f"who acts: {WHO}")]
-Json = Annotated[bool, arg(help="print one JSON document instead of text")]
-TaskFile = Annotated[Path | None, arg(metavar="FILE", help="a .toml file of your tasks, added to the shipped ones")]
-SkillFile = Annotated[Path | None, arg(metavar="FILE", help="a .toml file of your skills, added to the shipped ones")]
-Encoder = Annotated[str | None, arg(metavar="MODULE:FUNCTION", help=_ENCODER)]
-SuiteName = Annotated[str | None, arg(metavar="SUITE", help=_SUITE)]
+Who = Annotated[str, arg(metavar="POLICY", help=f"policy that acts: {WHO}")]
+Json = Annotated[Flag, arg(help="print one JSON document instead of text")]
+TaskFile = Annotated[Maybe[Path], arg(metavar="FILE", help="a .toml file of your tasks, added to the shipped ones")]
+SkillFile = Annotated[Maybe[Path], arg(metavar="FILE", help="a .toml file of your skills, added to the shipped ones")]
+Encoder = Annotated[Maybe[str], arg(metavar="MODULE:FUNCTION", help=_ENCODER)]
+SuiteName = Annotated[Maybe[str], arg(metavar="SUITE", help=_SUITE)]
 PlanSources = Annotated[tuple[str, ...], arg(metavar="SOURCES", help=f"{PLANS}; for each task the last plan is used")]
-Evaluator = Annotated[str | None, arg(metavar="FILE", help=_EVALUATOR)]
-Device = Annotated[str, arg(help=_DEVICE)]
+Evaluator = Annotated[Maybe[str], arg(metavar="FILE", help=_EVALUATOR)]
+Device = Annotated[str, arg(metavar="DEVICE", help=_DEVICE)]
 
-_PLAN_OF = re.compile(r"^def[ \t]+([a-z]\w*)[ \t]*\(", re.MULTILINE)
+_PLAN_TASK = re.compile(r"^def[ \t]+([a-z]\w*)[ \t]*\(", re.MULTILINE)
 
 
 def import_object(option: str, name: str) -> Any:
-    """Import what "package.module:name" names; the working folder is searched first."""
+    """Import the object of "package.module:name"; the working folder is searched first."""
     module, _, attribute = name.partition(":")
     if "" not in sys.path:
         sys.path.insert(0, "")
@@ -168,9 +170,40 @@ def import_object(option: str, name: str) -> Any:
         raise ValueError(f"{option} must be like my_module:name, got {name!r} ({error})") from error
 
 
+def is_object(policy: str) -> bool:
+    """Return whether a policy is given as my_module:policy."""
+    return ":" in policy and not Path(policy).exists()
+
+
+def read_object(name: str) -> Any:
+    """Import the policy of "my_module:policy"."""
+    policy = import_object("the policy", name)
+    if not callable(policy) or isinstance(policy, type):
+        raise ValueError(f"the policy {name} must map a TensorDict to a TensorDict, got {policy!r:.80}")
+    return policy
+
+
+def policy_name(policy: str) -> str:
+    """Return a short name of a policy for labels and file names."""
+    return policy.partition(":")[2] if is_object(policy) else Path(policy).stem
+
+
 def read_encoder(name: str | None) -> TextEncoder | None:
     """Import the function of --text-encoder."""
     return None if name is None else import_object("--text-encoder", name)
+
+
+def read_evaluator(name: str, plans: Plans, text_encoder: str | None = None) -> lw.QueryEvaluator:
+    """Return an evaluator for ``plans``: from a file or "my_module:evaluator", or a new one of a registered class."""
+    encoder = read_encoder(text_encoder)
+    if Path(name).exists() or not (":" in name or name == "StateQueryEvaluator"):
+        return lw.training.load_evaluator(name, plans, text_encoder=encoder)
+    evaluator: Any = import_object("--evaluator", name) if ":" in name else lw.StateQueryEvaluator
+    if isinstance(evaluator, lw.QueryEvaluator):
+        return evaluator.with_plans(plans)
+    if not (isinstance(evaluator, type) and issubclass(evaluator, lw.QueryEvaluator)):
+        raise ValueError(f"--evaluator {name} must be a lw.QueryEvaluator or a class of them, got {evaluator!r:.80}")
+    return evaluator(plans)
 
 
 def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite | None:
@@ -187,8 +220,8 @@ def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite |
 
 def read_tasks(task_file: Path | None, names: Sequence[str] = (), suite: str | None = None) -> Mapping[str, Task]:
     """Return the tasks of the suite that ``names`` belong to; for Meta-World, those of --task-file too."""
-    if (found := read_suite(suite, names)) is not None:
-        return found.tasks
+    if (named_suite := read_suite(suite, names)) is not None:
+        return named_suite.tasks
     return TASKS if task_file is None else load_tasks(task_file)
 
 
@@ -196,8 +229,8 @@ def tasks_of_plans(path: Path, task: str | None, task_file: Path | None) -> Mapp
     """Return the tasks that a .plan file, or a folder of them, may name: those of one suite."""
     names = [] if task is None else [task]
     for file in sorted(path.glob("*.plan")) if path.is_dir() else [path]:
-        if file.suffix == ".plan" and file.is_file() and (plan := _PLAN_OF.search(read_text(file, PlanError))):
-            names += [plan[1].replace("__", "/", 1).replace("_", "-")] * ("__" in plan[1])
+        if file.suffix == ".plan" and file.is_file() and (match := _PLAN_TASK.search(read_text(file, PlanError))):
+            names += [match[1].replace("__", "/", 1).replace("_", "-")] * ("__" in match[1])
     return read_tasks(task_file, names)
 
 
@@ -216,21 +249,21 @@ def _suite_of(tasks: Mapping[str, Task]) -> lw.suites.Suite | None:
 
 
 def read_skills(skill_file: Path | None, tasks: Mapping[str, Task]) -> Mapping[str, ScriptedSkill]:
-    """Load the scripted skills of the suite that ``tasks`` are of, with those of --skill-file."""
+    """Load the scripted skills of the suite that ``tasks`` belong to, with those of --skill-file."""
     shipped = load_skills()
-    own = shipped if skill_file is None else load_skills(skill_file, tasks=tasks)
+    skills = shipped if skill_file is None else load_skills(skill_file, tasks=tasks)
     if (suite := _suite_of(tasks)) is None:
-        return own
-    return {**(suite.skills or {}), **{text: skill for text, skill in own.items() if shipped.get(text) != skill}}
+        return skills
+    return {**(suite.skills or {}), **{text: skill for text, skill in skills.items() if shipped.get(text) != skill}}
 
 
 def read_plans(sources: Sequence[str], tasks: Mapping[str, Task]) -> Plans:
-    """Load the plans of --plans."""
+    """Load the plans of --plans. If ``tasks`` belong to another suite, MT10 and MT50 stand for its plans."""
     return Plans(find_plans(sources, tasks))
 
 
 def find_plans(sources: Sequence[str], tasks: Mapping[str, Task]) -> dict[str, ConditionalPlan]:
-    """Load plans. If ``tasks`` belong to another suite, MT10 and MT50 stand for its plans, if it has any."""
+    """Load plans as :func:`read_plans`, possibly none."""
     if not sources:
         raise ValueError("--plans requires at least one source: MT10, MT50, a file or a folder")
     suite = _suite_of(tasks)
@@ -245,8 +278,8 @@ def find_plans(sources: Sequence[str], tasks: Mapping[str, Task]) -> dict[str, C
             try:
                 plans[task] = ConditionalPlan(task, plan.steps, tasks[task])
             except PlanError as error:
-                why = f"the shipped plan does not fit the {task} of --task-file"
-                raise PlanError(f"--plans: {why}; name your own plan for it last ({error})") from error
+                reason = f"the shipped plan does not fit the {task} of --task-file"
+                raise PlanError(f"--plans: {reason}; name your own plan for it last ({error})") from error
     return plans
 
 

@@ -11,19 +11,20 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._util.checks import check_choice, counted
+from lw_torchrl._util.checks import Count, Natural, Positive, Probability, Scale, check_choice, counted
 from lw_torchrl._util.files import read_text
 from lw_torchrl.cli import options
-from lw_torchrl.cli.options import Columns, Output, Row
+from lw_torchrl.cli.options import Columns, Flag, Maybe, Output, Row
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import PlanError, Plans
 from lw_torchrl.language.tasks import Task, check_task
 from lw_torchrl.suites.suite import load_suite
 
 _FORMATS = "basic, chain or goal, followed by _py, _py_md or _md"
-_ASKED = (
-    "model base_url constrain free_skills vocabulary temperature max_tokens seed name concurrency retries timeout cache"
-)
+_PLANNER_OPTIONS = (
+    "model", "base_url", "constrain", "free_skills", "vocabulary", "temperature", "max_tokens", "seed", "name",
+    "concurrency", "timeout", "cache",
+)  # fmt: skip
 _SOURCES = f"{options.PLANS}, a suite, or answers of `plan generate`, FORMAT/TASK-ATTEMPT.py"
 Format = Annotated[str, arg(help=f"plan format: {_FORMATS}")]
 
@@ -37,7 +38,7 @@ class Prompt:
 
     task: options.TaskName
     format: Format = "chain_py"
-    vocabulary: bool = False  # also list the objects of the task and the supported queries
+    vocabulary: Flag = False  # also list the objects of the task and the supported queries
     plans: Annotated[options.PlanSources, arg(help=f"plans of the examples: {options.PLANS}")] = ("MT10",)
     task_file: options.TaskFile = None
 
@@ -55,21 +56,20 @@ class _Model:
 
     tasks: options.TaskNames
     model: str  # the model's name at the server
-    base_url: str | None = None  # the server's address; None for OPENAI_BASE_URL, or else OpenAI's
-    attempts: int = 1  # answers to each prompt
-    constrain: bool = False  # force answers to follow a JSON schema, so that every plan can be carried out
-    free_skills: bool = False  # with --constrain, allow skills in any words instead of only scripted ones
-    vocabulary: bool = False  # also list the objects of the task and the supported queries in prompts
-    temperature: float | None = None  # sampling temperature; None for the server's
-    max_tokens: int = 1024  # maximum tokens per answer (reasoning models need more)
-    seed: int | None = None  # seed of the first attempt; attempt k uses SEED + k; None sends none
-    name: str | None = None  # folder name for the answers; None for the model's name
+    base_url: Maybe[str] = None  # the server's address (default: OPENAI_BASE_URL, or OpenAI's)
+    attempts: Count = 1  # answers to each prompt
+    constrain: Flag = False  # force answers to follow a JSON schema, so that every plan can be carried out
+    free_skills: Flag = False  # with --constrain, allow free-form skills besides the scripted ones
+    vocabulary: Flag = False  # also list the objects of the task and the supported queries in prompts
+    temperature: Maybe[Scale] = None  # sampling temperature (default: the server's)
+    max_tokens: Count = 1024  # maximum tokens per answer (reasoning models need more)
+    seed: Maybe[Natural] = None  # seed of the first attempt; attempt k uses SEED + k (default: no seed)
+    name: Maybe[str] = None  # folder name for the answers (default: the model's name)
     plans: Annotated[options.PlanSources, arg(help=f"plans of the prompts' examples: {options.PLANS}")] = ("MT10",)
     skill_file: options.SkillFile = None
     task_file: options.TaskFile = None
-    concurrency: int = 4  # number of simultaneous requests
-    retries: int = 6  # retries of a request after a rate limit or a server error, with growing waits
-    timeout: float = 300.0  # seconds for one request, until the end of its answer
+    concurrency: Count = 4  # number of simultaneous requests
+    timeout: Positive = 300.0  # seconds for one request, until the end of its answer
     cache: Path = Path("runs/answers")  # folder that caches all answers
     out: Path = Path("runs/plans")  # folder for the answers: OUT/NAME/FORMAT/TASK-ATTEMPT.py or .md
     json: options.Json = False
@@ -77,9 +77,9 @@ class _Model:
     def planner(self) -> tuple[lw.OpenAIPlanner, list[Task], Mapping[str, Task]]:
         """Return the model, the selected tasks and all tasks."""
         known = options.read_tasks(self.task_file, self.tasks)
-        asked = {name: getattr(self, name) for name in _ASKED.split()}
+        own = {name: getattr(self, name) for name in _PLANNER_OPTIONS}
         skills = options.read_skills(self.skill_file, known) if self.skill_file else None
-        planner = lw.OpenAIPlanner(skills=skills, plans=options.read_plans(self.plans, known), **asked)
+        planner = lw.OpenAIPlanner(skills=skills, plans=options.read_plans(self.plans, known), **own)
         return planner, [known[name] for name in options.select_tasks(self.tasks, known)], known
 
 
@@ -89,7 +89,7 @@ class Generate(_Model):
 
     The model runs behind an OpenAI-compatible server: OpenAI's own, vLLM (http://127.0.0.1:8000/v1), Ollama
     (http://127.0.0.1:11434/v1) or llama.cpp's (http://127.0.0.1:8080/v1). The key is read from OPENAI_API_KEY; a local
-    server needs none. Answers are cached: the same command only asks what is missing.
+    server needs none. Answers are cached: the same command only asks for answers that are missing.
 
     Example: lw-torchrl plan generate MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --attempts 4
     """
@@ -107,8 +107,8 @@ class Generate(_Model):
             tokens += answers.tokens.total
             notes += [note for answer in answers for note in answer.notes]
             for task in dict.fromkeys(answer.task for answer in answers):
-                some = [answer for answer in answers if answer.task == task]
-                rows.append({"task": task, "format": format, **_counts(some)})
+                of_task = [answer for answer in answers if answer.task == task]
+                rows.append({"task": task, "format": format, **_counts(of_task)})
         output = Output(self.json)
         title = f"{planner.model} at {planner.address}"
         output.table("answers", rows, {key.replace("_", " "): key for row in rows[:1] for key in row}, title)
@@ -132,7 +132,7 @@ def _counts(answers: Sequence[lw.planners.Answer]) -> dict[str, int]:
 
 @dataclass(kw_only=True)
 class Repair(_Model):
-    """Run a model's plans by scripted skills, report what failed to the model, and ask again.
+    """Run a language model's plans with scripted skills, report failures to the model, and ask it again.
 
     The report names the step where the robot got stuck, conditions that never held, distances that stayed too large,
     and text that could not be parsed. The answers of round k are kept in OUT/NAME-roundk. If it is stopped, the same
@@ -142,10 +142,10 @@ class Repair(_Model):
     """
 
     format: Format = "chain_py"
-    rounds: int = 3  # maximum number of repair rounds
-    enough: float = 0.8  # success rate above which a plan is not repaired
-    episodes: int = 10  # episodes of each plan
-    episode_seed: int = 0  # random seed of the episodes (use a different one for evaluation)
+    rounds: Count = 3  # maximum number of repair rounds
+    enough: Probability = 0.8  # success rate above which a plan is not repaired
+    episodes: Count = 10  # episodes of each plan
+    episode_seed: Natural = 0  # random seed of the episodes (use a different one for evaluation)
 
     def run(self) -> Output:
         planner, tasks, known = self.planner()
@@ -156,10 +156,10 @@ class Repair(_Model):
         first = planner.plans(tasks, format=self.format, attempts=self.attempts, out=self.out, recorded=True)
         how: dict[str, Any] = {"rounds": self.rounds, "enough": self.enough, "episodes": self.episodes}
         repairs = repair_plans(planner, first, tasks=known, out=self.out, seed=self.episode_seed, **how)
-        rows = [
-            {"task": one.answers[0].task, "attempt": one.answers[0].attempt, "success": [c.success for c in one.checks]}
-            for one in repairs
-        ]
+        rows = []
+        for repair in repairs:
+            answer, success = repair.answers[0], [check.success for check in repair.checks]
+            rows.append({"task": answer.task, "attempt": answer.attempt, "success": success})
 
         def after(number: int) -> Callable[[Row], str]:
             return lambda row: f"{row['success'][number]:.0%}" if number < len(row["success"]) else ""
@@ -168,10 +168,10 @@ class Repair(_Model):
         columns: Columns = {"task": "task", "attempt": "attempt", **rounds}
         output = Output(self.json)
         output.table("plans", rows, columns, f"success by scripted skills, {planner.model} in {self.format}")
-        output.notes(note for one in repairs for answer in one.answers for note in answer.notes)
-        asked = sum(not answer.cached for answer in first)
-        print(f"{counted(len(first), 'first answer')}, {asked} asked now")
-        done = max(len(one.checks) for one in repairs) - 1
+        output.notes(note for repair in repairs for answer in repair.answers for note in answer.notes)
+        requested = sum(not answer.cached for answer in first)
+        print(f"{counted(len(first), 'first answer')}, {requested} requested now")
+        done = max(len(repair.checks) for repair in repairs) - 1
         folders = [self.out / planner.name, *(self.out / f"{planner.name}-round{k}" for k in range(1, done + 1))]
         return output.show("folders", folders, f"written to {', '.join(map(str, folders))}")
 
@@ -190,9 +190,9 @@ class Read:
     """
 
     sources: Positional[Annotated[tuple[str, ...], options.REQUIRED, arg(metavar="SOURCES", help=_SOURCES)]]
-    task: str | None = None  # show only this task; None reads an answer's task from its file name
-    format: str | None = None  # plan format of an answer; None reads it from the folder name
-    out: Path | None = None  # folder for .plan files: for each task the plan with the highest confidence
+    task: Maybe[str] = None  # show only this task (default, for an answer: its file name)
+    format: Maybe[str] = None  # plan format of an answer (default: its folder's name)
+    out: Maybe[Path] = None  # folder for .plan files: for each task the plan with the highest confidence
     task_file: options.TaskFile = None
     json: options.Json = False
 
@@ -226,6 +226,7 @@ class Read:
         return output
 
     def _plans(self, source: str) -> list[lw.ConditionalPlan]:
+        """Return the plans of one source, those of --task if it is given."""
         file = Path(source)
         if file.is_file() and file.suffix not in (".plan", ".json"):
             return self._decoded(file)

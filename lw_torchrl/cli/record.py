@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,9 +9,10 @@ from typing import Annotated, Any
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 import lw_torchrl as lw
+from lw_torchrl._util.checks import Natural
 from lw_torchrl.cli import options
-from lw_torchrl.cli.acting import Acting, policy_name
-from lw_torchrl.cli.options import Output
+from lw_torchrl.cli.evaluate import Rollout
+from lw_torchrl.cli.options import Flag, Maybe, Output
 
 
 @dataclass(kw_only=True)
@@ -24,68 +24,78 @@ class Record:
 
     tasks: options.TaskNames
     policy: options.Who = "expert"
-    compare: str | None = None  # a second policy, in the same initial states and with the same noise, side by side
-    episodes: tuple[int, ...] = (0,)  # indices of the episodes, as in an evaluation with the same seed
-    out: Path | None = None  # .rrd file to write; None for runs/recordings/TASK-POLICY.rrd
+    compare: Maybe[str] = None  # a second policy, in the same initial states and with the same noise, side by side
+    episodes: tuple[Natural, ...] = (0,)  # indices of the episodes, as in an evaluation with the same seed
+    out: Maybe[Path] = None  # .rrd file to write (default: runs/recordings/TASK-POLICY.rrd)
     json: options.Json = False
-    acting: OmitArgPrefixes[Acting] = field(default_factory=Acting)
+    rollout: OmitArgPrefixes[Rollout] = field(default_factory=Rollout)
 
     def run(self) -> Output:
         from lw_torchrl.record.rollouts import new_recording, run_recorded
 
-        tasks, run = self.acting.choose(self.tasks), self.acting.run
+        rollout = self.rollout
+        tasks, arguments = rollout.choose(self.tasks), rollout.arguments
         label = tasks[0].replace("/", "-") if len(tasks) == 1 else f"{len(tasks)}-tasks"
-        out = self.out or Path("runs/recordings") / f"{label}-{policy_name(self.policy)}.rrd"
-        reference = self.acting.trusted_plans
-        cast = [(who, *self.acting.policy(who, tasks)) for who in (self.policy, self.compare) if who is not None]
+        out = self.out or Path("runs/recordings") / f"{label}-{options.policy_name(self.policy)}.rrd"
+        reference = rollout.trusted_plans
+        policies = [(name, *rollout.policy(name, tasks)) for name in (self.policy, self.compare) if name is not None]
         rows: list[dict[str, Any]] = []
-        recorded: list[list[str]] = []
+        pages: list[list[str]] = []  # of each policy, the names of its episodes
         with new_recording(out) as logger:
-            for who, policy, shown, evaluator in cast:
-                asked: dict[str, Any] = {"plans": shown, "episodes": self.episodes, "evaluator": evaluator, **run}
-                stop = self.acting.stop_at_success
-                episodes = run_recorded(policy, tasks, stop_at_success=stop, progress=True, **asked)
+            for number, (name, policy, plans, evaluator) in enumerate(policies, 1):
+                run: dict[str, Any] = {"plans": plans, "episodes": self.episodes, "evaluator": evaluator, **arguments}
+                run["stop_at_success"] = rollout.stop_at_success
+                episodes = run_recorded(policy, tasks, progress=True, **run)
                 failures: dict[tuple[str, int], Any] = {}
-                if self.acting.attribute and shown is not None and lw.modules.plans_of(policy) is not None:
-                    again: dict[str, Any] = {"actor": policy, "reference": reference, "evaluator": evaluator, **run}
-                    attributed = lw.attribute_failures(episodes, shown, **again)
+                if rollout.attribute and plans is not None and lw.modules.plans_of(policy) is not None:
+                    rerun: dict[str, Any] = {"actor": policy, "reference": reference, "evaluator": evaluator}
+                    attributed = lw.attribute_failures(episodes, plans, **rerun, **arguments)
                     failures = {(failure.task, failure.episode): failure for failure in attributed}
-                    if failures and not recorded:
+                    if failures and number == 1:
                         logger.show_causes(self._result(episodes, attributed))
-                pages = []
+                pages.append([])
                 for episode in episodes:
-                    failure, first = failures.get((episode.task, episode.episode)), episode.first_success
-                    ended = "failed" if first is None else f"success at step {first}"
-                    ended += "" if failure is None else f", {failure.cause}: {failure.why}"
-                    print(f"{episode.task}, episode {episode.episode}, {policy_name(who)}: {ended}")
-                    row = {"task": episode.task, "episode": episode.episode, "policy": policy_name(who)}
-                    rows.append(row | {"first_success": first, "failure": failure and failure.to_json()})
-                    page: dict[str, Any] = {"seed": self.acting.seed, "policy": policy_name(who), "failure": failure}
-                    name = f"{episode.task}-{episode.episode}-{len(recorded) + 1}" if self.compare else None
-                    suite = self.acting.in_suite
-                    pages.append(lw.log_rollout(logger, episode.steps, shown, suite=suite, name=name, **page))
-                recorded.append(pages)
-            for pair, episode in zip(zip(*recorded, strict=True), episodes, strict=True) if self.compare else ():
+                    failure = failures.get((episode.task, episode.episode))
+                    rows.append(_report(episode, options.policy_name(name), failure))
+                    page: dict[str, Any] = {"seed": rollout.seed, "policy": rows[-1]["policy"], "failure": failure}
+                    page["name"] = f"{episode.task}-{episode.episode}-{number}" if self.compare else None
+                    suite = rollout.chosen_suite
+                    pages[-1].append(lw.log_rollout(logger, episode.steps, plans, suite=suite, **page))
+            for pair, episode in zip(zip(*pages, strict=True), episodes, strict=True) if self.compare else ():
                 logger.compare(pair, f"{episode.task} · episode {episode.episode} · side by side")
         output = Output(self.json).show("episodes", rows)
         return output.show("recording", out, f"written to {out}\nopen it with: lw-torchrl view {out}")
 
     def _result(self, episodes: Any, failures: Any) -> lw.EvaluationResult:
         """Return the recorded episodes and their failures as an evaluation's result."""
-        ended = [(one.task, one.episode, one.first_success is not None, one.first_success) for one in episodes]
         config = {
-            "tasks": list(dict.fromkeys(one.task for one in episodes)),
+            "tasks": list(dict.fromkeys(episode.task for episode in episodes)),
             "episodes_per_task": len(self.episodes),
-            "seed": self.acting.seed,
-            "max_steps": max(len(one.steps) for one in episodes),
+            "seed": self.rollout.seed,
+            "max_steps": max(len(episode.steps) for episode in episodes),
         }
-        listed = tuple(lw.evaluation.EpisodeResult(*one, None, None) for one in ended)
-        return lw.EvaluationResult(config, listed, failures=tuple(failures))
+        results = []
+        for episode in episodes:
+            first = episode.first_success
+            results.append(
+                lw.evaluation.EpisodeResult(episode.task, episode.episode, first is not None, first, None, None)
+            )
+        return lw.EvaluationResult(config, tuple(results), failures=tuple(failures))
+
+
+def _report(episode: Any, policy: str, failure: Any) -> dict[str, Any]:
+    """Print how an episode ended, and return it as a row of the JSON document."""
+    first = episode.first_success
+    ended = "failed" if first is None else f"success at step {first}"
+    ended += "" if failure is None else f", {failure.cause}: {failure.why}"
+    print(f"{episode.task}, episode {episode.episode}, {policy}: {ended}")
+    row = {"task": episode.task, "episode": episode.episode, "policy": policy, "first_success": first}
+    return row | {"failure": failure and failure.to_json()}
 
 
 @dataclass(kw_only=True)
 class View:
-    """Open recordings in the rerun viewer, or write a picture or a web page of one.
+    """Open recordings in the rerun viewer, in a window or a browser, or write a picture of one.
 
     Several recordings are opened together in one viewer.
 
@@ -96,30 +106,20 @@ class View:
 
     recordings: Positional[Annotated[tuple[Path, ...], options.REQUIRED, arg(metavar="FILES")]]
     """.rrd files, or folders with one"""
-    episode: str | None = None  # title of the tab to open
-    step: int | None = None  # step to open at; None for the one that decides the episode, or the last of a training
-    screenshot: Path | None = None  # write a .png without a window; requires a Vulkan driver (mesa-vulkan-drivers)
+    episode: Maybe[str] = None  # title of the tab to open
+    step: Maybe[Natural] = None  # step to open at (default: the decisive one of an episode, or the last of a training)
+    screenshot: Maybe[Path] = None  # .png file to write without a window; requires Vulkan (mesa-vulkan-drivers)
     window_size: str = "1400x900"  # width x height of the window or picture, in pixels
-    html: Path | None = None  # write one self-contained HTML page (about 11 MB)
-    web: bool = False  # serve a page on this machine and print its address, until Ctrl-C
-    port: int = 0  # with --web, port of the page (0 picks a free one)
+    web: Flag = False  # serve rerun's web viewer on this machine and print its address, until Ctrl-C
+    port: Natural = 0  # with --web, port of the web viewer (0 picks a free one)
 
     def run(self) -> None:
-        from lw_torchrl.record import WebPage, open_viewer, write_html
+        from lw_torchrl.record import open_viewer
 
-        if sum((self.screenshot is not None, self.html is not None, self.web)) > 1:
-            raise ValueError("choose one of --screenshot, --html and --web")
-        if (self.web or self.html is not None) and len(self.recordings) > 1:
-            raise ValueError(f"--web and --html show one recording, got {len(self.recordings)}")
+        if self.web and (self.screenshot is not None or self.step is not None):
+            raise ValueError("--web excludes --screenshot and --step")
+        web_port = self.port if self.web else None
         tab: dict[str, Any] = {"episode": self.episode, "step": self.step}
-        if self.web:
-            with WebPage(self.recordings[0], port=self.port, **tab) as page:
-                print(f"{page.address}  (Ctrl-C ends it)", flush=True)
-                with suppress(KeyboardInterrupt):
-                    page.serve()
-        elif self.html is not None:
-            write_html(self.recordings[0], self.html, **tab)
-        else:
-            open_viewer(self.recordings, self.screenshot, self.window_size, **tab)
-        if written := self.html or self.screenshot:
-            print(f"written to {written}")
+        open_viewer(self.recordings, self.screenshot, self.window_size, web_port=web_port, **tab)
+        if self.screenshot is not None:
+            print(f"written to {self.screenshot}")

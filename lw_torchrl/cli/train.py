@@ -11,14 +11,13 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._util.checks import counted
+from lw_torchrl._util.checks import Count, Natural, Probability, Scale, counted
 from lw_torchrl.cli import options
-from lw_torchrl.cli.acting import read_evaluator
-from lw_torchrl.cli.options import Output
+from lw_torchrl.cli.options import Maybe, Output, read_evaluator
 
 _METHOD = (
-    "what the policy is conditioned on: pcbc (plans), dc (task descriptions), one-hot (task numbers), or the name of "
-    "your own method"
+    "condition the policy on plans (pcbc), task descriptions (dc) or task numbers (one-hot), or the name of your own "
+    "method"
 )
 _LOSS = (
     "bc (imitate the expert); on any data with rewards: advantage (learn a value, then imitate rows, weighted by their "
@@ -38,33 +37,31 @@ class Train:
     """
 
     data: Positional[Annotated[Path, arg(metavar="DATA")]]  # dataset of `lw-torchrl collect`
-    out: Path  # policy file to write
+    out: Path  # .safetensors file of the policy
     tasks: Annotated[tuple[str, ...], options.OPTIONAL] = ()  # train on the demonstrations of these tasks only
     plans: options.PlanSources = ("MT10",)
     task_file: options.TaskFile = None
     text_encoder: options.Encoder = None
     loss: Annotated[Literal["bc", "advantage", "iql", "td3-bc", "cql"], arg(help=_LOSS)] = "bc"
     method: Annotated[str, arg(help=_METHOD)] = "pcbc"
-    features: Literal["raw", "differences", "relative", "both"] | None = None
-    """what the network sees: the raw observation; differences between hand, objects and goal; relative (differences
-    without the hand's height and the gripper's opening); or both (raw and differences). None for differences"""
-    width: int | None = None  # units of each hidden layer; None for the method's, 256
-    depth: int | None = None  # number of hidden layers; None for the method's, 3
-    after_success: int = 20  # with --loss bc, drop steps more than N steps after the first success
+    features: Maybe[Literal["raw", "differences", "relative", "both"]] = None
+    """features of the state: raw (the observation), differences (between hand, objects and goal; the default), both, or
+    relative (differences without the hand's height and the gripper's opening)"""
+    width: Maybe[Count] = None  # units of each hidden layer (default: 256)
+    depth: Maybe[Natural] = None  # number of hidden layers (default: 3)
+    after_success: Natural = 20  # with --loss bc, drop steps more than N steps after the first success
     reward: Literal["sparse", "dense", "cost", "dense_cost"] = "dense_cost"  # reward of the losses other than bc
-    begin: Path | None = None  # fine-tune this policy file, with its plans, network and normalisation
+    begin: Maybe[Path] = None  # fine-tune this policy file, with its plans, network and normalisation
     evaluator: options.Evaluator = None
-    answers: Literal["soft", "hard"] | None = None
-    """the evaluator's answers: soft (probabilities) or hard (0 or 1); None for soft, or for hard with --begin"""
-    qaf_anchor: float = 0.0  # weight of the cross entropy with the exact answers; use 1 for a new evaluator
-    steps: int | None = None  # number of minibatches; None for 8000 with --loss bc, 4000 otherwise
-    batch_size: int | None = None  # equally many rows of each task; None for 500 with --loss bc, 250 otherwise
-    learning_rate: float = 1e-3  # at the start; a cosine brings it to 0
-    seed: int = 0  # random seed of initial weights and minibatches
-    evaluate_every: int | None = None  # evaluate every N steps and at the end, and log the success rate
-    evaluate_episodes: int = 5  # episodes of each task in an evaluation
-    evaluate_seed: int = 1000  # random seed of these episodes (not one that the demonstrations used)
-    logger: Literal["csv", "tensorboard", "wandb", "rerun"] | None = None  # log the training in logs/ beside OUT
+    qaf_anchor: Scale = 0.0  # weight of the cross entropy with the exact answers; use 1 for a new evaluator
+    steps: Maybe[Count] = None  # number of minibatches (default: 8000 with --loss bc, else 4000)
+    batch_size: Maybe[Count] = None  # rows in a minibatch, equally many of each task (default: 500 with bc, else 250)
+    learning_rate: Scale = 1e-3  # learning rate at the start; a cosine brings it to 0
+    seed: Natural = 0  # random seed of initial weights and minibatches
+    evaluate_every: Maybe[Count] = None  # evaluate every N steps and at the end, and log the success rate
+    evaluate_episodes: Count = 5  # episodes of each task in an evaluation
+    evaluate_seed: Natural = 1000  # random seed of these episodes (use a different one than for demonstrations)
+    logger: Maybe[Literal["csv", "tensorboard", "wandb", "rerun"]] = None  # log the training in logs/ beside OUT
     device: options.Device = "cpu"
     json: options.Json = False
 
@@ -87,7 +84,7 @@ class Train:
         rows: dict[str, Any] = {"device": self.device}
         rows["episodes"] = dict.fromkeys(tasks, dataset.episodes_per_task) if self.tasks else None
         torch.manual_seed(self.seed)
-        actor = self._new_actor(plans, tuple(sorted(tasks))) if self.begin is None else self._begun_actor(plans)
+        actor = self._new_actor(plans, tuple(sorted(tasks))) if self.begin is None else self._begun_actor()
         logger = None if self.logger is None else make_logger(self.logger, self.out)
         run: dict[str, Any] = {"checkpoint": self.out, "logger": logger, "evaluate_every": self.evaluate_every}
         trainer: Any
@@ -101,25 +98,20 @@ class Train:
             trainer = self._learn(actor, plans, rows, run)
         loss, steps = trainer.train(), trainer.config.steps
         output = Output(self.json).show("policy", self.out).show("steps", steps)
-        trained = "" if loss != loss else f", loss {loss:.4f}"  # nan: nothing was left to train
-        return output.show("loss", loss, f"trained to step {steps}{trained}: {self.out}")
+        return output.show("loss", loss, f"{_trained(steps, loss)}: {self.out}")
 
     def _check(self) -> None:
         if self.begin is not None and self.out.resolve() == self.begin.resolve():
             raise ValueError("--out must be a different file from --begin")
         if self.loss != "bc" and (self.evaluator is not None or self.qaf_anchor):
             raise ValueError("--evaluator and --qaf-anchor only apply to --loss bc")
-        if self.answers is not None and self.evaluator is None:
-            raise ValueError("--answers requires --evaluator")
 
     @property
     def _numbers(self) -> dict[str, Any]:
-        """The options of the trainers' configs, where they are given."""
-        numbers: dict[str, Any] = {"learning_rate": self.learning_rate, "seed": self.seed}
-        numbers |= {"steps": self.steps or 8000, "batch_size": self.batch_size or 500}
-        if self.loss != "bc":
-            numbers |= {"steps": self.steps or 4000, "batch_size": self.batch_size or 250}
-        return numbers
+        """The options that the trainers' configs share."""
+        steps, batch_size = (8000, 500) if self.loss == "bc" else (4000, 250)
+        numbers = {"steps": self.steps or steps, "batch_size": self.batch_size or batch_size}
+        return {**numbers, "learning_rate": self.learning_rate, "seed": self.seed}
 
     def _clone(self, actor: Any, rows: Mapping[str, Any], run: Mapping[str, Any]) -> Any:
         sampler = lw.TaskBalancedSampler(exact=True)
@@ -138,19 +130,19 @@ class Train:
         plans = plans_of(actor) or plans
         config = lw.OfflineConfig(**self._numbers)
 
-        def replay(**ahead: Any) -> lw.LanguageWorldExperienceReplay:
-            shown: dict[str, Any] = {"label": "executed", "terminate_on_success": True, "reward": self.reward}
-            shown |= {"transform": lw.QAFTransform(plans), "sampler": lw.TaskBalancedSampler(exact=True)}
-            return lw.LanguageWorldExperienceReplay(self.data, **shown, **rows, **ahead)
+        def replay(**n_step: Any) -> lw.LanguageWorldExperienceReplay:
+            same: dict[str, Any] = {"label": "executed", "terminate_on_success": True, "reward": self.reward}
+            same |= {"transform": lw.QAFTransform(plans), "sampler": lw.TaskBalancedSampler(exact=True)}
+            return lw.LanguageWorldExperienceReplay(self.data, **same, **rows, **n_step)
 
-        data = ahead = replay(n_steps=N_STEPS, gamma=GAMMA)
+        data = n_step_data = replay(n_steps=N_STEPS, gamma=GAMMA)
         device = place(actor, self.device)
         if self.loss == "advantage":
             file = self.out.with_name(f"{self.out.stem}.value.safetensors")
             value: dict[str, Any] = {"checkpoint": file, "title": "training the value"}
-            advantage = learn_advantages(plans, ahead, config, device, **value)
+            advantage = learn_advantages(plans, n_step_data, config, device, **value)
             data = replay()
-            data.add_column("advantage", advantage, of=ahead)
+            data.add_column("advantage", advantage, of=n_step_data)
         if self.begin is None:
             lw.training.fit_normalization(actor, data)
         loss = make_loss(self.loss, actor, plans, data).to(device)
@@ -169,6 +161,7 @@ class Train:
         return {name: float(rate) for name, rate in rates.items() if rate is not None}
 
     def _new_actor(self, plans: lw.Plans, tasks: tuple[str, ...]) -> Any:
+        """Return an untrained policy for ``tasks``, with its evaluator in front."""
         import torch
         from tensordict.nn import TensorDictSequential
 
@@ -189,22 +182,23 @@ class Train:
             actor = make_policy(self.method, lw.Plans({task: plans[task] for task in tasks}), **parts)
         if self.evaluator is None:
             return actor
-        return TensorDictSequential(self._read_evaluator(plans, self.answers or "soft"), actor)
+        return TensorDictSequential(self._read_evaluator(plans, "soft"), actor)
 
-    def _begun_actor(self, plans: lw.Plans) -> Any:
+    def _begun_actor(self) -> Any:
+        """Load the policy of --begin, with its evaluator in front."""
         from tensordict.nn import TensorDictSequential
 
         from lw_torchrl.modules.policy import plans_of
 
         assert self.begin is not None
         if self.method != "pcbc" or (self.features, self.width, self.depth) != (None, None, None):
-            raise ValueError("--begin brings its own --method, --features, --width and --depth; leave them out")
+            raise ValueError("--begin has its own --method, --features, --width and --depth; leave them out")
         actor: Any = lw.load_actor(self.begin, text_encoder=options.read_encoder(self.text_encoder))
         if self.evaluator is None:
             return actor
         if "qaf" not in actor.in_keys or (own := plans_of(actor)) is None:
             raise ValueError(f"--evaluator requires a policy that reads qaf, --begin is a {type(actor).__name__}")
-        return TensorDictSequential(self._read_evaluator(own, self.answers or "hard"), actor)
+        return TensorDictSequential(self._read_evaluator(own, "hard"), actor)
 
     def _read_evaluator(self, plans: lw.Plans, answers: Literal["soft", "hard"]) -> lw.QueryEvaluator:
         assert self.evaluator is not None
@@ -214,7 +208,7 @@ class Train:
 
 
 def _read_transform(actor: Any, replay: Any, data: Path) -> None:
-    """Make the rows hold what the actor reads besides the observation: answers to conditions, or pictures."""
+    """Add to the rows what the actor reads besides the observation: answers to conditions, or pictures."""
     from lw_torchrl.modules.policy import plans_of
     from lw_torchrl.modules.query_evaluator import evaluators_of
 
@@ -225,6 +219,10 @@ def _read_transform(actor: Any, replay: Any, data: Path) -> None:
             replay.add_column("pixels", lw.data.load_pictures(replay, **pictures))
     if "qaf" in actor.in_keys and (plans := plans_of(actor)) is not None:
         replay.append_transform(lw.QAFTransform(plans))
+
+
+def _trained(steps: int, loss: float) -> str:
+    return f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}")  # NaN: nothing was left to train
 
 
 def make_logger(kind: str, out: Path) -> Any:
@@ -260,23 +258,23 @@ class TrainEvaluator:
     out: Path  # folder for evaluator.safetensors, report.json and the collected episodes
     data: Annotated[tuple[Path, ...], options.OPTIONAL] = ()
     """datasets of `lw-torchrl collect` to use instead of collecting episodes"""
-    behaviours: tuple[str, ...] = ("expert", "scripted", "spoilt-30", "random")  # who acts, as for `collect --policy`
-    episodes: int = 5  # episodes collected of each task and behaviour
-    max_steps: int = 500  # steps of an episode
-    noise: tuple[float, ...] = (0.0, 0.1, 0.2)  # standard deviations of the expert's execution noise, used in turn
+    behaviours: tuple[str, ...] = ("expert", "scripted", "spoilt-30", "random")
+    """policies that act, as for `collect --policy`"""
+    episodes: Count = 5  # episodes collected of each task and policy
+    max_steps: Count = 500  # steps of an episode
+    noise: tuple[Scale, ...] = (0.0, 0.1, 0.2)  # standard deviations of the expert's execution noise, used in turn
     cameras: Annotated[tuple[str, ...], options.OPTIONAL, arg(help=_CAMERAS)] = ()
-    picture: int = 64  # with --cameras, height and width of a picture in pixels
-    every: int | None = None  # use every N-th state of an episode; None for 1, with --cameras 5
+    picture: Count = 64  # with --cameras, height and width of a picture in pixels
+    every: Maybe[Count] = None  # use every N-th state of an episode (default: 1, with --cameras 5)
     held_out_tasks: Annotated[tuple[str, ...], options.OPTIONAL] = ()
     """tasks to hold out from training, or the number of tasks to draw at random and hold out"""
-    held_out_pairs: float = 0.1  # fraction of object pairs whose queries are excluded from training
-    width: int = 128  # units of each hidden layer
-    depth: int = 3  # number of hidden layers
-    steps: int | None = None  # number of minibatches; None for 6000, with --cameras 4000
-    batch_size: int | None = None  # checks in a minibatch (with --cameras: states); None for 1024 (48)
-    learning_rate: float | None = None  # at the start; a cosine brings it to 0; None for 0.003, with --cameras 0.002
-    seed: int = 0  # random seed of episodes, held-out choices, initial weights and minibatches
-    num_envs: int | None = None  # environments stepped together; does not change the result
+    held_out_pairs: Probability = 0.1  # fraction of object pairs whose queries are excluded from training
+    width: Count = 128  # units of each hidden layer
+    depth: Natural = 3  # number of hidden layers
+    steps: Maybe[Count] = None  # number of minibatches (default: 6000, with --cameras 4000)
+    batch_size: Maybe[Count] = None  # checks in a minibatch (default: 1024; with --cameras 48 states)
+    learning_rate: Maybe[Scale] = None  # at the start (default: 0.003, with --cameras 0.002)
+    seed: Natural = 0  # random seed of episodes, held-out choices, initial weights and minibatches
     device: options.Device = "cpu"
     json: options.Json = False
 
@@ -298,29 +296,28 @@ class TrainEvaluator:
             evaluator = lw.StateQueryEvaluator(plans, width=self.width, depth=self.depth)
         replay = self._replay(tasks)
         if self.cameras:
-            for root in self.data or [self.out / "data" / who for who in self.behaviours]:
+            for root in self.data or [self.out / "data" / name for name in self.behaviours]:
                 lw.data.add_pictures(root, **pictures, every=config.every)
             replay.add_column("pixels", lw.data.load_pictures(replay, **pictures, every=config.every))
         labelled = lw.training.LabelledQueries(replay, config)
-        if not any(asked for name, asked in labelled.parts.items() if name != "training"):
+        if not any(queries for name, queries in labelled.parts.items() if name != "training"):
             raise ValueError("nothing is held out to score the evaluator on; collect at least --episodes 2")
         file = self.out / "evaluator.safetensors"
         trainer = lw.training.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=file, device=self.device)
         loss = trainer.train()
         evaluator.cpu()
         output = Output(self.json).show("evaluator", file).show("steps", config.steps)
-        trained = "" if loss != loss else f", loss {loss:.4f}"  # nan: nothing was left to train
-        output.show("loss", loss, f"trained to step {config.steps}{trained}")
+        output.show("loss", loss, _trained(config.steps, loss))
         report = lw.evaluation.score_evaluator(evaluator, labelled)
-        output.show("parts", {name: one.to_json() for name, one in report.parts.items()}, report.table())
+        output.show("parts", {name: part.to_json() for name, part in report.parts.items()}, report.table())
         report.save(self.out / "report.json")
         print(f"written to {self.out}")
         return output
 
     def _config(self) -> Any:
         numbers: dict[str, Any] = {"learning_rate": 2e-3} if self.cameras else {"steps": 6000}
-        stated = {name: getattr(self, name) for name in ("steps", "batch_size", "learning_rate", "every")}
-        numbers |= {name: value for name, value in stated.items() if value is not None}
+        given = {name: getattr(self, name) for name in ("steps", "batch_size", "learning_rate", "every")}
+        numbers |= {name: value for name, value in given.items() if value is not None}
         drawn = len(self.held_out_tasks) == 1 and self.held_out_tasks[0].isdigit()
         numbers["held_out_tasks"] = int(self.held_out_tasks[0]) if drawn else self.held_out_tasks
         make = lw.training.ImageQueryEvaluatorConfig if self.cameras else lw.training.QueryEvaluatorConfig
@@ -330,16 +327,16 @@ class TrainEvaluator:
         """Collect the episodes, unless --data names datasets, and return a buffer over those of the tasks."""
         from lw_torchrl.data.dataset import read_metadata
 
-        roots = self.data or tuple(self.out / "data" / who for who in self.behaviours)
+        roots = self.data or tuple(self.out / "data" / name for name in self.behaviours)
         if not self.data:
-            for who, root in zip(self.behaviours, roots, strict=True):
-                run: dict[str, Any] = {"max_steps": self.max_steps, "seed": self.seed, "num_envs": self.num_envs}
-                run["noise_scale"] = self.noise if who == "expert" else 0.0
-                lw.collect_demonstrations(tasks, root=root, policy=who, episodes_per_task=self.episodes, **run)
+            for name, root in zip(self.behaviours, roots, strict=True):
+                run: dict[str, Any] = {"max_steps": self.max_steps, "seed": self.seed}
+                run["noise_scale"] = self.noise if name == "expert" else 0.0
+                lw.collect_demonstrations(tasks, root=root, policy=name, episodes_per_task=self.episodes, **run)
         chosen = []  # of each dataset, every episode of the tasks
         for root in roots:
             dataset = read_metadata(root).config
-            if not (there := [task for task in tasks if task in dataset.tasks]):
+            if not (shared := [task for task in tasks if task in dataset.tasks]):
                 raise ValueError(f"--data {root} has none of the tasks; it has {', '.join(dataset.tasks)}")
-            chosen.append(dict.fromkeys(there, dataset.episodes_per_task))
+            chosen.append(dict.fromkeys(shared, dataset.episodes_per_task))
         return lw.LanguageWorldExperienceReplay(list(roots), label="executed", episodes=chosen)

@@ -75,7 +75,7 @@ class Behaviour:
         return cls(**described)
 
 
-EXPERT = Behaviour("expert", "expert")
+EXPERT: Behaviour = Behaviour("expert", "expert")
 NOISY = "noisy"  # the label of an expert's episodes that are executed with noise
 _SEGMENTS = (
     Behaviour("scripted"),

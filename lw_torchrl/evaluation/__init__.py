@@ -2,8 +2,7 @@
 
 import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.evaluation.diagnose.attribution import attribute_failures
-from lw_torchrl.evaluation.diagnose.failure import Failure, MendedEpisode
-from lw_torchrl.evaluation.diagnose.findings import CAUSES
+from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure, MendedEpisode
 from lw_torchrl.evaluation.evaluator_score import EvaluatorScore, score_evaluator
 from lw_torchrl.evaluation.figures import plot_failures, plot_success
 from lw_torchrl.evaluation.hub import describe_policy, from_pretrained, policy_card, push_to_hub, save_pretrained

@@ -24,10 +24,10 @@ _ROWS = 256
 
 @dataclass(frozen=True)
 class PartScore:
-    """Answers to one held-out part of :class:`LabelledQueries`, counted by predicate, negated or not."""
+    """Counts of answers to one held-out part of :class:`LabelledQueries`, by predicate, negated or not."""
 
-    right: dict[str, tuple[int, int]]  # the number of correct answers where the clause is false and where it is true
-    asked: dict[str, tuple[int, int]]  # the number of all answers, likewise
+    right: dict[str, tuple[int, int]]  # correct answers where the clause is false, and where it is true
+    asked: dict[str, tuple[int, int]]  # all answers, likewise
 
     @property
     def answers(self) -> int:
@@ -71,7 +71,7 @@ class EvaluatorScore:
     about: dict[str, Any]  # the data and the split, as JSON
 
     def table(self, most: int = 4) -> str:
-        """Return the rates as text, with this many of the worst predicates of each part."""
+        """Return the rates as text, with the N worst predicates of each part."""
         lines = [f"{'':36}{'answers':>10}{'accuracy':>10}{'balanced':>10}"]
         for part, score in self.parts.items():
             rows: list[tuple[str, int, str | None]] = [(PARTS[part], score.answers, None)]
@@ -88,7 +88,10 @@ class EvaluatorScore:
 
 @typed
 def score_evaluator(evaluator: ClauseEvaluator, data: LabelledQueries) -> EvaluatorScore:
-    """Score an evaluator on the held-out parts of the data, of which there must be some. Its plans do not matter.
+    """Score an evaluator on the held-out parts of the data; its plans do not matter.
+
+    Raises:
+        ValueError: no data are held out.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
@@ -107,17 +110,16 @@ def score_evaluator(evaluator: ClauseEvaluator, data: LabelledQueries) -> Evalua
 
 
 def _score(evaluator: ClauseEvaluator, part: list[TaskQueries]) -> PartScore:
-    right: dict[str, tuple[int, int]] = {}
-    asked: dict[str, tuple[int, int]] = {}
+    score = PartScore({}, {})
     with torch.no_grad(), evaluating(evaluator):
         for queries in part:
             logits, truth = clause_logits(evaluator, queries)
-            for table, counted in ((asked, torch.ones_like(truth)), (right, (logits > 0) == truth)):
+            for table, counted in ((score.asked, torch.ones_like(truth)), (score.right, (logits > 0) == truth)):
                 numbers = torch.stack([counted & ~truth, counted & truth], dim=-1).sum(0).tolist()
                 for clause, (false, true) in zip(queries.clauses, numbers, strict=True):
                     before = table.get(clause.predicate, (0, 0))
                     table[clause.predicate] = before[0] + false, before[1] + true
-    return PartScore(right, asked)
+    return score
 
 
 def clause_logits(evaluator: ClauseEvaluator, queries: TaskQueries) -> tuple[Tensor, Tensor]:

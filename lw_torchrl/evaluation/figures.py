@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from lw_torchrl._util.checks import counted, typed
 from lw_torchrl._util.files import AnyPath, replacing
-from lw_torchrl.evaluation.diagnose.failure import count_causes
-from lw_torchrl.evaluation.diagnose.findings import CAUSES
-from lw_torchrl.evaluation.result import EvaluationResult, attributed, wilson_interval
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from lw_torchrl.evaluation.diagnose.failure import CAUSES
+from lw_torchrl.evaluation.result import EvaluationResult, wilson_interval
 
 _FORMATS = (".png", ".svg", ".pdf", ".jpg", ".jpeg")
 COLORS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d755d", "#e45756")
-_LONG_LABEL = 50  # letters of a legend that do not stand in two columns
+_LONG_LABEL = 50  # letters of a legend label that does not fit into two columns
 _CAUSE_COLORS: dict[str, str] = {
     **{"query": "#4c78a8", "plan": "#f58518", "skill": "#54a24b", "out of time": "#b279a2", "undecided": "#bab0ac"},
     **{"not reproducible": "#d5cec9", "perception": "#72b7b2", "gripper": "#eeca3b", "actuation": "#9d755d"},
@@ -28,26 +23,27 @@ _CAUSE_COLORS: dict[str, str] = {
 
 
 def check_image(path: AnyPath | None) -> None:
-    """Raise :class:`ValueError` unless the file's name tells a format."""
-    if path is not None and (given := Path(path).suffix.lower()) not in _FORMATS:
-        raise ValueError(f"path must end in {', '.join(_FORMATS)}, got {given!r} of {str(path)!r}")
+    """Raise :class:`ValueError` unless the file's suffix is that of an image format."""
+    if path is not None and (suffix := Path(path).suffix.lower()) not in _FORMATS:
+        raise ValueError(f"path must end in {', '.join(_FORMATS)}, got {suffix!r} of {str(path)!r}")
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """Return an empty figure, in inches."""
+def new_figure(width: float, height: float) -> Any:
+    """Return an empty ``matplotlib.figure.Figure``, in inches; it opens no window and needs no backend."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def saved(figure: Figure, path: AnyPath | None) -> Figure:
+def saved(figure: Any, path: AnyPath | None) -> Any:
+    """Write a figure to a file, if there is a path, and return the figure."""
     if path is not None:
         with replacing(path) as temporary:
             figure.savefig(temporary, dpi=140)
     return figure
 
 
-def trim(axes: Axes, grid: Literal["x", "y"] | None = None) -> None:
+def trim(axes: Any, grid: Literal["x", "y"] | None = None) -> None:
     """Remove the upper and right spines, and draw lines across ``grid`` behind everything else."""
     axes.spines[["top", "right"]].set_visible(False)
     if grid is not None:
@@ -56,8 +52,8 @@ def trim(axes: Axes, grid: Literal["x", "y"] | None = None) -> None:
 
 
 @typed
-def plot_success(result: EvaluationResult, path: AnyPath | None = None, *, title: str = "") -> Figure:
-    """Draw the any-step success rate of each task, best first, with 95 % intervals over the episodes.
+def plot_success(result: EvaluationResult, path: AnyPath | None = None, *, title: str = "") -> Any:
+    """Return a ``matplotlib`` figure of each task's success rate at any step, best first, with 95 % intervals.
 
     It is written to ``path``, a .png, .svg, .pdf or .jpg file, if one is given.
 
@@ -88,10 +84,11 @@ def plot_success(result: EvaluationResult, path: AnyPath | None = None, *, title
 
 
 @typed
-def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, title: str = "") -> Figure:
-    """Draw the failed episodes of each task by cause, of a result of ``evaluate(..., attribute=True)``, most on top.
+def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, title: str = "") -> Any:
+    """Return a ``matplotlib`` figure of each task's failed episodes by cause, most failures on top.
 
-    It is written to ``path`` as by :func:`plot_success`.
+    The result is one of ``evaluate(..., attribute=True)``. The figure is written to ``path`` as by
+    :func:`plot_success`.
 
     Example:
         >>> from lw_torchrl.evaluation import EpisodeResult, Failure
@@ -104,10 +101,10 @@ def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, titl
     from matplotlib.ticker import MaxNLocator
 
     check_image(path)
-    failures, trials = attributed(result), result.config["episodes_per_task"]
-    counts = count_causes(result.config["tasks"], failures)
-    tasks = sorted((task for task in counts if sum(counts[task].values())), key=lambda t: (sum(counts[t].values()), t))
-    figure = new_figure(8.0, 1.9 + 0.27 * len(tasks) + 0.1 * len({one.cause for one in failures}))
+    counts, trials = result.failure_counts(), result.config["episodes_per_task"]
+    tasks = sorted((task for task in counts if counts[task]), key=lambda task: (counts[task].total(), task))
+    failures = sum(row.total() for row in counts.values())
+    figure = new_figure(8.0, 1.9 + 0.27 * len(tasks) + 0.1 * len({cause for row in counts.values() for cause in row}))
     axes = figure.subplots()
     left = np.zeros(len(tasks))
     for cause, meaning in CAUSES.items():
@@ -123,7 +120,7 @@ def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, titl
     axes.margins(y=0.5 / max(1, len(tasks)))
     axes.set_xlabel(f"failed episodes (of {trials}; tasks without any are left out)")
     episodes = counted(trials * len(counts), "episode")
-    axes.set_title(f"{title}\n{len(failures)} of {episodes} failed".strip())
+    axes.set_title(f"{title}\n{failures} of {episodes} failed".strip())
     trim(axes)
     if failures:
         columns = 2 if max(map(len, axes.get_legend_handles_labels()[1])) <= _LONG_LABEL else 1

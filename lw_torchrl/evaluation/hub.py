@@ -8,16 +8,13 @@ from importlib.resources import files
 from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lw_torchrl._util.checks import counted, typed
 from lw_torchrl._util.files import AnyPath, replacing, shipped_policy, write_text
 from lw_torchrl.evaluation.result import EvaluationResult, wilson_interval
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.training.checkpoint import demonstrated_tasks, load_actor, policy_file, read_description
-
-if TYPE_CHECKING:
-    from huggingface_hub import ModelCard
 
 _SHOWN = {
     *("loss", "reward"),
@@ -39,7 +36,7 @@ def hub() -> Any:
 
 
 @typed
-def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo: str = "") -> ModelCard:
+def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo: str = "") -> Any:
     """Make a model card of a policy: training data, success rates, limits, how to load and cite it.
 
     Args:
@@ -48,10 +45,10 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
         repo: the Hub repository to load it from, such as "me/my-policy"; "" for a file.
 
     Returns:
-        ``huggingface_hub.ModelCard``; ``str()`` of it is Markdown, and ``card.save("README.md")`` writes it.
+        ``huggingface_hub.ModelCard``; ``str(card)`` is Markdown, and ``card.save("README.md")`` writes it.
 
     Raises:
-        ValueError: the result is of tasks that the policy does not know.
+        ValueError: the result has tasks that the policy does not know.
         ImportError: the extra ``[hub]`` is not installed.
 
     Example:
@@ -60,38 +57,34 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
 
     Source: ``huggingface_hub.ModelCard``; Mitchell et al., 'Model Cards for Model Reporting'.
     """
-    measured, about = _measured(policy, result), {"library_name": "lw_torchrl", "pipeline_tag": "robotics"}
-    metadata = hub().ModelCardData(**about, tags=_TAGS, model_name=Path(policy).stem)
-    if measured is not None:
+    about = {"library_name": "lw_torchrl", "pipeline_tag": "robotics", "tags": _TAGS, "model_name": Path(policy).stem}
+    metadata, result = hub().ModelCardData(**about), _own_result(policy, result)
+    if result is not None:
         row = {"task_type": "robotics", "dataset_type": "meta-world", "metric_type": "success_rate"}
-        row |= {"dataset_name": counted(len(measured.success_once), "task"), "metric_name": "mean success"}
-        metadata.eval_results = [hub().EvalResult(**row, metric_value=round(measured.mean_success, 3))]
-    text = describe_policy(policy, measured, repo=repo)
-    card: ModelCard = hub().ModelCard(f"---\n{metadata.to_yaml()}\n---\n\n{text}")
-    return card
+        row |= {"dataset_name": counted(len(result.success_once), "task"), "metric_name": "mean success"}
+        metadata.eval_results = [hub().EvalResult(**row, metric_value=round(result.mean_success, 3))]
+    return hub().ModelCard(f"---\n{metadata.to_yaml()}\n---\n\n{describe_policy(policy, result, repo=repo)}")
 
 
-def _measured(policy: AnyPath, result: EvaluationResult | None) -> EvaluationResult | None:
-    """Return the given result, or a shipped policy's own."""
+def _own_result(policy: AnyPath, result: EvaluationResult | None) -> EvaluationResult | None:
+    """Return the given result, or else a shipped policy's own."""
     shipped = shipped_policy(policy)
     return EvaluationResult.load(shipped.with_suffix(".json")) if result is None and shipped is not None else result
 
 
 @typed
 def describe_policy(policy: AnyPath, result: EvaluationResult | None = None, *, repo: str = "") -> str:
-    """Describe a policy in Markdown: training data, success rates, limits, how to load and cite it.
-
-    The arguments and errors are those of :func:`policy_card`, but no extra is needed.
+    """Return the text of :func:`policy_card` as Markdown. It has the same arguments, but needs no extra.
 
     Example:
         >>> describe_policy("few-shot-mt50").splitlines()[0]
         '# few-shot-mt50'
     """
+    result = _own_result(policy, result)
     description, demonstrated = read_description(policy), demonstrated_tasks(policy)
     tasks = _tasks(description["actor"])
-    result = _measured(policy, result)
     if result is not None and tasks and (unknown := set(result.config["tasks"]) - tasks):
-        raise ValueError(f"result must be of the policy's tasks, it does not know {', '.join(sorted(unknown))}")
+        raise ValueError(f"result must only have tasks that the policy knows, not {', '.join(sorted(unknown))}")
     limits = [f"- {counted(len(tasks - demonstrated), 'task')} had no demonstrations."] * bool(tasks - demonstrated)
     rates = {} if result is None else result.success_once
     if weak := [f"{task} ({rate:.2f})" for task, rate in rates.items() if rate is not None and rate < 0.8]:
@@ -111,7 +104,7 @@ def describe_policy(policy: AnyPath, result: EvaluationResult | None = None, *, 
 
 
 def _tasks(node: Any) -> set[str]:
-    """Return the tasks that a description names: those of its plans, and of the options of its parts."""
+    """Return the tasks in a module's description: those of its plans, and of the options of its parts."""
     if isinstance(node, list):
         return set().union(*map(_tasks, node))
     if not isinstance(node, dict):
@@ -163,7 +156,7 @@ def _success(result: EvaluationResult) -> str:
 def save_pretrained(
     policy: AnyPath, folder: AnyPath, result: EvaluationResult | None = None, *, repo: str = ""
 ) -> None:
-    """Write a policy and its card to a folder, as ``policy.safetensors`` and ``README.md``, which are replaced.
+    """Write a policy and its card to a folder, as ``policy.safetensors`` and ``README.md``; earlier ones are replaced.
 
     The other arguments and the errors are those of :func:`policy_card`.
 
@@ -205,15 +198,15 @@ def push_to_hub(
 
 @typed
 def from_pretrained(source: AnyPath, *, revision: str | None = None, text_encoder: TextEncoder | None = None) -> Any:
-    """Load a policy from a folder or from the Hugging Face Hub, in eval mode. Nothing in the file is executed.
+    """Load a policy from a folder or from the Hugging Face Hub, in eval mode. No code in the file is executed.
 
     Args:
         source: a folder that :func:`save_pretrained` wrote, or a repository such as "me/my-policy".
         revision: the repository's branch, tag or commit.
-        text_encoder: as for :func:`~lw_torchrl.load_actor`, like other errors.
+        text_encoder: as for :func:`~lw_torchrl.load_actor`, whose errors it raises too.
 
     Raises:
-        FileNotFoundError: the folder holds no policy; or there is no such folder, nor such a repository.
+        FileNotFoundError: the folder holds no policy; or there is no such folder and no such repository.
         ImportError: the extra ``[hub]`` is not installed.
     """
     if Path(source).is_dir():
@@ -223,6 +216,6 @@ def from_pretrained(source: AnyPath, *, revision: str | None = None, text_encode
     try:
         path = hub().hf_hub_download(str(source), POLICY_FILE, revision=revision)
     except (OSError, ValueError) as error:
-        missing = f"source: there is no folder {str(source)!r}, and no such policy on the Hub: {error}"
-        raise FileNotFoundError(missing) from error
+        message = f"source: there is no folder {str(source)!r}, and no such policy on the Hub: {error}"
+        raise FileNotFoundError(message) from error
     return load_actor(path, text_encoder=text_encoder)

@@ -26,13 +26,13 @@ _LATE = 50  # the last steps of a failed episode, in which it makes no progress
 
 @dataclass
 class TaskUse:
-    """How one task's plan was used in all its episodes, each up to 20 steps after its first success."""
+    """The use of one task's plan in all its episodes, each up to 20 steps after its first success."""
 
     states: int  # number of states
     true: list[float]  # per step of the plan, the share of states in which its condition held
     chosen: list[float]  # per step, the share of states in which it had the largest weight; empty without weights
     covered: float  # the share of states before the first success in which a condition held
-    gaps: list[tuple[int, int, int]]  # the uncovered stretches: episode, first and last step
+    gaps: list[tuple[int, int, int]]  # stretches in which no condition held: episode, first and last step
     num_true: float  # the median number of conditions that held before the first success
     stuck: list[int]  # per step, the failed episodes in which it was chosen (or true) most in the last 50 steps
     furthest: list[int]  # per step, the failed episodes in which it was the last one chosen (or true) in 5 states
@@ -49,32 +49,26 @@ class _Episode(NamedTuple):
     before: int  # states before the first success
     success: bool
 
-    def gaps(self) -> list[tuple[int, int, int]]:
-        stretches = groupby(enumerate(self.qaf[: self.before].any(-1).tolist()), itemgetter(1))
-        gaps = [[state for state, _ in stretch] for holds, stretch in stretches if not holds]
-        return [(self.number, gap[0], gap[-1]) for gap in gaps]
-
 
 class PlanUse:
     """Collect how plans are used in finished episodes: pass it to :func:`evaluate` as ``on_episode``."""
 
     def __init__(self, plans: AnyPlans) -> None:
         self.plans = as_plans(plans)
-        self._seen: dict[str, list[_Episode]] = {}
+        self._episodes: dict[str, list[_Episode]] = {}
 
     def __call__(self, episode: FinishedEpisode) -> None:
         success = episode.first_success
-        before = success or len(episode.steps)
-        steps = len(self.plans[episode.task].steps)
-        qaf = episode.steps.get("qaf")[: before + _AFTER, :steps]
-        weights = episode.steps.get("skill_weights", None)
-        chosen = None if weights is None else weights[: before + _AFTER, :steps].argmax(-1)
-        one = _Episode(episode.episode, qaf, chosen, before, success is not None)
-        self._seen.setdefault(episode.task, []).append(one)
+        before, steps = success or len(episode.steps), len(self.plans[episode.task].steps)
+        counted = episode.steps[: before + _AFTER]
+        weights = counted.get("skill_weights", None)
+        chosen = None if weights is None else weights[:, :steps].argmax(-1)
+        kept = _Episode(episode.episode, counted.get("qaf")[:, :steps], chosen, before, success is not None)
+        self._episodes.setdefault(episode.task, []).append(kept)
 
     def tasks(self) -> dict[str, TaskUse]:
         """Return the use of each task's plan."""
-        return {task: _summed(seen) for task, seen in sorted(self._seen.items())}
+        return {task: _sum(episodes) for task, episodes in sorted(self._episodes.items())}
 
 
 def where_stuck(active: Tensor, window: int) -> tuple[int, int]:
@@ -84,37 +78,38 @@ def where_stuck(active: Tensor, window: int) -> tuple[int, int]:
     return int(states.argmax()), int(reached[-1]) if len(reached) else 0
 
 
-def _summed(seen: list[_Episode]) -> TaskUse:
-    qaf = torch.cat([one.qaf for one in seen])
+def _sum(episodes: list[_Episode]) -> TaskUse:
+    qaf = torch.cat([episode.qaf for episode in episodes])
     steps = qaf.shape[1]
-    before = torch.cat([one.qaf[: one.before] for one in seen])
-    stuck, furthest = [0] * steps, [0] * steps
-    for one in seen:
-        if not one.success:
-            active = one.qaf.long() if one.chosen is None else one_hot(one.chosen, steps)
+    before = torch.cat([episode.qaf[: episode.before] for episode in episodes])
+    stuck, furthest, gaps = [0] * steps, [0] * steps, []
+    for episode in episodes:
+        holds = episode.qaf[: episode.before].any(-1).tolist()
+        stretches = [(held, [*group]) for held, group in groupby(enumerate(holds), itemgetter(1))]
+        gaps += [(episode.number, group[0][0], group[-1][0]) for held, group in stretches if not held]
+        if not episode.success:
+            active = episode.qaf.long() if episode.chosen is None else one_hot(episode.chosen, steps)
             stuck[where_stuck(active, _LATE)[0]] += 1
             furthest[where_stuck(active, len(active))[1]] += 1
-    chosen = [one.chosen for one in seen if one.chosen is not None]
-    counts = torch.bincount(torch.cat(chosen), minlength=steps) if len(chosen) == len(seen) else torch.zeros(0)
+    chosen = [episode.chosen for episode in episodes if episode.chosen is not None]
+    counts = torch.bincount(torch.cat(chosen), minlength=steps) if len(chosen) == len(episodes) else torch.zeros(0)
     return TaskUse(
         states=len(qaf),
         true=qaf.float().mean(0).tolist(),
         chosen=(counts / len(qaf)).tolist(),
         covered=float(before.any(-1).float().mean()),
-        gaps=sorted(gap for one in seen for gap in one.gaps()),
+        gaps=sorted(gaps),
         num_true=float(median(before.sum(-1).tolist())),
         stuck=stuck,
         furthest=furthest,
-        failed=sum(not one.success for one in seen),
+        failed=sum(not episode.success for episode in episodes),
     )
 
 
 def expert_use(
     plans: AnyPlans, tasks: str | Iterable[str] | None = None, *, episodes_per_task: int = 10, seed: int = 0
 ) -> dict[str, TaskUse]:
-    """Return which conditions of the plans hold in the states that Meta-World's experts visit, without action noise.
-
-    Episodes end 20 steps after their first success.
+    """Return how often the plans' conditions hold in the states that Meta-World's experts visit, without action noise.
 
     Example:
         >>> import lw_torchrl as lw

@@ -1,4 +1,4 @@
-"""evaluate: exactly k episodes of each task, from the same initial states for every actor."""
+"""evaluate: run exactly k episodes of each task, from the same initial states for every actor."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 
-from lw_torchrl._util.checks import Count, Scale, check_value, typed
+from lw_torchrl._util.checks import Count, Scale, typed
 from lw_torchrl._util.keys import check_key
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation.diagnose.attribution import attribute_failures, keys_to_attribute
@@ -50,15 +50,15 @@ def evaluate(
     """Run episodes 0 to k - 1 of each task and return their results.
 
     The actor runs in eval mode with deterministic exploration. The executed action is its action plus
-    N(0, noise_scale²) on each of its numbers, clipped. The result depends neither on ``num_envs`` nor on the other
-    tasks: the actor is run on blocks of a fixed number of rows, and all randomness comes from (task, seed, episode).
+    N(0, noise_scale²) on each of its entries, clipped. The result depends neither on ``num_envs`` nor on the other
+    tasks: the actor runs on blocks of a fixed number of rows, and all randomness comes from (task, seed, episode).
 
     Args:
         actor: reads ``observation``, ``task_id`` and, if it has plans, ``qaf``; writes ``action`` (N, 4) float32.
         tasks: as for :func:`resolve_tasks`; for an actor that knows its tasks, some of them.
         plans: the plans whose conditions are answered; None for the actor's own.
         episodes_per_task: k.
-        seed: random seed (use a different one from that of the demonstrations).
+        seed: random seed (use a different one than for the demonstrations).
         noise_scale: standard deviation of the action noise.
         num_envs: environments stepped together, at least the number of tasks; by default about 256.
         stop_at_success: end an episode at its first success; success at the end and return are then None.
@@ -69,19 +69,19 @@ def evaluate(
         also_record: more keys to pass to ``on_episode``: "qaf", "skill_weights".
         on_episode: called with each finished episode, a named tuple of ``task``, ``episode`` (its index) and ``steps``,
             a TensorDict of batch (T,): ``action``, ``("next", "success")``, ``("next", "reward")``, ``also_record``.
-        device: where the actor works, and stays: "cpu", "cuda", "cuda:1", "mps" or "auto"; None leaves it where it is.
-            The environment and its queries are always on the CPU.
+        device: the actor's device, to which it is moved: "cpu", "cuda", "cuda:1", "mps" or "auto"; None leaves it where
+            it is. The environment and its queries are always on the CPU.
         evaluator: a module, function or transform in front of the actor that answers the conditions, such as
             :class:`~lw_torchrl.CorruptQAF`; None for exact answers at every step.
-        attribute: find out why episodes failed, see :func:`attribute_failures`: ``.failures`` of the result.
+        attribute: find the causes of failed episodes, see :func:`attribute_failures`: ``.failures`` of the result.
         reference: trusted plans for the same tasks, with which failed episodes are re-run.
 
     Warns:
-        UserWarning: a simulation became unstable, which ends its episode; the actor cannot carry out the reference.
+        UserWarning: a simulation became unstable, which ends its episode; the actor cannot follow the reference.
 
     Raises:
-        ValueError: a wrong argument, plans that differ from the actor's, a task without a plan or not among the
-            actor's, a key in ``also_record`` that nothing writes, an action that is NaN.
+        ValueError: the plans differ from the actor's, a task has no plan or is not among the actor's, nothing writes a
+            key in ``also_record``, or an action is NaN.
 
     Example:
         >>> import lw_torchrl as lw
@@ -98,20 +98,18 @@ def evaluate(
         answered.require(names)
     known = tasks_of(actor)
     if known is not None and (other := ", ".join(task for task in names if task not in known)):
-        raise ValueError(f"tasks must be among the actor's, {', '.join(known)}; it was not made for: {other}")
+        raise ValueError(f"tasks must be among the actor's, {', '.join(known)}; the actor does not know {other}")
     if attribute and answered is None:
-        raise ValueError("attribute must be False for an actor without plans, unless plans are given")
+        raise ValueError("attribute=True needs plans: pass plans, or an actor that has plans")
     if reference is not None and not attribute:
-        raise ValueError("reference is for attribute=True, which re-runs failed episodes with it")
-    if isinstance(also_record, str) or not isinstance(also_record, Iterable):
-        raise TypeError(f"also_record must be a list of keys, got {also_record!r}")
-    for key in (also_record := list(also_record)):
+        raise ValueError("reference is only used with attribute=True, which re-runs failed episodes with it")
+    if isinstance(also_record, str):
+        raise TypeError(f"also_record must be a list of keys, got the string {also_record!r}")
+    for key in also_record:
         check_key("also_record", key)
-    if num_envs is not None:
-        check_value("num_envs", num_envs, int)
     shared: dict[str, Any] = {"seed": seed, "max_steps": max_steps or own_suite.max_steps}
     env_options = shared | {"suite": own_suite, "engine": engine, "num_threads": num_threads}
-    how: dict[str, Any] = {"noise_scale": noise_scale, "num_envs": num_envs, "device": device, "progress": progress}
+    run: dict[str, Any] = {"noise_scale": noise_scale, "num_envs": num_envs, "device": device, "progress": progress}
     results: list[EpisodeResult] = []
     failed: list[FinishedEpisode] = []
 
@@ -138,13 +136,13 @@ def evaluate(
         keys=["action", ("next", "success"), ("next", "reward"), *also_record],
         optional=(lambda env: keys_to_attribute(actor, env)) if attribute else (),
         after_success=0 if stop_at_success else None,
-        **how,
+        **run,
     )
     config = {"tasks": list(names), "episodes_per_task": episodes_per_task, "noise_scale": noise_scale, **shared}
     config |= {"stop_at_success": stop_at_success, "reward": reward}
     failures = None
     if attribute and answered is not None:
         failed.sort(key=lambda episode: episode[:2])
-        given: dict[str, Any] = {"actor": actor, "reference": reference, "evaluator": evaluator}
-        failures = tuple(attribute_failures(failed, answered, **given, **env_options, **how))
+        parts: dict[str, Any] = {"actor": actor, "reference": reference, "evaluator": evaluator}
+        failures = tuple(attribute_failures(failed, answered, **parts, **env_options, **run))
     return EvaluationResult(config, tuple(sorted(results, key=lambda e: (e.task, e.episode))), failures=failures)

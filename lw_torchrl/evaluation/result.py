@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
-from reprlib import repr as short
 from typing import Any
 
 from torch import Tensor
 
-from lw_torchrl._util.checks import Count, Natural, Scale, check_value, typed_fields
+from lw_torchrl._util.checks import Count, Natural, Scale, check_value, shown, typed_fields
 from lw_torchrl._util.files import AnyPath, read_json, write_json
 from lw_torchrl._util.reproducibility import package_versions
-from lw_torchrl.evaluation.diagnose.failure import Failure, failure_table, is_number, read_failures, read_records
+from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure, Finite, record_from_json
 
 FORMAT = "lw_torchrl.evaluation"
 FORMAT_VERSION = 1
+_CONFIG = {"episodes_per_task": Count, "max_steps": Count, "seed": int, "noise_scale": Scale, "stop_at_success": bool}
 
 
 @typed_fields
@@ -30,47 +31,47 @@ class EpisodeResult:
 
     task: str
     episode: Natural
-    success: bool  # at some step
+    success: bool  # at any step
     first_success: Count | None  # the first successful step, from 1
     success_at_end: bool | None  # at the last step; None if the episode was stopped at its success
-    episode_return: float | None  # the sum of the rewards; None if the episode was stopped
-    actions: Tensor | None = field(default=None, compare=False, repr=False)  # (T, 4) as executed; they are not saved
+    episode_return: Finite | None  # the sum of the rewards; None if the episode was stopped
+    actions: Tensor | None = field(default=None, compare=False, repr=False)  # (T, 4) as executed; not saved
 
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """The result of :func:`evaluate`, with episodes and failures by task and episode."""
+    """The result of :func:`evaluate`, with episodes and failures sorted by task and episode."""
 
     config: dict[str, Any]  # tasks, episodes_per_task, seed, noise_scale, stop_at_success, max_steps
     episodes: tuple[EpisodeResult, ...]
-    origin: dict[str, Any] = field(default_factory=dict, compare=False)  # provenance, as save noted it
+    origin: dict[str, Any] = field(default_factory=dict, compare=False)  # provenance, as recorded by save
     failures: tuple[Failure, ...] | None = None  # why each failed episode failed; None unless they were attributed
 
     def _by_task(self, value: Callable[[list[EpisodeResult]], float | None]) -> dict[str, float | None]:
-        found: dict[str, list[EpisodeResult]] = {}
+        episodes: dict[str, list[EpisodeResult]] = {}
         for episode in self.episodes:
-            found.setdefault(episode.task, []).append(episode)
-        return {task: value(found.get(task, [])) for task in self.config["tasks"]}
+            episodes.setdefault(episode.task, []).append(episode)
+        return {task: value(episodes.get(task, [])) for task in self.config["tasks"]}
 
     @cached_property
     def success_once(self) -> dict[str, float | None]:
-        """Task to the fraction of its episodes that succeeded at some step: the headline."""
-        return self._by_task(lambda found: sum(e.success for e in found) / len(found))
+        """Task to the fraction of its episodes that succeeded at any step: the main success rate."""
+        return self._by_task(lambda episodes: sum(e.success for e in episodes) / len(episodes))
 
     @cached_property
     def success_at_end(self) -> dict[str, float | None]:
-        """Task to the fraction of its episodes that stood in success at the last step; None if stopped early."""
-        return self._by_task(lambda found: _mean([e.success_at_end for e in found]))
+        """Task to the fraction of its episodes that were successful at the last step; None if stopped early."""
+        return self._by_task(lambda episodes: _mean([e.success_at_end for e in episodes]))
 
     @cached_property
     def first_success(self) -> dict[str, float | None]:
-        """Task to the mean first successful step over its successful episodes; None where there is none."""
-        return self._by_task(lambda found: _mean([e.first_success for e in found if e.success]))
+        """Task to the mean first successful step over its successful episodes; None if it has none."""
+        return self._by_task(lambda episodes: _mean([e.first_success for e in episodes if e.success]))
 
     @cached_property
     def mean_return(self) -> dict[str, float | None]:
-        """Task to the mean sum of rewards; None if episodes were stopped early."""
-        return self._by_task(lambda found: _mean([e.episode_return for e in found]))
+        """Task to the mean return; None if episodes were stopped early."""
+        return self._by_task(lambda episodes: _mean([e.episode_return for e in episodes]))
 
     @property
     def mean_success(self) -> float:
@@ -86,18 +87,18 @@ class EvaluationResult:
         plans: str | None = None,
         evaluator: AnyPath | None = None,
     ) -> None:
-        """Write the result as JSON, with date and versions; a file is replaced whole or not at all.
+        """Write the result as JSON, with date and versions; an earlier file is replaced whole.
 
         Args:
             path: the file.
-            checkpoint, evaluator: the files of the actor and its evaluator; their paths and SHA-256 are noted.
+            checkpoint, evaluator: the files of the actor and its evaluator, to record their paths and SHA-256.
             plans: the fingerprint of the plans.
         """
-        made = {"date": datetime.now(UTC).isoformat(timespec="seconds"), "versions": package_versions()}
-        origin: dict[str, Any] = dict(self.origin) or made
-        for name, given in (("checkpoint", checkpoint), ("evaluator", evaluator)):
-            if given is not None:
-                origin[name] = {"path": str(given), "sha256": sha256(Path(given).read_bytes()).hexdigest()}
+        now = {"date": datetime.now(UTC).isoformat(timespec="seconds"), "versions": package_versions()}
+        origin: dict[str, Any] = dict(self.origin) or now
+        for name, file in (("checkpoint", checkpoint), ("evaluator", evaluator)):
+            if file is not None:
+                origin[name] = {"path": str(file), "sha256": sha256(Path(file).read_bytes()).hexdigest()}
         if plans is not None:
             origin["plans"] = plans
         content: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "origin": origin, "config": self.config}
@@ -112,24 +113,47 @@ class EvaluationResult:
     def load(cls, path: AnyPath) -> EvaluationResult:
         """Read a result; raise :class:`ValueError` if the file is damaged or not a result of this version."""
         try:
-            found = read_json(path, "the result")
-            if (found["format"], found["version"]) != (FORMAT, FORMAT_VERSION) or type(found["version"]) is not int:
-                raise ValueError(f"format {short(found['format'])} version {short(found['version'])}")
-            config, origin = found["config"], found.get("origin", {})
-            if not isinstance(config, dict) or not isinstance(origin, dict):
-                raise ValueError("its config and its origin must be objects")
-            _check_config(config)
-            episodes = _read_episodes(found["episodes"], config)
-            if not isinstance(found["success_once"], dict) or set(found["success_once"]) != set(config["tasks"]):
-                raise ValueError("the tasks of its success_once are not those of its config")
-            failed = [(episode.task, episode.episode) for episode in episodes if not episode.success]
-            failures = read_failures(found["failures"], config, failed) if "failures" in found else None
-            return cls(config, episodes, origin, failures)
+            content = read_json(path, "the result")
+            if (content["format"], content["version"]) != (FORMAT, FORMAT_VERSION) or content["version"] is True:
+                raise ValueError(f"format {shown(content['format'])} version {shown(content['version'])}")
+            config = check_value("config", content["config"], dict)
+            tasks = check_value("config: tasks", config["tasks"], list[str])
+            for name, hint in _CONFIG.items():
+                check_value(f"config: {name}", config[name], hint)
+            episodes = tuple(record_from_json(EpisodeResult, entry) for entry in content["episodes"])
+            failures = None
+            if "failures" in content:
+                failures = tuple(map(Failure.from_json, check_value("failures", content["failures"], list)))
+            result = cls(config, episodes, check_value("origin", content.get("origin", {}), dict), failures)
+            result._check()
+            if set(content["success_once"]) != {*tasks}:
+                raise ValueError("the tasks of success_once must be those of config")
+            return result
         except FileNotFoundError:
             raise FileNotFoundError(f"path: no result file {str(path)!r}; evaluate(...).save(path) writes it") from None
         except (ValueError, KeyError, TypeError) as error:
-            what, why = f"result of {FORMAT} version {FORMAT_VERSION}", f"{type(error).__name__}: {str(error)[:500]}"
-            raise ValueError(f"path: {str(path)!r} is not a {what} ({why})") from error
+            expected = f"result of {FORMAT} version {FORMAT_VERSION}"
+            reason = f"{type(error).__name__}: {str(error)[:500]}"
+            raise ValueError(f"path: {str(path)!r} is not a {expected} ({reason})") from error
+
+    def _check(self) -> None:
+        """Raise :class:`ValueError` unless config, episodes and failures agree."""
+        tasks, number, last = (self.config[name] for name in ("tasks", "episodes_per_task", "max_steps"))
+        for episode in self.episodes:
+            first = episode.first_success
+            if episode.success == (first is None) or (first or 0) > last or (episode.success_at_end and not first):
+                raise ValueError(f"episodes: success, first_success and success_at_end must agree, got {episode}")
+        counts = Counter(task for task, _ in {(episode.task, episode.episode) for episode in self.episodes})
+        if not tasks or counts != dict.fromkeys(tasks, number) or len(self.episodes) != number * len(tasks):
+            raise ValueError(f"episodes must be {number} different ones of each task, as in config")
+        if self.failures is None:
+            return
+        failed = sorted((episode.task, episode.episode) for episode in self.episodes if not episode.success)
+        if failed != sorted((failure.task, failure.episode) for failure in self.failures):
+            raise ValueError("failures must be one for each episode without success")
+        for failure in self.failures:
+            if failure.seed != self.config["seed"] or failure.at >= last:
+                raise ValueError(f"failures: seed and at must fit config, got {failure.seed} and {failure.at}")
 
     def table(self) -> str:
         """Return the rates per task as text in columns."""
@@ -141,16 +165,26 @@ class EvaluationResult:
             lines.append(f"{name:28} {once:>8} {end:>8} {'-' if first is None else f'{first:.0f}':>10}")
         return "\n".join(lines)
 
+    def failure_counts(self) -> dict[str, Counter[str]]:
+        """Return the number of failures of each cause, by task; raise :class:`ValueError` if none were attributed."""
+        if self.failures is None:
+            raise ValueError("the result has no failures: they are attributed by evaluate(..., attribute=True)")
+        tasks = self.config["tasks"]
+        return {task: Counter(failure.cause for failure in self.failures if failure.task == task) for task in tasks}
+
     def failure_table(self) -> str:
         """Return the numbers of failed episodes as text: a row for each task, a column for each cause."""
-        return failure_table(self.config["tasks"], self.config["episodes_per_task"], attributed(self))
-
-
-def attributed(result: EvaluationResult) -> tuple[Failure, ...]:
-    """Return the failures; raise :class:`ValueError` if they were not attributed."""
-    if result.failures is None:
-        raise ValueError("the result has no failures: they are attributed by evaluate(..., attribute=True)")
-    return result.failures
+        counts, number = self.failure_counts(), self.config["episodes_per_task"]
+        rows = [(task, causes, number) for task, causes in counts.items()]
+        if len(rows) > 1:
+            rows.append(("all", sum(counts.values(), Counter()), number * len(rows)))
+        causes = [cause for cause in CAUSES if any(row[cause] for row in counts.values())]
+        width = max(len("task"), *map(len, counts))
+        lines = [f"{'task':{width}}  {'failed':>10}  " + "  ".join(f"{cause:>5}" for cause in causes)]
+        for task, row, trials in rows:
+            cells = "  ".join(f"{row[cause]:>{max(5, len(cause))}}" for cause in causes)
+            lines.append(f"{task:{width}}  {f'{row.total()} of {trials}':>10}  {cells}")
+        return "\n".join(lines)
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
@@ -163,37 +197,3 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
 def _mean(values: Collection[Any]) -> float | None:
     return None if not values or None in values else sum(values) / len(values)
-
-
-def _check_config(config: dict[str, Any]) -> None:
-    tasks = config["tasks"]
-    named = isinstance(tasks, list) and all(isinstance(task, str) for task in tasks)
-    if not named or not tasks or len(set(tasks)) != len(tasks):
-        raise ValueError(f"config: tasks must be different names, got {short(tasks)}")
-    for name in ("episodes_per_task", "max_steps"):
-        check_value(f"config: {name}", config[name], Count)
-    check_value("config: seed", config["seed"], int)
-    check_value("config: noise_scale", config["noise_scale"], Scale)
-    check_value("config: stop_at_success", config["stop_at_success"], bool)
-
-
-def _read_episodes(stated: Any, config: dict[str, Any]) -> tuple[EpisodeResult, ...]:
-    """Return the episodes of a file; raise unless they are different and as many per task as its config says."""
-    count, wanted, max_steps = dict.fromkeys(config["tasks"], 0), config["episodes_per_task"], config["max_steps"]
-
-    def faults(one: EpisodeResult) -> Iterator[str]:
-        if one.task not in count:
-            yield "task must be in config"
-        if one.success != (one.first_success is not None) or (one.first_success or 0) > max_steps:
-            yield f"first_success must be a step up to {max_steps}, or null without success"
-        if one.success_at_end and not one.success:
-            yield "success_at_end must be false without success"
-        if not (one.episode_return is None or is_number(one.episode_return)):
-            yield "episode_return must be a number or null"
-
-    found = read_records("episodes", stated, EpisodeResult, faults)
-    for task, _ in {(one.task, one.episode) for one in found}:
-        count[task] += 1
-    if len(found) != sum(count.values()) or set(count.values()) != {wanted}:
-        raise ValueError(f"episodes must be {wanted} different ones of each task, as config: episodes_per_task says")
-    return found

@@ -52,24 +52,24 @@ def rollout(
     Arguments without a description are those of :func:`evaluate`, which also describes what an episode depends on.
 
     Args:
-        label: the work, for the progress bar.
+        label: title of the progress bar.
         tasks: name to task.
         episodes: name of a task to indices of its episodes.
         env_options: further arguments of :class:`LanguageWorldEnv`: ``seed``, ``suite``, ``max_steps``.
-        keys: what to record of each step; :class:`ValueError` if the environment and the policy do not write it.
+        keys: keys to record in each step; :class:`ValueError` if neither environment nor policy writes one.
         optional: more keys, or a function from the environment to them, recorded if they are written.
         after_success: end an episode N steps after its first success; None for never.
-        place: a key for the place of each row's episode in its task's list.
+        place: a key for the index of each row's episode in its task's list.
         first: a transform that runs before all others.
         wrap: called with the actor; returns the policy that acts instead.
     """
-    most = len(tasks) * max(map(len, episodes.values()))  # more rows would have no work
+    most = len(tasks) * max(map(len, episodes.values()))  # more rows would be idle
     rows = min(most, len(tasks) * max(1, ROWS // len(tasks))) if num_envs is None else min(num_envs, most)
     base = LanguageWorldEnv(list(tasks.values()), num_envs=rows, strict=True, **env_options)
     env = _with_transforms(base, first, transform_of(actor, plans), _transform_of_evaluator(evaluator))
-    wanted = [unravel_key(key) for key in (optional(env) if callable(optional) else optional)]
-    written = {unravel_key(key) for one in (actor, evaluator) for key in getattr(one, "out_keys", ())} | _written(env)
-    recorded = list(dict.fromkeys([*map(unravel_key, keys), *(key for key in wanted if key in written)]))
+    more = [unravel_key(key) for key in (optional(env) if callable(optional) else optional)]
+    written = {unravel_key(key) for part in (actor, evaluator) for key in getattr(part, "out_keys", ())} | _written(env)
+    recorded = list(dict.fromkeys([*map(unravel_key, keys), *(key for key in more if key in written)]))
     acting = actor if wrap is None else wrap(actor)
     if evaluator is not None and not isinstance(evaluator, Transform):
         acting = EvaluatorInFront(evaluator, acting)
@@ -96,7 +96,7 @@ def _with_transforms(base: EnvBase, *transforms: Transform | None) -> EnvBase:
 
 
 def _transform_of_evaluator(evaluator: Any) -> Transform | None:
-    """Return the transform to run after the exact answers: the evaluator, or the one that writes what it reads."""
+    """Return the transform to run after the exact answers: the evaluator itself, or the transform that it needs."""
     if isinstance(evaluator, Transform):
         return evaluator.clone()  # a transform belongs to one environment
     return evaluator.transform() if isinstance(evaluator, QueryEvaluator) else None
@@ -111,8 +111,8 @@ def _written(env: EnvBase) -> set[NestedKey]:
 
 def _checked(policy: Acts, env: EnvBase, keys: Iterable[NestedKey]) -> Acts:
     """Return ``policy`` with its action checked, and at the first call that it and the environment write ``keys``."""
-    later, size = _written(env), env.action_spec.shape[-1]
-    unseen = [key for key in keys if key not in later]
+    by_env, size = _written(env), env.action_spec.shape[-1]
+    unseen = [key for key in keys if key not in by_env]
 
     def run(tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = policy(tensordict)
@@ -120,14 +120,14 @@ def _checked(policy: Acts, env: EnvBase, keys: Iterable[NestedKey]) -> Acts:
         while unseen:
             if (key := unseen.pop()) not in tensordict.keys(True):
                 written = tensordict.exclude("_step").keys(True, True)
-                raise unknown_name("also_record", key, [*dict.fromkeys([*written, *sorted(later, key=str)])])
+                raise unknown_name("also_record", key, [*dict.fromkeys([*written, *sorted(by_env, key=str)])])
         return tensordict
 
     return run
 
 
 class EvaluatorInFront(nn.Module):
-    """A policy behind an evaluator, whose answers replace ``qaf``."""
+    """A policy after an evaluator, whose answers replace ``qaf``."""
 
     def __init__(self, evaluator: Acts, actor: Acts) -> None:
         super().__init__()
@@ -152,7 +152,7 @@ def actor_plans(actor: Any, plans: AnyPlans | None) -> Plans | None:
 def suite_tasks(
     tasks: TaskList, plans: Plans | None, suite: str | Suite | None = None
 ) -> tuple[Suite, dict[str, Task]]:
-    """Return the suite, and the tasks by name; a name that only a plan defines stands for the plan's task."""
+    """Return the suite, and the tasks by name; a name that the suite lacks stands for the task of the plan."""
     tasks = listed_tasks(tasks)
     chosen = find_suite(tasks, suite)
     own = {} if plans is None else {plan.task: plan.definition for plan in plans.values()}

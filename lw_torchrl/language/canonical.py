@@ -1,16 +1,22 @@
-"""canonical_plan: read a free-form plan as verbs, objects and targets, and complete it where it says too little."""
+"""canonical_plan: parse a free-form plan into verbs, objects and targets, and complete it if it says too little."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lw_torchrl._util.checks import typed
-from lw_torchrl.language.coverage import coverage
-from lw_torchrl.language.objects import GOAL, GRIPPER
+from lw_torchrl._util.files import read_toml
+from lw_torchrl.language.layout import places
+from lw_torchrl.language.objects import GOAL, GRIPPER, Coordinate
 from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, PlanStep, as_plans
 from lw_torchrl.language.queries import Clause, Query
+from lw_torchrl.language.relations import STATES, comparisons
 from lw_torchrl.language.roles import BY_HAND, VECTORS, Direction, Manner, StepRole, Verb, motion_of
 from lw_torchrl.language.step_parser import ParsedStep, compared_with_gripper, parse_steps
 from lw_torchrl.language.tasks import (
@@ -26,58 +32,61 @@ from lw_torchrl.language.tasks import (
 )
 
 MIN_CONFIDENCE = 0.75
-"""A plan of at least this confidence keeps its own conditions."""
+"""The confidence from which a plan keeps its own conditions."""
 Source = Literal["plan", "completed", "fallback"]
 _SOURCES = {"plan": "its own steps", "completed": "completed", "fallback": "replaced by the fallback plan"}
 
 
 @dataclass(frozen=True)
 class CanonicalReport:
-    """How :func:`canonical_plan` read a plan.
+    """How :func:`canonical_plan` reads a plan.
 
-    Its source is "plan", the plan's own steps; "completed", its motion, objects and direction with standard
-    conditions, if its own do not cover the typical states; or "fallback", the fallback plan, if it has no motion.
+    The source is "plan" if the plan keeps its own steps. It is "completed" if they do not cover the typical states: the
+    plan keeps its motion, objects and direction, with standard conditions. It is "fallback" if the plan has no motion
+    and becomes the fallback plan.
     """
 
     written: ConditionalPlan
     plan: ConditionalPlan  # the canonical form
     source: Source
-    read: tuple[PlanStep, ...]  # the plan's own steps as they were read, also where ``plan`` has others
-    left_out: tuple[str, ...]  # the skills that could not be read
+    read: tuple[PlanStep, ...]  # the plan's own steps as parsed, even if ``plan`` has others
+    left_out: tuple[str, ...]  # the skills that could not be parsed
 
     def notes(self) -> list[dict[str, Any]]:
-        """The result of each step as written, then the steps that replace them, if any, as JSON.
+        """Return the result for each written step, then the steps that replace them, if any, as JSON.
 
-        The keys are ``written``, None for a step that the plan lacked; ``skill``, ``verb``, ``moved``, ``target`` and
-        ``condition``, None for what was left out; ``confidence``; and ``seen``, whether policies see the step.
+        The keys are ``written``, None for an added step; ``skill``, ``verb``, ``moved``, ``target`` and ``condition``,
+        None for a step that was left out; ``confidence``; and ``seen``, whether policies see the step.
         """
 
         def note(step: PlanStep, seen: bool) -> dict[str, Any]:
             role = _role(step)
-            names = {"skill": step.skill, "verb": role.verb, "moved": role.moved, "target": role.target}
-            about = {"condition": str(step.condition), "confidence": role.confidence, "seen": seen}
-            return {"written": role.written or None, **names, **about}
+            parsed = {"skill": step.skill, "verb": role.verb, "moved": role.moved, "target": role.target}
+            rest = {"condition": str(step.condition), "confidence": role.confidence, "seen": seen}
+            return {"written": role.written or None, **parsed, **rest}
 
-        own = self.source == "plan"
-        notes = [note(step, own) for step in self.read] + [note(step, True) for step in self.plan.steps if not own]
+        is_own = self.source == "plan"
+        notes = [note(step, is_own) for step in self.read] + [
+            note(step, True) for step in self.plan.steps if not is_own
+        ]
         nothing = dict.fromkeys(("skill", "verb", "moved", "target", "condition"))
         return notes + [{"written": skill, **nothing, "confidence": 0.0, "seen": False} for skill in self.left_out]
 
 
 @typed
 def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> ConditionalPlan:
-    """Read a free-form plan and return it with a role for each step, completed where it says too little.
+    """Parse a free-form plan and return it with a role for each step, completed if it says too little.
 
-    Each step gets a verb, an object that is moved, a target and a direction (:class:`StepRole`), from its words, its
-    conditions and the task's objects alone. Where the hand acts on an object that has a named point, the point stands
-    for it. A plan whose conditions leave typical states out, or that closes the gripper around nothing, keeps its
-    motion, objects and direction, and gets standard conditions. A plan without any motion becomes
-    :func:`fallback_plan`. A plan whose steps have roles already is not read again.
+    Each step gets a verb, an object that moves, a target and a direction (:class:`StepRole`), from its words, its
+    condition and the task's objects alone. Where the hand acts on an object with a named point, the point replaces the
+    object. A plan whose conditions miss typical states, or that closes the gripper around nothing, keeps its motion,
+    objects and direction, and gets standard conditions. A plan without any motion becomes :func:`fallback_plan`. A plan
+    with roles is not parsed again.
 
     Args:
         plan: a plan in any words.
-        fallback: append the steps of the fallback plan, whose roles say ``fallback=True``. Policies try them when the
-            plan makes no progress. Nothing is appended where the plan became the fallback plan, or has one.
+        fallback: append the steps of the fallback plan, whose roles have ``fallback=True``. Policies try them when the
+            plan makes no progress. Nothing is appended to a plan that has a fallback, or that is the fallback plan.
 
     Example:
         >>> import lw_torchrl as lw
@@ -87,7 +96,7 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
         >>> [step.role.verb for step in plan.steps]
         ['approach', 'descend', 'close', 'carry']
 
-    Source: ours; the paper encodes a skill's words as they are.
+    Source: ours; the paper encodes the words of a skill as they are.
     """
     if any(step.role is None for step in plan.steps):
         plan = explain_canonical(plan).plan
@@ -119,22 +128,22 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
     """
     task, parsed = plan.definition, parse_steps(plan)
     read = _with_roles(plan, parsed)
-    confidence, last = _confidence(task, read), motion_of([_role(step) for step in read])
+    confidence, motion = _confidence(task, read), motion_of([_role(step) for step in read])
     source: Source
     if confidence >= MIN_CONFIDENCE and _is_complete(read):
         source, steps = "plan", read
-    elif last is not None:
-        source, steps = "completed", _completed(task, read, last)
+    elif motion is not None:
+        source, steps = "completed", _completed(task, read, motion)
     else:
         source, steps = "fallback", fallback_plan(task).steps
     left_out = tuple(step.skill for step, reading in zip(plan.steps, parsed, strict=True) if reading is None)
-    seen = []
+    explained = []
     for number, step in enumerate(steps):
         written = _role(step).written
         reasons = [f"confidence {confidence:.2f}, {_SOURCES[source]}"] if number == 0 else []
         reasons += [f"as written: {written}"] if written and written != step.skill else []
-        seen.append(replace(step, reason="; ".join(reasons)))
-    canonical = ConditionalPlan(plan.task, tuple(seen), task, confidence)
+        explained.append(replace(step, reason="; ".join(reasons)))
+    canonical = ConditionalPlan(plan.task, tuple(explained), task, confidence)
     return CanonicalReport(plan, canonical, source, read, left_out)
 
 
@@ -148,11 +157,11 @@ def fallback_plan(task: str | Task) -> ConditionalPlan:
     if held is not None:
         steps = _completed(task, (), StepRole("move", held, GOAL, "grasp", confidence=0.0))
         return ConditionalPlan(task.name, steps, task)
-    named = whole_objects(task)
-    goal = next((name for name in named if is_goal(task, name)), None)
-    near, target = _gripper_is("near", goal or named[0]), GOAL if goal else named[0]
-    come = _step(_negated(near), StepRole("reach", GRIPPER, target, "reach"))
-    return ConditionalPlan(task.name, (come, _step(near, StepRole("hold", GRIPPER, target, "reach"))), task)
+    names = whole_objects(task)
+    goal = next((name for name in names if is_goal(task, name)), None)
+    near, target = _gripper_is("near", goal or names[0]), GOAL if goal else names[0]
+    approach = _step(_negated(near), StepRole("reach", GRIPPER, target, "reach"))
+    return ConditionalPlan(task.name, (approach, _step(near, StepRole("hold", GRIPPER, target, "reach"))), task)
 
 
 def _role(step: PlanStep) -> StepRole:
@@ -173,7 +182,7 @@ def _negated(query: Query) -> Query:
 
 
 def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> tuple[PlanStep, ...]:
-    """Return the steps that could be read, with the purpose that each has in the plan."""
+    """Return the steps that could be parsed, with their roles in the plan."""
     task = plan.definition
     pairs = [(step, each) for step, each in zip(plan.steps, parsed, strict=True) if each and each.moved and each.target]
     read = [each for _, each in pairs]
@@ -182,10 +191,10 @@ def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> t
     steps = []
     for number, (step, each) in enumerate(pairs):
         verb, manner, direction = each.verb, _manner(each), each.direction
-        # The first step from this one on that moves something, otherwise the last one before it.
+        # The purpose is the next step that moves something, or this one; else the last one before it.
         purpose = next((other for other in (*read[number:], *read[:number][::-1]) if other.verb not in BY_HAND), None)
         if verb in BY_HAND:
-            verb, manner, direction = _coming(each, purpose if not grasping else None)
+            verb, manner, direction = _approach(each, purpose if not grasping else None)
         target, moved = str(each.target), str(each.moved)
         if moved == GRIPPER and first is not None and same_object(task, target, first):
             target = _compared_point(step, task, target) or point_on(task, target)
@@ -195,17 +204,17 @@ def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> t
     return tuple(_over_walls(steps, task))
 
 
-def _coming(each: ParsedStep, purpose: ParsedStep | None) -> tuple[Verb, Manner, Direction | None]:
-    """Return the verb, manner and direction of a hand that comes for a ``purpose``; None for a plan that grasps."""
-    down = "descend" if each.verb == "beside" else each.verb
+def _approach(each: ParsedStep, purpose: ParsedStep | None) -> tuple[Verb, Manner, Direction | None]:
+    """Return the verb, manner and direction of a hand that approaches for a ``purpose``; None stands for a grasp."""
+    verb = "descend" if each.verb == "beside" else each.verb
     if purpose is None:
-        return down, "grasp", None
+        return verb, "grasp", None
     manner = _manner(purpose)
     if manner == "push":
         return ("beside" if each.verb == "descend" else each.verb), manner, purpose.direction
     if manner == "press":
         return ("push" if each.verb == "descend" else each.verb), manner, purpose.direction
-    return down, manner, each.direction or (purpose.direction if manner == "pull" else None)
+    return verb, manner, each.direction or (purpose.direction if manner == "pull" else None)
 
 
 def _compared_point(step: PlanStep, task: Task, name: str) -> str | None:
@@ -222,7 +231,7 @@ def _manner(each: ParsedStep) -> Manner:
 
 
 def _at_points(condition: Query, task: Task) -> Query:
-    """Return a condition whose clauses about the gripper name the point where the first object is touched."""
+    """Replace the first object by the point where it is touched, in clauses about the gripper."""
     first = first_object(task)
 
     def at(name: str) -> str:
@@ -237,14 +246,14 @@ def _at_points(condition: Query, task: Task) -> Query:
 
 
 def _over_walls(steps: Sequence[PlanStep], task: Task) -> list[PlanStep]:
-    """Send "lift the puck over the wall" to the target of a later "move it to the goal", in one way through the air."""
+    """Send "lift the puck over the wall" straight to the target of a later "move it to the goal"."""
     direct = list(steps)
     for number, step in enumerate(steps):
         role = _role(step)
         later = (_role(other) for other in steps[number + 1 :])
         after = next((other for other in later if other.verb in ("carry", "move")), None)
-        fixed = not any(isinstance(at, int) for at in role_object(task, role.target).position)
-        if role.verb != "carry" or not fixed or after is None or same_object(task, role.target, after.target):
+        is_fixed = not any(isinstance(at, int) for at in role_object(task, role.target).position)
+        if role.verb != "carry" or not is_fixed or after is None or same_object(task, role.target, after.target):
             continue
         if same_object(task, role.moved, after.moved):
             direct[number] = _step(step.condition, replace(role, moved=after.moved, target=after.target))
@@ -252,24 +261,24 @@ def _over_walls(steps: Sequence[PlanStep], task: Task) -> list[PlanStep]:
 
 
 def _is_complete(steps: Sequence[PlanStep]) -> bool:
-    """Return whether a plan moves something and, if it grasps, comes to the object and closes the gripper before."""
+    """Return whether a plan moves something and, if it grasps, approaches the object and closes the gripper first."""
     roles = [_role(step) for step in steps]
     verbs = [role.verb for role in roles]
     moving = next((number for number, verb in enumerate(verbs) if verb in ("carry", "move")), None)
     if any(role.verb == "pull" and "handle" not in role.target.split() for role in roles):
-        return False  # a handle can be hooked; anything else is held better in closed fingers
+        return False  # a handle can be hooked; anything else must be held
     if moving is None:
         return motion_of(roles) is not None
     return "close" in verbs[:moving] and not {"approach", "descend"}.isdisjoint(verbs[: verbs.index("close")])
 
 
-def _completed(task: Task, steps: Sequence[PlanStep], last: StepRole) -> tuple[PlanStep, ...]:
-    """Return the plan's motion, ``last``, at the object that it names, with standard conditions."""
+def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple[PlanStep, ...]:
+    """Return a plan with the given motion, at the object that the steps touch, with standard conditions."""
     roles = [_role(step) for step in steps]
-    if last.manner == "reach":
+    if motion.manner == "reach":
         return tuple(steps)
-    if any(role.verb == "carry" and (role.moved, role.target) == (last.moved, last.target) for role in roles):
-        last = replace(last, verb="carry")
+    if any(role.verb == "carry" and (role.moved, role.target) == (motion.moved, motion.target) for role in roles):
+        motion = replace(motion, verb="carry")
     point = _touched(task, roles)
     above, near, over = (_gripper_is(relation, point) for relation in ("above", "near", "vertically aligned with"))
     away = _negated(near)
@@ -278,31 +287,32 @@ def _completed(task: Task, steps: Sequence[PlanStep], last: StepRole) -> tuple[P
         both = Query(tuple(clause for query in conditions for clause in query.clauses))
         return _step(both, StepRole(verb, GRIPPER, point, manner, way, confidence=0.0))
 
-    if last.manner in ("grasp", "pull"):
+    if motion.manner in ("grasp", "pull"):
         held = object_of(task, point)
-        if last.verb == "pull":
-            way = last.direction if last.direction in VECTORS else None
-            last = replace(last, verb="move", manner="grasp", moved=held, target=held if way else GOAL, direction=way)
-        elif last.moved == GRIPPER:
-            last = replace(last, moved=held)
+        if motion.verb == "pull":
+            way = motion.direction if motion.direction in VECTORS else None
+            goal = held if way else GOAL
+            motion = replace(motion, verb="move", manner="grasp", moved=held, target=goal, direction=way)
+        elif motion.moved == GRIPPER:
+            motion = replace(motion, moved=held)
         return (
             by_hand("approach", "grasp", _negated(above), away),
             by_hand("descend", "grasp", above, away),
             by_hand("close", "grasp", near, _gripper_is("open")),
-            _step(Query((*near.clauses, *_gripper_is("closed").clauses)), last),
+            _step(Query((*near.clauses, *_gripper_is("closed").clauses)), motion),
         )
-    way, last = last.direction, replace(last, target=point)
-    if last.manner == "press":
-        return by_hand("approach", "press", _negated(over), way=way), _step(over, last)
+    way, motion = motion.direction, replace(motion, target=point)
+    if motion.manner == "press":
+        return by_hand("approach", "press", _negated(over), way=way), _step(over, motion)
     if way == "away":
         level = _gripper_is("forward aligned with", point)
-        return by_hand("beside", "push", _negated(level), way=way), _step(level, last)
-    come = by_hand("approach", "push", _negated(over), way=way), by_hand("beside", "push", over, away, way=way)
-    return *come, _step(near, last)
+        return by_hand("beside", "push", _negated(level), way=way), _step(level, motion)
+    approach = by_hand("approach", "push", _negated(over), way=way), by_hand("beside", "push", over, away, way=way)
+    return *approach, _step(near, motion)
 
 
 def _touched(task: Task, roles: Sequence[StepRole]) -> str:
-    """Return where the hand acts: where it first comes down to, else what it first goes over."""
+    """Return where the hand acts: the first place that it comes down to, else the first that it goes over."""
     hands = [role for role in roles if role.moved == GRIPPER != role.target and not is_goal(task, role.target)]
     hand = min(hands, key=lambda role: role.verb == "approach", default=None)
     name = first_object(task) if hand is None else hand.target
@@ -319,28 +329,89 @@ def _has_sides(roles: Sequence[StepRole]) -> bool:
 def _confidence(task: Task, steps: Sequence[PlanStep]) -> float:
     """Return the fraction of typical states of the plan's motion in which its steps do what the motion needs."""
     roles = [_role(step) for step in steps]
-    last = motion_of(roles)
-    if last is None:
+    motion = motion_of(roles)
+    if motion is None:
         return 0.0
-    if last.manner == "reach" or _has_sides(roles):
+    if motion.manner == "reach" or _has_sides(roles):
         return 1.0
-    motion = "pull" if last.verb == "pull" else last.manner
-    return coverage(task, _touched(task, roles), motion, [(step.condition, _role(step).verb) for step in steps])
+    manner = "pull" if motion.verb == "pull" else motion.manner
+    return _coverage(task, _touched(task, roles), manner, [(step.condition, _role(step).verb) for step in steps])
+
+
+# The typical states are synthetic: objects and a goal at fixed places, and the hand at offsets from the touched point.
+_Floats = NDArray[np.float32]
+_OBJECTS = ((0.0, 0.6, 0.02), (0.2, 0.7, 0.02), (-0.2, 0.7, 0.02), (0.0, 0.8, 0.02))
+_GOAL = (0.1, 0.8, 0.2)
+_MOTIONS = read_toml(files("lw_torchrl.language") / "data" / "motions.toml", ValueError)
+_MOTIONS |= {motion: _MOTIONS["coming"] + _MOTIONS[motion] for motion in ("grasp", "pull")}
+_TYPICAL = {
+    motion: [(offset, opening, lift, {*verbs.split()}) for hands, opening, lift, verbs in rows for offset in hands]
+    for motion, rows in _MOTIONS.items()
+}
+
+
+def _coverage(task: Task, point: str, motion: str, steps: Sequence[tuple[Query, Verb]]) -> float:
+    """Return the fraction of a motion's typical states in which some step is active and every active step is right."""
+    good = 0
+    for offset, opening, lift, verbs in _TYPICAL[motion]:
+        state = _state(task, point, offset, opening, lift)
+        active = {verb for query, verb in steps if all(_is_true(clause, task, state) for clause in query.clauses)}
+        good += bool(active) and active <= verbs
+    return good / len(_TYPICAL[motion])
+
+
+def _state(task: Task, point: str, offset: Sequence[float], opening: float, lift: float) -> _Floats:
+    touched, layout = role_object(task, point), task.layout
+    state = np.zeros(layout.size, np.float32)
+    for place, xyz in zip(layout.positions[1:-1], _OBJECTS, strict=False):
+        state[place] = xyz
+    state[layout.positions[-1]] = _GOAL
+    if at := [number for number in touched.position if isinstance(number, int)]:
+        state[at[-1]] += np.float32(lift)
+    hand = _position(touched.position, state) + _floats(touched.offset) + _floats(offset)
+    state[list(places(layout.positions[0]))] = hand
+    state[layout.opening] = opening
+    return state
+
+
+def _floats(numbers: Sequence[float]) -> _Floats:
+    return np.array(numbers, np.float32)
+
+
+def _position(position: Sequence[Coordinate], state: _Floats) -> _Floats:
+    return _floats([state[at] if isinstance(at, int) else at for at in position])
+
+
+def _is_true(clause: Clause, task: Task, state: _Floats) -> bool:
+    """Return the truth of a clause, with the precision and the order of operations of QueryProgram, but no torch."""
+    second, shift = _floats((0.0, 0.0, 0.0)), np.zeros(3)
+    if clause.predicate in STATES:
+        first = _floats((0.0, 0.0, state[task.openings[clause.subject]]))
+    else:
+        subject = task.object(clause.subject)
+        first, shift = _position(subject.position, state), np.array(subject.offset)
+        if clause.object is not None:
+            other = task.object(clause.object)
+            second, shift = _position(other.position, state), shift - other.offset
+    truth = True
+    for part in comparisons(clause.predicate, task.layout):
+        d = first - second + _floats(shift + np.array((0.0, 0.0, part.raise_z)))
+        d = d[["xyz".index(axis) for axis in part.axes]]
+        value, threshold = np.sqrt((d * d).sum()) if part.length else d[0], np.float32(part.threshold)
+        truth &= bool({"<": value < threshold, ">": value > threshold, "<=": value <= threshold}[part.sense])
+    return truth != clause.negated
 
 
 def worth(plan: ConditionalPlan) -> tuple[bool, float, float]:
-    """Return a key to compare plans for a task, the larger is better: whether the plan has a motion, its confidence,
-    and the mean confidence of its steps."""
+    """Return a key that ranks plans for a task: has a motion, confidence, mean confidence of its steps."""
     report = explain_canonical(plan)
     steps = sum(_role(step).confidence for step in report.read) / (len(report.read) + len(report.left_out))
     return report.source != "fallback", report.plan.confidence or 0.0, steps
 
 
 def most_confident(plans: Iterable[ConditionalPlan]) -> ConditionalPlan:
-    """Return the plan with the largest :func:`worth`, the first of equals."""
-    if not (listed := list(plans)):
-        raise ValueError("plans must be at least one, got none")
-    return max(listed, key=worth)
+    """Return the first plan with the largest :func:`worth`."""
+    return max(plans, key=worth)
 
 
 def canonical_like(plans: Plans, reference: Plans | None) -> Plans:

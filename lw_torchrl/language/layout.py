@@ -1,13 +1,13 @@
-"""Layout: what the numbers of a suite's observations and actions mean."""
+"""Layout: the meaning of the numbers in a suite's observations and actions."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
-from lw_torchrl._util.checks import shown, typed_fields
+from lw_torchrl._util.checks import Count, Natural, Positive, check_value, shown, typed_fields
 from lw_torchrl._util.registry import ReadOnlyDict
 
 
@@ -16,8 +16,8 @@ from lw_torchrl._util.registry import ReadOnlyDict
 class Slot:
     """The numbers of an observation that describe one object."""
 
-    position: int  # index of its x; y and z follow
-    quaternion: int | None = None  # index of the first of its four numbers; None without an orientation
+    position: Natural  # index of its x; y and z follow
+    quaternion: Natural | None = None  # index of the first of its four numbers; None without an orientation
 
     @property
     def xyz(self) -> slice:
@@ -26,7 +26,7 @@ class Slot:
 
     @property
     def numbers(self) -> tuple[slice, ...]:
-        """The numbers of the position and, where it is told, of the orientation."""
+        """The numbers of the position and, if there is one, of the orientation."""
         return (self.xyz,) if self.quaternion is None else (self.xyz, slice(self.quaternion, self.quaternion + 4))
 
 
@@ -35,9 +35,9 @@ class Slot:
 class Layout:
     """The meaning of the numbers of observations and actions, for all tasks of a suite.
 
-    Positions are in metres: x to the right, y away from the robot, z above the table. Where an index is of an x, y and
-    z follow. Without a ``displacement`` of the hand, scripted skills, ``RandomYaw`` and ``TransferredActor`` refuse an
-    action. Scripted skills say 1 to close everywhere; actions and data have the sign of ``closes``.
+    Positions are in metres: x to the right, y away from the robot, z above the table. An index of an x stands for x, y
+    and z. Scripted skills, ``RandomYaw`` and ``TransferredActor`` need a layout with a ``displacement`` of the hand.
+    In scripted skills an effort of 1 closes the gripper; in actions and data, ``closes`` is the sign that closes it.
 
     Example:
         >>> METAWORLD.positions
@@ -47,84 +47,83 @@ class Layout:
     """
 
     name: str
-    size: int  # D, how many numbers an observation has
-    hand: int  # index of the gripper's x
-    opening: int  # index of the gripper's opening, from 0, closed, to 1, open
-    things: tuple[Slot, ...]  # in the order in which tasks have them; all but the first may be absent: zeros
-    goal: int  # index of the x of the task's target, which has no past
-    past: int | None = None  # the previous step's numbers are at their index + past; after a reset, the current ones
-    action_size: int = 4  # A, how many numbers an action has, each in [-1, 1]
-    displacement: int | None = 0  # index of the x of the hand's displacement; None if actions are something else
-    reach: float = 0.01  # metres that the hand moves in a step at a displacement of 1, once it moves
-    gripper: int | None = 3  # index of the gripper's effort
-    closes: int = 1  # the effort's sign that closes, 1 or -1
-    binary_gripper: bool = False  # it opens or closes fully in a few steps, so an effort is mapped to open or closed
-    closes_above: float = 0.3  # the effort above which such a gripper closes
-    thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)  # metres, by relation, of this suite
+    size: Count  # D, the length of an observation
+    hand: Natural  # index of the gripper's x
+    opening: Natural  # index of the gripper's opening, from 0 (closed) to 1 (open)
+    things: tuple[Slot, ...]  # the objects of a task, in its order; zeros for those that a task lacks
+    goal: Natural  # index of the x of the task's target, which has no past
+    past: Natural | None = None  # offset from a number's index to its value in the previous step
+    action_size: Count = 4  # A, the length of an action; each number is in [-1, 1]
+    displacement: Natural | None = 0  # index of the x of the hand's displacement; None if actions have none
+    reach: Positive = 0.01  # metres that the moving hand travels in a step at a displacement of 1
+    gripper: Natural | None = 3  # index of the gripper's effort
+    closes: Literal[1, -1] = 1  # sign of the effort that closes the gripper
+    binary_gripper: bool = False  # whether the gripper can only open or close fully, within a few steps
+    closes_above: float = 0.3  # effort above which a binary gripper closes
+    thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)  # relation to this suite's metres
 
     def __post_init__(self) -> None:
         layout = f"layout {self.name!r}"
-        if not self.things or not all(isinstance(thing, Slot) for thing in self.things):
-            raise ValueError(f"things of {layout} must be at least one Slot, got {self.things!r}")
-        used = [*self.present, *self.positions]
-        if min(part.start for part in used) < 0 or max(part.stop for part in used) > self.size:
+        if not self.things:
+            raise ValueError(f"things of {layout} must hold at least one Slot")
+        present = (*self.present, *self._past(self.present))
+        if max(part.stop for part in (*present, *self.positions)) > self.size:
             raise ValueError(f"{layout} has an index outside the {self.size} numbers of an observation")
-        told = [number for part in (*self.present, *self._past(self.present)) for number in places(part)]
-        if twice := sorted({number for number in told if told.count(number) > 1}):
+        used = [number for part in present for number in places(part)]
+        if twice := sorted(number for number in used if used.count(number) > 1):
             raise ValueError(f"{layout} uses number {twice[0]} of an observation for two purposes")
         for name, index, width in (("displacement", self.displacement, 3), ("gripper", self.gripper, 1)):
-            if index is not None and not 0 <= index <= self.action_size - width:
+            if index is not None and index + width > self.action_size:
                 raise ValueError(f"{name} of {layout} must be within {self.action_size} numbers, got {index}")
         if self.displacement is not None and self.gripper in range(self.displacement, self.displacement + 3):
             raise ValueError(f"gripper of {layout} must not be an index of the displacement, got {self.gripper}")
-        if self.closes not in (1, -1):
-            raise ValueError(f"closes of {layout} must be 1 or -1, got {shown(self.closes)}")
-        if self.reach <= 0:
-            raise ValueError(f"reach of {layout} must be above 0 metres, got {shown(self.reach)}")
         for relation, threshold in self.thresholds.items():
-            if not isinstance(relation, str) or type(threshold) is not float or abs(threshold) > 1e3:
-                raise ValueError(f"thresholds of {layout} must map relations to metres, got {relation!r}")
+            check_value(f"thresholds of {layout}: {relation!r}", threshold, float)
         object.__setattr__(self, "thresholds", ReadOnlyDict(dict(self.thresholds)))
         for name in ("present", "positions", "all_positions", "parts"):
             getattr(self, name)  # computed here: torch.compile cannot trace the lock of a cached_property
 
     @cached_property
     def present(self) -> tuple[slice, ...]:
-        """The numbers of this step that may have a past: the hand, its opening, those of each thing."""
+        """The numbers that describe this step: hand, opening, objects. The goal is not among them."""
         opening = slice(self.opening, self.opening + 1)
         return (slice(self.hand, self.hand + 3), opening, *(part for thing in self.things for part in thing.numbers))
 
     @cached_property
     def positions(self) -> tuple[slice, ...]:
-        """The positions of this step: of the hand, of each thing, of the goal."""
+        """The positions in this step: hand, objects, goal."""
         starts = (self.hand, *(thing.position for thing in self.things), self.goal)
         return tuple(slice(start, start + 3) for start in starts)
 
     @cached_property
     def all_positions(self) -> tuple[slice, ...]:
-        """All positions, also those of the step before."""
+        """All positions, including those of the previous step."""
         return (*self.positions, *self._past(self.positions[:-1]))
 
     @cached_property
     def parts(self) -> tuple[tuple[slice, ...], ...]:
-        """The numbers of each thing, now and a step before, then those of the goal."""
+        """The numbers of each object, in this and the previous step, then those of the goal."""
         things = [(*thing.numbers, *self._past(thing.numbers)) for thing in self.things]
         return (*things, (self.positions[-1],))
 
     @property
     def effort(self) -> slice:
-        """The gripper's effort among the numbers of an action; none of them where there is none."""
+        """The gripper's effort among the numbers of an action; empty without a gripper."""
         return slice(0, 0) if self.gripper is None else slice(self.gripper, self.gripper + 1)
 
-    def displaced(self, what: str) -> slice:
-        """The hand's displacement among the numbers of an action; :class:`ValueError` names ``what`` needs one."""
+    def displaced(self, user: str) -> slice:
+        """Return the hand's displacement among the numbers of an action.
+
+        Raises:
+            ValueError: the layout has none; the message names the ``user`` that needs it.
+        """
         if self.displacement is None:
             lacks = f"an action of layout {self.name!r} has no displacement of the hand, which it needs"
-            raise ValueError(f"{what}: {lacks}")
+            raise ValueError(f"{user}: {lacks}")
         return slice(self.displacement, self.displacement + 3)
 
     def a_step_before(self, part: slice) -> slice:
-        """Where the same numbers stand of the step before."""
+        """Return the indices of the same numbers in the previous step."""
         if self.past is None:
             raise ValueError(f"layout {self.name!r} has no numbers of the step before")
         return slice(part.start + self.past, part.stop + self.past)
@@ -134,30 +133,27 @@ class Layout:
         return () if self.past is None else tuple(map(self.a_step_before, parts))
 
     def to_json(self) -> dict[str, Any]:
-        """What :meth:`from_json` reads back."""
+        """Return the layout as JSON."""
         things = [[thing.position, thing.quaternion] for thing in self.things]
-        own = {each.name: getattr(self, each.name) for each in fields(self)}
-        return {**own, "things": things, "thresholds": dict(self.thresholds)}
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {**values, "things": things, "thresholds": dict(self.thresholds)}
 
     @classmethod
-    def from_json(cls, found: Any) -> Layout:
-        """The layout of :meth:`to_json`; any other value is a ValueError."""
+    def from_json(cls, row: Any) -> Layout:
+        """Rebuild the layout from :meth:`to_json`; raise :class:`ValueError` for any other value."""
         names = [each.name for each in fields(cls)]
-        if not isinstance(found, Mapping) or set(found) != set(names):
-            raise ValueError(f"layout must be a table of {', '.join(names)}, got {shown(found)}")
-        things = found["things"]
-        if not isinstance(things, list) or not all(isinstance(one, list) and len(one) == 2 for one in things):
-            raise ValueError(f"things of a layout must be pairs of indices, got {shown(things)}")
+        if not isinstance(row, Mapping) or set(row) != set(names):
+            raise ValueError(f"layout must be a table of {', '.join(names)}, got {shown(row)}")
         try:
-            return cls(**{**found, "things": tuple(Slot(*one) for one in things)})
+            return cls(**{**row, "things": tuple(Slot(*pair) for pair in row["things"])})
         except TypeError as error:
             raise ValueError(f"layout: {error}") from error
 
 
 def places(part: slice) -> tuple[int, ...]:
-    """The numbers' indices: (36, 37, 38) for Meta-World's goal."""
+    """Return the indices of a slice: (36, 37, 38) for Meta-World's goal."""
     return tuple(range(part.start, part.stop))
 
 
 METAWORLD = Layout("metaworld", 39, hand=0, opening=3, things=(Slot(4, 7), Slot(11, 14)), goal=36, past=18, reach=0.01)
-"""Meta-World's 39 numbers; the second thing is zeros in a task with one."""
+"""Meta-World's 39 numbers. In a task with one object, the second object's numbers are zeros."""

@@ -1,4 +1,4 @@
-"""From anyone's words to ours: the nearest query, the nearest scripted skill, and both for the steps of an answer."""
+"""The nearest query and the nearest scripted skill to free-form text."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from rapidfuzz import fuzz, process
 
-from lw_torchrl._util.checks import check_choice, shown, typed
-from lw_torchrl.language.embeddings import sentence_vectors
+from lw_torchrl._util.checks import check_choice, check_value, typed
 from lw_torchrl.language.objects import WORDS
 from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, check_length, read_query
 from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.skills import ScriptedSkill, SkillError, Skills, load_skills, skills_for
 from lw_torchrl.language.tasks import Task, get_task
+from lw_torchrl.language.text import sentence_vectors
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
 _NEGATIONS = frozenset(("not", "no", "never", "without", "cannot"))
-# Words that do not tell which query is meant.
+# Words without meaning for the choice of a query.
 _EMPTY = frozenset(("the", "a", "an", "is", "are", "be", "does", "do", "did", "has", "have", "robot's", "robot"))
-_LONGEST = 400  # characters of a text that is compared
-_MOST_CLAUSES = 8  # of a condition outside the language
-_MOST_COMPARED = 64  # conditions and goals of an answer outside the language, a limit to its time
-LIMIT, SKILL_LIMIT = 0.4, 0.7  # distances beyond which no condition and no skill is near; see docs/planners.md
+_LONGEST = 400  # characters of a text that is mapped
+_MOST_CLAUSES = 8  # of a condition that is mapped
+_MOST_COMPARED = 64  # mapped conditions and goals of an answer, a limit to the time of decoding
+LIMIT, SKILL_LIMIT = 0.4, 0.7  # the largest distances of a mapped condition and of a mapped skill; docs/planners.md
 _TARGETS = ("target location", "reach target")
 _TARGET = re.compile(
     r"\b(?:the\s)?(?:reach\s)?(?:goal|target)(?:\s(?:location|position|area|place|point|destination))?\b"
@@ -37,7 +37,7 @@ _TARGET = re.compile(
 
 
 class QueryPart(NamedTuple):
-    """One clause of a text, the query it was taken for, and how alike they are, in [0, 1]."""
+    """A clause of a text, its nearest query, and their similarity in [0, 1]."""
 
     text: str
     query: Query
@@ -49,21 +49,25 @@ class QueryMatch:
     """The nearest query to a text."""
 
     query: Query
-    score: float  # the mean of its parts' scores, in [0, 1]; 1 for a text that is a query itself
-    parts: tuple[QueryPart, ...]  # what each clause of the text was taken for
+    score: float  # mean of the parts' scores, in [0, 1]; 1 if the text is a query
+    parts: tuple[QueryPart, ...]  # the match of each clause of the text
 
 
 @typed
 def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] = "edit") -> QueryMatch:
-    """The query of a task that is nearest to a text.
+    """Return the query of a task that is nearest to a text.
 
-    A text that is a query is found as it is. Otherwise it is split at "and" and "but", and each part is taken for the
-    nearest base query. A part without a subject takes that of the part before. A part with "not", "doesn't" or "never"
-    is taken for the negation of the base query nearest to the rest of it, so that truth is never inverted.
+    A query matches itself. Any other text is split at "and" and "but", and each part matches its nearest base query. A
+    part without a subject has the subject of the previous part. A part with "not", "doesn't" or "never" matches the
+    negation of the base query nearest to its other words, so that a match never inverts the meaning.
 
     Args:
-        text: any words, of at most 64 parts.
-        by: "edit", closest in spelling; "embedding", closest in meaning (an ImportError without the extra ``[text]``).
+        text: any text, of at most 64 parts.
+        by: "edit" compares spelling; "embedding" compares meaning and needs the extra ``[text]``.
+
+    Raises:
+        QueryError: the text has more than 64 parts.
+        ImportError: the extra ``[text]`` is not installed.
 
     Example:
         >>> str(nearest_query("gripper open and over the target locaton", "push").query)
@@ -77,16 +81,16 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
     split = [" ".join(part.split()) for part in re.split(r"\b(?:and|but)\b", text, flags=re.IGNORECASE)]
     split = [part for part in split if _content(_affirmed(part)[0])] or [" ".join(text.split())]
     check_length(text, split)
-    known: dict[tuple[str, str], QueryPart] = {}  # a text may repeat itself
+    known: dict[tuple[str, str], QueryPart] = {}  # parts are often repeated
     parts: list[QueryPart] = []
     subject = ""
     for part in split:
         if (part, subject) not in known:
-            found = _nearest_part(part, owner, by)
-            if subject and found.score < 1.0:
+            match = _nearest_part(part, owner, by)
+            if subject and match.score < 1.0:
                 joined = _nearest_part(f"the {subject} {part}", owner, by)
-                found = joined._replace(text=part) if joined.score > found.score else found
-            known[part, subject] = found
+                match = joined._replace(text=part) if joined.score > match.score else match
+            known[part, subject] = match
         parts.append(known[part, subject])
         subject = parts[-1].query.clauses[0].subject
     query = Query(tuple(clause for part in parts for clause in part.query.clauses))
@@ -101,15 +105,15 @@ def _nearest_part(part: str, task: Task, by: str) -> QueryPart:
     if by == "edit":
         _, similarity, at = process.extractOne(_content(words), contents, scorer=fuzz.ratio)
         score = similarity / 100
-    else:  # an encoder cannot read a lone surrogate
-        vector = sentence_vectors([" ".join(words).encode("utf-8", "replace").decode()])[0]
-        alike = _vectors(tuple(map(str, clauses))) @ vector
-        at, score = int(alike.argmax()), float(alike.max().clip(0.0, 1.0))
+    else:
+        text = " ".join(words).encode("utf-8", "replace").decode()  # an encoder cannot read a lone surrogate
+        similarities = _vectors(tuple(map(str, clauses))) @ sentence_vectors([text])[0]
+        at, score = int(similarities.argmax()), float(similarities.max().clip(0.0, 1.0))
     return QueryPart(part, Query((replace(clauses[at], negated=negated),)), score)
 
 
 def _affirmed(text: str) -> tuple[list[str], bool]:
-    """The words of a text but its negations, and whether it is a negation."""
+    """Return the words of a text without its negations, and whether it is negated."""
     plain = re.sub(r"(\w)n't\b", r"\1 not", text.replace("’", "'").casefold())
     words = re.sub(r"[^\w\s'-]", " ", plain).split()
     kept = [word for word in words if word not in _NEGATIONS]
@@ -121,9 +125,10 @@ def _content(words: list[str]) -> str:
 
 
 @lru_cache(maxsize=256)
-def _choices(task: Task, relations: tuple[str, ...]) -> tuple[tuple[Clause, ...], tuple[str, ...]]:
-    affirmed = tuple(clause for clause in base_clauses(task, relations) if not clause.negated)
-    return affirmed, tuple(_content(str(clause).split()) for clause in affirmed)
+def _choices(task: Task, predicates: tuple[str, ...]) -> tuple[tuple[Clause, ...], tuple[str, ...]]:
+    """Return the affirmed base clauses of a task, and the words of each that count."""
+    clauses = tuple(clause for clause in base_clauses(task, predicates) if not clause.negated)
+    return clauses, tuple(_content(str(clause).split()) for clause in clauses)
 
 
 @lru_cache(maxsize=256)
@@ -135,11 +140,14 @@ def _vectors(texts: tuple[str, ...]) -> NDArray[np.float32]:
 def nearest_skill(
     text: str, task: str | Task | None = None, skills: Skills | Iterable[str] | None = None
 ) -> tuple[ScriptedSkill, float]:
-    """Return the scripted skill with the closest text, by edit distance, and how close it is, in [0, 1].
+    """Return the scripted skill with the most similar text, by edit distance, and the similarity in [0, 1].
 
     Args:
-        task: consider only skills whose objects this task has; with none it is a :class:`SkillError`.
-        skills: to choose from; None for the shipped ones.
+        task: consider only skills whose objects this task has.
+        skills: the skills to choose from; None for the shipped ones.
+
+    Raises:
+        SkillError: no skill suits the task.
 
     Example:
         >>> nearest_skill("put gripper above puck", task="push")[0].text
@@ -151,27 +159,28 @@ def nearest_skill(
     table = shipped if skills is None else skills
     if not isinstance(table, Mapping):
         table = {check_choice("skills", name, shipped): shipped[name] for name in table}
-    for name, skill in table.items():
-        if not isinstance(skill, ScriptedSkill):
-            raise TypeError(f"skills[{name!r}] must be a ScriptedSkill, got {shown(skill)} ({type(skill).__name__})")
+    for skill in table.values():
+        check_value("skills", skill, ScriptedSkill)
     allowed = tuple(name for name, skill in table.items() if task is None or skill.suits(task))
     if not allowed:
         raise SkillError(f"no scripted skill suits task {task!r}")
     words = " ".join(text.lower().replace("_", " ").split())
-    found = process.extractOne(words, allowed, scorer=fuzz.ratio)
-    return table[found[0]], found[1] / 100
+    name, similarity, _ = process.extractOne(words, allowed, scorer=fuzz.ratio)
+    return table[name], similarity / 100
 
 
 class MappedQuery(NamedTuple):
-    """The query that a text was taken for."""
+    """The query that a text was mapped to."""
 
-    query: Query | None
+    query: Query | None  # None if no query is near enough
     distance: float  # of its furthest clause
     exact: bool = False  # whether the text is a query itself
 
 
 class StepMapper:
-    """Maps the words of an answer, by data/words.toml, to queries and skills; a distance is 1 minus a similarity.
+    """A map from the words of an answer to queries and skills, with distances of 1 minus the similarity.
+
+    Phrases of data/words.toml are replaced first.
 
     Source: paper section 'LLM Experiments', which takes the nearest by string edit distance.
     """
@@ -181,7 +190,7 @@ class StepMapper:
         self.compared = 0
 
     def query(self, text: str) -> MappedQuery:
-        """Map a text to the nearest query; to none if that is beyond the limit."""
+        """Map a text to the nearest query within the limit."""
         if (query := read_query(text, self.task)) is not None:
             return MappedQuery(query, 0.0, exact=True)
         self.compared += 1
@@ -191,21 +200,21 @@ class StepMapper:
         return MappedQuery(query if distance <= LIMIT else None, distance)
 
     def skill(self, text: str) -> tuple[str | None, float]:
-        """The text of the nearest scripted skill and its distance; no text if that is beyond the limit."""
+        """Return the text of the nearest scripted skill, None if it is beyond the limit, and its distance."""
         if text in self.skills:
             return text, 0.0
         if not self.skills or len(text) > _LONGEST:
             return None, 1.0
         words = _with_target(text, self.task)
-        if found := _phrases("skills").match(words):
-            words = WORDS["skills"][found[0]] + words[found.end() :]
+        if match := _phrases("skills").match(words):
+            words = WORDS["skills"][match[0]] + words[match.end() :]
         skill, score = nearest_skill(words, None, self.skills)
         return (skill.text if 1.0 - score <= SKILL_LIMIT else None), 1.0 - score
 
 
 @lru_cache(maxsize=4096)
 def _nearest_condition(text: str, task: Task) -> tuple[Query | None, float]:
-    words = _phrases("conditions").sub(lambda found: WORDS["conditions"][found[0]], _with_target(text, task))
+    words = _phrases("conditions").sub(lambda match: WORDS["conditions"][match[0]], _with_target(text, task))
     with suppress(QueryError):
         match = nearest_query(words, task)
         if len(match.parts) <= _MOST_CLAUSES:
@@ -214,7 +223,7 @@ def _nearest_condition(text: str, task: Task) -> tuple[Query | None, float]:
 
 
 def _with_target(text: str, task: Task) -> str:
-    """The text in lower case, with the task's own name for its goal, which models call "goal" or "target position"."""
+    """Return the text in lower case, with the task's own name for "goal", "target position" and the like."""
     name = next((name for name in _TARGETS if name in task.object_names), None)
 
     def named(goal: re.Match[str]) -> str:
@@ -225,6 +234,6 @@ def _with_target(text: str, task: Task) -> str:
 
 @cache
 def _phrases(kind: str) -> re.Pattern[str]:
-    """Any phrase of the table, the longest first."""
+    """Return a pattern of the phrases in a table of words.toml, the longest first."""
     longest = sorted(WORDS[kind], key=len, reverse=True)
     return re.compile(rf"\b(?:{'|'.join(map(re.escape, longest))})\b")

@@ -1,4 +1,4 @@
-"""decode_plan: what a language model wrote, as a plan of one task, with notes of what was left out or changed."""
+"""decode_plan: from a language model's text to a plan of one task, with notes on what was left out or changed."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from lw_torchrl.language.formats.base import Clause, Note, Reading, Section, lis
 from lw_torchrl.language.formats.prose import ProseReading
 from lw_torchrl.language.formats.python import PythonReading
 from lw_torchrl.language.nearest import MappedQuery, StepMapper
-from lw_torchrl.language.plan_text import MOST_STEPS
-from lw_torchrl.language.plans import ConditionalPlan, PlanStep
+from lw_torchrl.language.plans import MOST_STEPS, ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import Query
 from lw_torchrl.language.skills import Skills, canonical_skill
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
@@ -21,19 +20,19 @@ from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
 
 @dataclass(frozen=True)
 class DecodedStep:
-    """One clause of a text, and what became of it; distances are from 0, a text that is a query or a skill, to 1."""
+    """A clause of a text and how it was read. Distances are from 0, a text that is a query or a skill, to 1."""
 
-    line: int  # where it stands in the text, from 1
+    line: int  # of the text, from 1
     written_condition: str  # in the text's words
     written_skill: str  # in the text's words: ``robot.put("gripper above mug")`` is "put gripper above mug"
     condition: Query | None  # the nearest query; None if none is near enough
     condition_distance: float  # the largest of its clauses
     scripted: str | None  # the text of the nearest scripted skill; None if none is near enough
     skill_distance: float
-    written_goal: str = ""  # the state to reach in the text's words, "" if it says none
-    goal: Query | None = None  # as ``condition``
+    written_goal: str = ""  # the state to reach in the text's words; "" if there is none
+    goal: Query | None = None  # the nearest query; None if none is near enough
     goal_distance: float = 0.0
-    dropped: str = ""  # why it is no step of the plan; "" if it is one
+    dropped: str = ""  # why the clause is not a step of the plan; "" if it is one
 
 
 @dataclass(frozen=True)
@@ -41,19 +40,19 @@ class DecodedPlan:
     """The plan that :func:`decode_plan` read from a text.
 
     Attributes:
-        plan: its conditions as queries and its skills in the text's words; None if there is none.
-        scripted: the same with the nearest scripted skills, without steps that have none; None if no step is left.
+        plan: the plan with queries as conditions and skills in the text's words; None if there is none.
+        scripted: the plan with the nearest scripted skills, without steps that have none; None if no step is left.
     """
 
     plan: ConditionalPlan | None
     scripted: ConditionalPlan | None
     reason: str  # why there is no plan; "" if there is one
     notes: tuple[Note, ...]  # what was left out or changed, in the order of the lines
-    steps: tuple[DecodedStep, ...]  # the clauses for the task, also those that were dropped
+    steps: tuple[DecodedStep, ...]  # the clauses for the task, including the dropped ones
 
     @property
     def all_scripted(self) -> bool:
-        """Whether there is a plan, and every step of it has a scripted skill."""
+        """Whether there is a plan, and each of its steps has a scripted skill."""
         return self.plan is not None and self.scripted is not None and len(self.scripted.steps) == len(self.plan.steps)
 
 
@@ -64,21 +63,20 @@ _LONGEST = 65_536  # characters of a text that are read
 def decode_plan(
     text: str, task: str | Task, format: str, *, skills: Skills | None = None, tasks: Tasks = TASKS
 ) -> DecodedPlan:
-    """Read a plan from whatever a language model wrote. No text raises an error, and none is executed.
+    """Read a plan from any text that a language model wrote. The text is never executed, and no text raises an error.
 
-    Only clauses for ``task`` count: those of functions and headings of its name, and those before any name, which go
-    on where the prompt ended. Thoughts, up to ``</think>`` or as other models mark them, are left out. Of several
-    versions the longest counts, of equals the first. Python where prose was asked for, or the reverse, is read too.
+    Only clauses for ``task`` are read: those in functions and headings with its name, and those before any name, which
+    continue the prompt. Of several versions the longest is taken, of equal ones the first. Thoughts, marked by
+    ``</think>`` or in other models' ways, are left out. Python instead of prose, or the reverse, is read too.
 
-    A condition outside the query language is replaced by the nearest query by edit distance, clause by clause, or
-    dropped with its step if none is near. Skills stay as written in ``plan``; ``scripted`` has the nearest scripted
-    ones.
+    A condition outside the query language is replaced by the nearest query by edit distance, clause by clause. If none
+    is near, the step is dropped. Skills stay as written in ``plan``; ``scripted`` has the nearest scripted ones.
 
     Args:
-        text: the answer; what follows 65,536 characters or 1,000 steps is left out.
-        format: the format that was asked for, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
+        text: the answer, up to 65,536 characters and 1,000 steps; the rest is left out.
+        format: the requested format, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
         skills: the scripted skills to choose from; None for the shipped ones.
-        tasks: where a task's name is looked up, as from :func:`~lw_torchrl.load_tasks`.
+        tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
 
     Example:
         >>> answer = "When the gripper isn't above puck, the robot should put gripper above puck."
@@ -94,22 +92,22 @@ def decode_plan(
 
 
 def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> DecodedPlan:
-    """As :func:`decode_plan`, by the reader of any form; a text in another form is read as what it is."""
+    """Decode a plan like :func:`decode_plan`, with a format's reader and a mapper."""
     owner, notes = mapper.task, list[Note]()
     text = without_thoughts(text, notes)
     if len(text) > _LONGEST:
         notes.append(Note(text.count("\n", 0, _LONGEST) + 1, f"the rest of {len(text)} characters is not read"))
     reading, section = _read(text[:_LONGEST], owner, read)
     if further := section.clauses[MOST_STEPS:]:
-        reading.note(further[0].line, f"begins what is more than {MOST_STEPS} steps; {len(further)} are left out")
+        reading.note(further[0].line, f"the plan has more than {MOST_STEPS} steps; {len(further)} are left out")
         del section.clauses[MOST_STEPS:]
     listed = listed_steps(section.listed, len(section.clauses)) or [""] * len(section.clauses)
-    clauses = [  # a clause may only say a state to reach
-        clause if clause.skill else replace(clause, skill=words or _in_words(clause.goal))
+    clauses = [  # a clause may have a goal instead of a skill
+        clause if clause.skill else replace(clause, skill=words or _as_skill(clause.goal))
         for clause, words in zip(section.clauses, listed, strict=True)
     ]
     steps = [_mapped(clause, mapper, notes) for clause in clauses]
-    notes += _about(reading, section, owner)
+    notes += _section_notes(reading, section, owner)
 
     def plan(skills: Sequence[str | None]) -> ConditionalPlan | None:
         kept = tuple(
@@ -129,29 +127,29 @@ def _same(name: str, task: Task) -> bool:
 
 
 def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Reading, Section]:
-    """What the text says, by the reader that finds something for the task, and the section that is taken."""
-    found: list[tuple[Reading, Section]] = []
+    """Return the reading of the first reader that finds clauses for the task, and the section with the most."""
+    empty: list[tuple[Reading, Section]] = []
     for reader in dict.fromkeys((read, PythonReading, ProseReading)):
         reading = reader(text)
-        asked = [reading.sections[0], *(section for section in reading.sections[1:] if _same(section.task, task))]
-        section = max(asked, key=lambda section: len(section.clauses))
+        own = [reading.sections[0], *(section for section in reading.sections[1:] if _same(section.task, task))]
+        section = max(own, key=lambda section: len(section.clauses))
         if section.clauses:
-            if found:
-                reading.note(section.clauses[0].line, "is written in another format than was asked for")
+            if empty:
+                reading.note(section.clauses[0].line, "the plan is not in the requested format")
             return reading, section
-        found.append((reading, section))
-    return found[0]
+        empty.append((reading, section))
+    return empty[0]
 
 
-def _in_words(goal: str) -> str:
-    """A state to reach as a skill: "the robot's gripper is above mug" is "move gripper above mug"."""
-    said = []
+def _as_skill(goal: str) -> str:
+    """Return a goal as a skill: "move gripper above mug" for "the robot's gripper is above mug"."""
+    skills = []
     for state in re.split(r"\s+and\s+", goal):
-        found = re.match(r"(?:the\s+)?(?:robot's\s+)?(.+?)\s+is\s+(.+)", state)
-        thing, place = found.groups() if found else ("until", state)
-        closing = thing == "gripper" and place in ("open", "closed")
-        said.append(f"{place.removesuffix('d')} the gripper" if closing else f"move {thing} {place}")
-    return " and ".join(said)
+        match = re.match(r"(?:the\s+)?(?:robot's\s+)?(.+?)\s+is\s+(.+)", state)
+        moved, place = match.groups() if match else ("until", state)
+        is_opening = moved == "gripper" and place in ("open", "closed")
+        skills.append(f"{place.removesuffix('d')} the gripper" if is_opening else f"move {moved} {place}")
+    return " and ".join(skills)
 
 
 def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedStep:
@@ -170,14 +168,14 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
     if condition is None:
         dropped = f"no query is near enough to the condition {shown(written)} (distance {distance:.2f})"
     elif not exact:
-        note(f"the condition {shown(written)} is taken for {str(condition)!r} (distance {distance:.2f})")
+        note(f"the condition {shown(written)} is read as {str(condition)!r} (distance {distance:.2f})")
     if dropped:
         note(f"a step is left out: {dropped}")
     else:
         if clause.goal and goal is None:
             note(f"no query is near enough to the goal {shown(clause.goal)} (distance {goal_distance:.2f})")
         elif clause.goal and not exact_goal:
-            note(f"the goal {shown(clause.goal)} is taken for {str(goal)!r} (distance {goal_distance:.2f})")
+            note(f"the goal {shown(clause.goal)} is read as {str(goal)!r} (distance {goal_distance:.2f})")
         if scripted is None:
             note(f"no scripted skill is near enough to {shown(words)} (distance {skill_distance:.2f})")
         elif scripted != words:
@@ -186,25 +184,24 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
     return DecodedStep(clause.line, written, words, *mapped)
 
 
-def _about(reading: Reading, section: Section, task: Task) -> list[Note]:
-    """The reader's notes on the section that counts, and one note for each other section."""
+def _section_notes(reading: Reading, section: Section, task: Task) -> list[Note]:
+    """Return the reader's notes on the section that was taken, and one note for each other section."""
     ends = [later.line for later in reading.sections[1:]]
     notes = []
-    for found, end in zip(reading.sections, [*ends, float("inf")], strict=True):
-        own = [note for note in reading.notes if found.line <= note.line < end]
-        if found is section or (not found.task and not found.clauses):
-            notes += own
-        elif found.clauses:
-            what = "is another version" if _same(found.task, task) else "was not asked for"
-            named = repr(found.task) if found.task else "what stands before any name"
-            notes.append(Note(found.line, f"{named} {what}; {counted(len(found.clauses), 'step')} left out"))
+    for other, end in zip(reading.sections, [*ends, float("inf")], strict=True):
+        if other is section or (not other.task and not other.clauses):
+            notes += [note for note in reading.notes if other.line <= note.line < end]
+        elif other.clauses:
+            what = "is another version" if _same(other.task, task) else "was not requested"
+            name = repr(other.task) if other.task else "the text before any name"
+            notes.append(Note(other.line, f"{name} {what}; {counted(len(other.clauses), 'step')} left out"))
     return notes
 
 
 def _why_none(reading: Reading, steps: list[DecodedStep], task: Task, text: str) -> str:
     if steps:
         kept = f"none of its {counted(len(steps), 'step')} for {task.name} could be kept"
-        return f"{kept}; of the first: {steps[0].dropped}"
+        return f"{kept}; for the first: {steps[0].dropped}"
     if not text.strip():
         return "the text is empty"
     if others := sorted({other.task for other in reading.sections if other.clauses}):
@@ -216,15 +213,15 @@ _OPENS = r"<think(?:ing)?>|\[think\]|<\|channel\|>(?:analysis|commentary)"
 _CLOSES = r"</think(?:ing)?>|\[/think\]|<\|channel\|>final[^\n]{0,80}?<\|message\|>"
 _TAG = re.compile(f"(?P<opens>{_OPENS})|{_CLOSES}", re.IGNORECASE)
 _LINE_ENDS = re.compile(r"[ \t\r]*(?:\n|\Z)")
-_COMMENT = re.compile(r"#(?!\w)")  # "#2" is none
+_COMMENT = re.compile(r"#(?!\w)")  # "#2" is not a comment
 _IS_JSON = re.compile(r"\s*(?:```\w*\s*)?\{")
 
 
 def without_thoughts(text: str, notes: list[Note]) -> str:
-    """An answer without the model's thoughts, which may hold drafts. They get a note; every line keeps its number.
+    """Return an answer without the model's thoughts, which may hold drafts; add a note. Lines keep their numbers.
 
-    A closing tag alone closes what began before the text, if it ends its line outside of a plan's comments. An opening
-    tag in a comment or a string opens nothing. The tags of gpt-oss always count. JSON has no thoughts.
+    A closing tag without an opening one ends a thought that began before the text, if the tag ends its line and is not
+    in a comment. An opening tag in a comment or a string is ignored. gpt-oss's tags always count. JSON has no thoughts.
     """
     spans, opened, at, comment, quotes = list[tuple[int, int]](), None, 0, False, 0
     for tag in _TAG.finditer("" if _IS_JSON.match(text) else text):
@@ -245,8 +242,8 @@ def without_thoughts(text: str, notes: list[Note]) -> str:
         spans.append((opened, len(text)))
     if not spans:
         return text
-    how = "" if opened is None else ", and is cut off there"
-    notes.append(Note(text.count("\n", 0, spans[0][0]) + 1, f"thinks aloud; that is left out{how}"))
+    how = "" if opened is None else ", and cut off there"
+    notes.append(Note(text.count("\n", 0, spans[0][0]) + 1, f"a thought is left out{how}"))
     kept, at = list[str](), 0
     for start, end in spans:
         kept += [text[at:start], "\n" * text.count("\n", start, end)]

@@ -1,40 +1,147 @@
-"""Plans on disk: .plan files, folders of them, JSON of language models' pairs."""
+"""Plans as text and on disk: the chain_py format of .plan files, folders of them, and JSON of (condition, skill) pairs.
+
+Reading is strict here. :func:`~lw_torchrl.decode_plan` reads what language models write.
+"""
 
 from __future__ import annotations
 
+import re
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Literal
 
-from lw_torchrl._util.checks import shown, typed
+from lw_torchrl._util.checks import did_you_mean, shown, typed
 from lw_torchrl._util.files import AnyPath, parse_json, read_text, write_text
 from lw_torchrl.language.nearest import nearest_query
-from lw_torchrl.language.plan_text import MOST_STEPS, PLAN_LIMIT, no_task, too_many_steps
-from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, PlanError, Plans, PlanStep, as_plans, parse_plan
-from lw_torchrl.language.queries import QueryError
+from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, PlanError, Plans, PlanStep, as_plans
+from lw_torchrl.language.queries import Query, QueryError, check_query
 from lw_torchrl.language.tasks import MT10, TASKS, Tasks
 
-_MOST_PAIRS = 2_000  # of a file, each compared with all queries of its task
+PLAN_LIMIT = 2**18  # characters of a plan's text, and bytes of a file of plans; a limit to the time of reading
+_TEXT = r'"((?:[^"\\]|\\.)*)"|\'((?:[^\'\\]|\\.)*)\''
+_DEF = re.compile(r"def\s+([A-Za-z]\w*)\s*\(\s*robot\s*\)\s*:")
+_CHECK = re.compile(rf"if\s+check\s*\(\s*(?:{_TEXT})\s*\)\s*:")
+_SKILL = re.compile(rf"robot\.([A-Za-z]\w*)\s*\(\s*+(?:{_TEXT})?\s*+(?:,?\s*+goal\s*=\s*(?:{_TEXT}))?\s*+\)")
+
+
+def parse_plan(text: str, task: str | None = None, source: str = "plan", tasks: Tasks = TASKS) -> ConditionalPlan:
+    """Parse a plan in the chain_py format. It is never executed: every line is matched against a few forms::
+
+        def drawer_open(robot):
+            # The gripper has to come from above.
+            if check("the robot's gripper is not vertically aligned with the drawer handle"):
+                robot.place("the gripper above the drawer handle")
+
+    A goal other than the skill's usual one follows the skill: ``robot.place("...", goal="the gripper is open")``.
+
+    Args:
+        text: the plan.
+        task: the expected task; None accepts the one that its ``def`` line names.
+        source: the text's name in errors.
+        tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
+
+    Raises:
+        PlanError: the text is not a plan; the message names the first faulty line.
+
+    Source: paper section 'Conditional Plan Generation' and its figure of a chain_py plan.
+    """
+    plan, faults = check_plan(text, task, source, tasks)
+    if plan is None:
+        raise PlanError(faults[0])
+    return plan
+
+
+@typed
+def check_plan(
+    text: str, task: str | None = None, source: str = "plan", tasks: Tasks = TASKS
+) -> tuple[ConditionalPlan | None, list[str]]:
+    """Parse a plan like :func:`parse_plan`, but return all its faults in the order of the lines, with None as plan."""
+    if len(text) > PLAN_LIMIT:
+        return None, [f"{source}: a plan's text must have at most {PLAN_LIMIT} characters, got {len(text)}"]
+    name: str | None = None
+    condition: Query | None = None
+    is_open = False  # a condition, faulty or not, waits for its skill
+    faults: list[str] = []
+    steps: list[PlanStep] = []
+    reason: list[str] = []
+    for number, raw in enumerate(text.splitlines(), 1):
+        line, where, fault = raw.strip(), f"{source}, line {number}", ""
+        if not line:
+            continue
+        if line.startswith("#"):
+            if name is not None:
+                reason.append(line.lstrip("# "))
+        elif match := _DEF.fullmatch(line):
+            if name is not None:
+                return None, [*faults, f"{where}: a second plan begins; a plan file holds one"]
+            name = match[1].replace("__", "/").replace("_", "-")
+            if name not in tasks:
+                return None, [*faults, f"{where}: {shown(name)} is not a task{did_you_mean(name, tasks)}"]
+            if task is not None and name != task:
+                return None, [*faults, f"{where}: this is a plan for {name!r}, expected one for {task!r}"]
+        elif name is None:
+            fault = f"expected 'def task_name(robot):' before {shown(line)}"
+        elif match := _CHECK.fullmatch(line):
+            if is_open:
+                fault = 'the condition above has no skill; expected robot.verb("details")'
+            is_open, condition = True, None
+            try:
+                condition = check_query(_unquote(match, 1), tasks[name])
+            except ValueError as error:
+                fault = fault or str(error)
+        elif match := _SKILL.fullmatch(line):
+            if not is_open:
+                fault = 'the skill has no condition; expected if check("condition"): above it'
+            elif condition is not None:
+                goal = _unquote(match, 4)
+                try:
+                    reached = check_query(goal, tasks[name]) if goal else None
+                    skill = f"{match[1]} {_unquote(match, 2)}"
+                    steps.append(PlanStep(condition, skill, " ".join(reason), reached))
+                except ValueError as error:
+                    fault = f"goal: {error}"
+            is_open, condition, reason = False, None, []
+        else:
+            fault = f'expected a comment, if check("condition"): or robot.verb("details"), got {shown(line)}'
+            if line.startswith("if"):
+                is_open, condition = True, None
+        if fault:
+            faults.append(f"{where}: {fault}")
+    if not faults and name is None:
+        faults.append(f"{source}: no plan found; a plan begins with 'def task_name(robot):'")
+    elif not faults and is_open:
+        faults.append(f"{source}: the last condition has no skill")
+    if faults or name is None:
+        return None, faults
+    try:
+        return ConditionalPlan(name, tuple(steps), tasks[name]), []
+    except PlanError as error:
+        return None, [str(error)]
+
+
+def _unquote(match: re.Match[str], group: int) -> str:
+    return re.sub(r"\\(.)", r"\1", match[group] or match[group + 1] or "").strip()
 
 
 @typed
 def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks: Tasks = TASKS) -> Plans:
     """Load plans.
 
-    A .json file maps task names to lists of (condition, skill) pairs, at its top or under the key "plans", as language
-    models wrote them. A condition outside the query language is replaced by the nearest query (:func:`nearest_query`),
-    and the step's ``reason`` keeps its words.
+    A .json file maps task names to lists of (condition, skill) pairs, at its top or under the key "plans". A condition
+    outside the query language is replaced by the nearest query (:func:`nearest_query`), and kept as the step's
+    ``reason``.
 
     Args:
-        source: "MT10" or "MT50" for the shipped plans of a set; otherwise the path of a .plan or .json file, or of a
-            folder of .plan files. A .plan file may have any name but that of another task.
-        skills: which of the shipped plans: "own", where every step has a scripted skill; "MT10", where every step is
-            worded as in the plans of MT10, for policies that have only seen these.
-        tasks: whose objects the conditions name, by task name, as from :func:`~lw_torchrl.load_tasks`.
+        source: "MT10" or "MT50" for the shipped plans; or the path of a .plan or .json file, or of a folder of .plan
+            files. A .plan file may have any name except another task's.
+        skills: which shipped plans: "own", where every step has a scripted skill; "MT10", where every step is worded as
+            in the plans of MT10, for policies that have only seen these.
+        tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
 
     Raises:
-        PlanError: (a ValueError) a file holds no valid plan, or one for another task than the one it is named after.
+        FileNotFoundError: there is no such file, or no plan in the folder.
+        PlanError: (a ValueError) a file is not a valid plan, or is for another task than its name says.
 
     Example:
         >>> load_plans("MT10")["reach"].task
@@ -42,9 +149,9 @@ def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks
     """
     if source in ("MT10", "MT50"):
         data = files("lw_torchrl.language") / "data"
-        other = "plans_mt10_skills" if skills == "MT10" else "plans"
+        folder = "plans_mt10_skills" if skills == "MT10" else "plans"
         names = MT10 if source == "MT10" else tuple(TASKS)
-        return _read_all([data / ("plans" if task in MT10 else other) / f"{task}.plan" for task in names], tasks)
+        return _read_all([data / ("plans" if task in MT10 else folder) / f"{task}.plan" for task in names], tasks)
     if skills != "own":
         raise ValueError(f"skills={skills!r} is for the shipped plans, 'MT10' and 'MT50', got source {str(source)!r}")
     path = Path(source)
@@ -52,46 +159,41 @@ def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks
         raise FileNotFoundError(f"no plan file or folder {str(path)!r}; 'MT10' and 'MT50' name the shipped plans")
     if path.suffix == ".json":
         return _read_pairs(path, tasks)
-    # A name with a dot in front is what a killed save_plans leaves.
-    listed = [path] if path.is_file() else sorted(p for p in path.glob("*.plan") if p.name[0] != ".")
-    if not listed:
-        how = "lw.decode_plan reads a language model's answer, lw.save_plans writes .plan files"
-        raise FileNotFoundError(f"the folder {str(path)!r} holds no .plan files; {how}")
-    return _read_all(list[Traversable](listed), tasks)
+    # A killed save_plans leaves files whose names start with a dot.
+    paths = [path] if path.is_file() else sorted(p for p in path.glob("*.plan") if p.name[0] != ".")
+    if not paths:
+        hint = "lw.decode_plan reads a language model's answer, lw.save_plans writes .plan files"
+        raise FileNotFoundError(f"the folder {str(path)!r} holds no .plan files; {hint}")
+    return _read_all(list[Traversable](paths), tasks)
 
 
-def _read_all(found: list[Traversable], tasks: Tasks) -> Plans:
-    plans: dict[str, tuple[str, ConditionalPlan]] = {}
-    for file in found:
-        stem = file.name.removesuffix(".plan").replace("__", "/")
-        text = read_text(file, PlanError, limit=PLAN_LIMIT)
-        plan = parse_plan(text, stem if stem in tasks else None, file.name, tasks)
-        first, _ = plans.setdefault(plan.task, (file.name, plan))
-        if first != file.name:
-            raise PlanError(f"{file.name}: a second plan for {plan.task!r}; {first} holds one, too")
-    return Plans([plan for _, plan in plans.values()])
+def _read_all(paths: list[Traversable], tasks: Tasks) -> Plans:
+    plans: dict[str, ConditionalPlan] = {}
+    names: dict[str, str] = {}
+    for path in paths:
+        stem = path.name.removesuffix(".plan").replace("__", "/")
+        text = read_text(path, PlanError, limit=PLAN_LIMIT)
+        plan = parse_plan(text, stem if stem in tasks else None, path.name, tasks)
+        if plan.task in plans:
+            raise PlanError(f"{path.name}: a second plan for {plan.task!r}; {names[plan.task]} holds one, too")
+        plans[plan.task], names[plan.task] = plan, path.name
+    return Plans(plans)
 
 
 def _read_pairs(path: Path, tasks: Tasks) -> Plans:
     try:
-        whole = parse_json(read_text(path, PlanError, limit=PLAN_LIMIT).encode())
+        content = parse_json(read_text(path, PlanError, limit=PLAN_LIMIT).encode())
     except ValueError as error:
         raise PlanError(f"{path.name}: expected JSON, task names with lists of pairs: {error}") from error
-    found = whole.get("plans", whole)
-    if not isinstance(found, dict):
-        raise PlanError(f"{path.name}: expected task names with lists of (condition, skill) pairs, got {shown(found)}")
-    if (number := sum(len(pairs) for pairs in found.values() if isinstance(pairs, list))) > _MOST_PAIRS:
-        raise PlanError(f"{path.name}: its plans must have at most {_MOST_PAIRS} pairs in all, got {number}")
+    rows = content.get("plans", content)
+    if not isinstance(rows, dict):
+        raise PlanError(f"{path.name}: expected task names with lists of (condition, skill) pairs, got {shown(rows)}")
     plans = []
-    for name, pairs in found.items():
+    for name, pairs in rows.items():
         if name not in tasks:
-            raise PlanError(no_task(path.name, name, tasks))
-        if not isinstance(pairs, list):
-            raise PlanError(f"{path.name}, {name}: expected a list of (condition, skill) pairs, got {shown(pairs)}")
-        if len(pairs) > MOST_STEPS:
-            raise PlanError(too_many_steps(f"{path.name}, {name}", len(pairs)))
+            raise PlanError(f"{path.name}: {shown(name)} is not a task{did_you_mean(name, tasks)}")
         steps = []
-        for number, pair in enumerate(pairs, 1):
+        for number, pair in enumerate(pairs if isinstance(pairs, list) else [pairs], 1):
             where = f"{path.name}, {name}, step {number}"
             if not (isinstance(pair, list) and len(pair) == 2 and all(isinstance(text, str) for text in pair)):
                 raise PlanError(f"{where}: expected a condition and a skill, two strings, got {shown(pair)}")
@@ -106,9 +208,12 @@ def _read_pairs(path: Path, tasks: Tasks) -> Plans:
 
 @typed
 def save_plans(plans: AnyPlans, folder: AnyPath) -> list[Path]:
-    """Write each plan to ``folder``/<task>.plan, "__" for a slash; a file is replaced whole or not at all."""
+    """Write each plan to ``folder``/<task>.plan, with "__" for a slash, and return the paths.
+
+    A file is replaced whole or not at all.
+    """
     texts = {Path(folder) / f"{task.replace('/', '__')}.plan": str(plan) for task, plan in as_plans(plans).items()}
     Path(folder).mkdir(parents=True, exist_ok=True)
-    for file, text in texts.items():
-        write_text(file, text)
+    for path, text in texts.items():
+        write_text(path, text)
     return list(texts)

@@ -4,67 +4,85 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from hashlib import sha256
-from types import NoneType
-from typing import Any, NoReturn
+from typing import Any
 
-from lw_torchrl._util.checks import Probability, shown, typed, typed_fields
+from lw_torchrl._util.checks import Probability, check_value, shown, typed, typed_fields
 from lw_torchrl.language.layout import METAWORLD, Layout
-from lw_torchrl.language.plan_text import MOST_STEPS, function_head, one_line, quote, read_plan_text, too_many_steps
 from lw_torchrl.language.queries import Query, check_query, read_query
 from lw_torchrl.language.relations import comparisons
 from lw_torchrl.language.roles import StepRole
 from lw_torchrl.language.skills import canonical_skill, load_skills
-from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task, one_layout, role_object, task_ids
+from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task, one_layout, role_object, task_ids
+
+MOST_STEPS = 1_000  # of a plan; the longest shipped one has 6
 
 
 class PlanError(ValueError):
-    """A text or a list of steps that is no conditional plan."""
+    """A text or a list of steps that is not a conditional plan."""
+
+
+def one_line(text: str) -> str:
+    """Return a description or a reason with spaces instead of line ends."""
+    return " ".join(text.split())
+
+
+def quote(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def function_head(task: Task) -> str:
+    """Return the first lines of a task's function: a comment with its description, and ``def``."""
+    name = task.name.replace("/", "__").replace("-", "_")
+    return f"# {task.name}: {one_line(task.description)}\ndef {name}(robot):\n"
 
 
 @lru_cache(maxsize=1024)
 def usual_goal(skill: str, task: Task) -> Query | None:
-    """The state that the scripted skill of this text steers to, if it has one that the task's queries can say."""
-    found = load_skills().get(skill)
-    return None if found is None else read_query(found.variants.get(task.name, found).goal, task)
+    """Return the state that a scripted skill steers to; None if it has none, or if the task lacks its objects."""
+    scripted = load_skills().get(skill)
+    return None if scripted is None else read_query(scripted.variants.get(task.name, scripted).goal, task)
 
 
 @typed_fields
 @dataclass(frozen=True)
 class PlanStep:
-    """One step: while ``condition`` holds, do ``skill``. Its queries are of the plan's task."""
+    """A step of a plan: while ``condition`` is true, carry out ``skill``. Its queries are of the plan's task."""
 
     condition: Query
     skill: str  # plain English, "place the gripper above the puck"
-    reason: str = field(default="", compare=False)  # a comment for the reader; it does not change what the plan does
-    goal: Query | None = None  # the state to reach, if not the skill's usual one; :attr:`ConditionalPlan.goals` has all
-    role: StepRole | None = None  # what the step does to which object, in plans of :func:`~lw_torchrl.canonical_plan`
+    reason: str = field(default="", compare=False)  # a comment for the reader, without effect on the plan
+    goal: Query | None = None  # the state to reach, if it is not the skill's usual one; see ConditionalPlan.goals
+    role: StepRole | None = None  # the action and its objects, in plans of :func:`~lw_torchrl.canonical_plan`
 
     def mentions(self, task: Task) -> set[str]:
-        """The names of the objects that the condition or the skill mentions; "target location" may stand for the goal.
+        """Return the names of the objects that the condition or the skill mentions; the goal may be "target location".
 
-        A role says which objects the skill mentions; without one they are found in the skill's text.
+        The role tells the objects of the skill. Without a role, they are searched for in its text.
         """
         clauses = self.condition.clauses
         names = {name for clause in clauses for name in (clause.subject, clause.object) if name is not None}
         if self.role is not None:
             return names.union(self.role.objects)
-        longest = sorted(task.object_names, key=len, reverse=True)  # "drawer handle" is not "drawer"
+        longest = sorted(task.object_names, key=len, reverse=True)  # "drawer handle" before "drawer"
         return names.union(re.findall(rf"(?<![\w-])(?:{'|'.join(map(re.escape, longest))})(?![\w-])", self.skill))
 
 
 @typed_fields
 @dataclass(frozen=True)
 class ConditionalPlan:
-    """The steps that carry out one task, as in the paper's section 'Conditional Plan Generation'.
+    """A plan for one task: 1 to 1,000 steps, as in the paper's section 'Conditional Plan Generation'.
 
-    It has 1 to 1,000 steps, in canonical spelling, so that its text reads back as the same plan: conditions as
-    ``str(query)``, "the" before nouns. Equal conditions, skills and goals make equal plans. A plan of
-    :func:`~lw_torchrl.canonical_plan` has as its confidence the fraction of typical states in which the plan, as
-    written, does what its motion needs.
+    Its conditions and skills are kept in canonical spelling (``str(query)``, "the" before nouns), so that its text
+    reads back as the same plan. Two plans are equal if their conditions, skills and goals are. In a plan of
+    :func:`~lw_torchrl.canonical_plan`, ``confidence`` is the fraction of typical states in which the plan, as written,
+    does what its motion needs.
+
+    Raises:
+        PlanError: a condition, a skill or a role does not suit the task; the message names the step.
 
     Example:
         >>> plan = ConditionalPlan.from_pairs("reach", [("gripper is open", "move the gripper to the target")])
@@ -74,66 +92,56 @@ class ConditionalPlan:
 
     task: str
     steps: tuple[PlanStep, ...]
-    # The task whose objects the conditions name; None for the shipped task of that name.
+    # The task whose objects the conditions name; by default the shipped task of that name.
     definition: Task = field(default=None, compare=False, repr=False)  # type: ignore[assignment]
     confidence: Probability | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.steps, str) or not isinstance(self.steps, Iterable):
-            raise TypeError(f"steps must be a tuple of PlanStep, got {shown(self.steps)}")
-        if not isinstance(self.definition, (Task, NoneType)):
-            raise TypeError(f"definition must be a Task, got {shown(self.definition)}")
-        listed, definition = tuple(self.steps), self.definition or TASKS[check_task(self.task)]
-        if len(listed) > MOST_STEPS:
-            raise PlanError(too_many_steps(f"plan of task {self.task!r}", len(listed)))
-        if definition.name != self.task:
-            raise PlanError(f"definition of plan {self.task!r} is of another task, {definition.name!r}")
-        object.__setattr__(self, "definition", definition)
+        task, plan = self.definition or TASKS[check_task(self.task)], f"plan {self.task!r}"
+        if not 1 <= len(self.steps) <= MOST_STEPS:
+            raise PlanError(f"{plan} must have 1 to {MOST_STEPS} steps, got {len(self.steps)}")
+        if task.name != self.task:
+            raise PlanError(f"definition of {plan} is of another task, {task.name!r}")
         steps = []
-        for number, step in enumerate(listed, 1):
-            where = f"step {number} of plan {self.task!r}"
-            if not isinstance(step, PlanStep):
-                raise TypeError(f"{where} must be a PlanStep with a skill in words, got {step!r}")
+        for number, step in enumerate(self.steps, 1):
+            check_value(f"step {number} of {plan}", step, PlanStep)
             try:
-                condition, skill = check_query(step.condition, definition), canonical_skill(step.skill, definition)
-                goal = None if step.goal is None else check_query(step.goal, definition)
+                condition, skill = check_query(step.condition, task), canonical_skill(step.skill, task)
+                goal = None if step.goal is None else check_query(step.goal, task)
                 for name in () if step.role is None else step.role.objects:
-                    role_object(definition, name)
+                    role_object(task, name)
             except ValueError as error:
-                raise PlanError(f"{where}: {error}") from error
-            goal = None if goal == usual_goal(skill, definition) else goal
+                raise PlanError(f"step {number} of {plan}: {error}") from error
+            goal = None if goal == usual_goal(skill, task) else goal
             steps.append(replace(step, condition=condition, skill=skill, goal=goal))
-        if not steps:
-            raise PlanError(f"plan of task {self.task!r} must have at least one step, got none")
+        object.__setattr__(self, "definition", task)
         object.__setattr__(self, "steps", tuple(steps))
 
     @classmethod
     def from_pairs(cls, task: str | Task, pairs: Iterable[tuple[str | Query, str]]) -> ConditionalPlan:
-        """A plan from (condition, skill) pairs, the conditions in any accepted spelling."""
+        """Return a plan of (condition, skill) pairs; conditions may be texts in any accepted spelling."""
         definition = get_task(task)
         steps = tuple(PlanStep(check_query(query, definition), skill) for query, skill in pairs)
         return cls(definition.name, steps, definition)
 
     @property
     def goals(self) -> tuple[Query | None, ...]:
-        """The state that each step's skill is to reach: its own goal, else the skill's usual one; None without both."""
+        """The state to reach in each step: the step's goal, else the skill's usual one, else None."""
         return tuple(step.goal or usual_goal(step.skill, self.definition) for step in self.steps)
 
     def __str__(self) -> str:
-        """The plan as text in the chain_py format; :func:`parse_plan` reads it back."""
+        """Return the plan as text in the chain_py format, which :func:`parse_plan` reads."""
         lines = []
         for step in self.steps:
             if reason := one_line(step.reason).lstrip("# "):
                 lines.append(f"    # {reason}")
             verb, _, details = step.skill.partition(" ")
-            said = [quote(details)]
-            if step.goal is not None:
-                said.append(f"goal={quote(str(step.goal))}")
-            lines += [f"    if check({quote(str(step.condition))}):", f"        robot.{verb}({', '.join(said)})"]
+            goal = "" if step.goal is None else f", goal={quote(str(step.goal))}"
+            lines += [f"    if check({quote(str(step.condition))}):", f"        robot.{verb}({quote(details)}{goal})"]
         return function_head(self.definition) + "".join(f"{line}\n" for line in lines)
 
     def to_json(self) -> dict[str, Any]:
-        """The plan as chain_py text, its task unless this is a shipped one, and the roles and confidence if any."""
+        """Return the plan as JSON: its text, and its task (unless it is shipped), roles and confidence, if any."""
         row: dict[str, Any] = {"plan": str(self)}
         if self.definition != TASKS.get(self.task):
             row["task"] = self.definition.to_json()
@@ -144,6 +152,8 @@ class ConditionalPlan:
     @classmethod
     def from_json(cls, name: str, row: Any) -> ConditionalPlan:
         """Rebuild the plan of the task ``name`` from :meth:`to_json`; raise :class:`PlanError` for any other value."""
+        from lw_torchrl.language.plan_files import parse_plan  # here, because plan_files imports this module
+
         where, keys = f"plan of {shown(name)}", ("plan", "task", "roles", "confidence")
         if not isinstance(row, dict) or not isinstance(row.get("plan"), str) or set(row) - {*keys}:
             raise PlanError(f'{where} must be like {{"plan": text, "task": table}}, got {shown(row)}')
@@ -164,68 +174,21 @@ class ConditionalPlan:
             raise PlanError(f"{where}: {error}") from error
 
 
-def check_plan(
-    text: str, task: str | None = None, source: str = "plan", tasks: Tasks = TASKS
-) -> tuple[ConditionalPlan | None, list[str]]:
-    """As :func:`parse_plan`, but the plan, None if it has faults, and all its faults in the order of the lines."""
-    faults: list[str] = []
-    return _read(text, task, source, tasks, faults.append), faults
-
-
-def parse_plan(text: str, task: str | None = None, source: str = "plan", tasks: Tasks = TASKS) -> ConditionalPlan:
-    """Read one plan in the chain_py format. It is not executed: every line is matched against a few forms::
-
-        def drawer_open(robot):
-            # The gripper has to come from above.
-            if check("the robot's gripper is not vertically aligned with the drawer handle"):
-                robot.place("the gripper above the drawer handle")
-
-    A goal that is not the skill's usual one stands behind it: ``robot.place("...", goal="the gripper is open")``.
-
-    Args:
-        text: the plan; its first fault is a :class:`PlanError` with the line.
-        task: the task it must be for; None for the one that its ``def`` line names.
-        source: the text's name in errors.
-        tasks: whose objects the conditions name, by task name, as from :func:`~lw_torchrl.load_tasks`.
-
-    Source: paper section 'Conditional Plan Generation' and its figure of a chain_py plan.
-    """
-
-    def refuse(fault: str) -> NoReturn:
-        raise PlanError(fault)
-
-    plan = _read(text, task, source, tasks, refuse)
-    assert plan is not None  # or a fault was refused
-    return plan
-
-
-def _read(text: str, task: str | None, source: str, tasks: Tasks, report: Callable[..., Any]) -> ConditionalPlan | None:
-    if (found := read_plan_text(text, task, source, tasks, report)) is None:
-        return None
-    name, steps = found
-    try:
-        return ConditionalPlan(name, tuple(PlanStep(*step) for step in steps), tasks[name])
-    except PlanError as error:
-        return report(str(error))
-
-
 class Plans(Mapping[str, ConditionalPlan]):
-    """An immutable mapping from task names, sorted, to their plans. ``layout`` is that of the tasks."""
+    """An immutable mapping from task names, sorted, to their plans. ``layout`` is the layout of the tasks."""
 
     @typed
     def __init__(self, plans: Mapping[str, ConditionalPlan] | Iterable[ConditionalPlan]) -> None:
         listed = list(plans.values() if isinstance(plans, Mapping) else plans)
         for plan in listed:
             if not isinstance(plan, ConditionalPlan):
-                made = "from_pairs makes one of conditions and skills, QueryProgram takes queries alone"
-                raise TypeError(f"plans must hold ConditionalPlan, got {plan!r} ({type(plan).__name__}); {made}")
+                hint = "ConditionalPlan.from_pairs makes one; QueryProgram accepts queries"
+                raise TypeError(f"plans must hold ConditionalPlan, got {shown(plan)}; {hint}")
         for name, plan in plans.items() if isinstance(plans, Mapping) else ():
             if name != plan.task:
                 raise PlanError(f"plans[{name!r}] is a plan for another task, {plan.task!r}")
-        if len({plan.task for plan in listed}) != len(listed):
-            raise PlanError("plans must hold one plan for each task")
-        if not listed:
-            raise PlanError("plans must hold at least one plan, got none")
+        if not listed or len({plan.task for plan in listed}) != len(listed):
+            raise PlanError(f"plans must hold at least one plan, and one for each task, got {len(listed)}")
         self._plans = {plan.task: plan for plan in sorted(listed, key=lambda p: p.task)}
         try:
             self.layout: Layout = one_layout(plan.definition for plan in listed)
@@ -246,7 +209,7 @@ class Plans(Mapping[str, ConditionalPlan]):
 
     @cached_property
     def num_steps(self) -> int:
-        """S, the steps of the longest plan."""
+        """S, the number of steps of the longest plan."""
         return max(len(plan.steps) for plan in self.values())
 
     @cached_property
@@ -266,44 +229,47 @@ class Plans(Mapping[str, ConditionalPlan]):
 
     @property
     def numbers(self) -> dict[str, int]:
-        """A number for each task's plan, below 2**60: plans with another :attr:`fingerprint` have another number."""
+        """A number below 2**60 for each task's plan, derived from its :attr:`fingerprint`."""
         return {task: int(Plans([plan]).fingerprint[:15], 16) for task, plan in self.items()}
 
     @property
     def fingerprint(self) -> str:
-        """32 hex digits of all that queries and attention depend on: each step's condition and skill, the number of
-        steps, the objects of each task with their positions and offsets, and what each used relation means now.
+        """A hash, 32 hex digits, of everything that queries and attention depend on.
 
-        Plans with the same fingerprint give the same ``qaf``. Reasons and descriptions do not count.
+        That is each step's condition and skill, the number of steps, the objects of each task with their positions and
+        offsets, and the current meaning of the used relations, but not reasons and descriptions. Plans with the same
+        fingerprint give the same ``qaf``.
         """
         used = {clause.predicate for plan in self.values() for step in plan.steps for clause in step.condition.clauses}
 
         def facts(plan: ConditionalPlan) -> dict[str, Any]:
-            objects = [(one.name, one.position, list(map(float, one.offset))) for one in plan.definition.objects]
+            objects = [
+                (named.name, named.position, list(map(float, named.offset))) for named in plan.definition.objects
+            ]
             return {"steps": [(str(step.condition), step.skill) for step in plan.steps], "objects": objects}
 
-        told = {
+        content = {
             "steps": self.num_steps,
             "predicates": {name: [asdict(part) for part in comparisons(name, self.layout)] for name in sorted(used)},
             "plans": {task: facts(plan) for task, plan in self.items()},
         }
         if self.layout != METAWORLD:
-            told["layout"] = self.layout.to_json()
-        return sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:32]
+            content["layout"] = self.layout.to_json()
+        return sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
 
     def to_json(self) -> dict[str, Any]:
-        """Return each task's plan as :meth:`ConditionalPlan.to_json` has it."""
+        """Return each task's :meth:`ConditionalPlan.to_json`."""
         return {task: plan.to_json() for task, plan in self.items()}
 
     @classmethod
-    def from_json(cls, found: Any) -> Plans:
-        """The plans of :meth:`to_json`; any other value is a :class:`PlanError`."""
-        if not isinstance(found, dict):
-            raise PlanError(f"plans must be an object of task names and plans, got {shown(found)}")
-        return cls([ConditionalPlan.from_json(name, row) for name, row in found.items()])
+    def from_json(cls, row: Any) -> Plans:
+        """Rebuild the plans from :meth:`to_json`; raise :class:`PlanError` for any other value."""
+        if not isinstance(row, dict):
+            raise PlanError(f"plans must be an object of task names and plans, got {shown(row)}")
+        return cls([ConditionalPlan.from_json(name, plan) for name, plan in row.items()])
 
     def differences(self, other: Plans) -> list[str]:
-        """The common tasks whose plans have other fingerprints."""
+        """Return the common tasks whose plans have different fingerprints."""
         theirs = other.numbers
         return [task for task, number in self.numbers.items() if number != theirs.get(task, number)]
 
@@ -315,14 +281,14 @@ class Plans(Mapping[str, ConditionalPlan]):
 
 
 AnyPlans = Plans | Mapping[str, ConditionalPlan]
-"""What an argument ``plans`` takes: :class:`Plans`, or a mapping from task names that they are made of."""
+"""The type of arguments ``plans``: :class:`Plans`, or a mapping from task names to plans."""
 
 
 def as_plans(plans: AnyPlans, argument: str = "plans") -> Plans:
-    """``plans`` as :class:`Plans`; a mapping is checked and copied. Errors name the argument."""
+    """Return ``plans`` as :class:`Plans`, a mapping checked and copied. Errors name the argument."""
     if isinstance(plans, Plans):
         return plans
-    if isinstance(plans, ConditionalPlan) or not isinstance(plans, Mapping):
+    if not isinstance(plans, Mapping):
         raise TypeError(f"{argument} must map task names to ConditionalPlan, got {type(plans).__name__}")
     try:
         return Plans(plans)

@@ -19,17 +19,17 @@ from lw_torchrl.language.tasks import Task, get_task
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
 _MOST_CLAUSES = 64  # the tables have room for as many in every step
-_MOST_COMPARED = 8  # objects of a task whose queries are compared with the text of an error
+_MOST_COMPARED = 8  # objects whose queries are compared with a wrong text, a limit to the time of an error
 
 
 @dataclass(frozen=True)
 class Clause:
-    """One statement about one or two objects."""
+    """A statement about one or two objects."""
 
     subject: str
-    predicate: str  # one of the relations, "touching the table", or a state: "open", "closed"
+    predicate: str  # a relation, "touching the table", or a state such as "open"
     object: str | None = None  # the second object of a relation
-    negated: bool = False  # whether it says that the predicate does not hold
+    negated: bool = False
 
     def __str__(self) -> str:
         words = f"the {self.subject} is {'not ' if self.negated else ''}{self.predicate}"
@@ -38,7 +38,7 @@ class Clause:
 
 @dataclass(frozen=True)
 class Query:
-    """A conjunction of clauses; it holds where all of them hold. ``str`` gives the canonical spelling.
+    """A conjunction of clauses, which is true if all of them are. ``str`` gives the canonical spelling.
 
     Example:
         >>> str(parse_query("Is the gripper open and not above the puck?", task="pick-place"))
@@ -52,7 +52,7 @@ class Query:
 
 
 class QueryError(ValueError):
-    """A text that is no query of its task."""
+    """A text that is not a query of its task."""
 
 
 def check_length(text: str, parts: Sequence[str]) -> None:
@@ -62,38 +62,39 @@ def check_length(text: str, parts: Sequence[str]) -> None:
 
 
 @lru_cache(maxsize=256)
-def base_clauses(task: Task, said: tuple[str, ...]) -> tuple[Clause, ...]:
-    """The clauses that :func:`supported_queries` lists as texts; ``said`` names the relations and states."""
-    relations, states = ([name for name in said if name in table] for table in (RELATIONS, STATES))
+def base_clauses(task: Task, predicates: tuple[str, ...]) -> tuple[Clause, ...]:
+    """Return the clauses of :func:`supported_queries` with the given relations and states."""
+    relations, states = ([name for name in predicates if name in table] for table in (RELATIONS, STATES))
     clauses = []
     for first, second in permutations(task.object_names, 2):
         for relation in relations:
             if relation != "around" or first == GRIPPER:
                 clauses += [Clause(first, relation, second, negated) for negated in (False, True)]
-    things = [places(part) for part in task.layout.positions[1:-1]]
-    for thing in task.objects:
-        if not thing.ours and thing.position in things:
-            clauses += [Clause(thing.name, TOUCHING), Clause(thing.name, TOUCHING, negated=True)]
-    clauses += [Clause(thing.name, state) for thing in task.objects if thing.opening is not None for state in states]
+    movable = [places(part) for part in task.layout.positions[1:-1]]
+    for named in task.objects:
+        if not named.ours and named.position in movable:
+            clauses += [Clause(named.name, TOUCHING), Clause(named.name, TOUCHING, negated=True)]
+    clauses += [Clause(named.name, state) for named in task.objects if named.opening is not None for state in states]
     return (*clauses, Clause(GRIPPER, "open"), Clause(GRIPPER, "closed"))
 
 
 @typed
 def supported_queries(task: str | Task, published_only: bool = False) -> tuple[str, ...]:
-    """The base queries of a task, in canonical spelling.
+    """Return the base queries of a task, in canonical spelling.
 
-    :func:`parse_query` reads more: any relation between two different objects, "touching the table" for any object,
-    the negations of open, closed and other states, and conjunctions of all these.
+    :func:`parse_query` accepts more: any relation between two different objects, "touching the table" for any object,
+    negated states, and conjunctions of all these.
 
     Args:
-        published_only: only the paper's queries, without the points that we named and relations that were added.
+        published_only: return only the paper's queries, without our points and your relations.
 
     Example:
         >>> len(supported_queries("reach")), supported_queries("reach")[0]
         (52, "the robot's gripper is near the reach target")
     """
-    found, said = (get_task(task).published, PUBLISHED) if published_only else (get_task(task), tuple(PREDICATES))
-    return tuple(map(str, base_clauses(found, said)))
+    owner = get_task(task)
+    clauses = base_clauses(owner.published, PUBLISHED) if published_only else base_clauses(owner, tuple(PREDICATES))
+    return tuple(map(str, clauses))
 
 
 def _cut(text: str, most: int = 80) -> str:
@@ -101,37 +102,38 @@ def _cut(text: str, most: int = 80) -> str:
 
 
 class _ClauseParser:
-    """Reads one clause from left to right; an error points at the word."""
+    """A parser of one clause, from left to right, whose errors point at a word."""
 
     def __init__(self, words: Sequence[str], task: Task, text: str, explain: bool) -> None:
         self.words, self.task, self.text, self.explain, self.at = words, task, text, explain, 0
-        self.inferred = ""  # "the puck is", of a clause that leaves its subject out
+        self.inferred = ""  # "the puck is", if the clause leaves out its subject
         self.names = {name: name for name in task.object_names}
         self.names.update({alias: name for alias, name in _ALIASES.items() if alias not in self.names})
 
     def error(self, expected: str) -> QueryError:
-        if not self.explain:
-            return QueryError("no query")
-        found = f"{_cut(self.words[self.at], 40)!r} (word {self.at + 1})" if self.at < len(self.words) else "its end"
-        said = " ".join(self.words[max(0, self.at - 8) : self.at + 8])
-        close = process.extractOne((self.inferred + said)[:300], self.comparable(), scorer=fuzz.ratio)
+        if not self.explain:  # finding the nearest query takes most of an error's time
+            return QueryError("not a query")
+        word = f"{_cut(self.words[self.at], 40)!r} (word {self.at + 1})" if self.at < len(self.words) else "its end"
+        context = " ".join(self.words[max(0, self.at - 8) : self.at + 8])
+        close = process.extractOne((self.inferred + context)[:300], self.comparable(), scorer=fuzz.ratio)
         return QueryError(
-            f"query {_cut(self.text)!r} of task {self.task.name!r}: at {found} in {_cut(said, 60)!r}, "
+            f"query {_cut(self.text)!r} of task {self.task.name!r}: at {word} in {_cut(context, 60)!r}, "
             f"expected {expected}. The nearest query is {close[0]!r}; supported_queries({self.task.name!r}) lists all."
         )
 
     def comparable(self) -> tuple[str, ...]:
-        """The queries to compare with; if a task has many objects, those of objects that the text may mean."""
-        named = self.task.object_names
-        if len(named) <= _MOST_COMPARED:
+        """Return the queries to compare with: in a task with many objects, those of the most similar objects."""
+        names = self.task.object_names
+        if len(names) <= _MOST_COMPARED:
             return supported_queries(self.task)
-        said = (self.inferred + " ".join(self.words))[:300]
-        found = process.extract(said, named[1:], scorer=fuzz.partial_ratio, limit=_MOST_COMPARED - 1)
-        kept = {GRIPPER, *(name for name, _, _ in found)}
-        objects = tuple(one for one in self.task.objects if one.name in kept)
+        text = (self.inferred + " ".join(self.words))[:300]
+        similar = process.extract(text, names[1:], scorer=fuzz.partial_ratio, limit=_MOST_COMPARED - 1)
+        kept = {GRIPPER, *(name for name, _, _ in similar)}
+        objects = tuple(named for named in self.task.objects if named.name in kept)
         return supported_queries(replace(self.task, objects=objects))
 
     def take(self, phrase: str) -> bool:
+        """Consume a phrase if it comes next; return whether it did."""
         words = phrase.split()
         if list(self.words[self.at : self.at + len(words)]) != words:
             return False
@@ -139,6 +141,7 @@ class _ClauseParser:
         return True
 
     def name(self) -> str | None:
+        """Consume an object's name and return it; None if none comes next."""
         start = self.at
         self.at += self.at_article()
         for name in sorted(self.names, key=len, reverse=True):
@@ -188,14 +191,16 @@ class _ClauseParser:
 
 @typed
 def parse_query(text: str, task: str | Task) -> Query:
-    """Read an English condition about a state of ``task``.
+    """Parse an English condition on a state of ``task``.
 
-    Questions, capitals, articles or none, "the gripper", "isn't" are accepted, and clauses without the repeated subject
-    ("... is open and not above the puck").
+    It may be a question, in capitals, without articles, with "the gripper" or "isn't". A clause may leave out the
+    subject of the previous one ("... is open and not above the puck").
 
     Args:
-        text: "Is the gripper open and not above the puck?", or any other accepted spelling, of at most 64 clauses. For
-            any other text a :class:`QueryError` points at the word and names the nearest query.
+        text: "Is the gripper open and not above the puck?", of at most 64 clauses.
+
+    Raises:
+        QueryError: the text is not a query; the message points at the word and names the nearest query.
 
     Example:
         >>> str(parse_query("the gripper above the puck", task="push"))
@@ -207,7 +212,7 @@ def parse_query(text: str, task: str | Task) -> Query:
 
 
 def read_query(text: str, task: Task) -> Query | None:
-    """As :func:`parse_query`, but None for a text that is no query: most of an error's time goes to the nearest."""
+    """Parse a condition like :func:`parse_query`, but return None quickly if the text is not a query."""
     try:
         return _parse(text, task, explain=False)
     except QueryError:
@@ -226,13 +231,13 @@ def _parse(text: str, task: Task, explain: bool) -> Query:
 
 
 def check_query(query: str | Query, task: str | Task) -> Query:
-    """Return ``query`` as a :class:`Query` of ``task``: a text is parsed, a Query must name the task's objects."""
+    """Return ``query`` as a :class:`Query` of ``task``: parse a text, check a Query against the task's objects."""
     if not isinstance(query, Query):
         return parse_query(query, task)
     owner = get_task(task)
     if 0 < len(query.clauses) <= _MOST_CLAUSES and all(_is_of(clause, owner) for clause in query.clauses):
         return query
-    return parse_query(str(query), owner)  # reads aliases, or explains the fault
+    return parse_query(str(query), owner)  # resolves aliases, or explains the fault
 
 
 def _is_of(clause: Clause, task: Task) -> bool:

@@ -12,10 +12,10 @@ def answer(
     observation: Any, task_id: Any, ids: Any, row_of: Any, ends: Any, places: Any, metres: Any, bit: Any, flipped: Any,
     conjunction: Any, care: Any, want: Any, constants: Any, truth: Any,
 ) -> bool:  # fmt: skip
-    """Write the truth (B, S) bool of each row's queries, with the operations of the tables, in their order.
+    """Write the truth (B, S) bool of each row's queries, by the same operations as the tables and in the same order.
 
-    ``observation`` is (B, D) float32 or float64, metres, ``task_id`` (B,) int64; ``ids`` and what follows are the
-    tables of :class:`QueryFacts`. False for a task without queries, or an observation that holds NaN or infinity.
+    ``observation`` is (B, D) float32 or float64, metres; ``task_id`` is (B,) int64; ``ids`` to ``constants`` are the
+    tables of :class:`QueryFacts`. Return False for a task without queries, and for NaN or infinity.
     """
     size = observation.shape[1]
     numbers = np.empty(size + constants.shape[0], observation.dtype)
@@ -26,14 +26,14 @@ def answer(
         for i in range(size):
             number = observation[b, i]
             numbers[i] = number
-            finite &= number - number == 0
+            finite &= number - number == 0  # false for NaN and infinity
         task, row = task_id[b], -1
         if 0 <= task < len(row_of):
             row = row_of[task]
         else:
-            found = np.searchsorted(ids, task)
-            if found < len(ids) and ids[found] == task:
-                row = found
+            nearest = np.searchsorted(ids, task)
+            if nearest < len(ids) and ids[nearest] == task:
+                row = nearest
         if row < 0:
             return False
         t = np.uint64(row)

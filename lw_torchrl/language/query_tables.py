@@ -1,4 +1,4 @@
-"""What :class:`~lw_torchrl.QueryProgram` answers from: queries compiled to tensors, and to bits for its kernel."""
+"""The tables of :class:`~lw_torchrl.QueryProgram`: queries compiled to tensors, and to bits for its kernel."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from lw_torchrl.language.tasks import MT50, Task, one_layout, task_id
 
 
 class Atom(NamedTuple):
-    """A comparison of two positions. Where its sense is not "<", the opposite of its value is compared."""
+    """A comparison of two positions, brought to the form "value < threshold".
+
+    For the senses ">" and "<=" the positions are swapped, which negates the value, and so is the threshold's sign.
+    """
 
     first: TypedPosition
     second: TypedPosition
@@ -25,41 +28,43 @@ class Atom(NamedTuple):
     part: Comparison
 
     def coordinates(self, side: int, constants: list[float], size: int) -> list[int]:
-        """Where the coordinates of one position stand; those of 0 for an axis left out."""
+        """Return the index of each coordinate of one position; the index of 0.0 for unused axes."""
         position = (self.first, self.second)[side if self.part.sense == "<" else 1 - side]
         used = [c if axis in self.part.axes else 0.0 for axis, (_, c) in zip("xyz", position, strict=True)]
         return coordinate_indices(used, constants, size)
 
     @property
     def offset(self) -> list[float]:
-        """What is added to the difference of the positions, metres."""
+        """The metres that are added to the difference of the positions."""
         x, y, z = self.shift
-        used, sign = zip("xyz", (x, y, z + self.part.raise_z), strict=True), 1 if self.part.sense == "<" else -1
-        return [sign * metres if axis in self.part.axes else 0.0 for axis, metres in used]
+        axes, sign = zip("xyz", (x, y, z + self.part.raise_z), strict=True), 1 if self.part.sense == "<" else -1
+        return [sign * metres if axis in self.part.axes else 0.0 for axis, metres in axes]
 
     @property
     def threshold(self) -> float:
-        """Metres; the value is below it where the atom holds."""
+        """Metres; the value is below it if the atom is true (or false, if it is :attr:`flipped`)."""
         return self.part.threshold if self.part.sense == "<" else -self.part.threshold
 
     @property
     def far(self) -> bool:
-        return self.part.length and self.part.sense != "<"  # the opposite of a length is compared
+        """Whether the length must be negated: swapping the positions does not change a length."""
+        return self.part.length and self.part.sense != "<"
 
     @property
     def flipped(self) -> bool:
-        return self.part.sense == "<="  # the atom holds where its value is not below the threshold
+        """Whether the atom is true where its value is not below the threshold."""
+        return self.part.sense == "<="
 
 
 _ORIGIN = typed_position((0.0, 0.0, 0.0))
 _NO_SHIFT = (0.0, 0.0, 0.0)
-# Of the origin and itself, the padding of the tables: far from changing its truth at any temperature.
+# The padding of the tables compares the origin with itself: far from changing its truth at any temperature.
 _ALWAYS = Atom(_ORIGIN, _ORIGIN, _NO_SHIFT, Comparison("xyz", "<", 1e4, temperature=1e-6))
 _NEVER = Atom(_ORIGIN, _ORIGIN, _NO_SHIFT, Comparison("xyz", "<", -1e4, temperature=1e-6))
 
 
 def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
-    """The atoms that must all hold for a clause without its "not"."""
+    """Return the atoms that must all be true for a clause, without its "not"."""
     second, shift = _ORIGIN, _NO_SHIFT
     if clause.predicate in STATES:
         first = typed_position((0.0, 0.0, task.openings[clause.subject]))
@@ -75,30 +80,33 @@ def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
 
 
 class QueryTables(NamedTuple):
-    """A task's atoms (A), and which J of them make up each clause (K) of each query (S); of tasks (T), or of rows."""
+    """The atoms (A) of each task, and which J of them make up each clause (K) of each query (S).
 
-    first: Tensor  # (T, 3*A) int64, index of each coordinate of the first position; of 0 for an axis left out
+    The first dimension is tasks (T) as compiled, and rows of a batch as selected.
+    """
+
+    first: Tensor  # (T, 3*A) int64, index of each coordinate of the first position; of 0.0 for unused axes
     second: Tensor  # (T, 3*A) int64
     shift: Tensor  # (T, 3, A) float64, metres, added to the difference
-    length: Tensor  # (T, A) bool, the difference's length is compared, otherwise its one coordinate
-    far: Tensor  # (T, A) bool, it is the length's opposite that is compared, with the threshold's
-    threshold: Tensor  # (T, A) float64, metres; the atom holds below it
-    flipped: Tensor  # (T, A) bool, take the atom's complement
+    length: Tensor  # (T, A) bool, compare the length of the difference; otherwise its one coordinate
+    far: Tensor  # (T, A) bool, negate the length
+    threshold: Tensor  # (T, A) float64, metres; the value is below it where the atom is true
+    flipped: Tensor  # (T, A) bool, negate the atom
     temperature: Tensor  # (T, A) float64, metres to one logit
     atoms: Tensor  # (T, J*K*S) int64
-    negated: Tensor  # (T, K, S) bool, take the clause's complement
-    constants: Tensor  # (T, C) float64, read as if they followed the observation
+    negated: Tensor  # (T, K, S) bool, negate the clause
+    constants: Tensor  # (T, C) float64, indexed as if they followed the observation
 
 
 def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> QueryTables:
-    """The tables of the queries of tasks, which have a row for each task, in the mapping's order."""
+    """Compile the queries of tasks to tables with a row for each task, in the mapping's order."""
     steps = max(map(len, queries.values()))
     width = max(len(query.clauses) for listed in queries.values() for query in listed)
-    found = [_task_atoms(task, listed, steps, width) for task, listed in queries.items()]
-    most = max(len(atoms) for atoms, _, _ in found)
-    parts = max(2, *(len(each) for _, places, _ in found for row in places for each in row))
-    filled = [[[[*each, *[0] * (parts - len(each))] for each in row] for row in places] for _, places, _ in found]
-    listed = [atoms + [_ALWAYS] * (most - len(atoms)) for atoms, _, _ in found]
+    compiled = [_task_atoms(task, listed, steps, width) for task, listed in queries.items()]
+    most = max(len(atoms) for atoms, _, _ in compiled)
+    parts = max(2, *(len(each) for _, places, _ in compiled for row in places for each in row))
+    padded = [[[[*each, *[0] * (parts - len(each))] for each in row] for row in places] for _, places, _ in compiled]
+    listed = [atoms + [_ALWAYS] * (most - len(atoms)) for atoms, _, _ in compiled]
     constants, size = [0.0], one_layout(queries).size
 
     def table(value: Callable[[Atom], Any], dtype: torch.dtype = torch.int64) -> Tensor:
@@ -114,59 +122,63 @@ def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> QueryTables:
         threshold=table(lambda atom: atom.threshold, torch.float64),
         flipped=table(lambda atom: atom.flipped, torch.bool),
         temperature=table(lambda atom: atom.part.temperature, torch.float64),
-        atoms=torch.tensor(filled).permute(0, 3, 2, 1).flatten(1),
-        negated=torch.tensor([negated for _, _, negated in found]).transpose(1, 2).contiguous(),
+        atoms=torch.tensor(padded).permute(0, 3, 2, 1).flatten(1),
+        negated=torch.tensor([negated for _, _, negated in compiled]).transpose(1, 2).contiguous(),
         constants=torch.tensor([constants] * len(listed), dtype=torch.float64),
     )
 
 
 def _task_atoms(task: Task, queries: Sequence[Query], steps: int, width: int) -> tuple[list[Atom], list, list]:
-    """The atoms of one task, each once; those of each clause (steps, width, J); what is negated (steps, width)."""
+    """Return a task's atoms, each once; the atoms of each clause (steps, width, J); and whether it is negated."""
     clauses = [[(clause_atoms(clause, task), clause.negated) for clause in query.clauses] for query in queries]
     clauses += [[([_NEVER], False)]] * (steps - len(queries))
     padded = [[*listed, *[([], False)] * (width - len(listed))] for listed in clauses]
-    atoms = dict.fromkeys([_ALWAYS, *(atom for listed in padded for found, _ in listed for atom in found)])
+    atoms = dict.fromkeys([_ALWAYS, *(atom for listed in padded for group, _ in listed for atom in group)])
     place = {atom: number for number, atom in enumerate(atoms)}
-    places = [[[place[atom] for atom in found] for found, _ in row] for row in padded]
+    places = [[[place[atom] for atom in group] for group, _ in row] for row in padded]
     return list(atoms), places, [[negated for _, negated in row] for row in padded]
 
 
-MOST_FACTS = 63  # of a task; the last bit of 64 is never true
+MOST_FACTS = 63  # of a task; the last of 64 bits is never true
 _FALSE = 1 << MOST_FACTS
 Bits = NDArray[np.uint64]
 
 
 class QueryFacts(NamedTuple):
-    """The facts (F) of all tasks, one after another: a task's comparisons of lengths, then those of one coordinate;
-    then its conjunctions (D). A query holds where the bits of its task's facts that it cares for are those it wants."""
+    """The facts (F) of all tasks as bits, one task after another.
 
-    ids: NDArray[np.int64]  # (T,), of the tasks, ascending
+    The facts of a task are its comparisons of lengths, its comparisons of one coordinate, and its conjunctions (D). A
+    query is true if those of the facts' bits that it cares for are the wanted ones.
+    """
+
+    ids: NDArray[np.int64]  # (T,), task ids, ascending
     row_of: NDArray[np.int64]  # (50,), the row of each of the 50 tasks, -1 for one without
     ends: Bits  # (T, 5): a task's lengths begin and end, its coordinates end, its conjunctions begin and end
-    places: Bits  # (F, 6), of x, y and z of both positions in turn; of a coordinate's, the first two alone
+    places: Bits  # (F, 6), x, y and z of both positions in turn; for a coordinate only the first two are used
     metres: NDArray[np.floating[Any]]  # (F, 5): the shift along x, y and z, the length's sign, the threshold
     bit: Bits  # (F,)
     flipped: Bits  # (T,)
-    conjunction: Bits  # (D, 2): the bits that must be true, and the bit that this makes true
+    conjunction: Bits  # (D, 2): bits that must all be true, and the bit that is then true
     care: Bits  # (T, S)
     want: Bits  # (T, S)
-    constants: NDArray[np.floating[Any]]  # (C,), read as if they followed the observation
+    constants: NDArray[np.floating[Any]]  # (C,), indexed as if they followed the observation
 
     def of(self, dtype: Any) -> QueryFacts:
         return self._replace(metres=self.metres.astype(dtype), constants=self.constants.astype(dtype))
 
 
 def _task_facts(task: Task, queries: Sequence[Query]) -> tuple[dict[Atom, int], dict[int, int], list[tuple[int, int]]]:
-    """A task's atoms' places; the bit that all atoms of some bits hold; each query's care bits, and which are true."""
+    """Return the bit number of each atom, the bit of each conjunction, and the cared-for and wanted bits of queries."""
     places: dict[Atom, int] = {}
 
     def bits(clause: Clause) -> int:
         return sum({1 << places.setdefault(atom, len(places)) for atom in clause_atoms(clause, task)})
 
-    asked = [[(bits(clause), clause.negated) for clause in query.clauses] for query in queries]
+    # All atoms first: the conjunctions' bits follow them.
+    listed = [[(bits(clause), clause.negated) for clause in query.clauses] for query in queries]
     conjunctions: dict[int, int] = {}
     literals = []
-    for clauses in asked:
+    for clauses in listed:
         true = false = 0
         for together, negated in clauses:
             if not negated:
@@ -180,7 +192,7 @@ def _task_facts(task: Task, queries: Sequence[Query]) -> tuple[dict[Atom, int], 
 
 
 def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
-    """The facts of the queries of tasks, in the order of their ids; None where a task has too many for 64 bits."""
+    """Compile the queries of tasks, in the order of their ids, to facts; None if a task has too many for 64 bits."""
     ids = [task_id(task.name) for task in queries]
     row_of = np.full(len(MT50), -1)
     for row, number in enumerate(ids):
@@ -208,7 +220,7 @@ def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
     steps = max(len(literals) for *_, literals in tasks)
     padded = [literals + [(_FALSE, _FALSE)] * (steps - len(literals)) for *_, literals in tasks]
     care, want = np.moveaxis(np.array(padded, np.uint64), 2, 0)
-    whole = {"ends": ends, "places": places, "bit": bits, "flipped": flipped, "care": care, "want": want}
-    facts = {name: np.array(table, np.uint64, order="C") for name, table in whole.items()}
+    tables = {"ends": ends, "places": places, "bit": bits, "flipped": flipped, "care": care, "want": want}
+    facts = {name: np.array(table, np.uint64, order="C") for name, table in tables.items()}
     facts["conjunction"] = np.array(conjunctions, np.uint64).reshape(-1, 2)
     return QueryFacts(ids=np.array(ids), row_of=row_of, metres=np.array(metres), constants=np.array(constants), **facts)

@@ -1,4 +1,4 @@
-"""StepRole: what a step does to which object, as policies see it."""
+"""StepRole: the verb, objects and direction of a plan's step; and the rewriting of free-form steps."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from lw_torchrl.language.objects import GOAL, GRIPPER, WORDS
 from lw_torchrl.language.tasks import Task, whole_objects
 
 _WORDS = WORDS["canonical"]
-_HANDS: dict[str, str] = dict.fromkeys([GRIPPER, *_WORDS["hands"]], GRIPPER)  # other names of the gripper
-_NO_NAME = {"location", "target", "reach", "other", "side", "top", "edge"}  # words that name nothing on their own
+_HANDS: dict[str, str] = dict.fromkeys([GRIPPER, *_WORDS["hands"]], GRIPPER)  # names of the gripper
+_NO_NAME = {"location", "target", "reach", "other", "side", "top", "edge"}  # words that do not identify an object
 _GOAL = r"(?:the )?(?:reach |reacher )?(?:goal|target|destination)(?: (?:location|position|area|place|point|bin|spot))?"
-_LONGEST = 500  # characters; a step is never longer, and rewriting takes time that grows with their square
+_LONGEST = 500  # characters; no real step is longer, and the time of rewriting grows with the square
 
 
 def _any(words: Iterable[str]) -> str:
@@ -33,7 +33,7 @@ _PATTERNS = {
 
 
 def _compiled(text: str) -> re.Pattern[str]:
-    """Compile a rewriting of the table, whose words in capitals stand for patterns."""
+    """Compile a regular expression of words.toml, in which words in capitals stand for patterns."""
     for name, pattern in _PATTERNS.items():
         text = text.replace(name, pattern)
     return re.compile(text)
@@ -48,7 +48,10 @@ _SYNONYMS = {word: verb for verb, words in _WORDS["synonyms"].items() for word i
 
 
 def simplify(text: str) -> str:
-    """Rewrite a text whose objects are marked: "carefully hover over <mug>" is "move <robot's gripper> over <mug>"."""
+    """Rewrite a text with marked objects in known words.
+
+    "carefully hover over <mug>" becomes "move <robot's gripper> over <mug>".
+    """
     if len(text) > _LONGEST:
         return text
     for pattern, simple in _REWRITINGS:
@@ -59,7 +62,7 @@ def simplify(text: str) -> str:
 
 @lru_cache(maxsize=256)
 def _names(task: Task) -> dict[str, str]:
-    """Map regular expressions to the name of the object that they match, the longest first."""
+    """Return regular expressions and the name of the object that each matches, the longest first."""
     names = _HANDS | {name: name for name in task.object_names}
     words: dict[str, str] = {}
     for name in whole_objects(task):
@@ -75,7 +78,7 @@ def _names(task: Task) -> dict[str, str]:
 
 
 def mark_objects(text: str, task: Task) -> str:
-    """Put each object that a text names in <>: "put the gripper above <mug>"."""
+    """Put each object that a text names in <>: "put <robot's gripper> above <mug>"."""
     text = text.lower()
     for pattern, name in _names(task).items():
         text = re.sub(rf"(?<![\w<'-])(?:the )?(?:{pattern})(?![\w-])(?![^<]*>)", f"<{name}>", text)
@@ -84,14 +87,14 @@ def mark_objects(text: str, task: Task) -> str:
 
 
 Verb = Literal["approach", "beside", "descend", "close", "open", "push", "pull", "carry", "move", "reach", "hold"]
-"""What is done: "carry" goes through the air, "move" straight."""
+"""The action of a step. "carry" lifts an object through the air, "move" moves it in a straight line."""
 Manner = Literal["grasp", "push", "press", "pull", "reach"]
-"""The purpose of a step, which says how the hand comes: to grasp from above, to push from the side."""
+"""The purpose of a step, which determines how the hand approaches: from above to grasp, from the side to push."""
 Direction = Literal["left", "right", "away", "toward", "up", "down", "goal"]
 VECTORS: dict[str, tuple[float, float, float]] = {way: tuple(xyz) for way, xyz in WORDS["roles"]["vectors"].items()}
-"""Directions as unit vectors in the suites' frame; "left" and "right" are those of the query language."""
+"""Unit vectors of directions in the suites' frame; "left" and "right" are as in the query language."""
 BY_HAND = ("approach", "descend", "beside", "open")
-"""The verbs of a step that only brings the gripper to its place."""
+"""The verbs of steps that only bring the gripper into position."""
 _OWN_MOTIONS: list[list[str]] = WORDS["canonical"]["own"]
 _SAME_MOTION: dict[str, Verb] = {"carry": "move", "open": "descend", "hold": "reach"}
 _VERBS = [verb for verb in get_args(Verb) if verb not in _SAME_MOTION]
@@ -101,43 +104,43 @@ _SKILLS, _WAYS = WORDS["roles"]["skills"], WORDS["roles"]["ways"]
 @typed_fields
 @dataclass(frozen=True)
 class StepRole:
-    """What one step of a plan does, as :func:`~lw_torchrl.canonical_plan` reads it.
+    """The meaning of one step of a plan, as read by :func:`~lw_torchrl.canonical_plan`.
 
-    What is moved, and its target, are names of the task's objects, or "target location", the goal.
+    Objects are named as in the task, and the goal is "target location".
     """
 
     verb: Verb
-    moved: str
-    target: str
+    moved: str  # the object that moves
+    target: str  # the object or point to go to
     manner: Manner
-    direction: Direction | None = None  # where an object is moved to, also of a hand that comes to do so
+    direction: Direction | None = None  # direction in which an object is moved, also while the hand approaches it
     toward: str | None = None  # the object that the direction "goal" leads to; None for the task's goal
-    written: str = ""  # the skill in the plan's own words; "" for a step that the plan lacked
+    written: str = ""  # the skill as written in the plan; "" for an added step
     confidence: Probability = 1.0  # from 0, a guess, to 1, stated in the plan's words
-    fallback: bool = False  # whether the step is of the fallback plan, which is tried when the plan makes no progress
+    fallback: bool = False  # whether the step belongs to the fallback plan, tried when the plan makes no progress
 
     @property
     def skill(self) -> str:
-        """The step in the wording that all plans share: "carry the mug to the target location"."""
-        said = _SKILLS[self.verb].format(moved=self.moved, target=self.target)
+        """The step in standard wording: "carry the mug to the target location"."""
+        skill = _SKILLS[self.verb].format(moved=self.moved, target=self.target)
         way = "" if self.direction is None else _WAYS.get(self.direction, self.direction)
         way = f"toward the {self.toward or GOAL}" if way == "goal" else way
         if self.verb == "move" and way:
             return f"slide the {self.moved} {way}"
         if self.verb in ("push", "pull"):
-            return f"{said} {way}"
+            return f"{skill} {way}"
         if self.verb in BY_HAND and self.manner != "grasp":
-            return f"{said} to {self.manner} it {way}".rstrip()
-        return said
+            return f"{skill} to {self.manner} it {way}".rstrip()
+        return skill
 
     @property
     def objects(self) -> tuple[str, ...]:
-        """The names of the objects that the step is about, "target location" for the goal."""
-        led = (self.toward or GOAL,) if self.direction == "goal" else ()
-        return tuple(dict.fromkeys((self.moved, self.target, *led)))
+        """The names of the objects that the step mentions, "target location" for the goal."""
+        goal = (self.toward or GOAL,) if self.direction == "goal" else ()
+        return tuple(dict.fromkeys((self.moved, self.target, *goal)))
 
     def to_json(self) -> dict[str, Any]:
-        """The fields that differ from their defaults; :meth:`from_json` reads them back."""
+        """Return the fields that differ from their defaults."""
         return {each.name: value for each in fields(self) if (value := getattr(self, each.name)) != each.default}
 
     @classmethod
@@ -153,16 +156,16 @@ class StepRole:
 
 
 def motion_of(roles: Sequence[StepRole]) -> StepRole | None:
-    """The last step that moves an object; in a plan without one, the last that brings the gripper to its place."""
+    """Return the last step that moves an object, else the last that reaches a place; None if there is neither."""
     moving = [role for role in roles if role.verb in ("carry", "move", "push", "pull")]
     return next(reversed(moving or [role for role in roles if role.verb == "reach"]), None)
 
 
 def role_vectors(roles: Sequence[StepRole]) -> list[list[float]]:
-    """One vector for each step of a plan: what is done, without the objects.
+    """Return a vector for each step of a plan, which describes the action without the objects.
 
-    It holds ones for the step's verb, its manner and, if MT10 demonstrates the plan's motion in a way of its own, for
-    that. Verbs of the same motion share theirs. The fallback plan's steps have a motion of their own.
+    It is one-hot for the verb, one-hot for the manner, and has a one if MT10 demonstrates the plan's motion in a way of
+    its own. Verbs of the same motion share a number. The steps of the fallback plan have their own motion.
     """
     vectors = []
     motions = {fallback: motion_of([role for role in roles if role.fallback is fallback]) for fallback in (False, True)}

@@ -1,4 +1,4 @@
-"""parse_steps: the verb, the moved object, its target and the direction of each step of a free-form plan."""
+"""parse_steps: the verb, moved object, target and direction of each step of a free-form plan."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _DIRECTIONS: dict[str, Direction] = {
 }
 _PLACES = {name: frozenset(words) for name, words in WORDS["canonical"]["places"].items()}
 _KNOWN = frozenset().union(*_VERBS.values()) | {"align", "slide", "sweep"}
-# "above the dial to turn it left": a later step's business
+# In "put the gripper above the dial to turn it left" the purpose is left to a later step.
 _PURPOSE = re.compile(r"(?<=>) (?:in order )?to \w+ it\b.*")
 _TOOL = re.compile(r"(?<!line )(?<!level )(?<!aligned )\bwith <([^>]*)>")
 
@@ -27,30 +27,30 @@ class ParsedStep:
     """The meaning of one step."""
 
     verb: Verb
-    moved: str | None  # what is to arrive at the target: the robot's gripper, or an object that it holds
-    target: str | None  # the object or point to go to; like ``moved``, None if unknown
-    direction: Direction | None = None  # where an object is pushed, pulled or moved to; "goal" leads to ``toward``
-    confidence: float = 1.0  # lower if it is inferred from the condition or from common usage
+    moved: str | None  # what moves to the target: the robot's gripper, or an object that it holds; None if unknown
+    target: str | None  # the object or point to go to; None if unknown
+    direction: Direction | None = None  # direction in which an object is moved; "goal" leads to ``toward``
+    confidence: float = 1.0  # lower if the meaning is inferred from the condition or from common usage
     toward: str | None = None  # an object; None for the task's goal
 
 
 def compared_with_gripper(step: PlanStep) -> tuple[str, ...]:
-    """Return the objects that a step's condition compares with the gripper, in its order."""
+    """Return the objects that a step's condition compares with the gripper, in the order of the condition."""
     pairs = [(clause.subject, clause.object) for clause in step.condition.clauses if clause.object is not None]
     return tuple(second if first == GRIPPER else first for first, second in pairs if GRIPPER in (first, second))
 
 
 @dataclass(frozen=True)
 class _Facts:
-    """What a condition says about the gripper."""
+    """The facts about the gripper in a condition."""
 
     at: bool  # near or around an object
     not_at: bool
-    aligned: bool  # any other relation
+    aligned: bool  # in any other relation to an object
     not_aligned: bool
     open: bool
     closed: bool
-    near: tuple[str, ...]  # the objects that it is compared with
+    near: tuple[str, ...]  # the objects that the gripper is compared with
 
     @classmethod
     def of(cls, step: PlanStep) -> _Facts:
@@ -65,12 +65,13 @@ class _Facts:
 
 
 def parse_steps(plan: ConditionalPlan) -> tuple[ParsedStep | None, ...]:
-    """Parse each step of a plan; None for a step that cannot be read."""
+    """Parse each step of a plan; return None for a step that cannot be parsed."""
     task = plan.definition
     facts = [_Facts.of(step) for step in plan.steps]
     marked = [mark_objects(step.skill, task) for step in plan.steps]
     parsed = _parse(plan, _resolve_it([simplify(text) for text in marked], facts, task), facts)
-    if all(each is None or each.verb in _NO_MOTION for each in parsed):  # "grab it and pull" in one step
+    # A plan without a motion may have it in the second half of a step: "grab it and pull".
+    if all(each is None or each.verb in _NO_MOTION for each in parsed):
         parsed = _parse(plan, _resolve_it([_last_clause(text) for text in marked], facts, task), facts)
     return parsed
 
@@ -80,7 +81,7 @@ _NO_MOTION = {"approach", "beside", "descend", "close", "open"}
 
 
 def _last_clause(text: str) -> str:
-    """Return what is said last, about the object named first: "grab <mug> and pull it back" is "pull <mug> back"."""
+    """Return the last clause of a step, with its object: "pull <mug> back" for "grab <mug> and pull it back"."""
     first, _, second = text.rpartition(" and ")
     name = next((name for name in re.findall(r"<[^>]*>", first) if name != f"<{GRIPPER}>"), "it")
     return simplify(re.sub(r"\b(?:it|them)\b", name, second, count=1)) if first else simplify(text)
@@ -96,23 +97,24 @@ def _parse(plan: ConditionalPlan, texts: list[str], facts: list[_Facts]) -> tupl
 
 
 def _resolve_it(texts: Iterable[str], facts: Iterable[_Facts], task: Task) -> list[str]:
-    """Replace "it" in "pull it" by the object of the step before, else by the first object."""
-    resolved, before = [], first_object(task)
+    """Replace "it" in "pull it" by the object of the previous step, else by the first object."""
+    resolved, previous = [], first_object(task)
     for text, fact in zip(texts, facts, strict=True):
-        meant = before or (fact.near[-1] if fact.near else None)
-        if meant is not None and (start := _IT.match(text)):
-            meant = GRIPPER if f"<{meant}>" in text else meant  # "park it over <mug>", which is the mug already
-            text = f"{start[1]} <{meant}>{text[start.end() :]}"
+        referent = previous or (fact.near[-1] if fact.near else None)
+        if referent is not None and (start := _IT.match(text)):
+            # In "park it over <mug>" after a step with the mug, "it" is the gripper.
+            referent = GRIPPER if f"<{referent}>" in text else referent
+            text = f"{start[1]} <{referent}>{text[start.end() :]}"
         resolved.append(text)
         named = (name for name in re.findall(r"<([^>]*)>", text) if name != GRIPPER and not is_goal(task, name))
-        before = next(named, before)
+        previous = next(named, previous)
     return resolved
 
 
 def _only_sent(step: ParsedStep | None, text: str) -> ParsedStep | None:
-    """Read "move the gripper to the block" as the whole motion of a plan that does nothing else."""
-    to_it = step and step.verb == "descend" and re.match(rf"\w+ <{GRIPPER}> (?:to|at|toward|onto) <", text)
-    return replace(step, verb="reach") if step and to_it else step
+    """Read "move the gripper to the block" as reaching, in a plan that does nothing else."""
+    goes_to = step and step.verb == "descend" and re.match(rf"\w+ <{GRIPPER}> (?:to|at|toward|onto) <", text)
+    return replace(step, verb="reach") if step and goes_to else step
 
 
 def _grasps(text: str, facts: _Facts) -> bool:
@@ -124,7 +126,7 @@ def _grasps(text: str, facts: _Facts) -> bool:
 
 
 def _pushed_or_pulled(parsed: Sequence[ParsedStep | None]) -> list[ParsedStep | None]:
-    """Decide where the words leave it open: a hand that came down around an object pulls it, any other pushes it."""
+    """Decide between push and pull if the words do not: a hand that came down around an object pulls it."""
     verbs = {step.verb for step in parsed if step is not None}
 
     def decided(step: ParsedStep) -> ParsedStep:
@@ -137,7 +139,7 @@ def _pushed_or_pulled(parsed: Sequence[ParsedStep | None]) -> list[ParsedStep | 
 
 
 class _StepParser:
-    """Parses one step."""
+    """A parser of one step."""
 
     def __init__(self, step: PlanStep, task: Task, text: str, facts: _Facts, grasping: bool) -> None:
         self.step, self.task, self.text, self.facts, self.grasping = step, task, text, facts, grasping
@@ -181,7 +183,7 @@ class _StepParser:
         return self._by_hand() if self.by_hand else self._object_moved(noun)
 
     def _closed(self, noun: str) -> ParsedStep:
-        """Read "grab the mug" as approaching it if the hand is not there yet, as lifting it if the hand holds it."""
+        """Parse "grab the mug": descend if the hand is not there yet, lift if the hand holds the mug, else close."""
         if self.facts.not_at and not self.facts.at and not self.facts.closed:
             return ParsedStep("descend", GRIPPER, noun)
         if self.verb == "pick" and self.facts.closed and not self.facts.open:
@@ -189,7 +191,7 @@ class _StepParser:
         return ParsedStep("close", GRIPPER, noun)
 
     def _by_hand(self) -> ParsedStep | None:
-        """Parse a step that puts the gripper somewhere; an object that it holds moves with it."""
+        """Parse a step that moves the gripper, and with it the object that it holds."""
         target = self.named[-1] if self.named else self.near
         if target is None:
             return None
@@ -214,6 +216,7 @@ class _StepParser:
         return ParsedStep("approach" if far and not down else "descend", GRIPPER, target)
 
     def _object_moved(self, noun: str) -> ParsedStep:
+        """Parse a step that moves an object."""
         target = self._target(noun)
         moved = self.tool if self.tool is not None and (target is None or not is_goal(self.task, target)) else noun
         if target is not None:
@@ -239,7 +242,7 @@ class _StepParser:
         return ParsedStep("push", GRIPPER, moved, direction or "goal", confidence=1.0 if pushed else 0.5, toward=toward)
 
     def _target(self, noun: str) -> str | None:
-        """Return where an object is moved to, by the words, or by what the condition compares it with."""
+        """Return the target of an object that is moved: from the words, else from the condition's comparisons."""
         if goals := [name for name in self.named if is_goal(self.task, name)]:
             return goals[-1]
         for name in reversed(self.named[1:] if self.tool is None else self.named):
@@ -253,12 +256,12 @@ class _StepParser:
         return target
 
     def _pairs(self) -> list[tuple[str, str]]:
-        """Return the objects that the condition compares; an object that is at another need not come to it."""
+        """Return the pairs of objects that the condition compares, except those that are already at each other."""
         clauses = [c for c in self.step.condition.clauses if c.negated or c.predicate not in ("near", "around")]
         return [(c.subject, c.object) for c in clauses if c.object is not None and GRIPPER not in (c.subject, c.object)]
 
     def _compared_point(self, moved: str, target: str) -> str:
-        """Return the point on the moved object that the condition compares with the target: a wrench's ring."""
+        """Return the point on the moved object that the condition compares with the target, such as a wrench's ring."""
         for pair in self._pairs():
             for point, other in (pair, pair[::-1]):
                 if same_object(self.task, other, target) and same_object(self.task, point, moved):

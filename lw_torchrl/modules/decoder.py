@@ -27,7 +27,7 @@ LEAST_STD = 1e-3
 
 
 class _ActionMLP(MLP):
-    """Base of the decoders. ``squash`` can be set after construction, so it is no fixed part of the ``config``."""
+    """Base of the decoders. ``squash`` can be set after construction, so ``config`` reads its present value."""
 
     _options: dict[str, Any]
     squash: bool

@@ -99,7 +99,7 @@ def _one_per_row(task_id: Tensor, tensordict: TensorDictBase) -> Tensor:
 
 
 class DescriptorConditionedActor(ConditionedActor):
-    """The paper's descriptor conditioning (DC): the description's latent and the observation give the action.
+    """A policy that is conditioned on the task's description instead of a plan, the paper's baseline DC.
 
     Its parts are ``latent``, a :class:`TaskLatent`, then ``features`` and ``decoder`` as in
     :class:`PlanConditionedActor`. Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes
@@ -134,10 +134,10 @@ class DescriptorConditionedActor(ConditionedActor):
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
-        tasks = list(named_tasks(tasks).values())
-        features = as_features(features, one_layout(tasks), noise=0.05)
+        known = list(named_tasks(tasks).values())
+        features = as_features(features, one_layout(known), noise=0.05)
         trunk = descriptor_trunk(
-            tasks, condition=condition, task_encoder=task_encoder, features=features, text_encoder=text_encoder
+            known, condition=condition, task_encoder=task_encoder, features=features, text_encoder=text_encoder
         )
         super().__init__(trunk, decoder, in_keys=in_keys, out_keys=out_keys)
 

@@ -79,7 +79,7 @@ class ObservationFeatures(Features):
         kind: "raw", the observation; "differences", see :func:`differences`; "relative", see :func:`relative`;
             "opening", only the gripper's opening; "none", nothing; "both", the observation and the differences.
         noise: standard deviation of the noise while training, in standard deviations of each feature.
-        layout: the layout of the observations.
+        layout: the layout of the observations; None for Meta-World's.
         in_keys, out_keys: other names for what it reads and writes; nested keys are allowed.
 
     Attributes:
@@ -100,14 +100,14 @@ class ObservationFeatures(Features):
         self,
         kind: Kind = "differences",
         noise: float = 0.0,
-        layout: Layout = METAWORLD,
+        layout: Layout | None = None,
         *,
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
     ) -> None:
         super().__init__(noise, as_keys("in_keys", in_keys, ("observation",)), out_keys)
-        self.kind, self.layout = kind, layout
-        self.width = _KINDS[kind](torch.zeros(layout.size), layout).shape[-1]
+        self.kind, self.layout = kind, layout or METAWORLD
+        self.width = _KINDS[kind](torch.zeros(self.layout.size), self.layout).shape[-1]
         self.register_buffer("mean", torch.zeros(self.width))
         self.register_buffer("std", torch.ones(self.width))
 
@@ -118,7 +118,11 @@ class ObservationFeatures(Features):
         return {"kind": self.kind, "noise": self.noise, "layout": self.layout, **keys}
 
     def with_plans(self, plans: AnyPlans) -> ObservationFeatures:
-        """Return the features, with the same statistics, for plans of a layout; ValueError if they differ there."""
+        """Return the features, with the same statistics, for the layout of other plans.
+
+        Raises:
+            ValueError: features that mean something else in that layout.
+        """
         layout = as_plans(plans).layout
         if layout == self.layout:
             return self

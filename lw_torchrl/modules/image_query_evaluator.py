@@ -44,7 +44,7 @@ def _conv(before: int, after: int, stride: int = 1) -> nn.Sequential:
 
 
 class PointingNetwork(ClauseNetwork):
-    """Locates objects in pictures and judges clauses by their positions, as :class:`ClauseNetwork` does.
+    """A network that locates objects in pictures and judges clauses by their positions.
 
     An object's learned vector is compared with the features at every place of each camera's picture; a softmax over the
     places attends to one of them. From the mean coordinates and features there, and the coordinates of landmarks that
@@ -108,11 +108,11 @@ own, which may be frozen by ``requires_grad_(False)``, so that files can name it
 
 
 class ImageQueryEvaluator(ClauseEvaluator):
-    """Answers conditions from camera pictures, by a network that was trained on exact answers.
+    """A query evaluator that answers conditions from camera pictures, by a network trained on exact answers.
 
     Reads ``pixels`` (B, height, width·C, 3) uint8, of C cameras side by side, and ``task_id`` (B,) int64; writes
     ``qaf`` and ``qaf_logits`` (B, S) float32 as :class:`QueryEvaluator` does. See :class:`PointingNetwork` for the
-    network. ``transform()`` returns the :class:`CameraTransform` that takes its pictures.
+    network. ``transform()`` returns the :class:`CameraTransform` that renders its pictures.
 
     Args:
         plans, answers, predicates: as for :class:`~lw_torchrl.modules.query_evaluator.ClauseEvaluator`, with its
@@ -174,7 +174,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
         self.config |= dict(hidden=hidden, depth=depth, names=list(self.names))
 
     def transform(self) -> CameraTransform:
-        """Return a new transform that takes its pictures."""
+        """Return a new transform that renders its pictures."""
         return CameraTransform(self.cameras, height=self.height, width=self.width, every=self.every)
 
     def check_seen(self, seen: Tensor) -> None:

@@ -120,47 +120,42 @@ class RenamedInputs(TensorDictModuleBase):
             keys = as_keys("in_keys", keys, list(map(str, before)))
             check_apart(keys, self.out_keys_source)
             renamed = dict(zip(before, keys, strict=True))
-            self.__dict__.update(_parts_reading(self, renamed, {}))
+            _rename_parts(self, renamed, {})
         self._in_keys = list(keys)
 
 
-# The next three functions copy modules without copying weights: a shared part must keep the names that it reads in
-# another policy, so each policy has its own shallow copy of the module objects.
+# Two policies may share a part, and each must keep the names that it reads. So renaming copies the module objects, but
+# not their weights.
 
 
-def _reading(module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any]) -> Any:
+def _reading(module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any], in_order: bool) -> Any:
     """Return a module on the same weights that reads renamed keys; ``copies`` are those made so far."""
     if not isinstance(module, (TensorDictModuleBase, nn.ModuleDict, nn.ModuleList)):
         return module
     if module not in copies:
         other = copies[module] = copy.copy(module)
-        other.__dict__.update(_parts_reading(module, renamed, copies))
+        _rename_parts(other, renamed, copies, in_order)
         if isinstance(module, TensorDictModuleBase):
             other.__dict__["_in_keys"] = [renamed.get(key, key) for key in module.in_keys]
     return copies[module]
 
 
-def _parts_reading(module: nn.Module, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any]) -> dict[str, Any]:
-    """Return the attributes of a module that hold its parts, which read renamed keys."""
-    if isinstance(module, TensorDictSequential):
-        parts: dict[str, Any] = {"module": _sequence_reading(module, renamed, copies)}
-    else:
-        parts = {name: _reading(part, renamed, copies) for name, part in module._modules.items()}
+def _rename_parts(
+    module: nn.Module, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any], in_order: bool = False
+) -> None:
+    """Replace a module's parts by copies that read renamed keys.
+
+    Parts that run ``in_order`` read a key that an earlier part writes by its old name.
+    """
+    in_sequence, remaining, parts = isinstance(module, TensorDictSequential), renamed, {}
+    for name, part in module._modules.items():
+        parts[name] = _reading(part, remaining, copies, in_sequence)
+        if in_order:
+            remaining = {key: new for key, new in remaining.items() if key not in getattr(part, "out_keys", ())}
     # ProbabilisticTensorDictSequential also keeps its deterministic part in an attribute, outside of _modules.
-    hidden = {n: part for n, part in vars(module).items() if isinstance(part, TensorDictModuleBase)}
-    return {"_modules": parts, **{name: _reading(part, renamed, copies) for name, part in hidden.items()}}
-
-
-def _sequence_reading(
-    sequence: TensorDictSequential, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any]
-) -> nn.Module:
-    """Return a sequence's parts, which read renamed keys unless an earlier part writes them."""
-    container: Any = copy.copy(sequence.module)
-    container.__dict__["_modules"] = {}
-    for name, part in sequence.module._modules.items():
-        container._modules[name] = _reading(part, renamed, copies)
-        renamed = {key: new for key, new in renamed.items() if key not in part.out_keys}
-    return container
+    hidden = {name: part for name, part in vars(module).items() if isinstance(part, TensorDictModuleBase)}
+    module.__dict__.update({name: _reading(part, renamed, copies, False) for name, part in hidden.items()})
+    module.__dict__["_modules"] = parts
 
 
 class NamedParts(RenamedInputs, TensorDictSequential):

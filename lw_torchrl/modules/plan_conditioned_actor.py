@@ -30,7 +30,7 @@ def plan_trunk(
     features: nn.Module | None = None,
     text_encoder: TextEncoder | None = None,
 ) -> TensorDictSequential:
-    """Return attention, mixer and features: the skill that the plan chooses now, and what is seen of the state.
+    """Return attention, mixer and features as one sequence: the latent of the active skills, and the features.
 
     Reads ``qaf`` (B, S) bool, ``task_id`` (B,) int64 and ``observation`` (B, 39) float32; writes ``skill_weights``
     (B, S), ``skill_latent`` (B, D) and ``features`` (B, F) float32. The arguments are :class:`PlanConditionedActor`'s,

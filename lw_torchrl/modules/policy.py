@@ -78,7 +78,7 @@ def plans_of(actor: Any) -> Plans | None:
 
 
 def tasks_of(actor: Any) -> tuple[str, ...] | None:
-    """Return the tasks that an actor knows: its own ``tasks``, or those of its plans; None if it does not say."""
+    """Return the tasks that an actor knows: its own ``tasks``, or those of its plans; None if unknown."""
     tasks = _first(actor, "tasks")
     return None if tasks is None else tuple(tasks)
 
@@ -91,7 +91,7 @@ def layout_of(actor: Any) -> Layout:
 
 
 def draws(actor: Any) -> bool:
-    """Return whether an actor's actions, without exploration, depend on random numbers that were drawn before."""
+    """Return whether an actor draws random numbers even without exploration: actions then depend on earlier calls."""
     return any(getattr(part, "draws", False) for part in _parts(actor))
 
 
@@ -109,7 +109,7 @@ def with_plans(actor: Any, plans: AnyPlans) -> Any:
 
 
 def transform_of(actor: Any, plans: Plans | None = None) -> Transform | None:
-    """Return a new transform that writes what an actor reads and an environment does not give; None for nothing.
+    """Return a new transform that writes the keys that an actor reads and an environment lacks; None if none.
 
     Args:
         actor: any actor; a part with a method ``transform()`` states its own.

@@ -29,7 +29,7 @@ Answers = Literal["soft", "hard"]
 
 
 class QueryEvaluator(TensorDictModuleBase):
-    """Answers the plans' conditions in front of a policy: ``TensorDictSequential(evaluator, actor)``.
+    """Base class of modules that answer plans' conditions for a policy: ``TensorDictSequential(evaluator, actor)``.
 
     Training the sequence trains both. A subclass implements :meth:`logits`, and adds the keyword arguments that rebuild
     it to ``config``.
@@ -122,7 +122,7 @@ class QueryEvaluator(TensorDictModuleBase):
         return write(tensordict, self, [qaf, logits])
 
     def transform(self) -> Transform | None:
-        """Return a new transform that writes what it reads and an environment does not; None if there is nothing."""
+        """Return a new transform that writes the keys that it reads and an environment lacks; None if none."""
         return None
 
     def with_plans(self, plans: AnyPlans) -> QueryEvaluator:
@@ -186,11 +186,12 @@ def conjunction(logits: Tensor, mask: Tensor) -> Tensor:
 
 
 class ClauseEvaluator(QueryEvaluator):
-    """Answers conditions by a network that was trained on the answers of the query answering function.
+    """Base class of query evaluators whose network was trained on exact answers.
 
-    Reads a view of a state and ``task_id``; writes as :class:`QueryEvaluator`, -1e4 beyond a plan's last step. Clauses
-    are answered one by one and combined by :func:`conjunction`. A subclass sets ``network``, from views of B states and
-    their clauses (B, C) to logits (B, C), and ``seen_dims``, the number of dimensions of a view.
+    Reads a view of a state, such as an observation or pictures, and ``task_id``; writes as :class:`QueryEvaluator`,
+    -1e4 beyond a plan's last step. Clauses are answered one by one and combined by :func:`conjunction`. A subclass sets
+    ``network``, from views of B states and their clauses (B, C) to logits (B, C), and ``seen_dims``, the number of
+    dimensions of a view.
 
     Args:
         plans, answers: as for :class:`QueryEvaluator`.
@@ -344,7 +345,7 @@ class ClauseNetwork(nn.Module):
 
 
 class StateQueryEvaluator(ClauseEvaluator):
-    """Answers conditions from the observation, by a network that was trained on exact answers.
+    """A query evaluator that answers conditions from the observation, by a network trained on exact answers.
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``qaf`` and ``qaf_logits`` (B, S) float32
     as :class:`QueryEvaluator` does. It looks objects' positions up in the observation, so it only learns what

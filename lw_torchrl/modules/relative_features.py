@@ -24,7 +24,7 @@ from lw_torchrl.modules.features import Features, check_observation, check_rows,
 from lw_torchrl.transforms.qaf import plan_program
 from lw_torchrl.transforms.random_yaw import tilt_key, turn_observation, turn_vectors, yaw_key
 
-_SCALE = 0.1  # metres
+_SCALE = 0.1  # metres: the unit of the positions that a network reads
 _FAR = 0.25  # metres: farther positions count as this far, since demonstrations hardly show them
 _LIFTED = 0.15  # metres: the height at which an object is carried above its target
 _AWAY = 0.15  # metres: "move the puck to the left" has a target this far away
@@ -247,7 +247,7 @@ class RoleFeatures(_RelativePositions):
         return other
 
     def share(self) -> None:
-        """Give the contacts to the features that :meth:`with_plans` made, after the buffers were changed."""
+        """Copy the contacts to the features that :meth:`with_plans` made; call it after changing the buffers."""
         for other in self._sharing:
             if other is not self:
                 other._copy(self)
@@ -286,7 +286,7 @@ class RoleFeatures(_RelativePositions):
             self.contact[own], self.demonstrated[own] = other.contact[theirs], other.demonstrated[theirs]
 
     def of_steps(self, observation: Tensor, rows: Tensor) -> Tensor:
-        """Return the relative positions of each step; targets are contacts, and what is carried is lifted first."""
+        """Return the relative positions of each step; targets are contacts, and carried objects are lifted first."""
         contact = pick(self.at_contact, rows)[..., None] * pick(self.contact, rows).unsqueeze(-2)
         positions = super().of_steps(observation, rows) + contact.unsqueeze(-2)
         lifts = (pick(self.lifts, rows) & ~pick(self.demonstrated, rows).unsqueeze(-1))[..., None, None]

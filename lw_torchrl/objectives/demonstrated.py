@@ -26,7 +26,7 @@ else:
 
 class _ImitatesDemonstrations(_Loss):
     _fixed: Mapping[str, Any] = {}  # options that users cannot set
-    in_keys: list[NestedKey]
+    _in_keys: list[NestedKey]
 
     @typed
     def __init__(
@@ -44,18 +44,15 @@ class _ImitatesDemonstrations(_Loss):
         if spec is not None and not isinstance(spec, Composite) and len(spec.shape) > 1:
             got = f"shape {tuple(spec.shape)}; use env.action_spec_unbatched"
             raise ValueError(f"action_spec must have no batch dimension, got {got}")
-        if isinstance(qvalue_network, list) and not all(
-            isinstance(q, TensorDictModuleBase) for q in qvalue_network or [0]
-        ):
+        critics = qvalue_network if isinstance(qvalue_network, list) else [qvalue_network]
+        if not critics or not all(isinstance(critic, TensorDictModuleBase) for critic in critics):
             raise TypeError(f"qvalue_network must be a TensorDictModule, or a list, got {shown(qvalue_network)}")
         super().__init__(actor_network, qvalue_network, reduction=reduction, **self._fixed, **options)
         self.bc_weight = bc_weight
-        self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
 
-    def set_keys(self, **keys: NestedKey) -> None:
-        """See :class:`torchrl.objectives.LossModule`."""
-        super().set_keys(**keys)
-        self.in_keys = [*self.in_keys, self.tensor_keys.is_demonstration]
+    def _set_in_keys(self) -> None:  # TorchRL calls it when in_keys are first read, and when set_keys changes them
+        super()._set_in_keys()
+        self._in_keys.append(self.tensor_keys.is_demonstration)
 
     def _imitation(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
         """Return the squared distance of actions (B, A) to the demonstrated ones, (B,) float32, 0 for other rows.

@@ -23,7 +23,7 @@ Reduction = Literal["none", "mean", "sum"]
 
 
 class ExpectileValueLoss(LossModule):
-    """Learns the value V of a state by expectile regression, without a value of actions.
+    """Loss of a state value V by expectile regression, without a value of actions.
 
     The loss of a row is |τ - 1(u < 0)|·u², where u is the target minus V. The target is the reward plus the discounted
     value, by the target network, of the next state (n steps ahead where the rows have ``steps_to_next_obs``). With an
@@ -103,9 +103,9 @@ class ExpectileValueLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        own, keys = self.value_network.in_keys, self.tensor_keys
-        following = [*own, keys.reward, keys.done, keys.terminated]
-        return list(dict.fromkeys([*own, *(unravel_key(("next", key)) for key in following)]))
+        inputs, keys = self.value_network.in_keys, self.tensor_keys
+        following = [*inputs, keys.reward, keys.done, keys.terminated]
+        return list(dict.fromkeys([*inputs, *(unravel_key(("next", key)) for key in following)]))
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> ExpectileValueLoss:
         """Set the estimator of the targets, and return the loss.
@@ -124,7 +124,7 @@ class ExpectileValueLoss(LossModule):
         return self
 
     def train(self, mode: bool = True) -> ExpectileValueLoss:
-        """Set the mode of the network too."""
+        """Set the mode of the network too, which the loss does not hold as a submodule."""
         self.value_network.train(mode)
         return super().train(mode)
 
@@ -133,7 +133,7 @@ class ExpectileValueLoss(LossModule):
         """Return the losses, and write ``td_error``."""
         target = self._target(tensordict)
         values = self._values(tensordict, self.value_network_params)
-        error = target - values
+        error = target - values  # (B, E)
         weight = torch.where(error < 0, 1.0 - self.expectile, self.expectile)
         tensordict.set(self.tensor_keys.priority, error.detach().square().amax(-1))
         by_row, weights = (weight * error.square()).sum(-1), self._maybe_get_priority_weight(tensordict)
@@ -160,6 +160,7 @@ class ExpectileValueLoss(LossModule):
         """Return the value of each member, (B, E)."""
         network, keys = self.value_network, self.tensor_keys
         key = keys.values if unravel_key(keys.values) in network.out_keys else keys.value
+        # An ensemble also writes its minimum, from which its members could not learn by themselves.
         is_ensemble = len(getattr(network, "heads", ())) > 1
         if unravel_key(key) not in network.out_keys or (is_ensemble and key != keys.values):
             needed = keys.values if is_ensemble else keys.value
@@ -173,7 +174,7 @@ class ExpectileValueLoss(LossModule):
 
 
 class AdvantageWeightedLoss(LossModule):
-    """Imitates a batch's actions with weights exp(β·A), at most ``max_weight``, where A is a row's advantage.
+    """Imitation loss with weights exp(β·A), at most ``max_weight``, where A is a row's advantage.
 
     Reads what the actor reads, ``action`` (B, 4) float32, and ``advantage`` (B, 1) float32, which
     :meth:`ExpectileValueLoss.advantage` returns and :func:`standardize_by_task` makes comparable. Returns
@@ -243,7 +244,7 @@ class AdvantageWeightedLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the loss; the input stays as it is."""
+        """Return the loss; the input is not changed."""
         action, advantage = read(tensordict, [self.tensor_keys.action, self.tensor_keys.advantage])
         if advantage.shape != (*tensordict.batch_size, 1) or advantage.dtype != action.dtype:
             got = f"shape {tuple(advantage.shape)} in {advantage.dtype}"

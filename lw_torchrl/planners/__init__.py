@@ -1,6 +1,6 @@
 """Plans from language models: prompts, questions to a server, and answers.
 
-:mod:`~lw_torchrl.planners.repairing` checks plans in the simulator, and asks for better ones.
+:mod:`~lw_torchrl.planners.repairing` checks plans in the simulator and asks for better ones.
 """
 
 from lw_torchrl.planners.answer_files import (
@@ -8,11 +8,12 @@ from lw_torchrl.planners.answer_files import (
     Answers,
     FilePlanner,
     Planner,
+    PlannerError,
+    Tokens,
     answer_path,
     folder_name,
     write_answer,
 )
-from lw_torchrl.planners.chat import PlannerError, Tokens
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
 from lw_torchrl.planners.prompts import plan_prompt, plan_schema, prompt_examples
 

@@ -1,4 +1,4 @@
-"""Answers of language models: the plans in them, their files, the planner that reads these, and the cache."""
+"""Answers of language models: the plans in them, their files, and the planner that reads these."""
 
 from __future__ import annotations
 
@@ -7,26 +7,60 @@ import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
-from hashlib import sha256
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from lw_torchrl._util.checks import Count, check_choice, check_value, counted, differences, shown, typed, unknown_name
 from lw_torchrl._util.files import AnyPath, read_json, read_text, write_json, write_text
 from lw_torchrl.language.formats import PLAN_FORMATS, encode_plan
-from lw_torchrl.language.formats.structured import read_structured
 from lw_torchrl.language.nearest import StepMapper
 from lw_torchrl.language.plan_decoding import DecodedPlan, decode_as, decode_plan
 from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import Task, TaskList, named_tasks
-from lw_torchrl.planners.chat import PlannerError, Reply, Tokens
-from lw_torchrl.planners.prompts import passes
+from lw_torchrl.planners.prompts import passes, read_structured
 
 CUT_OFF = "it was cut off at max_tokens"
-_CACHE_VERSION = 1
+_CUT_OFF = {"length": CUT_OFF, "content_filter": "the server's content filter cut it off"}
 _ROW = {"llm": str, "format": str, "task": str, "attempt": int, "completion": str}  # of a .jsonl file
 _Place = tuple[str, str, int]  # format, task, attempt
+
+
+class PlannerError(RuntimeError):
+    """A planner could not answer a question; the message names the model, the question, the cause and a remedy.
+
+    After a ``fatal`` error, every other question to the same planner would fail in the same way.
+    """
+
+    def __init__(self, message: str, *, fatal: bool = False) -> None:
+        super().__init__(message)
+        self.fatal = fatal
+
+
+@dataclass(frozen=True)
+class Tokens:
+    """The number of tokens of prompts and of answers, as counted by the server; 0 if it does not count."""
+
+    prompt: int = 0
+    completion: int = 0
+
+    @property
+    def total(self) -> int:
+        return self.prompt + self.completion
+
+    def __add__(self, other: Tokens) -> Tokens:
+        return Tokens(self.prompt + other.prompt, self.completion + other.completion)
+
+
+@dataclass(frozen=True)
+class Reply:
+    """A server's reply to a question."""
+
+    text: str  # the answer; "" if there is none
+    finish: str = ""  # the server's finish_reason: "stop", "length", "content_filter", ""
+    refusal: str = ""  # the model's refusal
+    tokens: Tokens = field(default_factory=Tokens)
+    notes: tuple[str, ...] = ()  # remarks about the server
 
 
 @dataclass(frozen=True)
@@ -70,11 +104,10 @@ def read_reply(
 ) -> Answer:
     """Read the plan in a reply. With a ``schema`` the reply should be JSON, which is rewritten in the format."""
     read = PLAN_FORMATS[format].read if schema is None else read_structured
-    raw = storable(reply.text)
+    raw = _storable(reply.text)
     decoded = decode_as(raw, read, StepMapper(task, skills))
     text = encode_plan(decoded.plan, format) if schema and decoded.plan is not None else raw
-    reasons = {"length": CUT_OFF, "content_filter": "the server's content filter cut it off"}
-    notes = [reasons[reply.finish]] if reply.finish in reasons else []
+    notes = [_CUT_OFF[reply.finish]] if reply.finish in _CUT_OFF else []
     if reply.refusal:
         notes.append(f"the model refused: {shown(reply.refusal)}")
     elif not raw.strip():
@@ -84,11 +117,10 @@ def read_reply(
         with suppress(ValueError, RecursionError):
             valid = passes(json.loads(raw), schema)
         notes += [] if valid else ["the server did not keep to the schema"]
-    notes += reply.notes
-    return Answer(task.name, format, attempt, storable(text), raw, decoded, reply.tokens, notes=tuple(notes))
+    return Answer(task.name, format, attempt, _storable(text), raw, decoded, reply.tokens, notes=(*notes, *reply.notes))
 
 
-def storable(text: str) -> str:
+def _storable(text: str) -> str:
     r"""Return a text as a file gives it back: no lone surrogates or byte order mark, and "\n" as line end."""
     text = text.encode("utf-8", "replace").decode()
     return text.replace("\r\n", "\n").replace("\r", "\n").lstrip("\ufeff")
@@ -120,7 +152,7 @@ def write_settings(folder: Path, settings: Mapping[str, Any], *, reading: bool =
     """Write the settings that determine a model's answers to ``folder/settings.json``, unless they are there.
 
     Raises:
-        ValueError: the folder has answers of other settings; with ``reading``, of another model.
+        ValueError: the folder has answers with other settings; with ``reading``, of another model.
     """
     file = folder / "settings.json"
     before = read_json(file, "out: the settings") if file.is_file() else {}
@@ -151,7 +183,7 @@ def recorded_answers(source: AnyPath) -> dict[str, dict[_Place, str | Path]]:
 
 def answer_text(answer: str | Path) -> str:
     """Return the text of an answer that :func:`recorded_answers` gives."""
-    return storable(read_text(answer, ValueError) if isinstance(answer, Path) else answer)
+    return _storable(read_text(answer, ValueError) if isinstance(answer, Path) else answer)
 
 
 def _answers_in_folder(root: Path) -> Iterator[tuple[str, _Place, Path]]:
@@ -177,33 +209,8 @@ def _answers_in_lines(file: Path) -> Iterator[tuple[str, _Place, str]]:
         check_choice(f"{where}: format", row["format"], PLAN_FORMATS)
         name = folder_name(row["llm"])
         if models.setdefault(name, row["llm"]) != row["llm"]:
-            both = f"the models {models[name]!r} and {row['llm']!r} would both be {name!r}"
-            raise ValueError(f"{where}: {both}; give one of them another name")
+            raise ValueError(f"{where}: the folders of {models[name]!r} and {row['llm']!r} would both be {name!r}")
         yield name, (row["format"], row["task"], row["attempt"]), row["completion"]
-
-
-class AnswerCache:
-    """Replies in a folder, one JSON file each, under a hash of the request."""
-
-    def __init__(self, folder: AnyPath) -> None:
-        self.folder = Path(folder)
-
-    def path(self, request: Mapping[str, Any]) -> Path:
-        """Return the file of the reply to a request, which is named by everything that determines the reply."""
-        key = sha256(json.dumps([_CACHE_VERSION, request], sort_keys=True).encode()).hexdigest()
-        return self.folder / key[:2] / f"{key}.json"
-
-    def read(self, request: Mapping[str, Any]) -> Reply | None:
-        """Return the reply to a request; None if there is none, or if its file is damaged."""
-        with suppress(FileNotFoundError, ValueError, KeyError, TypeError):  # the question can be asked again
-            answer = read_json(self.path(request), "the cached answer")["answer"]
-            reply = Reply(**{**answer, "tokens": Tokens(**answer["tokens"]), "notes": tuple(answer["notes"])})
-            texts = (reply.text, reply.finish, reply.refusal, *reply.notes)
-            return reply if all(isinstance(text, str) for text in texts) else None
-        return None
-
-    def write(self, request: Mapping[str, Any], reply: Reply) -> None:
-        write_json(self.path(request), {"request": request, "answer": asdict(reply)})
 
 
 @runtime_checkable
@@ -223,8 +230,11 @@ class Planner(Protocol):
         Args:
             tasks: "MT10", "MT50", a task's name, a :class:`~lw_torchrl.Task`, or a list of names and tasks.
             format: a name in :data:`~lw_torchrl.PLAN_FORMATS`.
-            attempts: answers to each question. If one is missing, it is a :class:`PlannerError`; the others are kept.
+            attempts: answers to each question.
             out: a folder; each answer is written to ``out/<name>/<format>/<task>-<attempt>.<ext>`` as it arrives.
+
+        Raises:
+            PlannerError: an answer is missing; the others are kept.
         """
         ...
 
@@ -273,9 +283,8 @@ class FilePlanner:
             for attempt in range(count):
                 if (format, name, attempt) not in self._answers:
                     recorded = [str(place[2]) for place in self.recorded if place[:2] == (format, name)]
-                    available = f"attempts {', '.join(recorded)}" if recorded else f"none in {format}"
                     what = f"no answer of {self.name!r} is recorded for {name} in {format}, attempt {attempt}"
-                    raise PlannerError(f"{what}; of {name} there are {available}")
+                    raise PlannerError(f"{what}; there are attempts: {', '.join(recorded) or 'none'}")
                 text = answer_text(self._answers[format, name, attempt])
                 decoded = decode_plan(text, task, format)
                 answers.append(Answer(name, format, attempt, text, text, decoded, cached=True))

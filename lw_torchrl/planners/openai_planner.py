@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 from collections.abc import Generator, Iterable, Mapping
-from contextlib import closing
-from dataclasses import replace
+from contextlib import closing, suppress
+from dataclasses import asdict, replace
 from hashlib import sha256
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from threading import Event
-from typing import Any, Literal
+from time import monotonic
+from typing import Any
+from urllib.parse import urlsplit
 
 from lw_torchrl._util.checks import Count, Natural, Positive, Scale, check_choice, check_value, counted, shown, typed
-from lw_torchrl._util.files import AnyPath, read_text
+from lw_torchrl._util.files import AnyPath, parse_json, read_json, read_text, write_json
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import AnyPlans, as_plans
@@ -21,20 +25,31 @@ from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import TASKS, Task, TaskList, Tasks, get_task, named_tasks
 from lw_torchrl.planners.answer_files import (
     Answer,
-    AnswerCache,
     Answers,
+    PlannerError,
+    Reply,
+    Tokens,
     answer_path,
     folder_name,
     read_reply,
     write_answer,
     write_settings,
 )
-from lw_torchrl.planners.chat import ChatClient, PlannerError, Reply, server_address
 from lw_torchrl.planners.prompts import Question, chat_messages, example_plans, plan_schema
 
+OPENAI = "https://api.openai.com/v1"
+REPLY_LIMIT = 4 * 2**20  # bytes
+_KEY = "OPENAI_API_KEY"
+# What to send to a server that refuses a field, and how its error names the field.
+_FALLBACKS = {
+    "max_completion_tokens": "max_completion_tokens",  # instead of max_tokens
+    "json_object": "response_format|json_schema",  # as the type of response_format, instead of json_schema
+    "no system message": "system role|role.{0,20}system",  # its text begins the user's message
+}
 _OWN_FIELDS = {"max_completion_tokens", "max_tokens", "messages", "model", "n", "response_format", "seed", "stream"}
 _OWN_FIELDS |= {"temperature"}
 _SETTINGS = ("model", "constrain", "free_skills", "vocabulary", "temperature", "max_tokens", "seed", "options")
+_CACHE_VERSION = 1
 
 
 class OpenAIPlanner:
@@ -56,7 +71,7 @@ class OpenAIPlanner:
         options: further fields of the request, ``{"top_p": 0.9}``.
         name: the folder for the answers; None for the model's name, with "-constrained" if it is constrained.
         cache: the folder of cached answers.
-        concurrency: questions at once.
+        concurrency: number of simultaneous questions.
         retries: retries after a rate limit, or an error of the server or the connection; ``openai`` chooses the wait.
         timeout: seconds for one try, from the request to the end of the answer.
 
@@ -89,7 +104,7 @@ class OpenAIPlanner:
         timeout: Positive = 300.0,
     ) -> None:
         if not model.strip():
-            raise TypeError(f"model must be a model's name, got {shown(model)}")
+            raise ValueError(f"model must be a model's name, got {shown(model)}")
         if free_skills and not constrain:
             raise ValueError("free_skills needs constrain; without it, skills are in any words")
         self.model, self.base_url, self.address = model, base_url, server_address(base_url)
@@ -105,7 +120,7 @@ class OpenAIPlanner:
             others = ", ".join(sorted(_OWN_FIELDS))
             raise ValueError(f"options must not set {', '.join(own)} (reserved: {others})")
         self.name = folder_name(name or (f"{model}-constrained" if constrain else model))
-        self.cache = AnswerCache(cache)
+        self.cache = Path(cache)
         self.concurrency, self.retries, self.timeout = concurrency, retries, timeout
 
     def __repr__(self) -> str:
@@ -145,7 +160,7 @@ class OpenAIPlanner:
         """Ask for plans, several at a time.
 
         Args:
-            tasks, format, attempts, out: see :meth:`Planner.plans`. The JSON of a constrained model is written beside
+            tasks, format, attempts, out: see :meth:`Planner.plans`. The JSON of a constrained model is written next to
                 its answer, and the settings to ``out/<name>/settings.json``.
             recorded: read the answers that are in ``out``, and ask only for the others.
             progress: show a progress bar.
@@ -153,13 +168,13 @@ class OpenAIPlanner:
         Raises:
             PlannerError: an answer is missing. The others are cached; the same call asks for the missing ones.
             ImportError: the extra ``[llm]`` is needed, and not installed.
-            ValueError: no scripted skill suits a task, or the folder has answers of other settings.
+            ValueError: no scripted skill suits a task, or the folder has answers with other settings.
         """
         check_choice("format", format, PLAN_FORMATS)
         count = check_value("attempts", attempts, Count)
         each = [(task, attempt) for task in named_tasks(tasks).values() for attempt in range(count)]
         questions = [Question(task, attempt, self.request(task, format, attempt)) for task, attempt in each]
-        return self._answers(questions, format, self.name, out, progress, "read" if recorded else "replace")
+        return self._answers(questions, format, self.name, out, progress, recorded)
 
     def revise(
         self,
@@ -176,16 +191,15 @@ class OpenAIPlanner:
         Args:
             answers: answers in one format.
             facts: a report on each, as :func:`~lw_torchrl.planners.repairing.plan_facts` writes it.
-            tasks: where tasks' names are looked up.
-            out: as for :meth:`plans`; the folder's name ends in ``-round<round>``. Another answer of this round in it
-                is a :class:`ValueError`.
+            tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
+            out: as for :meth:`plans`; the folder's name ends in ``-round<round>``.
             progress: show a progress bar.
         """
         before, reports = list(answers), list(facts)
         formats = {answer.format for answer in before}
         if len(formats) != 1 or len(reports) != len(before):
-            got = f"{counted(len(before), 'answer')} of {', '.join(sorted(formats)) or 'none'} and {len(reports)} facts"
-            raise ValueError(f"answers must be of one format, each with its facts, got {got}")
+            what = f"{counted(len(before), 'answer')} of {', '.join(sorted(formats)) or 'none'}"
+            raise ValueError(f"answers must be of one format, each with its facts, got {what} and {len(reports)} facts")
         (format,) = formats
         questions = []
         for answer, report in zip(before, reports, strict=True):
@@ -194,7 +208,7 @@ class OpenAIPlanner:
             request["messages"] += [{"role": "assistant", "content": answer.raw}, {"role": "user", "content": report}]
             questions.append(Question(task, answer.attempt, request))
         name = f"{self.name}-round{check_value('round', round, Count)}"
-        return self._answers(questions, format, name, out, progress, "refuse")
+        return self._answers(questions, format, name, out, progress)
 
     def _answers(
         self,
@@ -203,23 +217,20 @@ class OpenAIPlanner:
         name: str,
         out: AnyPath | None,
         progress: bool,
-        existing: Literal["read", "replace", "refuse"],
+        recorded: bool = False,
     ) -> Answers:
-        """Answer questions from ``out``, the cache and the server, in this order."""
+        """Answer questions from ``out`` if they are ``recorded``, else from the cache, else from the server."""
         answers: list[Answer] = []
         missing: list[Question] = []
         written = 0
         for question in questions:
-            reply = self.cache.read(question.request)
+            reply = self._cached(question.request)
             answer = None if reply is None else self._read(reply, question, format)
             path = answer_path(out or "", name, format, question.task.name, question.attempt)
-            if out is not None and existing != "replace" and path.is_file():
+            if recorded and out is not None and path.is_file():
                 written += 1
                 text = read_text(path, ValueError)
                 if answer is None or answer.text != text:
-                    if existing == "refuse":
-                        what = f"{str(path)!r} holds an answer to another question; it is not replaced"
-                        raise ValueError(f"out: {what}: give the new answers another name (--name) or out")
                     answer = read_reply(Reply(text), question.task, format, question.attempt, self.skills)
             if answer is None:
                 missing.append(question)
@@ -242,13 +253,25 @@ class OpenAIPlanner:
                 bar.update()
         if errors:
             others = f" {counted(len(errors) - 1, 'other question')} failed, too." if len(errors) > 1 else ""
-            kept = f"{len(answers)} of {counted(len(questions), 'answer')} are kept in {str(self.cache.folder)!r}"
+            kept = f"{len(answers)} of {counted(len(questions), 'answer')} are kept in {str(self.cache)!r}"
             message = f"{errors[0]}{others} {kept}; repeat the call to ask for the others."
             raise PlannerError(message, fatal=errors[0].fatal)
         return Answers(answers)
 
     def _read(self, reply: Reply, question: Question, format: str) -> Answer:
         return read_reply(reply, question.task, format, question.attempt, self.skills, question.request["schema"])
+
+    def cache_path(self, request: Mapping[str, Any]) -> Path:
+        """Return the file of the cached reply to a request, named by a hash of everything that determines it."""
+        key = sha256(json.dumps([_CACHE_VERSION, request], sort_keys=True).encode()).hexdigest()
+        return self.cache / key[:2] / f"{key}.json"
+
+    def _cached(self, request: Mapping[str, Any]) -> Reply | None:
+        """Return the cached reply; None if there is none, or if its file is damaged: then the question is repeated."""
+        with suppress(FileNotFoundError, ValueError, KeyError, TypeError):
+            answer = read_json(self.cache_path(request), "the cached answer")["answer"]
+            return Reply(**{**answer, "tokens": Tokens(**answer["tokens"]), "notes": tuple(answer["notes"])})
+        return None
 
     def _ask(self, questions: list[Question]) -> Generator[tuple[Question, Reply | PlannerError], None, None]:
         """Yield each question with its reply or error, in the order in which they arrive; stop at a fatal error."""
@@ -265,14 +288,223 @@ class OpenAIPlanner:
                 if error.fatal:
                     stopped.set()
                 return question, error
-            self.cache.write(question.request, reply)
+            write_json(self.cache_path(question.request), {"request": question.request, "answer": asdict(reply)})
             return question, reply
 
         with (
-            closing(ChatClient(self.model, self.base_url, self.timeout, self.retries)) as client,
-            ThreadPool(min(self.concurrency, len(questions))) as pool,  # of daemons, which Ctrl-C does not wait for
+            closing(_ChatClient(self.model, self.base_url, self.timeout, self.retries)) as client,
+            ThreadPool(min(self.concurrency, len(questions))) as pool,  # daemons, which Ctrl-C does not wait for
         ):
             try:
-                yield from ((asked, result) for asked, result in pool.imap_unordered(ask, questions) if result)
+                yield from ((question, result) for question, result in pool.imap_unordered(ask, questions) if result)
             finally:
                 stopped.set()
+
+
+def server_address(base_url: str | None) -> str:
+    """Return the address of a server, without a user name, password or query."""
+    try:
+        url = urlsplit(base_url or os.environ.get("OPENAI_BASE_URL") or OPENAI)
+        valid = bool(url.hostname) and url.scheme in ("http", "https") and url.port != 0
+    except ValueError:
+        valid = False
+    if not valid:
+        raise ValueError(f"base_url must be an address like 'http://127.0.0.1:8000/v1', got {shown(base_url)}")
+    return f"{url.scheme}://{url.netloc.rpartition('@')[2]}{url.path.rstrip('/')}"
+
+
+class _ChatClient:
+    """A client of one model, for any number of threads; the arguments are those of :class:`OpenAIPlanner`."""
+
+    def __init__(self, model: str, base_url: str | None, timeout: float, retries: int) -> None:
+        try:
+            import openai
+        except ImportError as error:
+            needs = "asking a model needs the extra [llm]: pip install 'lw_torchrl[llm]'"
+            raise ImportError(f"{needs} ({error})") from error
+        self._openai, self.model, self.address, self._timeout = openai, model, server_address(base_url), timeout
+        self._key = key = os.environ.get(_KEY, "").strip()
+        if self.address == OPENAI and not key:
+            advice = f"set the environment variable {_KEY}, or give the base_url of a server that needs none"
+            raise PlannerError(f"{model!r} at {self.address} needs a key: {advice}", fatal=True)
+        if not (key.isascii() and key.isprintable()):
+            raise PlannerError(f"the key in {_KEY} has characters that no key has; set it again", fatal=True)
+        self._fallbacks = frozenset({"max_completion_tokens"} if self.address == OPENAI else ())
+        options: Any = {"timeout": openai.Timeout(timeout, connect=min(timeout, 10.0))}
+        try:
+            options |= {"http_client": _limited(openai, timeout)(**options), "max_retries": retries}
+            self._client = openai.OpenAI(api_key=key or "none", base_url=base_url, **options)
+        except (ValueError, ImportError, OSError) as error:
+            advice = "check the environment variables of proxies (ALL_PROXY) and certificates (SSL_CERT_FILE)"
+            what = f"the HTTP client cannot be made ({_excerpt(str(error))})"
+            raise PlannerError(f"{what}; {advice}", fatal=True) from None
+
+    def close(self) -> None:
+        self._client.close()
+
+    def ask(self, request: Mapping[str, Any], question: str) -> Reply:
+        """Return the reply to a request, or raise a :class:`PlannerError` that names the ``question``."""
+        try:
+            content, fallbacks = self._complete(request)
+            reply, answering = _read_completion(self._without_key(content))
+        except PlannerError as error:
+            what, fatal = str(error), error.fatal
+        except self._openai.APIError as error:
+            what, fatal = self._explain(error)
+        else:
+            notes = list(reply.notes)
+            if request["schema"] and "json_object" in fallbacks:
+                notes.insert(0, "the schema was sent as json_object, since the server takes no json_schema")
+            if not (answering.startswith(self.model) or self.model.startswith(answering)):  # servers append a date
+                notes.insert(0, f"the server says that the model {answering!r} answered, not {self.model!r}")
+            clean = {name: self._without_key(getattr(reply, name)) for name in ("text", "refusal")}
+            return replace(reply, notes=tuple(notes), **clean)
+        raise PlannerError(f"{self.model!r} at {self.address}, {question}: {self._without_key(what)}.", fatal=fatal)
+
+    def _complete(self, request: Mapping[str, Any]) -> tuple[bytes, frozenset[str]]:
+        """Return the body of a reply, and the fallbacks with which the server accepted the request."""
+        while True:
+            fallbacks = self._fallbacks
+            try:
+                fields = _request_fields(self.model, request, fallbacks)
+                return self._client.chat.completions.with_raw_response.create(**fields).content, fallbacks
+            except self._openai.APIStatusError as error:
+                message = _error_text(error) if error.status_code in (400, 415, 422) else ""
+                refused = {name for name, words in _FALLBACKS.items() if re.search(words, message, re.IGNORECASE)}
+                if refused <= fallbacks:
+                    raise
+                self._fallbacks |= refused
+
+    def _explain(self, error: Any) -> tuple[str, bool]:
+        """Return the cause of a client's error, with a remedy, and whether it is fatal."""
+        tried = f"asked {counted(int(error.request.headers.get('x-stainless-retry-count', 0)) + 1, 'time')}"
+        status, message = getattr(error, "status_code", None), _excerpt(self._without_key(_error_text(error)))
+        if any(isinstance(cause, self._openai.APITimeoutError) for cause in (error, error.__cause__)):
+            limit = f"no whole answer within {self._timeout:g} s, {tried}"
+            return f"{limit}. Give a longer timeout, or a lower concurrency", False
+        if status is None:
+            cause = _excerpt(self._without_key(str(error.__cause__ or error))) or type(error.__cause__).__name__
+            advice = "Check that the server runs, and that base_url is its address"
+            return f"the connection failed or broke off, {tried}: {cause}. {advice}", True
+        if status in (401, 403):
+            known = f"the key in {_KEY} is not accepted" if self._key else f"the server needs a key, in {_KEY}"
+            return f"{known} ({message}). Give the key of this server", True
+        if status == 404:
+            return f"no such model or address ({message}). `GET {self.address}/models` lists its models", True
+        if status == 429:
+            return f"too many requests, {tried} ({message}). Continue later, or with a lower concurrency", True
+        if status >= 500:
+            return f"the server failed, {tried} ({message}). Its log may say why; ask again", False
+        if re.search(r"context|too long|max_tokens|maximum.{0,20}length", message, re.IGNORECASE):
+            advice = "Give fewer max_tokens, a shorter format (basic_py), or the server a longer context"
+            return f"the question does not fit ({message}). {advice}", False
+        return f"the request is refused ({message}). Leave out the options that the server does not know", False
+
+    def _without_key(self, text: Any) -> Any:
+        """Replace copies of the key in a text or in bytes; a shorter key, such as "none", may be an ordinary word."""
+        key, hidden = self._key, "(the key)"
+        if len(key) < 8:
+            return text
+        return text.replace(key, hidden) if isinstance(text, str) else text.replace(key.encode(), hidden.encode())
+
+
+def _limited(openai: Any, timeout: float) -> Any:
+    """Return a subclass of the ``openai`` package's HTTP client that bounds the time and the size of each reply.
+
+    Its own timeout bounds each read, so that a server that sends a byte now and then would never time out.
+    """
+
+    class LimitedClient(openai.DefaultHttpxClient):
+        def send(self, request: Any, **options: Any) -> Any:
+            end = monotonic() + timeout
+            response = super().send(request, **{**options, "stream": True})
+            content = bytearray()
+            with closing(response):
+                for part in response.iter_bytes():
+                    content += part
+                    if monotonic() > end:
+                        raise openai.APITimeoutError(request)
+                    if len(content) > REPLY_LIMIT:  # _read_completion reports it
+                        break
+            headers = {name: value for name, value in response.headers.items() if name.lower() != "content-encoding"}
+            status = _status(response.status_code, bytes(content))
+            return type(response)(status, headers=headers, content=bytes(content), request=request)
+
+    return LimitedClient
+
+
+def _status(status: int, content: bytes) -> int:
+    """Return the status that a reply should have had, for the client to decide whether to ask again."""
+    if status == 500 and b"response_format" in content:  # llama-cpp-python refuses a kind of schema
+        return 400
+    with suppress(ValueError):  # some gateways send an error with status 200, and its code in the body
+        if status == 200 and (error := parse_json(content).get("error")):
+            code = error.get("code") if isinstance(error, dict) else None
+            return code if type(code) is int and 400 <= code < 600 else 502
+    return status
+
+
+def _request_fields(model: str, request: Mapping[str, Any], fallbacks: frozenset[str]) -> dict[str, Any]:
+    messages, schema = request["messages"], request["schema"]
+    if "no system message" in fallbacks:
+        system, user, *others = messages
+        messages = [{**user, "content": f"{system['content']}\n\n{user['content']}"}, *others]
+    limit = "max_completion_tokens" if "max_completion_tokens" in fallbacks else "max_tokens"
+    fields = {"model": model, "messages": messages, limit: request["max_tokens"], "extra_body": request["options"]}
+    fields |= {name: request[name] for name in ("temperature", "seed") if request[name] is not None}
+    if schema:
+        strict = {"type": "json_schema", "json_schema": {"name": "plan", "schema": schema, "strict": True}}
+        plain = {"type": "json_object", "schema": schema}
+        fields["response_format"] = plain if "json_object" in fallbacks else strict
+    return fields
+
+
+def _error_text(error: Any) -> str:
+    """Return the message of an error, and what the server sent if the client does not understand it."""
+    text = error.response.text.strip() if hasattr(error, "response") else ""
+    return str(error) if text in str(error) or " - " in str(error) else f"{error} - {text}"
+
+
+def _read_completion(content: bytes) -> tuple[Reply, str]:
+    """Read a chat completion; return the reply, and the name of the model that answered.
+
+    Raises:
+        PlannerError: it is too large, not JSON, or not a chat completion.
+    """
+    if len(content) > REPLY_LIMIT:
+        size = f"the reply is larger than {REPLY_LIMIT // 2**20} MiB"
+        raise PlannerError(f"{size}. Give fewer max_tokens, and no options that make it long")
+    try:
+        body = parse_json(content)
+        choice = body["choices"][0]
+        message = choice["message"]
+        answer = message["content"]
+    except (ValueError, KeyError, IndexError, TypeError) as error:
+        if isinstance(error, ValueError) and content.strip()[:1] in (b"", b"{"):
+            raise PlannerError(f"the reply was cut off or is not JSON: {_excerpt(str(error))}. Ask again") from None
+        advice = "Check that base_url is the address of an OpenAI-compatible server; it usually ends in /v1"
+        text = _excerpt(content.decode("utf-8", "replace"))
+        raise PlannerError(f"the reply is not a chat completion: {text}. {advice}", fatal=True) from None
+    notes: tuple[str, ...] = ()
+    if isinstance(answer, list):  # parts: thoughts, and texts
+        answer = "".join(_text(part.get("text")) for part in answer if isinstance(part, dict))
+    elif not answer:
+        others = [name for name in ("reasoning_content", "reasoning", "tool_calls") if message.get(name)]
+        notes = tuple(f"the server sent {name} instead of an answer" for name in others)
+    usage = body.get("usage")
+    counts = [usage.get(name) if isinstance(usage, dict) else 0 for name in ("prompt_tokens", "completion_tokens")]
+    tokens = Tokens(*(count if type(count) is int and count >= 0 else 0 for count in counts))
+    finish, refusal = _text(choice.get("finish_reason")), _text(message.get("refusal"))
+    return Reply(_text(answer), finish, refusal, tokens, notes), _excerpt(_text(body.get("model")))
+
+
+def _text(value: Any) -> str:
+    """Return a text without lone surrogates, which no file can hold; "" for other values."""
+    return value.encode("utf-8", "replace").decode() if isinstance(value, str) else ""
+
+
+def _excerpt(text: str) -> str:
+    """Shorten a server's text to one printable line without HTML tags."""
+    text = " ".join(re.sub(r"<(style|script)\b.*?</\1>|<[^<>]*>", " ", text[:20_000], flags=re.DOTALL).split())
+    text = "".join(character if character.isprintable() else "?" for character in text)
+    return text if len(text) <= 300 else f"{text[:300]} ..."

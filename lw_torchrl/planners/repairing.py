@@ -20,32 +20,31 @@ from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.planners.answer_files import CUT_OFF, Answer
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
 
-_GAPS = 3  # maximum number of gaps to print, the longest ones
+_GAPS = 3  # number of gaps to print, the longest ones
 
 
 @dataclass(frozen=True)
 class PlanCheck:
-    """How a plan was read, and how it fares in the simulator."""
+    """How a plan was read, and how it performs in the simulator."""
 
     task: str
     decoded: DecodedPlan
-    expert: TaskUse | None = None  # how its conditions fare in the states of Meta-World's expert; None without a plan
-    own: TaskUse | None = None  # how its steps fare under scripted skills; None if these cannot carry it out
-    success: float = 0.0  # the success rate under scripted skills
-    failed: tuple[Tensor, ...] = ()  # the observations of failed episodes, (T, 39) float32
+    expert: TaskUse | None = None  # its conditions in the states of Meta-World's expert; None without a plan
+    own: TaskUse | None = None  # its steps under scripted skills; None if these cannot carry it out
+    success: float = 0.0  # success rate under scripted skills
+    failed: tuple[Tensor, ...] = ()  # observations of failed episodes, (T, 39) float32
 
     @property
     def never(self) -> tuple[int, ...]:
-        """The steps, from 0, whose condition held neither in the expert's states nor in the plan's own."""
+        """The steps, from 0, whose condition was true neither in the expert's states nor in the plan's own."""
         if self.expert is None:
             return ()
         own = [0.0] * len(self.expert.true) if self.own is None else self.own.true
         return tuple(k for k, (a, b) in enumerate(zip(self.expert.true, own, strict=True)) if a == 0.0 and b == 0.0)
 
     def __str__(self) -> str:
-        if self.decoded.plan is None:
+        if self.decoded.plan is None or self.expert is None:
             return "\n".join([f"{self.task}: no plan: {self.decoded.reason}", *map(str, self.decoded.notes)])
-        assert self.expert is not None
         lines = [f"{self.task}, {len(self.decoded.plan.steps)} steps"]
         for k, step in enumerate(step for step in self.decoded.steps if not step.dropped):
             own = "" if self.own is None else f", {self.own.true[k]:.0%} of its own; acts in {self.own.chosen[k]:.0%}"
@@ -137,13 +136,13 @@ class Repair:
 
 
 def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
-    """Write the report to a model on how its plan fared. Of the answer's ``notes``, only truncation is reported.
+    """Write the report to a model on how its plan performed. Of the answer's ``notes``, only truncation is reported.
 
     Example:
         >>> from lw_torchrl.language.tasks import TASKS
         >>> print(plan_facts(check_plan("I cannot.", "reach", "basic_py"), TASKS["reach"]))
         The answer was read, and no plan was found in it: it has no steps, neither for reach nor for another task.
-        In the answer, line 1: is no part of a plan: 'I cannot.'
+        In the answer, line 1: is not part of a plan: 'I cannot.'
         Write the plan for `reach` again, the whole of it, in the same form, with this corrected.
     """
     again = f"Write the plan for `{task.name}` again, the whole of it, in the same form, with this corrected."
@@ -172,12 +171,12 @@ def _distances(task: Task, failed: Iterable[Tensor]) -> list[str]:
     if not episodes:
         return []
     names = task.published.object_names
-    moved = [name for name in names if any((one[name] - one[name][0]).norm(dim=-1).max() > 0.02 for one in episodes)]
+    moved = [name for name in names if any((at[name] - at[name][0]).norm(dim=-1).max() > 0.02 for at in episodes)]
     pairs = [(GRIPPER, name) for name in names if name != GRIPPER]
     pairs += [(a, b) for a in moved for b in names if GRIPPER not in (a, b) and b not in moved]
     lines = []
     for a, b in pairs:
-        distances = [(one[a] - one[b]).norm(dim=-1) for one in episodes]
+        distances = [(at[a] - at[b]).norm(dim=-1) for at in episodes]
         both = [distance.min() for distance in distances], [distance[-1] for distance in distances]
         least, last = (100 * float(torch.stack(values).median()) for values in both)
         lines.append(f"The {a} came within {least:.0f} cm of the {b}, and ended {last:.0f} cm from it.")
@@ -218,7 +217,7 @@ def repair_plans(
         return checks
 
     first = list(answers)
-    repairs = [Repair((answer,), (checked,)) for answer, checked in zip(first, run(first), strict=True)]
+    repairs = [Repair((answer,), (check,)) for answer, check in zip(first, run(first), strict=True)]
     for number in range(1, rounds + 1):
         failing = [k for k, repair in enumerate(repairs) if repair.checks[-1].success < enough]
         if not failing:
@@ -231,6 +230,6 @@ def repair_plans(
         answered = planner.revise(before, facts, round=number, tasks=tasks, out=out, progress=progress)
         revised = {(answer.task, answer.attempt): answer for answer in answered}
         after = [revised[answer.task, answer.attempt] for answer in before]
-        for k, answer, checked in zip(failing, after, run(after), strict=True):
-            repairs[k] = Repair((*repairs[k].answers, answer), (*repairs[k].checks, checked))
+        for k, answer, check in zip(failing, after, run(after), strict=True):
+            repairs[k] = Repair((*repairs[k].answers, answer), (*repairs[k].checks, check))
     return repairs

@@ -8,6 +8,5 @@ from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.rollout_recorder import RolloutRecorder
 from lw_torchrl.record.rollouts import log_rollout
 from lw_torchrl.record.viewer import open_viewer
-from lw_torchrl.record.web_page import WebPage, write_html
 
-__all__ = ["RerunLogger", "RolloutRecorder", "WebPage", "log_rollout", "open_viewer", "write_html"]
+__all__ = ["RerunLogger", "RolloutRecorder", "log_rollout", "open_viewer"]

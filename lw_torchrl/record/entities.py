@@ -1,9 +1,12 @@
-"""Entity paths, timelines and colours that all parts of a recording share."""
+"""Entity paths, timelines, colours and images that all parts of a recording share."""
 
+import io
+from collections.abc import Iterable
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
@@ -11,8 +14,8 @@ if TYPE_CHECKING:
     import rerun.blueprint as rrb
 else:
 
-    class _Later:
-        """A module that is imported at the first use of one of its attributes."""
+    class _LazyModule:
+        """Import a module when one of its attributes is first used: rerun takes a second, and few programs record."""
 
         def __init__(self, name: str) -> None:
             self._name = name
@@ -22,10 +25,11 @@ else:
             setattr(self, attribute, value)
             return value
 
-    rr, rrb = _Later("rerun"), _Later("rerun.blueprint")
+    rr, rrb = _LazyModule("rerun"), _LazyModule("rerun.blueprint")
 
 EPISODE_TIMELINE, SECONDS_TIMELINE, METRIC_TIMELINE = "step", "time", "global_step"
-STEP_TIME = 0.0125  # seconds per step of an episode of an unknown suite: Meta-World's 80 Hz
+STEP_TIME = 0.0125  # seconds per step where the suite is unknown: Meta-World's 80 Hz
+JPEG_QUALITY = 90
 
 Color = tuple[int, ...]
 TRUE, FALSE = (70, 170, 105), (52, 56, 64)
@@ -50,6 +54,35 @@ def changes(values: NDArray[Any]) -> NDArray[np.int64]:
 
 
 def time_columns(steps: NDArray[np.int64], step_time: float) -> list[Any]:
-    """Return the two timelines of an episode: steps, and seconds, ``step_time`` for each step."""
+    """Return an episode's two timelines: steps, and seconds, ``step_time`` for each step."""
     nanoseconds = (steps * round(step_time * 1e9)).astype("timedelta64[ns]")
     return [rr.TimeColumn(EPISODE_TIMELINE, sequence=steps), rr.TimeColumn(SECONDS_TIMELINE, duration=nanoseconds)]
+
+
+def check_image(name: str, image: Any) -> NDArray[np.uint8]:
+    """Return an image as H×W×C uint8: from H×W, H×W×C or C×H×W with C = 1 or 3, of uint8 or of floats in [0, 1]."""
+    pixels = torch.as_tensor(image).detach().cpu()
+    shape = tuple(pixels.shape)
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    elif pixels.ndim == 3 and shape[-1] not in (1, 3) and shape[0] in (1, 3):
+        pixels = pixels.permute(1, 2, 0)
+    if pixels.is_floating_point() and bool(((pixels >= 0) & (pixels <= 1)).all()):
+        pixels = (pixels * 255).round().to(torch.uint8)
+    if pixels.ndim != 3 or pixels.shape[-1] not in (1, 3) or not pixels.numel() or pixels.dtype != torch.uint8:
+        allowed = "uint8, or floats in [0, 1], of shape H×W, H×W×C or C×H×W with C = 1 or 3"
+        raise ValueError(f"image {name!r} must be {allowed}, got {pixels.dtype} of shape {shape}")
+    return pixels.contiguous().numpy()
+
+
+def send_images(stream: Any, path: str, times: Any, images: Iterable[NDArray[np.uint8]]) -> None:
+    """Add images H×W×C, each a JPEG at its time."""
+    from PIL import Image
+
+    jpegs = []
+    for pixels in images:
+        buffer = io.BytesIO()
+        Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels).save(buffer, "JPEG", quality=JPEG_QUALITY)
+        jpegs.append(buffer.getvalue())
+    stream.log(path, rr.EncodedImage.from_fields(media_type="image/jpeg"), static=True)
+    stream.send_columns(path, times, rr.EncodedImage.columns(blob=jpegs))

@@ -14,16 +14,13 @@ from numpy.typing import NDArray
 from lw_torchrl.record.entities import entity_path, rr, time_columns
 from lw_torchrl.suites.engine import RowModel
 
-SHOWN_GROUPS = (0, 1, 2)  # Meta-World keeps what only collides in group 4
-DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that was given none: the material's counts
+SHOWN_GROUPS = (0, 1, 2)  # Meta-World keeps geoms that only collide in group 4
+DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom without a colour: its material's is used instead
 
-FINEST, COARSEST = 0.0015, 0.010
-CUBES_ALONG = 18.0
-"""The number of cubes along the longest side of a mesh, and the smallest and largest cube, metres."""
-AROUND, ALONG = 24, 7
-"""The number of corners of a round shape around its axis, and of a quarter of a circle along it."""
-
-GHOST = (150, 190, 255, 90)
+FINEST, COARSEST = 0.0015, 0.010  # edges of the smallest and largest cube in which corners are merged, metres
+CUBES_ALONG = 18.0  # the number of cubes along the longest side of a mesh
+AROUND, ALONG = 24, 7  # the number of corners of a round shape around its axis, and of a quarter circle along it
+GHOST_COLOR = (150, 190, 255, 90)
 
 Vertices = dict[str, NDArray[Any]]
 _prepared: dict[str, ModelGeometry] = {}
@@ -31,12 +28,12 @@ _prepared: dict[str, ModelGeometry] = {}
 
 @dataclass(frozen=True)
 class Motion:
-    """The poses of a model's B bodies, and what the fingers touched."""
+    """The poses of a model's B bodies in T states, and what the fingers touched."""
 
     model: RowModel
     position: NDArray[np.float32]  # T×B×3, metres
     quaternion: NDArray[np.float32]  # T×B×4, w first
-    touched: tuple[str, ...] | None = None  # T names of bodies, or "nothing"; None if that is unknown
+    touched: tuple[str, ...] | None = None  # T names of bodies, or "nothing"; None if the engine cannot tell
 
 
 @dataclass(frozen=True)
@@ -48,21 +45,21 @@ class ModelGeometry:
 
 
 def model_geometry(model: RowModel) -> ModelGeometry:
-    """Return the geometry of a model; it is prepared once for each XML file, in about half a second."""
+    """Return the geometry of a model; it is prepared once for each XML file, which takes about half a second."""
     if model.path not in _prepared:
         _prepared[model.path] = _prepare(model.model)
     return _prepared[model.path]
 
 
-Known = dict[str, bytes]
-"""The meshes of a recording with their static poses, b"" for a pose that each episode sets."""
+LoggedMeshes = dict[str, bytes]
+"""The meshes that a recording already has with their static poses, b"" for a pose that each episode sets."""
 
 
 def log_motion(
     stream: Any,
     root: str,
     motion: Motion,
-    known: Known,
+    logged: LoggedMeshes,
     step_time: float,
     drawn: NDArray[np.int64] | None = None,
     *,
@@ -80,33 +77,33 @@ def log_motion(
     moves = np.ones(poses.shape[:2], bool)
     moves[1:] = (poses[1:] != poses[:-1]).any(axis=2)
     frames: dict[str, str] = {}
-    placed: dict[str, tuple[NDArray[np.int64], NDArray[np.float32]]] = {}
+    frame_poses: dict[str, tuple[NDArray[np.int64], NDArray[np.float32]]] = {}
     for body, name, mesh in geometry.meshes:
         path = entity_path("ghosts" if ghost else "meshes", name)
-        place, turn = poses[:, body, :3], poses[:, body, 3:]
+        position, quaternion = poses[:, body, :3], poses[:, body, 3:]
         moved = np.flatnonzero(moves[:, body])
-        pose = b"" if len(moved) > 1 else place[0].tobytes() + turn[0].tobytes()
+        pose = b"" if len(moved) > 1 else position[0].tobytes() + quaternion[0].tobytes()
         if ghost and pose:
             continue
-        if path not in known:
-            known[path] = pose
-            look: dict[str, Any] = {"albedo_factor": GHOST, "vertex_colors": None} if ghost else {}
+        if path not in logged:
+            logged[path] = pose
+            look: dict[str, Any] = {"albedo_factor": GHOST_COLOR, "vertex_colors": None} if ghost else {}
             stream.log(path, rr.Mesh3D(**(mesh | look)), static=True)
             if pose:
-                still = rr.Transform3D(translation=place[0], quaternion=rr.Quaternion(xyzw=turn[0]))
-                stream.log(path, still, static=True)
-        # A mesh that stands as in the first episode needs no frame, which costs a page two kilobytes.
-        if pose and known[path] == pose:
+                static_pose = rr.Transform3D(translation=position[0], quaternion=rr.Quaternion(xyzw=quaternion[0]))
+                stream.log(path, static_pose, static=True)
+        # A mesh with the same pose as in the first episode needs no frame, which costs a page two kilobytes.
+        if pose and logged[path] == pose:
             frames[path] = ""
             continue
         frames[path] = f"{stream.get_recording_id()[-8:]}{root}/{geometry.bodies[body]}"
-        placed.setdefault(frames[path], (drawn[moved], poses[moved, body]))
-    if placed:  # all in one: an entity for each body would weigh as much again
-        rows, every = (np.concatenate(parts) for parts in zip(*placed.values(), strict=True))
+        frame_poses.setdefault(frames[path], (drawn[moved], poses[moved, body]))
+    if frame_poses:  # all in one entity: an entity for each body would double the size
+        rows, values = (np.concatenate(parts) for parts in zip(*frame_poses.values(), strict=True))
         order = np.argsort(rows, kind="stable")
-        names = np.repeat([*placed], [len(own) for own, _ in placed.values()])[order].tolist()
-        every = every[order]
-        columns = rr.Transform3D.columns(translation=every[:, :3], quaternion=every[:, 3:], child_frame=names)
+        names = np.repeat([*frame_poses], [len(own) for own, _ in frame_poses.values()])[order].tolist()
+        values = values[order]
+        columns = rr.Transform3D.columns(translation=values[:, :3], quaternion=values[:, 3:], child_frame=names)
         stream.send_columns(root, time_columns(rows[order], step_time), columns)
     return frames
 
@@ -164,7 +161,7 @@ def _placed(shape: Vertices, position: NDArray[np.float64], quaternion: NDArray[
 
 
 def _shape(model: Any, geom: int) -> Vertices | None:
-    """Return the geom's surface in its own frame, None for a plane."""
+    """Return a geom's surface in its own frame, None for a plane."""
     kind, size = mujoco.mjtGeom(int(model.geom_type[geom])).name, model.geom_size[geom]
     angle = np.linspace(0, np.pi / 2, ALONG)
     quarter, up, out = np.stack([np.cos(angle), np.sin(angle)], axis=1), np.array([0, 1]), np.array([1, 0])
@@ -177,10 +174,10 @@ def _shape(model: Any, geom: int) -> Vertices | None:
         return _box(size)
     if kind in ("mjGEOM_SPHERE", "mjGEOM_ELLIPSOID"):
         ball, scale = np.concatenate([low, quarter[1:]]), size if kind == "mjGEOM_ELLIPSOID" else size[[0, 0, 0]]
-        found = _turned([(ball, ball)])
-        normals = found["vertex_normals"] / scale
+        sphere = _turned([(ball, ball)])
+        normals = sphere["vertex_normals"] / scale
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        return found | {"vertex_positions": found["vertex_positions"] * scale, "vertex_normals": normals}
+        return sphere | {"vertex_positions": sphere["vertex_positions"] * scale, "vertex_normals": normals}
     radius, half = size[0], size[1]
     if kind == "mjGEOM_CAPSULE":
         rims = np.concatenate([low * radius - up * half, quarter * radius + up * half])
@@ -190,7 +187,7 @@ def _shape(model: Any, geom: int) -> Vertices | None:
         side = np.stack([bottom[1], top[0]])
         ones = np.ones((2, 1))
         return _turned([(bottom, ones * -up), (side, ones * out), (top, ones * up)])
-    raise NotImplementedError(f"geom {geom} is of type {kind}, which no model of Meta-World has")
+    raise NotImplementedError(f"geom {geom} is of type {kind}, which cannot be drawn")
 
 
 def _box(half: NDArray[np.float64]) -> Vertices:
@@ -205,7 +202,7 @@ def _box(half: NDArray[np.float64]) -> Vertices:
 
 
 def _turned(profile: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> Vertices:
-    """Turn lines of corners (K×2: from the axis, along it), from bottom to top, and their normals around z."""
+    """Turn lines of corners (K×2: from the axis, along it) and their normals around z, from bottom to top."""
     angle = np.arange(AROUND) * 2 * np.pi / AROUND
     circle = np.stack([np.cos(angle), np.sin(angle), np.ones(AROUND)], axis=1)
     corners, normals = (
@@ -237,7 +234,7 @@ def _corners(model: Any, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 
 def _color(model: Any, geom: int) -> NDArray[np.uint8]:
-    """Return (4,) uint8: the geom's colour, or its material's, times the mean of its texture."""
+    """Return a geom's colour, or its material's, times the mean of its texture, (4,) uint8."""
     material = model.geom_matid[geom]
     rgba = np.array(model.geom_rgba[geom], np.float64)
     if material >= 0:
@@ -252,7 +249,7 @@ def _color(model: Any, geom: int) -> NDArray[np.uint8]:
 
 
 def _clustered(corners: NDArray[np.float64], normals: NDArray[np.float64]) -> dict[str, Any]:
-    """Return a coarse mesh from triangles' corners (F×3×3, metres) and their unit normals (F×3×3).
+    """Simplify a mesh of triangles' corners (F×3×3, metres) and their unit normals (F×3×3).
 
     The corners in a cube move to their mean, so no gap opens; corners with different normals stay separate.
     """
@@ -262,7 +259,6 @@ def _clustered(corners: NDArray[np.float64], normals: NDArray[np.float64]) -> di
     cubes, cube = np.unique(_packed(((points - low) / size).astype(np.int64)), return_inverse=True)
     places = _means(points, cube, len(cubes))
     directed = cube * 125 + _packed(np.rint(directions * 2.0).astype(np.int64) + 2, 5)
-    # The first corner of each vertex tells its cube.
     _, first, vertex = np.unique(directed, return_index=True, return_inverse=True)
     mean_normals = _means(directions, vertex, len(first))
     mean_normals /= np.maximum(np.linalg.norm(mean_normals, axis=1, keepdims=True), 1e-9)

@@ -25,19 +25,10 @@ from lw_torchrl.record.entities import (
     step_color,
     time_columns,
 )
-from lw_torchrl.record.meshes import Known, Motion
-from lw_torchrl.record.recorded_episode import NOBODY, MendedRecording, RecordedEpisode
+from lw_torchrl.record.meshes import LoggedMeshes, Motion
+from lw_torchrl.record.recorded_episode import NO_STEP, Ghost, RecordedEpisode
 from lw_torchrl.record.scene import Point, eye_of, log_pictures, log_scene, touched_objects
-from lw_torchrl.record.verdict import (
-    Heading,
-    decisive_step,
-    drawn_steps,
-    farthest,
-    log_curves,
-    log_plan,
-    telling_steps,
-    verdict,
-)
+from lw_torchrl.record.verdict import Heading, decisive_step, drawn_steps, log_curves, log_plan, shown_steps, verdict
 
 NONE_HOLDS, EVENLY = "no condition holds", "evenly mixed"
 OPEN, CLOSED, NOTHING = "open", "closed", "nothing"
@@ -45,22 +36,30 @@ _WRONG = "false, answered true", "true, answered false"
 FAILED: Color = (215, 75, 75)
 WRONG: Color = (200, 60, 140)
 TOUCHES_CLOSED, TOUCHES_OPEN = (225, 130, 60), (150, 165, 220)
+MANY_LANES = 9  # with more lanes, a small window has little room for the verdict
+CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
+    "distance": ("Distance to the target, cm", None),
+    "action": ("Action", (-1.2, 1.2)),
+    "reward": ("Reward", None),
+    "skill_weights": ("Skill weights", (-0.1, 1.1)),
+    "corrected": ("How much of the correction counts", (-0.1, 1.1)),
+}
+"""Each curve's title, and the range of its numbers where it is fixed."""
 
 
 @dataclass
 class Lanes:
-    """Lanes below ``root``: one has an entry where its state changes, and an empty one at the end.
+    """Lanes below ``root``: a lane has an entry where its state changes, and an empty entry at the end.
 
     The viewer shows a lane's path as its title, with a backslash before anything but letters, digits and underscores,
-    and sorts the lanes; so paths are short, and names begin with numbers. ``states`` holds the text and colour of each
-    state, shared by all lanes of a view; ``conditions`` are the paths of the lanes of conditions.
+    and sorts the lanes; so paths are short, and names begin with numbers.
     """
 
     root: str
     step_time: float
-    states: dict[str, tuple[str, Color]] = field(default_factory=dict)
+    states: dict[str, tuple[str, Color]] = field(default_factory=dict)  # text and colour, shared by a view's lanes
     paths: list[str] = field(default_factory=list)
-    conditions: list[str] = field(default_factory=list)
+    conditions: list[str] = field(default_factory=list)  # paths of the lanes of conditions
 
     def send(self, stream: Any, name: str, first: int, states: NDArray[np.str_], looks: Mapping[str, Any]) -> str:
         """Add a lane that begins at step ``first`` and return its path; ``looks`` are colours, or texts and colours."""
@@ -69,7 +68,7 @@ class Lanes:
         rows = changes(states[:, None])
         entries = [*states[rows].tolist(), ""]
         times = time_columns(np.array([*rows, len(states)]) + first, self.step_time)
-        # This apostrophe counts as a letter.
+        # The viewer takes this apostrophe for a letter.
         path = self.root + entity_path(name.replace("'", "\u02bc").replace(" ", "_"))
         stream.send_columns(path, times, rr.StateChange.columns(state=entries))
         self.paths.append(path)
@@ -82,22 +81,22 @@ def log_lanes(
     episode: RecordedEpisode,
     ended: str,
     touched: Sequence[str] | None,
-    ghost: MendedRecording | None,
+    ghost: Ghost | None,
 ) -> Lanes:
     """Log the lanes of an episode below ``root``; ``ended`` is its verdict, ``touched`` what its fingers touched."""
     lanes = Lanes(root, episode.step_time)
     widths = [a.shape[1] for a in (episode.qaf, episode.believed, episode.skill_weights) if a is not None]
     columns = max([len(episode.steps), *widths])
-    width = len(str(columns))
+    digits = len(str(columns))
     if episode.success is not None:
-        won = episode.first_success is not None
-        looks = {"success": TRUE, "not yet": FALSE} if won else {ended: FAILED}
-        states = np.where(episode.success, "success", "not yet" if won else ended)
-        lanes.send(stream, f"{0:0{width}} verdict", 1, states, looks)
+        succeeded = episode.first_success is not None
+        looks = {"success": TRUE, "not yet": FALSE} if succeeded else {ended: FAILED}
+        states = np.where(episode.success, "success", "not yet" if succeeded else ended)
+        lanes.send(stream, f"{0:0{digits}} verdict", 1, states, looks)
     if episode.active is not None:
-        _send_steps(stream, lanes, f"{0:0{width}}b plan step", episode)
+        _log_active_step(stream, lanes, f"{0:0{digits}}b plan step", episode)
     if ghost is not None and ghost.episode.active is not None:
-        _send_steps(stream, lanes, f"{0:0{width}}c ghost with {ghost.by}", ghost.episode, "ghost")
+        _log_active_step(stream, lanes, f"{0:0{digits}}c ghost with {ghost.by}", ghost.episode, "ghost")
     for column in range(0 if episode.qaf is None else columns):
         assert episode.qaf is not None
         condition = episode.short_conditions[column] if episode.steps else "condition"
@@ -106,7 +105,7 @@ def log_lanes(
             believed = episode.believed[:, column]
             truth = np.where(believed != episode.qaf[:, column], np.where(believed, *_WRONG), truth)
         looks = {"true": TRUE, "false": FALSE, **dict.fromkeys(_WRONG, WRONG)}
-        lanes.conditions.append(lanes.send(stream, f"{column + 1:0{width}} {condition}", 0, truth, looks))
+        lanes.conditions.append(lanes.send(stream, f"{column + 1:0{digits}} {condition}", 0, truth, looks))
     if episode.opening is None:
         return lanes
     threshold = STATES[OPEN][0].threshold
@@ -123,49 +122,37 @@ def log_lanes(
     return lanes
 
 
-def _send_steps(stream: Any, lanes: Lanes, name: str, episode: RecordedEpisode, kind: str = "") -> None:
+def _log_active_step(stream: Any, lanes: Lanes, name: str, episode: RecordedEpisode, kind: str = "") -> None:
     """Log the active step, numbered from 1; the steps of another ``kind`` of plan have separate names."""
     assert episode.active is not None
     count = max(len(episode.steps), int(episode.active.max()) + 1)
-    named = [f"{i} {skill}" for i, (_, skill) in enumerate(episode.steps, 1)] or map(str, range(1, count + 1))
-    looks: dict[str, Any] = {f"{kind}{i}": (label, step_color(i)) for i, label in enumerate(named)}
+    labels = [f"{i} {skill}" for i, (_, skill) in enumerate(episode.steps, 1)] or map(str, range(1, count + 1))
+    looks: dict[str, Any] = {f"{kind}{i}": (label, step_color(i)) for i, label in enumerate(labels)}
     answered = True if episode.answers is None else episode.answers.any(axis=1)
-    nobody = np.where(np.broadcast_to(answered, len(episode)), EVENLY, NONE_HOLDS)
-    states = np.where(episode.active == NOBODY, nobody, np.array([*looks, ""])[episode.active])
+    inactive = np.where(np.broadcast_to(answered, len(episode)), EVENLY, NONE_HOLDS)
+    states = np.where(episode.active == NO_STEP, inactive, np.array([*looks, ""])[episode.active])
     lanes.send(stream, name, 0, states, looks | {NONE_HOLDS: FALSE, EVENLY: FALSE})
-
-
-MANY_LANES = 9  # with more lanes, a small window has little room for the verdict
-
-CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
-    "distance": ("Distance to the target, cm", None),
-    "action": ("Action", (-1.2, 1.2)),
-    "reward": ("Reward", None),
-    "skill_weights": ("Skill weights", (-0.1, 1.1)),
-    "corrected": ("How much of the correction counts", (-0.1, 1.1)),
-}
-"""Each curve's title, and the range of its numbers where they have one."""
 
 
 @dataclass(frozen=True)
 class Page:
-    """The part of an episode's data on which its views depend, which can be written as JSON."""
+    """The part of an episode's data on which its views depend; it can be written as JSON."""
 
     root: str
     trails: Collection[str]  # entities that are shown up to the cursor
-    eye: tuple[Point, Point]  # the place from which the scene is seen, and the place looked at
+    eye: tuple[Point, Point]  # the position from which the scene is seen, and the position looked at
     has_scene: bool  # whether anything is drawn in 3-D
-    shown: tuple[int, int]  # the first and last step worth a look
+    shown: tuple[int, int]  # the first and last step to show
     decisive: int  # the step to open it at
     curves: Collection[str]
-    lines: int  # of the plan's text, in a small window; 0 where there is no plan
+    lines: int  # of the plan's text, in a small window; 0 without a plan
     lanes: Sequence[str]  # their entities
-    conditions: Sequence[str]  # those of the lanes of conditions
+    conditions: Sequence[str]  # entities of the lanes of conditions
     states: dict[str, tuple[str, Color]]  # of the lanes: text and colour
-    farthest: float  # of the distances, cm
+    farthest: float  # the largest distance to a skill's target, cm
     row: dict[str, Any]  # in the overview
     frames: dict[str, str]  # as log_motion returns them
-    pictures: float  # that the policy saw: width over height, 0 without any
+    pictures: float  # width over height of the policy's pictures, 0 without any
     step_time: float  # seconds between two actions
     bounded: bool  # whether all actions are in [-1, 1]
 
@@ -178,19 +165,19 @@ class Page:
 
     def tab(self, title: str) -> rrb.Horizontal:
         """Return a tab with scene and curves on the left, texts and lanes on the right."""
-        # Shares are the pixels that a view needs in a window of 1100×700; what is longer scrolls.
+        # Shares are the pixels that a view needs in a window of 1100×700; longer texts scroll.
         plan = 60 + 15 * self.lines if self.lines else 0
         scene: Any = self._scene()
         if not self.has_scene and self.pictures:
             scene = self._pictures()
         elif self.pictures:  # 0.3 of the width for one picture, 0.4 for two side by side
-            seen = min(0.2 + 0.1 * self.pictures, 0.5)
-            scene = rrb.Horizontal(scene, self._pictures(), column_shares=[1 - seen, seen])
+            share = min(0.2 + 0.1 * self.pictures, 0.5)
+            scene = rrb.Horizontal(scene, self._pictures(), column_shares=[1 - share, share])
         left: list[tuple[float, Any]] = [(max(150, 500 - plan), scene)] if self.has_scene or self.pictures else []
-        left += [(plan, self._words("plan", "Plan"))] if plan else []
+        left += [(plan, self._text("plan", "Plan"))] if plan else []
         left += [(105, rrb.Tabs(*(self._curve(name) for name in CURVES if name in self.curves)))] if self.curves else []
         right = self._lanes(self.lanes)
-        right.insert(0, (max(100, 605 - sum(share for share, _ in right)), self._words("verdict", "Verdict")))
+        right.insert(0, (max(100, 605 - sum(share for share, _ in right)), self._text("verdict", "Verdict")))
         return rrb.Horizontal(_stacked(left), _stacked(right), column_shares=[9, 10], name=title)
 
     def column(self, title: str, shown: tuple[int, int], farthest: float) -> rrb.Vertical:
@@ -202,27 +189,27 @@ class Page:
         behind += [page._pictures()] if page.pictures else []
         scene = rrb.Tabs(page._scene(), *behind) if behind else page._scene()
         room = max(120, 487 - sum(share for share, _ in below))
-        return _stacked([(118, page._words("verdict", title)), (room, scene), *below], title)
+        return _stacked([(118, page._text("verdict", title)), (room, scene), *below], title)
 
     def _scene(self) -> rrb.Spatial3DView:
         first, now = rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.cursor_relative()
         timelines = EPISODE_TIMELINE, SECONDS_TIMELINE
         trail = rrb.VisibleTimeRanges([rr.VisibleTimeRange(name, start=first, end=now) for name in timelines])
-        shown: dict[Any, Any] = {path: trail for path in self.trails}
-        shown |= {mesh: rr.CoordinateFrame(frame) for mesh, frame in self.frames.items() if frame}
+        overrides: dict[Any, Any] = {path: trail for path in self.trails}
+        overrides |= {mesh: rr.CoordinateFrame(frame) for mesh, frame in self.frames.items() if frame}
         return rrb.Spatial3DView(
             origin=f"{self.root}/scene",
             contents=["$origin/**", *self.frames],
             name="Scene",
             line_grid=False,
             eye_controls=rrb.EyeControls3D(position=self.eye[0], look_target=self.eye[1]),
-            overrides=shown,
+            overrides=overrides,
         )
 
     def _pictures(self) -> rrb.Spatial2DView:
         return rrb.Spatial2DView(origin=f"{self.root}/seen", name="What it saw")
 
-    def _words(self, part: str, name: str) -> rrb.TextDocumentView:
+    def _text(self, part: str, name: str) -> rrb.TextDocumentView:
         return rrb.TextDocumentView(origin=f"{self.root}/{part}", name=name)
 
     def _lanes(self, lanes: Sequence[str], name: str = "What went on") -> list[tuple[float, Any]]:
@@ -251,6 +238,11 @@ def _stacked(parts: Sequence[tuple[float, Any]], name: str | None = None) -> rrb
     return rrb.Vertical(*(view for _, view in parts), row_shares=[share for share, _ in parts], name=name)
 
 
+def _window(shown: tuple[int, int]) -> Any:
+    first, last = (rr.TimeRangeBoundary.absolute(seq=step) for step in shown)
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
+
+
 def send_page(
     stream: Any,
     number: int,
@@ -258,8 +250,8 @@ def send_page(
     heading: Heading,
     episode: RecordedEpisode,
     motion: Motion | None,
-    ghost: MendedRecording | None,
-    meshes: Known,
+    ghost: Ghost | None,
+    meshes: LoggedMeshes,
 ) -> Page:
     """Log the recording's ``number``-th episode, under ``name``, and return its page."""
     root = entity_path(name)
@@ -275,22 +267,17 @@ def send_page(
         trails=trails,
         eye=eye,
         has_scene=bool(episode.objects) or motion is not None,
-        shown=telling_steps(heading, episode, ghost),
+        shown=shown_steps(heading, episode, ghost),
         decisive=decisive_step(heading, episode, ghost),
         curves=log_curves(stream, root, episode),
         lines=log_plan(stream, root, episode) if episode.steps else 0,
         lanes=lanes.paths,
         conditions=lanes.conditions,
         states=lanes.states,
-        farthest=farthest(episode),
+        farthest=1.0 if episode.distance is None else max(1.0, 100 * float(np.nanmax(episode.distance))),
         row=heading.row(episode, name),
         frames=frames,
         pictures=log_pictures(stream, root, episode, drawn),
         step_time=episode.step_time,
         bounded=bool((abs(episode.action) <= 1).all()),
     )
-
-
-def _window(shown: tuple[int, int]) -> Any:
-    first, last = (rr.TimeRangeBoundary.absolute(seq=step) for step in shown)
-    return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))

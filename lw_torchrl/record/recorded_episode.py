@@ -15,17 +15,16 @@ from tensordict import TensorDictBase
 
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.objects import GRIPPER
-from lw_torchrl.language.queries import Clause, Query
+from lw_torchrl.language.queries import Query
 from lw_torchrl.language.relations import TOUCHING
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.language.tasks import Task
-from lw_torchrl.record.entities import STEP_TIME, time_columns
+from lw_torchrl.record.entities import STEP_TIME, check_image, time_columns
 from lw_torchrl.record.meshes import Motion
-from lw_torchrl.record.metrics import check_image
 from lw_torchrl.suites.suite import Suite
 
-APART = 0.01  # two episodes have parted when something is more than this apart, metres
-NOBODY = -1  # instead of a step's number: no single step is active
+APART = 0.01  # two episodes part when the hand or an object is this far apart, metres
+NO_STEP = -1  # instead of a plan step's number: no single step is active
 
 
 @runtime_checkable
@@ -46,8 +45,8 @@ class TargetPose(NamedTuple):
     @property
     def distance(self) -> NDArray[np.float32]:
         """The distance between both, T, metres; NaN for a relative target."""
-        gap = np.linalg.norm(self.position - self.moved, axis=1)
-        return np.full_like(gap, np.nan) if self.relative else gap
+        distance = np.linalg.norm(self.position - self.moved, axis=1)
+        return np.full_like(distance, np.nan) if self.relative else distance
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class RecordedEpisode:
     action: NDArray[np.float32]  # T×A, of Meta-World displacement xyz and gripper effort, in [-1,1]; A may be 0
     objects: dict[str, NDArray[np.float32]]  # name -> T×3 position in metres, with a layout also the gripper's
     layout: Layout | None = METAWORLD  # None for a robot of unknown layout: only objects are drawn
-    observation: NDArray[np.float32] | None = None  # T×D, as the layout says; metres, gripper opening in [0,1]
+    observation: NDArray[np.float32] | None = None  # T×D, as the layout describes it; metres, gripper opening in [0,1]
     qaf: NDArray[np.bool_] | None = None  # T×S, truth of each condition
     believed: NDArray[np.bool_] | None = None  # T×S, the answers of a learned evaluator
     skill_weights: NDArray[np.float32] | None = None  # T×S, attention over the steps
@@ -65,14 +64,18 @@ class RecordedEpisode:
     reward: NDArray[np.float32] | None = None  # T, likewise
     corrected: NDArray[np.float32] | None = None  # T, the weight of a correction
     steps: tuple[tuple[str, str], ...] = ()  # the S (condition, skill) texts; empty without a plan
-    short_conditions: tuple[str, ...] = ()  # of each step
-    reasons: tuple[str, ...] = ()  # of each step, the plan's comment, or the skill as it was written
+    short_conditions: tuple[str, ...] = ()  # S
+    reasons: tuple[str, ...] = ()  # S: a step's comment in the plan, or the skill as it was written
     confidence: float | None = None  # of a canonical plan
-    target_poses: tuple[TargetPose | None, ...] = ()  # of each step; None if its skill is not a scripted one
-    pixels: NDArray[np.uint8] | None = None  # T×H×W×C, what the policy or its evaluator saw
+    target_poses: tuple[TargetPose | None, ...] = ()  # S; None for a skill that is not a scripted one
+    pixels: NDArray[np.uint8] | None = None  # T×H×W×C, the input of the policy or its evaluator
     step_time: float = STEP_TIME  # seconds between two actions
 
+    def __len__(self) -> int:
+        return len(self.action)
+
     def times(self, steps: NDArray[np.int64]) -> list[Any]:
+        """Return the columns of the episode's two timelines at ``steps``."""
         return time_columns(steps, self.step_time)
 
     def at(self, step: int) -> str:
@@ -104,9 +107,9 @@ class RecordedEpisode:
             if weights.shape[1] == 1:
                 return np.zeros(len(self), np.int64)
             second, first = np.sort(weights, axis=1)[:, -2:].T
-            return np.where(first - second > 1e-6, weights.argmax(axis=1), NOBODY)
+            return np.where(first - second > 1e-6, weights.argmax(axis=1), NO_STEP)
         if (answers := self.answers) is not None:
-            return np.where(answers.any(axis=1), answers.argmax(axis=1), NOBODY)
+            return np.where(answers.any(axis=1), answers.argmax(axis=1), NO_STEP)
         return None
 
     @property
@@ -130,21 +133,18 @@ class RecordedEpisode:
 
     def with_target_poses(self, task: Task, suite: Suite | None) -> RecordedEpisode:
         """Return the episode with the target poses of its plan's skills in ``task``."""
-        scripted = load_skills() if suite is None or suite.skills is None else suite.skills
+        skills = load_skills() if suite is None or suite.skills is None else suite.skills
         assert self.observation is not None
         positions = task.positions(torch.from_numpy(self.observation))
         poses: list[TargetPose | None] = [None] * len(self.steps)
         for step, (_, text) in enumerate(self.steps):
-            if text in scripted and scripted[text].suits(task):
-                skill = scripted[text].for_task(task)
+            if text in skills and skills[text].suits(task):
+                skill = skills[text].for_task(task)
                 moved = positions[skill.moved].numpy()
-                towards = positions[skill.target].numpy() + np.asarray(skill.offset, np.float32)
-                position = np.where(np.asarray(skill.gain) > 0, towards, moved).astype(np.float32)
+                target = positions[skill.target].numpy() + np.asarray(skill.offset, np.float32)
+                position = np.where(np.asarray(skill.gain) > 0, target, moved).astype(np.float32)
                 poses[step] = TargetPose(position, moved, skill.target == GRIPPER)
         return replace(self, target_poses=tuple(poses))
-
-    def __len__(self) -> int:
-        return len(self.action)
 
     @classmethod
     def from_rollout(
@@ -157,7 +157,7 @@ class RecordedEpisode:
     ) -> RecordedEpisode:
         """Check a rollout, as :meth:`lw_torchrl.RerunLogger.log_episode` describes it."""
         if len(rollout.batch_size) != 1 or not rollout.batch_size[0]:
-            hint = "; take one episode, rollout[i]" if len(rollout.batch_size) > 1 else ""
+            hint = "; select one episode, rollout[i]" if len(rollout.batch_size) > 1 else ""
             raise ValueError(f"rollout must have batch size (T,) with T >= 1, got {tuple(rollout.batch_size)}{hint}")
         steps = tuple((str(step.condition), step.skill) for step in plan.steps) if plan is not None else ()
         length = rollout.batch_size[0]
@@ -169,29 +169,28 @@ class RecordedEpisode:
             return _array(value, f"rollout[{key!r}]", (length, size))
 
         def optional(key: Any, *, flat: bool = False, truth: bool = False) -> NDArray[Any] | None:
-            """A column for each step of the plan without padding, or a flat one; truth above 0.5 if it is a number."""
+            """Return T×S, a column for each plan step without padding, or T if ``flat``; numbers above 0.5 are true."""
             if rollout.get(key, None) is None:
                 return None
             array, needed = column(key, None), 1 if flat else len(steps)
             if array.shape[1] < max(needed, 1):
-                columns = f"a column for each of {needed} plan steps, got {array.shape[1]}"
-                raise ValueError(f"rollout[{key!r}] must have {columns}")
+                raise ValueError(f"rollout[{key!r}] must have {needed} columns, got {array.shape[1]}")
             array = array > 0.5 if truth and array.dtype != np.bool_ else array
             return array[:, 0] if flat else array[:, : needed or None]
 
         executed: Any = ("next", "executed_action")
-        acted = "action" if rollout.get(executed, None) is None else executed
-        places = {name: _array(value, f"objects[{name!r}]", (length, 3)) for name, value in objects.items()}
+        action_key = "action" if rollout.get(executed, None) is None else executed
+        positions = {name: _array(value, f"objects[{name!r}]", (length, 3)) for name, value in objects.items()}
         if layout is not None:
-            observation, action = column("observation", layout.size), column(acted, layout.action_size)
-            places.setdefault(GRIPPER, observation[:, layout.positions[0]])
+            observation, action = column("observation", layout.size), column(action_key, layout.action_size)
+            positions.setdefault(GRIPPER, observation[:, layout.positions[0]])
         else:
-            observation, value = None, rollout.get(acted, torch.zeros(length, 0))
+            observation, value = None, rollout.get(action_key, torch.zeros(length, 0))
             action = _array(value[:, None].flatten(1).float(), "rollout['action']", (length, None))
         logits, pixels = optional("qaf_logits"), rollout.get("pixels", None)
         return cls(
             action=action,
-            objects=places,
+            objects=positions,
             layout=layout,
             observation=observation,
             qaf=optional("qaf", truth=True),
@@ -210,8 +209,8 @@ class RecordedEpisode:
 
 
 @dataclass(frozen=True)
-class MendedRecording:
-    """The same episode after a part was replaced ``by`` something: the ghost in its scene."""
+class Ghost:
+    """The same episode after a part was replaced ``by`` something; it is drawn translucent in the episode's scene."""
 
     by: str
     episode: RecordedEpisode
@@ -222,43 +221,39 @@ class MendedRecording:
         length = min(len(self.episode), len(other))
         if self.episode.observation is None or other.observation is None or other.layout is None:
             return length - 1
-        gap = np.zeros(length)
-        for place in other.layout.positions:
-            apart = self.episode.observation[:length, place] - other.observation[:length, place]
-            gap = np.maximum(gap, np.linalg.norm(apart, axis=1))
-        return int((gap > APART).argmax()) if (gap > APART).any() else length - 1
+        difference = self.episode.observation[:length] - other.observation[:length]
+        distances = [np.linalg.norm(difference[:, place], axis=1) for place in other.layout.positions]
+        apart = np.max(distances, axis=0) > APART
+        return int(apart.argmax()) if apart.any() else length - 1
 
 
 def short_condition(condition: Any) -> str:
     """Shorten a condition: "gripper above and not left or right of puck"; a text that is not a query stays as it is."""
     if not isinstance(condition, Query):
         return str(condition)
-    parts, before = [], ""
-    for (subject, target, _), clauses in groupby(enumerate(condition.clauses), _same_objects):
-        group = [clause for _, clause in clauses]
-        words = ["" if subject == before else subject.removeprefix("robot's ")]
-        before, negated = subject, False
-        for i, clause in enumerate(group):
+    parts, last_subject = [], ""
+    # Consecutive clauses about the same two objects make one part; a clause without an object is its own part.
+    numbered = [(c.subject, c.object, i if c.object is None else -1) for i, c in enumerate(condition.clauses)]
+    for (subject, target, _), pairs in groupby(zip(numbered, condition.clauses, strict=True), lambda pair: pair[0]):
+        clauses = [clause for _, clause in pairs]
+        words = ["" if subject == last_subject else subject.removeprefix("robot's ")]
+        last_subject, negated = subject, False
+        for i, clause in enumerate(clauses):
             joint = ("or" if negated else "and not") if clause.negated else "but" if negated else "and"
             first, *rest = clause.predicate.split()
-            is_last = clause is group[-1] or not rest or rest[-1] not in ("of", "with", "to")
+            keeps_preposition = clause is clauses[-1] or not rest or rest[-1] not in ("of", "with", "to")
             if clause.predicate == TOUCHING:
                 words.append("off table" if clause.negated else "on table")
             else:
-                words += [joint if i else "not" if clause.negated else "", first, *(rest if is_last else rest[:-1])]
+                words += [joint if i else "not" if clause.negated else "", first]
+                words += rest if keeps_preposition else rest[:-1]
             negated = clause.negated
         parts.append(" ".join(filter(None, [*words, target])))
     return " and ".join(parts)
 
 
-def _same_objects(numbered: tuple[int, Clause]) -> tuple[str, str | None, int]:
-    """Return a key that consecutive clauses about the same two objects share; one without an object is on its own."""
-    number, clause = numbered
-    return clause.subject, clause.object, number if clause.object is None else -1
-
-
 def _reason(step: Any) -> str:
-    """Return the comment of a plan's step, or of a canonical step how it was written."""
+    """Return the comment of a plan's step, or how a canonical step was written."""
     role = getattr(step, "role", None)
     if role is None:
         return str(getattr(step, "reason", ""))
@@ -269,8 +264,8 @@ def _reason(step: Any) -> str:
 def _array(value: Any, label: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
     """Return ``value`` as an array of ``shape`` (None: any size); another shape or NaN is a ValueError."""
     tensor = torch.as_tensor(value).detach().cpu()
-    allowed = "×".join("S" if size is None else str(size) for size in shape)
     if tensor.ndim != len(shape) or any(s not in (None, n) for s, n in zip(shape, tensor.shape, strict=True)):
+        allowed = "×".join("S" if size is None else str(size) for size in shape)
         raise ValueError(f"{label} must have shape {allowed}, got {'×'.join(map(str, tensor.shape)) or 'a scalar'}")
     array = tensor.numpy() if tensor.dtype == torch.bool else tensor.to(torch.float32).numpy()
     if not np.isfinite(array).all():

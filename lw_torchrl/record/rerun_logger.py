@@ -22,22 +22,30 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.record.loggers import Logger
 
-from lw_torchrl._util.checks import check_choice, typed
+from lw_torchrl._util.checks import Positive, check_choice, typed
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl.evaluation.figures import plot_failures
 from lw_torchrl.evaluation.result import EvaluationResult
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.plans import ConditionalPlan
-from lw_torchrl.record import metrics
-from lw_torchrl.record.entities import METRIC_TIMELINE, STEP_TIME, entity_path, rr, time_columns
-from lw_torchrl.record.meshes import Known, Motion
-from lw_torchrl.record.metrics import check_name
+from lw_torchrl.record.entities import (
+    METRIC_TIMELINE,
+    STEP_TIME,
+    check_image,
+    entity_path,
+    rr,
+    send_images,
+    time_columns,
+)
+from lw_torchrl.record.meshes import LoggedMeshes, Motion
 from lw_torchrl.record.page import send_page
-from lw_torchrl.record.recorded_episode import MendedRecording, PlanLike, RecordedEpisode
+from lw_torchrl.record.recorded_episode import Ghost, PlanLike, RecordedEpisode
 from lw_torchrl.record.tabs import OVERVIEW, TITLES, Tabs
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.suites.suite import known_suite
 
+MOST_CURVES = 64  # under one name
+BAR_COLOR = (80, 170, 255)
 BUFFERED_SCALARS = 1024
 SEND_SECONDS, SEND_SHARE = 0.5, 0.01
 """Buffered numbers are sent after SEND_SECONDS or SEND_SHARE of the logger's age, whichever is longer."""
@@ -45,22 +53,22 @@ FLUSH_SECONDS = 5.0
 
 
 class RerunLogger(Logger):
-    """A TorchRL logger that makes one rerun recording: metrics, images, videos, and whole episodes in 3-D.
+    """A TorchRL logger that writes one rerun recording: metrics, images, videos, and whole episodes in 3-D.
 
-    Rerun writes the file in a thread of its own while the run goes, so a killed run leaves a recording that
-    :func:`open_viewer` can open. A full disk or a lost viewer never stops the run: rerun prints an error, and the rest
-    of the recording is lost. A recording is never overwritten: if "run.rrd" exists, the logger writes "run-2.rrd".
+    Rerun writes the file in its own thread while the program runs, so a killed program leaves a recording that
+    :func:`open_viewer` can open. A full disk or a lost viewer never stops the program: rerun prints an error, and the
+    rest of the recording is lost. A recording is never overwritten: if "run.rrd" exists, the logger writes "run-2.rrd".
 
     Args:
         path: the file, ending in ".rrd"; missing folders are created. None writes no file.
-        connect: the address of a viewer that shows the recording as it grows, "127.0.0.1:9876" or
+        connect: the address of a running viewer that shows the recording as it grows, "127.0.0.1:9876" or
             "rerun+http://127.0.0.1:9876/proxy"; start it with ``rerun``. If no viewer answers, rerun waits five seconds
             at the start and at the end.
-        exp_name: the name of the run; None takes the file's, without ".rrd".
+        exp_name: the name of the run; None for the file's name without ".rrd".
 
     Attributes:
         path: the file that is written, or None.
-        experiment: the rerun RecordingStream, for logging more by hand. It is not rerun's global recording.
+        experiment: rerun's RecordingStream, for other rerun calls. It is not rerun's global recording.
 
     Example:
         >>> import tempfile, os
@@ -78,24 +86,24 @@ class RerunLogger(Logger):
     @typed
     def __init__(self, path: AnyPath | None = None, *, connect: str | None = None, exp_name: str | None = None) -> None:
         if path is None and connect is None:
-            raise ValueError("give path, a file to write, or connect, a viewer to show it in, or both; got neither")
+            raise ValueError("path (a file to write) or connect (a running viewer) is required, or both; got neither")
         if path is not None and Path(path).suffix != ".rrd":
             raise ValueError(f"path must end in '.rrd', got {str(path)!r}")
         self.path = None if path is None else _new_file(Path(path))
         self.connect = f"rerun+http://{connect}/proxy" if connect is not None and "://" not in connect else connect
         self._lock = threading.RLock()
         self._scalars: dict[str, tuple[list[int], list[list[float]]]] = {}
-        self._curves: dict[str, int] = {}
+        self._curves: dict[str, int] = {}  # name -> number of curves
         self._counters: dict[str, int] = {}
         self._hparams: dict[str, str] = {}
         self._tabs = Tabs()
-        self._meshes: Known = {}
+        self._meshes: LoggedMeshes = {}
         self._began = self._sent = time.monotonic()
         name = exp_name or (Path(path).stem if path is not None else "lw_torchrl")
         super().__init__(exp_name=name, log_dir=str(self.path.parent) if self.path else os.curdir)
 
     def _create_experiment(self) -> rr.RecordingStream:
-        # Recordings of one application share a layout in rerun's viewer, so each is an application of its own.
+        # Rerun's viewer gives all recordings of one application the same layout, so each is its own application.
         stream = rr.RecordingStream(f"{self.exp_name}-{uuid.uuid4().hex[:8]}", recording_id=uuid.uuid4())
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
@@ -120,7 +128,7 @@ class RerunLogger(Logger):
 
     def _open(self) -> rr.RecordingStream:
         if self._service_shutdown:
-            raise RuntimeError(f"{self!r} accepts nothing more; make a new RerunLogger")
+            raise RuntimeError(f"{self!r} was shut down; make a new RerunLogger")
         return self.experiment
 
     def log_scalar(self, name: str, value: Any, step: int | None = None) -> None:
@@ -132,7 +140,7 @@ class RerunLogger(Logger):
             step: the training step; None counts the calls with this name from 0.
         """
         stream = self._open()
-        row, parts = metrics.numbers(name, value), check_name(name).split("/")
+        row, parts = _numbers(name, value), _name_parts(name)
         with self._lock:
             if len(row) > self._curves.get(name, 0):
                 self._curves[name] = len(row)
@@ -146,13 +154,13 @@ class RerunLogger(Logger):
             self._send(now=len(values) >= BUFFERED_SCALARS)
 
     def log_image(self, name: str, image: Any, step: int | None = None) -> None:
-        """Add an image "images/<name>", a JPEG on the timeline "global_step", at ``step`` as in :meth:`log_scalar`.
+        """Add an image "images/<name>", a JPEG on the timeline "global_step"; ``step`` as in :meth:`log_scalar`.
 
         It is H×W, H×W×C or C×H×W, C = 1 or 3, of uint8 or of floats in [0, 1].
         """
-        stream, pixels = self._open(), metrics.check_image(name, image)
+        stream, pixels = self._open(), check_image(name, image)
         with self._lock:
-            metrics.send_images(stream, *self._place("images", name, step), [pixels])
+            send_images(stream, *self._place("images", name, step), [pixels])
             self._send()
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
@@ -165,30 +173,29 @@ class RerunLogger(Logger):
         """
         video = torch.as_tensor(video).detach().cpu()
         if video.ndim == 5 and len(video) != 1:
-            for i, one in enumerate(video):
-                self.log_video(f"{name}/{i}", one, step, **kwargs)
+            for i, clip in enumerate(video):
+                self.log_video(f"{name}/{i}", clip, step, **kwargs)
             return
         video = video[0] if video.ndim == 5 else video
         if video.ndim != 4 or video.shape[1] not in (1, 3) or not video.numel() or video.dtype != torch.uint8:
-            got = f"{str(video.dtype).removeprefix('torch.')} of shape {'×'.join(map(str, video.shape))}"
-            raise ValueError(f"video {name!r} must be uint8 of shape T×C×H×W with C = 1 or 3, got {got}")
+            given = f"{video.dtype} of shape {tuple(video.shape)}"
+            raise ValueError(f"video {name!r} must be uint8 of shape T×C×H×W with C = 1 or 3, got {given}")
         frames = video.permute(0, 2, 3, 1).contiguous().numpy()
-        stream, parts = self._open(), check_name(name).split("/")
+        stream, parts = self._open(), _name_parts(name)
         if step is not None:
             parts.append(f"step {int(step)}")
         times = time_columns(np.arange(len(frames)), 1 / float(kwargs.get("fps", 1 / STEP_TIME)))
         with self._lock:
-            metrics.send_images(stream, entity_path("videos", *parts), times, frames)
+            send_images(stream, entity_path("videos", *parts), times, frames)
             self._tabs.add_view("videos", "/".join(parts))
             self._send()
 
-    def log_hparams(self, cfg: Any) -> None:
+    @typed
+    def log_hparams(self, cfg: Mapping[Any, Any]) -> None:
         """Add a mapping (a DictConfig too) to the table "hparams"; nested keys are written "actor.width"."""
-        if not isinstance(cfg, Mapping):
-            raise TypeError(f"cfg must be a mapping, got {type(cfg).__name__}")
         stream = self._open()
         with self._lock:
-            self._hparams.update(metrics.flatten(cfg))
+            self._hparams.update(_flatten(cfg))
             rows = [("key", "value"), ("---", "---"), *sorted(self._hparams.items())]
             cells = [[text.replace("|", "\\|").replace("\n", " ") for text in row] for row in rows]
             table = "\n".join(f"| {key} | {value} |" for key, value in cells)
@@ -199,28 +206,35 @@ class RerunLogger(Logger):
     def log_histogram(self, name: str, data: Sequence[float] | Tensor | NDArray[Any], **kwargs: Any) -> None:
         """Add the counts of finite numbers as a bar chart "histograms/<name>", on the timeline "global_step".
 
-        ``step`` is that of :meth:`log_scalar`, and ``bins`` the number or the edges of the bins (30).
+        Args:
+            data: the numbers, of any shape.
+            **kwargs: ``step`` as in :meth:`log_scalar`; ``bins``, the number or the edges of the bins (30).
         """
-        chart = metrics.histogram(name, data, kwargs.get("bins", 30))
+        values = np.asarray(torch.as_tensor(data).detach().cpu().to(torch.float64)).ravel()
+        if not values.size or not np.isfinite(values).all():
+            raise ValueError(f"data of histogram {name!r} must be finite and not empty, got {values.tolist()[:8]}")
+        counts, edges = np.histogram(values, bins=kwargs.get("bins", 30))
+        bars = {"abscissa": [(edges[1:] + edges[:-1]) / 2], "widths": [np.diff(edges)], "color": [BAR_COLOR]}
+        chart = rr.BarChart.columns(values=[counts.astype(np.int64)], **bars)
         with self._lock:
             self._open().send_columns(*self._place("histograms", name, kwargs.get("step")), chart)
             self._send()
 
     def _place(self, kind: str, name: str, step: int | None) -> tuple[str, list[Any]]:
         """Add a view for a value logged at a training step; return its entity path and its time."""
-        path = entity_path(kind, *check_name(name).split("/"))
+        path = entity_path(kind, *_name_parts(name))
         self._tabs.add_view(kind, name)
         return path, [rr.TimeColumn(METRIC_TIMELINE, sequence=[self._count(path, step)])]
 
     def flush(self, timeout: float | None = None) -> None:
-        """Send everything to the file and the viewer, and wait for it, at most ``timeout`` seconds (5)."""
+        """Send everything to the file and the viewer, and wait at most ``timeout`` seconds (5) until it arrived."""
         if not self._service_shutdown:
             self._send(now=True, layout=self.connect is not None)
-            with suppress(RuntimeError):  # a full disk or a lost viewer, about which rerun has printed an error
+            with suppress(RuntimeError):  # a full disk or a lost viewer; rerun has printed an error
                 self.experiment.flush(timeout_sec=FLUSH_SECONDS if timeout is None else timeout)
 
     def shutdown(self, timeout: float | None = None) -> None:
-        """Send the rest, waiting as :meth:`flush` does, and close the file; a second call does nothing."""
+        """Flush and close the file; a second call does nothing."""
         if self._service_shutdown:
             return
         self._send(now=True, layout=True)
@@ -238,12 +252,12 @@ class RerunLogger(Logger):
         self._counters = dict(state_dict.get("counters", {}))
 
     def _count(self, path: str, step: int | None) -> int:
-        now = self._counters.get(path, 0) if step is None else int(step)
-        self._counters[path] = now + 1
-        return now
+        number = self._counters.get(path, 0) if step is None else int(step)
+        self._counters[path] = number + 1
+        return number
 
     def _send(self, *, now: bool = False, layout: bool = False) -> None:
-        """Save new tabs, and send buffered numbers if it is time for it or ``now``.
+        """Save new tabs, and send buffered numbers if they are due or ``now``.
 
         Rerun accepts a layout only whole, 0.1 MB a page, so a file gets it at its end and a live viewer now and then.
         """
@@ -264,9 +278,10 @@ class RerunLogger(Logger):
 
     @property
     def episodes(self) -> list[str]:
-        """The names of the episodes so far."""
+        """The names of the recorded episodes."""
         return list(self._tabs.pages)
 
+    @typed
     def log_episode(
         self,
         rollout: TensorDictBase,
@@ -275,7 +290,7 @@ class RerunLogger(Logger):
         objects: Mapping[str, Any] | None = None,
         plan: PlanLike | None = None,
         name: str | None = None,
-        step_time: float | None = None,
+        step_time: Positive | None = None,
     ) -> str:
         """Add one episode of any TorchRL environment: objects in 3-D, the verdict, the plan, the timeline and curves.
 
@@ -291,8 +306,11 @@ class RerunLogger(Logger):
             task: the task's name.
             objects: name -> T×3 positions in metres; "robot's gripper" is added if the layout is known.
             plan: its ``steps`` each have a ``condition`` and a ``skill``; None shows numbered columns.
-            name: the entity that contains everything, and the tab's title; None takes ``task``, then "task-2".
-            step_time: seconds per step; None for the suite's that has the task, else 0.0125.
+            name: the tab's title and the entity that contains everything; None for ``task``, then "task-2".
+            step_time: seconds per step; None for that of the suite that has the task, else 0.0125.
+
+        Raises:
+            ValueError: a column has another shape or is not finite, or the name is taken.
 
         Example:
             >>> import tempfile, torch
@@ -303,8 +321,6 @@ class RerunLogger(Logger):
             ...     logger.log_episode(rollout, task="swing", objects={"tip": tip}, step_time=0.05)
             'swing'
         """
-        if not isinstance(task, str) or not task.strip():
-            raise ValueError(f"task must be a task's name, got {task!r}")
         suite, observation = known_suite(task), rollout.get("observation", None)
         layout = None if suite is None else suite.layout
         if isinstance(plan, ConditionalPlan):
@@ -321,16 +337,16 @@ class RerunLogger(Logger):
         episode: RecordedEpisode,
         *,
         motion: Motion | None = None,
-        ghost: MendedRecording | None = None,
+        ghost: Ghost | None = None,
         name: str | None = None,
     ) -> str:
         """Add the page of a checked episode and return its name; with a motion, the robot's own meshes are shown."""
         stream = self._open()
         with self._lock:
-            reserved, wanted = (*TITLES, OVERVIEW, *self._tabs.pages), heading.name if name is None else name
-            if name is not None and (not name.strip() or name in reserved):
-                raise ValueError(f"name {name!r} is empty or reserved (reserved: {', '.join(reserved)})")
-            candidates = chain([wanted], (f"{wanted}-{i}" for i in count(2)))
+            reserved, first = (*TITLES, OVERVIEW, *self._tabs.pages), heading.name if name is None else name
+            if not first.strip() or (name is not None and name in reserved):
+                raise ValueError(f"name {first!r} is empty or reserved (reserved: {', '.join(reserved)})")
+            candidates = chain([first], (f"{first}-{i}" for i in count(2)))
             name = next(candidate for candidate in candidates if candidate not in reserved)
             page = send_page(stream, len(self.episodes) + 1, name, heading, episode, motion, ghost, self._meshes)
             self._tabs.add("page", vars(page))
@@ -345,6 +361,7 @@ class RerunLogger(Logger):
             self._open().log(path, rr.EncodedImage(contents=picture.getvalue(), media_type="image/png"), static=True)
             self._tabs.add("figure", path)
 
+    @typed
     def compare(self, names: Sequence[str], title: str = "Side by side") -> None:
         """Show the episodes of these names side by side, in a tab before their own; one cursor moves in all of them."""
         self._open()
@@ -369,3 +386,35 @@ def _new_file(path: Path) -> Path:
             free.touch(exist_ok=False)
             return free
     raise AssertionError("unreachable")
+
+
+def _name_parts(name: str) -> list[str]:
+    parts = name.split("/") if isinstance(name, str) else []
+    if not parts or not all(part.strip() for part in parts):
+        raise ValueError(f"name must be words joined by single slashes like 'loss/bc', got {name!r}")
+    return parts
+
+
+def _numbers(name: str, value: Any) -> list[float]:
+    """Return a metric's value as a list of numbers."""
+    if type(value) is float or type(value) is int:  # the usual case, without a tensor
+        return [float(value)]
+    try:
+        value = value.detach().cpu() if isinstance(value, Tensor) else value
+        values = torch.as_tensor(value, dtype=torch.float64).ravel().tolist()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"value of {name!r} must be a number or several, got {value!r}") from error
+    if not 1 <= len(values) <= MOST_CURVES:
+        raise ValueError(f"value of {name!r} must be 1 to {MOST_CURVES} numbers (see log_histogram), got {len(values)}")
+    return values
+
+
+def _flatten(cfg: Mapping[Any, Any], prefix: str = "") -> dict[str, str]:
+    """Flatten nested mappings: "actor.width" to the text of its value."""
+    flat: dict[str, str] = {}
+    for key, value in cfg.items():
+        if isinstance(value, Mapping) and value:
+            flat |= _flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = str(value)
+    return flat

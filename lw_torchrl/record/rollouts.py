@@ -6,7 +6,6 @@ import os
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,24 +17,24 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from lw_torchrl._util.checks import missing_keys, shown, typed
+from lw_torchrl._util.checks import missing_keys, typed
 from lw_torchrl._util.devices import device_of
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.envs.seeding import episode_seed
-from lw_torchrl.evaluation.diagnose.counterfactuals import own_evaluators
 from lw_torchrl.evaluation.diagnose.failure import Failure
+from lw_torchrl.evaluation.diagnose.replacements import own_evaluators
 from lw_torchrl.evaluation.diagnose.sentences import replacement_text
 from lw_torchrl.evaluation.rollout import actor_plans, suite_tasks
 from lw_torchrl.evaluation.rollout import rollout as run_rollout
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.objects import GRIPPER
-from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, Plans, as_plans
+from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.record.entities import STEP_TIME
 from lw_torchrl.record.meshes import Motion
-from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
+from lw_torchrl.record.recorded_episode import Ghost, RecordedEpisode
 from lw_torchrl.record.rerun_logger import RerunLogger, is_complete
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.suites.suite import Suite, known_suite, load_suite
@@ -61,8 +60,8 @@ def log_rollout(
     """Add a rollout to a recording: the robot in 3-D, a verdict, the plan at the cursor, the timeline and curves.
 
     With the environment's seed, the episode is simulated again from its task, ``seed``, ``episode`` and actions to show
-    the robot's motion. Its observations must be equal bit for bit; otherwise a warning says so, and a simple hand over
-    a table is drawn instead of the robot, as without a seed.
+    the robot's motion. If its observations are not equal bit for bit, a warning is issued, and a simple hand over a
+    table is drawn instead of the robot, as without a seed.
 
     Args:
         logger: the recording.
@@ -74,11 +73,11 @@ def log_rollout(
             episode in each row.
         plans: the plans that ``qaf`` answers; None without plans.
         seed: the environment's seed; with ``episode`` it determines how the episode began.
-        name: the episode's name in the recording, for batch size (T,); None takes "push-7", of task and episode.
+        name: the episode's name in the recording, for batch size (T,); None for task and episode, "push-7".
         policy: the policy's name, for the tab.
         failure: why the episode failed, for the verdict; for N rows a list with one entry each, or None.
         tasks: custom tasks that the plans do not define.
-        suite: the suite that simulates the episode again; None for the known one that has the task.
+        suite: the suite that simulates the episode again; None for the registered suite that has the task.
 
     Returns:
         The episode's name; for N rows a list of names.
@@ -97,9 +96,9 @@ def log_rollout(
         failures = failure if isinstance(failure, Sequence) else [failure] * len(rollout)
         same: dict[str, Any] = {"seed": seed, "policy": policy, "tasks": list(tasks), "suite": suite}
         rows = zip(rollout, failures, strict=True)
-        return [log_rollout(logger, row, plans, failure=why, **same) for row, why in rows]
-    if not isinstance(failure, Failure | None):
-        raise TypeError(f"failure must be one Failure for one episode, got {shown(failure)}")
+        return [log_rollout(logger, row, plans, failure=row_failure, **same) for row, row_failure in rows]
+    if isinstance(failure, Sequence):
+        raise TypeError(f"failure must be one Failure for one episode, got {len(failure)}")
     if suite is not None:
         suite = load_suite(suite)
         tasks = [*tasks, *suite.tasks.values()]
@@ -109,7 +108,7 @@ def log_rollout(
     if failure is not None and failure.mended is not None:
         by, plan, steps = failure.mended
         other, mended = read_rollout(steps, Plans([plan]), seed=seed, tasks=tasks, suite=suite)
-        ghost = MendedRecording(replacement_text(by), mended, None if motion is None else _motion(other, mended, suite))
+        ghost = Ghost(replacement_text(by), mended, None if motion is None else _motion(other, mended, suite))
     return logger.add_page(heading, episode, motion=motion, ghost=ghost, name=name)
 
 
@@ -126,11 +125,11 @@ def read_rollout(
 ) -> tuple[Heading, RecordedEpisode]:
     """Return heading and episode of a rollout (T,), checked as :func:`log_rollout` describes it."""
     plans = None if plans is None else as_plans(plans)
-    number = _single(rollout, "task_id", required=True)
-    index = _single(rollout, "episode", required=seed is not None)
+    number = _constant(rollout, "task_id", required=True)
+    index = _constant(rollout, "episode", required=seed is not None)
     assert number is not None
-    own = [*tasks, *(plan.definition for plan in (plans or {}).values())]
-    task = next((one for one in own if task_id(one.name) == number), None)
+    defined = [*tasks, *(plan.definition for plan in (plans or {}).values())]
+    task = next((task for task in defined if task_id(task.name) == number), None)
     if task is None and 0 <= number < len(MT50):
         task = TASKS[MT50[number]]
     label = f"task-{number}" if task is None else task.name
@@ -140,10 +139,10 @@ def read_rollout(
         plan = plans[label]
         answered = rollout.get("qaf_plan", None)
         if answered is not None and not bool((answered == Plans([plan]).numbers[label]).all()):
-            raise ValueError(f"rollout['qaf'] answers another plan of {label!r} than was given, as 'qaf_plan' tells")
+            raise ValueError(f"plans must hold the plan that rollout['qaf'] answers; that of {label!r} is another one")
     if failure is not None and (failure.task, failure.episode) != (label, failure.episode if index is None else index):
-        got = f"{failure.task} {failure.episode}"
-        raise ValueError(f"failure must be of the rollout's episode, {label} {index}, got that of {got}")
+        given = f"{failure.task} {failure.episode}"
+        raise ValueError(f"failure must be of the rollout's episode, {label} {index}, got {given}")
     observation = rollout.get("observation", None)
     objects: dict[str, Tensor] = {}
     if task is not None and observation is not None and observation.shape[1:] == (task.layout.size,):
@@ -160,7 +159,7 @@ def read_rollout(
 
 
 class DiffersError(ValueError):
-    """A second simulation of an episode differs; the text says where first, and by how much."""
+    """A second simulation of an episode differs; the message says where first, and by how much."""
 
 
 def simulate_again(
@@ -171,16 +170,17 @@ def simulate_again(
     observation: NDArray[np.float32],
     suite: Suite | None = None,
 ) -> Motion | None:
-    """Return the motion in an episode, of T + 1 rows, or None if the engine has no ``poses``.
+    """Simulate an episode again from its executed actions, T×A, and return the motion, of T + 1 rows.
 
-    Equal observations, bit for bit, mean equal motion; otherwise :class:`DiffersError`. Actions are T×A, as executed.
+    Return None if the engine has no ``poses``. Raise :class:`DiffersError` unless the observations, T×D, are equal bit
+    for bit: then the motion is equal too.
     """
     suite = load_suite("metaworld") if suite is None else suite
     engine: Any = suite.make_engine([task], reward="sparse", num_threads=1)
     try:
         if not hasattr(engine, "poses"):
             return None
-        seen = engine.reset([0], [episode_seed(suite.tasks[task], seed, episode)])[0].astype(np.float32)
+        simulated = engine.reset([0], [episode_seed(suite.tasks[task], seed, episode)])[0].astype(np.float32)
         shape, active = (len(action) + 1, engine.model(0).model.nbody), np.ones(1, bool)
         positions, quaternions = np.empty((*shape, 3), np.float32), np.empty((*shape, 4), np.float32)
         touched = []
@@ -189,10 +189,10 @@ def simulate_again(
             touched.append(engine.touched(0) if hasattr(engine, "touched") else None)
             if step == len(action):
                 break
-            if not np.array_equal(seen, observation[step]):
-                off = np.abs(seen.astype(np.float64) - observation[step])
-                raise DiffersError(f"step {step}: number {off.argmax()} is {off.max():.3g} off")
-            seen = engine.step(action[step : step + 1], active).observation[0].astype(np.float32)
+            if not np.array_equal(simulated, observation[step]):
+                error = np.abs(simulated.astype(np.float64) - observation[step])
+                raise DiffersError(f"step {step}: number {error.argmax()} differs by {error.max():.3g}")
+            simulated = engine.step(action[step : step + 1], active).observation[0].astype(np.float32)
         return Motion(engine.model(0), positions, quaternions, None if None in touched else tuple(map(str, touched)))
     finally:
         engine.close()
@@ -204,16 +204,17 @@ def _motion(heading: Heading, episode: RecordedEpisode, suite: Suite | None) -> 
     try:
         return simulate_again(heading.task, heading.seed, heading.episode, episode.action, episode.observation, suite)
     except DiffersError as error:
+        label = f"{heading.task}, episode {heading.episode} of seed {heading.seed}"
         warnings.warn(
-            f"simulating {heading.task}, episode {heading.episode} of seed {heading.seed}, again gives other numbers "
-            f"at {error}. Check the seed, and that these are the executed actions. A hand over a table is drawn "
-            "instead of the robot",
+            f"a second simulation of {label} differs at {error}; a hand over a table is drawn instead of the robot. "
+            "Check the seed, and that these are the executed actions",
             stacklevel=3,
         )
         return None
 
 
-def _single(rollout: TensorDictBase, key: str, *, required: bool) -> int | None:
+def _constant(rollout: TensorDictBase, key: str, *, required: bool) -> int | None:
+    """Return the number that all rows of an integer column hold."""
     if (column := rollout.get(key, None)) is None:
         if required:
             raise missing_keys(rollout.keys(True, True), key)
@@ -247,7 +248,7 @@ def run_recorded(
     """Run episodes as :func:`lw_torchrl.evaluate` does, with all keys that :func:`lw_torchrl.log_rollout` shows.
 
     The other arguments are those of :func:`lw_torchrl.evaluate`; ``episodes`` are indices of each task's episodes.
-    Return the episodes, by task in the given order and episode; they hold an evaluator's answers and the exact ones.
+    Return the episodes, by task in the given order and episode, with an evaluator's answers and the exact ones.
     """
     answered = actor_plans(actor, plans)
     own_suite, chosen = suite_tasks(tasks, answered, suite)
@@ -256,15 +257,15 @@ def run_recorded(
     has_answers = answered is not None and (evaluator is not None or bool(learned))
     finished: dict[tuple[str, int], FinishedEpisode] = {}
 
-    def keep(one: FinishedEpisode) -> None:
-        steps = one.steps
+    def keep(episode: FinishedEpisode) -> None:
+        steps = episode.steps
         if learned and "qaf_logits" not in steps.keys():
             steps = learned[0](steps.to(device_of(learned[0]))).cpu()
-        if has_answers and answered is not None:  # the exact answers, next to those that the policy acted on
+        if has_answers and answered is not None:  # the exact answers, next to those that the policy used
             if "qaf_logits" not in steps.keys():
                 steps.set("qaf_logits", 10.0 * steps.get("qaf").float() - 5.0)
             steps = QAFTransform(answered)(steps)
-        finished[one.task, one.episode] = one._replace(steps=steps)
+        finished[episode.task, episode.episode] = episode._replace(steps=steps)
 
     run_rollout(
         "recording",
@@ -306,12 +307,3 @@ def write_recording(
     with new_recording(path) as logger:
         for episode in episodes:
             log_rollout(logger, episode.steps, plans, **options)
-
-
-def active_skills(episode: FinishedEpisode, plan: ConditionalPlan) -> list[tuple[str, int]]:
-    """Return the skills with the largest weight, or "no condition holds", in order, with their steps, up to success."""
-    end = episode.first_success
-    leading = episode.steps.get("skill_weights")[:end].argmax(-1).tolist()
-    answered = episode.steps.get("qaf")[:end].any(-1).tolist()
-    names = [plan.steps[i].skill if any_ else "no condition holds" for i, any_ in zip(leading, answered, strict=True)]
-    return [(name, len(list(group))) for name, group in groupby(names)]

@@ -1,7 +1,7 @@
 """The 3-D scene of an episode: the robot, the objects, and the target of the active skill.
 
-Meta-World's frame: metres, x to the robot's right, y away from the robot, z up, the table's top at z = 0. Of a robot of
-unknown layout only the objects are drawn, seen from a place that shows them all.
+Meta-World's frame: metres, x to the robot's right, y away from the robot, z up, the table's top at z = 0. If the
+robot's layout is unknown, only the objects are drawn, seen from a position that shows them all.
 """
 
 from __future__ import annotations
@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lw_torchrl.language.objects import GRIPPER
-from lw_torchrl.record.entities import GOLD, GREEN, STEEL, Color, changes, entity_path, rr, step_color
-from lw_torchrl.record.meshes import GHOST, Known, Motion, log_motion
-from lw_torchrl.record.metrics import send_images
-from lw_torchrl.record.recorded_episode import MendedRecording, RecordedEpisode
+from lw_torchrl.record.entities import GOLD, GREEN, STEEL, Color, changes, entity_path, rr, send_images, step_color
+from lw_torchrl.record.meshes import GHOST_COLOR, LoggedMeshes, Motion, log_motion
+from lw_torchrl.record.recorded_episode import Ghost, RecordedEpisode
 
 OBJECT_COLORS: tuple[Color, ...] = ((80, 170, 255), (255, 120, 90), (200, 130, 255), (90, 220, 210))
 
@@ -29,7 +28,7 @@ TABLE_CENTER, TABLE_HALF = (0.0, 0.6, -0.010), (0.7, 0.4, 0.010)
 TABLE, GRID = (58, 64, 74), (92, 99, 112)
 SAME_PLACE = 0.05  # largest distance, metres, between the origin of a body and the position of its object
 FOCAL, LABEL, LETTER = 160.0, 26.0, 6.5
-"""In pixels, of the scene in a window of 1100×700: of its camera, the height of a name, the width of a letter."""
+"""Focal length, height of a name and width of a letter, in pixels of the scene in a window of 1100×700."""
 
 Point = tuple[float, float, float]
 # From behind the robot's right shoulder, over a table whose middle is at (0, 0.6, 0); with the arm, from the front.
@@ -38,7 +37,7 @@ ROBOT_EYE: tuple[Point, Point] = ((0.54, 0.18, 0.47), (-0.02, 0.62, 0.13))
 
 
 def scene_size(episode: RecordedEpisode) -> float:
-    """Return the size of a scene in metres: about 1 of a robot at its table, else the extent of its objects."""
+    """Return the size of a scene in metres: 1 for a robot at its table, else the extent of its objects."""
     if episode.layout is not None or not episode.objects:
         return 1.0
     places = np.concatenate([*episode.objects.values()])
@@ -46,7 +45,7 @@ def scene_size(episode: RecordedEpisode) -> float:
 
 
 def eye_of(episode: RecordedEpisode, motion: Motion | None) -> tuple[Point, Point]:
-    """Return the place from which a scene is seen, and the place that is looked at."""
+    """Return the position from which a scene is seen, and the position that is looked at."""
     if episode.layout is not None or not episode.objects:
         return SIMPLE_EYE if motion is None else ROBOT_EYE
     places, size = np.concatenate([*episode.objects.values()]), scene_size(episode)
@@ -59,10 +58,10 @@ def log_scene(
     root: str,
     episode: RecordedEpisode,
     motion: Motion | None,
-    known: Known,
+    meshes: LoggedMeshes,
     drawn: NDArray[np.int64],
     eye: tuple[Point, Point],
-    ghost: MendedRecording | None = None,
+    ghost: Ghost | None = None,
 ) -> tuple[list[str], dict[str, str]]:
     """Draw robot, objects, goal, the hand's path and the target pose under ``root``/scene, seen from ``eye``.
 
@@ -75,23 +74,23 @@ def log_scene(
     if motion is None and episode.layout is not None:
         _log_simple_robot(stream, scene, episode, drawn)
     elif motion is not None:
-        frames = log_motion(stream, f"{scene}/bodies", motion, known, episode.step_time, drawn)
+        frames = log_motion(stream, f"{scene}/bodies", motion, meshes, episode.step_time, drawn)
 
     def point(path: str, position: NDArray[np.float32], label: str | None, radius: float, color: Color) -> None:
         labels = None if label is None else [label]
         rows = drawn[changes(position[drawn])]
-        still = position[rows] if len(rows) == 1 else None
-        style = rr.Points3D.from_fields(positions=still, radii=[radius * size], colors=[color], labels=labels)
+        static = position[rows] if len(rows) == 1 else None
+        style = rr.Points3D.from_fields(positions=static, radii=[radius * size], colors=[color], labels=labels)
         stream.log(f"{scene}/{path}", style, static=True)
-        if still is None:
+        if static is None:
             stream.send_columns(f"{scene}/{path}", episode.times(rows), rr.Points3D.columns(positions=position[rows]))
 
-    def named(path: str, label: str, radius: float, color: Color) -> None:
+    def named_point(path: str, name: str, radius: float, color: Color) -> None:
         """Draw a point with its name, which is moved away if it would cover another name."""
-        away = offsets[label]
-        point(path, things[label], None if away.any() else label, radius, color)
+        away = offsets[name]
+        point(path, positions[name], None if away.any() else name, radius, color)
         if away.any():
-            point(f"names{entity_path(label)}", things[label] + away, label, 0.0005, color)
+            point(f"names{entity_path(name)}", positions[name] + away, name, 0.0005, color)
 
     def lines(path: str, strips: NDArray[np.float32], radius: float, color: Color) -> None:
         colors, radii = np.tile(np.array(color, np.uint8), (len(drawn), 1)), np.full(len(drawn), radius * size)
@@ -99,63 +98,60 @@ def log_scene(
         stream.send_columns(f"{scene}/{path}", episode.times(drawn), rr.LineStrips3D.columns(strips=strips, **look))
 
     goal = episode.goal
-    # Objects that stand for the goal, like "target location", have its colour, and their own label.
+    # Objects that are the goal, like "target location", have its colour, and their own label.
     goals = [] if goal is None else [name for name, at in episode.objects.items() if np.allclose(goal, at, atol=1e-3)]
-    things = {name: position for name, position in episode.objects.items() if name != GRIPPER}
+    positions = {name: position for name, position in episode.objects.items() if name != GRIPPER}
     colors: dict[str, Color] = {GRIPPER: GOLD} if GRIPPER in episode.objects else {}
-    colors |= dict(zip(things, cycle(OBJECT_COLORS), strict=False))
+    colors |= dict(zip(positions, cycle(OBJECT_COLORS), strict=False))
     if goal is not None and goal.any() and not goals:
-        things.setdefault("goal", goal)
-    offsets = name_offsets({name: position[drawn] for name, position in things.items()}, eye)
+        positions.setdefault("goal", goal)
+    offsets = name_offsets({name: position[drawn] for name, position in positions.items()}, eye)
     trails = []
     for name, color in (colors | {name: GREEN for name in goals if name != GRIPPER}).items():
         part, position = entity_path(name), episode.objects[name]
         if name != GRIPPER:
-            named(f"objects{part}", name, 0.016 if motion is None else 0.008, color)
+            named_point(f"objects{part}", name, 0.016 if motion is None else 0.008, color)
         elif motion is None:
             point(f"objects{part}", position, None, 0.005, color)
         if motion is None and episode.layout is not None:  # from each row straight down, or up, to the table's top
-            onto = position * np.array([1, 1, 0], np.float32)
-            lines(f"heights{part}", np.stack([position, onto], axis=1)[drawn], 0.0012, (*color, 150))
+            foot = position * np.array([1, 1, 0], np.float32)
+            lines(f"heights{part}", np.stack([position, foot], axis=1)[drawn], 0.0012, (*color, 150))
         if motion is None or name == GRIPPER:
             trails.append(f"{scene}/trails{part}")
-            way = position[drawn]
-            before = np.concatenate([way[:1], way[:-1]])
-            lines(f"trails{part}", np.stack([before, way], axis=1), 0.003 if motion is None else 0.002, color)
+            path = position[drawn]
+            before = np.concatenate([path[:1], path[:-1]])
+            lines(f"trails{part}", np.stack([before, path], axis=1), 0.003 if motion is None else 0.002, color)
 
-    if "goal" in things and "goal" not in episode.objects:
-        named("goal", "goal", 0.018, GREEN)
+    if "goal" in positions and "goal" not in episode.objects:
+        named_point("goal", "goal", 0.018, GREEN)
     _log_target(stream, scene, episode, drawn)
     if ghost is not None:
-        way = ghost.episode.objects[GRIPPER]
-        stream.log(f"{scene}/ghost", rr.LineStrips3D([way], colors=[GHOST], radii=[0.002]), static=True)
+        path = ghost.episode.objects[GRIPPER]
+        stream.log(f"{scene}/ghost", rr.LineStrips3D([path], colors=[GHOST_COLOR], radii=[0.002]), static=True)
         if motion is not None and ghost.motion is not None:
-            frames |= log_motion(stream, f"{scene}/ghost", ghost.motion, known, episode.step_time, drawn, ghost=True)
+            bodies = f"{scene}/ghost"
+            frames |= log_motion(stream, bodies, ghost.motion, meshes, episode.step_time, drawn, ghost=True)
     return trails, frames
 
 
 def touched_objects(motion: Motion, episode: RecordedEpisode) -> tuple[str, ...] | None:
-    """Return what the fingers touched in each row: the object where the touched body is, else the body's name."""
+    """Return what the fingers touched in each row: the object at the touched body's position, else the body's name."""
     if motion.touched is None:
         return None
-    touched = np.array(motion.touched[: len(episode)])
-    bodies = {motion.model.model.body(body).name for body in range(motion.model.model.nbody)}
+    touched, model = np.array(motion.touched[: len(episode)]), motion.model.model
     names = {}
-    for body in set(touched.tolist()) & bodies:
+    for body in set(touched.tolist()) & {model.body(number).name for number in range(model.nbody)}:
         rows = np.flatnonzero(touched == body)
-        place = motion.position[rows, motion.model.model.body(body).id]
-        others = {name: position[rows] - place for name, position in episode.objects.items() if name != GRIPPER}
-        away = [(float(np.linalg.norm(gap, axis=1).mean()), name) for name, gap in others.items()]
-        if away and min(away)[0] < SAME_PLACE:
-            names[body] = min(away)[1]
+        origin = motion.position[rows, model.body(body).id]
+        gaps = {name: position[rows] - origin for name, position in episode.objects.items() if name != GRIPPER}
+        distances = [(float(np.linalg.norm(gap, axis=1).mean()), name) for name, gap in gaps.items()]
+        if distances and min(distances)[0] < SAME_PLACE:
+            names[body] = min(distances)[1]
     return tuple(names.get(body, body) for body in touched.tolist())
 
 
 def log_pictures(stream: Any, root: str, episode: RecordedEpisode, drawn: NDArray[np.int64]) -> float:
-    """Log the pictures that the policy saw to ``root``/seen, where they change in rows that are ``drawn``.
-
-    Return their width over their height, 0 without pictures.
-    """
+    """Log the policy's pictures to ``root``/seen, where they change in ``drawn`` rows; return width over height."""
     if episode.pixels is None:
         return 0.0
     rows = drawn[changes(episode.pixels[drawn].reshape(len(drawn), -1))]
@@ -164,27 +160,28 @@ def log_pictures(stream: Any, root: str, episode: RecordedEpisode, drawn: NDArra
     return width / height
 
 
-def name_offsets(things: dict[str, NDArray[np.float32]], eye: tuple[Point, Point]) -> dict[str, NDArray[np.float32]]:
-    """Return the offset (3,) of each name from its object, T×3 metres, to overlap least, seen from ``eye``."""
+def name_offsets(positions: dict[str, NDArray[np.float32]], eye: tuple[Point, Point]) -> dict[str, NDArray[Any]]:
+    """Return the offset (3,) of each name from its object, T×3 metres, so that names overlap least from ``eye``."""
     place, ahead = np.array(eye[0], np.float32), np.subtract(eye[1], eye[0]).astype(np.float32)
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, [0, 0, 1]).astype(np.float32)
     right /= np.linalg.norm(right)
     up = np.cross(right, ahead)
-    offsets: dict[str, NDArray[np.float32]] = {}
-    taken: list[tuple[NDArray[Any], float]] = []
-    for name, position in things.items():
+    offsets: dict[str, NDArray[Any]] = {}
+    placed: list[tuple[NDArray[Any], float]] = []  # positions in pixels, and width, of the names so far
+    for name, position in positions.items():
         depth = np.maximum((position - place) @ ahead, 0.05)
-        at = np.stack([(position - place) @ right, (position - place) @ up], axis=1) * (FOCAL / depth)[:, None]
-        wide = LETTER * len(name) + 2 * LETTER
+        pixels = np.stack([(position - place) @ right, (position - place) @ up], axis=1) * (FOCAL / depth)[:, None]
+        width = LETTER * len(name) + 2 * LETTER
 
-        def covered(lines: int, at: Any = at, wide: float = wide) -> float:
-            shifted = at + np.array([0, lines * LABEL])
-            gaps = [(np.abs(shifted - other), (wide + width) / 2) for other, width in taken]
-            return sum(float(((gap[:, 0] < both) & (gap[:, 1] < 0.85 * LABEL)).mean()) for gap, both in gaps)
+        def overlap(lines: int, pixels: Any = pixels, width: float = width) -> float:
+            """Return the fraction of rows, summed over names, in which this name would cover another one."""
+            shifted = pixels + np.array([0, lines * LABEL])
+            gaps = [(np.abs(shifted - other), (width + other_width) / 2) for other, other_width in placed]
+            return sum(float(((gap[:, 0] < reach) & (gap[:, 1] < 0.85 * LABEL)).mean()) for gap, reach in gaps)
 
-        lines = min((0, 1, -1, 2, -2, 3), key=lambda lines: covered(lines) + 0.1 * abs(lines))
-        taken.append((at + np.array([0, lines * LABEL]), wide))
+        lines = min((0, 1, -1, 2, -2, 3), key=lambda lines: overlap(lines) + 0.1 * abs(lines))
+        placed.append((pixels + np.array([0, lines * LABEL]), width))
         offsets[name] = (up * lines * LABEL * float(depth.mean()) / FOCAL).astype(np.float32)
     return offsets
 
@@ -206,13 +203,13 @@ def _log_simple_robot(stream: Any, scene: str, episode: RecordedEpisode, drawn: 
     grid += [[(at, y - depth, z), (at, y + depth, z)] for at in along.tolist()]
     stream.log(f"{scene}/table/grid", rr.LineStrips3D(grid, colors=[GRID], radii=[0.0007]), static=True)
     box("gripper/palm", [(0.0, 0.0, PALM_RISE)], [PALM_HALF], STEEL)
-    # Its name stands above the hand, where the objects that it handles are not.
+    # The name is above the hand, away from the objects that it handles.
     box("gripper/wrist", [(0.0, 0.0, WRIST_RISE)], [WRIST_HALF], STEEL, [GRIPPER])
     box("gripper/fingers", None, [FINGER_HALF] * 2, GOLD)
     stream.send_columns(f"{scene}/gripper", times, rr.Transform3D.columns(translation=episode.objects[GRIPPER][drawn]))
     half = opening[drawn] * FINGER_TRAVEL / 2 + FINGER_HALF[1]
     zero, drop = np.zeros_like(half), np.full_like(half, -FINGER_DROP)
-    centers = np.stack([zero, half, drop, zero, -half, drop], axis=1).reshape(-1, 3)  # of two fingers, row by row
+    centers = np.stack([zero, half, drop, zero, -half, drop], axis=1).reshape(-1, 3)  # two fingers in each row
     fingers = rr.Boxes3D.columns(centers=centers.astype(np.float32))
     stream.send_columns(f"{scene}/gripper/fingers", times, fingers.partition([2] * len(drawn)))
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import fields
+from functools import partial
 from typing import Any, NamedTuple
 
 from lw_torchrl._util.checks import unknown_name
@@ -25,6 +26,7 @@ class Tab(NamedTuple):
 
     name: str
     title: str
+    view: Callable[[], Any]  # makes rerun's view
     episodes: list[str]
     timeline: str = EPISODE_TIMELINE
 
@@ -32,19 +34,19 @@ class Tab(NamedTuple):
 class Tabs:
     """The tabs of a recording, which make rerun's blueprint.
 
-    They are also saved as properties of the recording, for recordings that were never closed, and so have no blueprint.
+    They are also saved as properties of the recording: a recording that was never closed has no blueprint.
     """
 
     def __init__(self) -> None:
         self.pages: dict[str, Page] = {}
         self._compared: list[tuple[str, list[str]]] = []
         self._figures: list[str] = []  # entities of pictures in the overview
-        self._views: dict[str, list[str]] = {kind: [] for kind in TITLES}  # names of what is logged
+        self._views: dict[str, list[str]] = {kind: [] for kind in TITLES}  # names of logged values
         self._entries: list[str] = []
         self._saved = self._sent = 0
 
     def add_view(self, kind: str, name: str = "") -> None:
-        """Show what is logged as ``kind``/``name``, unless it is shown already."""
+        """Show the values logged as ``kind``/``name``, unless they are shown already."""
         if name not in self._views[kind]:
             self.add("view", [kind, name])
 
@@ -97,56 +99,58 @@ class Tabs:
             stream.log(entity_path(OVERVIEW, "table"), document, static=True)
         stream.send_blueprint(self.blueprint())
 
-    def blueprint(self, only: str | None = None) -> rrb.Blueprint:
-        """Return rerun's layout, of all tabs or of ``only`` one."""
-        tabs: list[Any] = []
-        if self._has_overview():
-            views: list[Any] = [rrb.TextDocumentView(origin=entity_path(OVERVIEW, "table"), name="Episodes")]
-            views += [rrb.Spatial2DView(origin=figure, name="Causes") for figure in self._figures]
-            tabs.append(rrb.Horizontal(*views, column_shares=[1] * len(views), name=OVERVIEW.title()))
-        for title, names in self._compared:  # a column for each episode
-            pages = [self.pages[name] for name in names]
-            shown = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
-            farthest = max(page.farthest for page in pages)
-            columns = [page.column(self._title(page), shown, farthest) for page in pages]
-            tabs.append(rrb.Horizontal(*columns, name=title))
-        of_episodes = [page.tab(self._title(page)) for page in self._ordered()]
-        of_training: list[Any] = []
-        for kind, names in self._views.items():
-            if names:
-                views = [_view(kind, name) for name in names]
-                of_training.append(views[0] if kind == "hparams" else rrb.Grid(*views, name=TITLES[kind]))
-        tabs += of_training + of_episodes if self._has_overview() else of_episodes + of_training
+    def blueprint(self, front: str | None = None) -> rrb.Blueprint:
+        """Return rerun's layout, with the tab ``front``, or the first one, in front."""
+        tabs = self.tabs()
         closed = {"state": "collapsed"}
         fps = 1 / next((page.step_time for page in self.pages.values()), STEP_TIME)
-        time = {"timeline": self.tab(only).timeline, "fps": fps, "play_state": "paused", "loop_mode": "all"}
+        time = {"timeline": self.tab(front).timeline, "fps": fps, "play_state": "paused", "loop_mode": "all"}
         panels = rrb.BlueprintPanel(**closed), rrb.SelectionPanel(**closed), rrb.TimePanel(**closed, **time)
-        shown = rrb.Tabs(*tabs) if only is None else tabs[self.index(only)]
-        return rrb.Blueprint(shown, *panels, auto_views=False)
+        active = None if front is None else self.index(front)
+        return rrb.Blueprint(rrb.Tabs(*(tab.view() for tab in tabs), active_tab=active), *panels, auto_views=False)
 
     def tabs(self) -> list[Tab]:
-        """Return the tabs from left to right. Training comes before many episodes, else nobody would find it."""
-        pages = self._ordered()
-        tabs = [Tab(title, title, names) for title, names in self._compared]
-        of_episodes = [Tab(page.row["name"], self._title(page), [page.row["name"]]) for page in pages]
+        """Return the tabs from left to right. The few tabs of a training come before many episodes."""
+        pages, has_overview = list(self.pages.values()), self._has_overview()
+        if has_overview:
+            pages.sort(key=lambda page: _order(page.row))
+        # Titles name the policy unless several episodes have the same one.
+        name_policies = len({page.row["policy"] for page in pages}) > 1 or len(pages) == 1
+        titles = {page.row["name"]: page.title(policy=name_policies) for page in pages}
+        compared = [
+            Tab(title, title, partial(self._comparison, title, names, titles), names) for title, names in self._compared
+        ]
+        of_episodes = [Tab(name, title, partial(self.pages[name].tab, title), [name]) for name, title in titles.items()]
         of_training = [
-            Tab(TITLES[kind], TITLES[kind], [], METRIC_TIMELINE if kind in ON_METRIC_TIMELINE else EPISODE_TIMELINE)
+            Tab(TITLES[kind], TITLES[kind], partial(_values_view, kind, names), [],
+                METRIC_TIMELINE if kind in ON_METRIC_TIMELINE else EPISODE_TIMELINE)
             for kind, names in self._views.items()
             if names
-        ]
-        if not self._has_overview():
-            return tabs + of_episodes + of_training
-        return [Tab(OVERVIEW, OVERVIEW.title(), [pages[0].row["name"]]), *tabs, *of_training, *of_episodes]
+        ]  # fmt: skip
+        if not has_overview:
+            return compared + of_episodes + of_training
+        first = Tab(OVERVIEW, OVERVIEW.title(), self._overview_view, [pages[0].row["name"]])
+        return [first, *compared, *of_training, *of_episodes]
+
+    def _overview_view(self) -> Any:
+        views: list[Any] = [rrb.TextDocumentView(origin=entity_path(OVERVIEW, "table"), name="Episodes")]
+        views += [rrb.Spatial2DView(origin=figure, name="Causes") for figure in self._figures]
+        return rrb.Horizontal(*views, column_shares=[1] * len(views), name=OVERVIEW.title())
+
+    def _comparison(self, title: str, names: list[str], titles: dict[str, str]) -> Any:
+        """Return a view with a column for each episode, all with the same axes."""
+        pages = [self.pages[name] for name in names]
+        shown = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
+        farthest = max(page.farthest for page in pages)
+        columns = [self.pages[name].column(titles[name], shown, farthest) for name in names]
+        return rrb.Horizontal(*columns, name=title)
 
     def tab(self, name: str | None = None) -> Tab:
         """Return the tab of a name, or the first one."""
         tabs = self.tabs()
-        return tabs[self.index(name)] if tabs or name is not None else Tab("", "", [], METRIC_TIMELINE)
-
-    def front(self) -> str | None:
-        """Return the name of the first tab; for an overview, of the episode that it begins with."""
-        first = self.tab()
-        return first.episodes[0] if first.name == OVERVIEW else first.name or None
+        if not tabs and name is None:
+            return Tab("", "", rrb.Tabs, [], METRIC_TIMELINE)
+        return tabs[self.index(name)]
 
     def opening_step(self, tab: str | None = None) -> int | None:
         """Return the step to open a tab at: the earliest decisive one of its episodes; None without episodes."""
@@ -165,20 +169,14 @@ class Tabs:
         """Return whether there are several episodes, other than the two of one comparison."""
         return len(self.pages) > 1 and len(self._compared) != 1
 
-    def _ordered(self) -> list[Page]:
-        """Return the pages from left to right; with an overview in its order, failures first."""
-        pages = list(self.pages.values())
-        return sorted(pages, key=lambda page: _order(page.row)) if self._has_overview() else pages
 
-    def _title(self, page: Page) -> str:
-        """Return the title of a page; it names the policy unless several episodes have the same one."""
-        policies = {other.row["policy"] for other in self.pages.values()}
-        return page.title(policy=len(policies) > 1 or len(self.pages) == 1)
+def _values_view(kind: str, names: list[str]) -> Any:
+    views = [_value_view(kind, name) for name in names]
+    return views[0] if kind == "hparams" else rrb.Grid(*views, name=TITLES[kind])
 
 
-def _view(kind: str, name: str) -> Any:
-    parts = name.split("/") if name else []
-    origin, title = entity_path(kind, *parts), name or TITLES[kind]
+def _value_view(kind: str, name: str) -> Any:
+    origin, title = entity_path(kind, *(name.split("/") if name else [])), name or TITLES[kind]
     if kind == "metrics":
         legend = rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=True)
         return rrb.TimeSeriesView(origin=origin, name=title, plot_legend=legend)

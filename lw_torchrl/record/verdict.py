@@ -7,20 +7,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl.evaluation.diagnose.failure import Failure
-from lw_torchrl.evaluation.diagnose.findings import CAUSES
+from lw_torchrl.evaluation.diagnose.failure import CAUSES, Failure
 from lw_torchrl.evaluation.diagnose.sentences import replaced_text
 from lw_torchrl.language.layout import Layout
-from lw_torchrl.language.plan_text import one_line
+from lw_torchrl.language.plans import one_line
 from lw_torchrl.record.entities import FALSE, STEEL, Color, changes, rr, step_color
-from lw_torchrl.record.recorded_episode import NOBODY, MendedRecording, RecordedEpisode
+from lw_torchrl.record.recorded_episode import NO_STEP, Ghost, RecordedEpisode
 
 AFTER_SUCCESS, AROUND_FAILURE = 8, 60
-"""The number of steps to show after a first success, and on both sides of the step at which a failure is seen."""
-LONGEST = 200  # the largest number of steps, from where a ghost parts to where the failure is seen, to show at once
+"""The number of steps to show after a first success, and before and after the step at which a failure shows."""
+LONGEST = 200  # the largest number of steps to show at once, from where a ghost parts to where the failure shows
 PLAN_LINES, LINE = 13, 78
-"""The number of lines of a plan that leave room for the scene in a window of 1100×700, and the letters of a line."""
-SELDOM = 8  # steps between two pictures of the scene where nothing happens: a tenth of a second
+"""The number of lines of a plan that leave room for the scene in a window of 1100×700, and of characters in a line."""
+SPARSE = 8  # steps between two drawings of the scene outside the shown steps: a tenth of a second
+MARKS = {True: "✓", False: "✗", None: "·"}
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Heading:
         return [self.task, *known, *([] if self.policy is None else [self.policy])]
 
     def row(self, episode: RecordedEpisode, name: str) -> dict[str, Any]:
-        """Return the row of an episode called ``name`` in the overview, with separate parts for filters."""
+        """Return the overview's row of an episode called ``name``."""
         at = episode.first_success or len(episode)
         ended = "" if episode.success is None else "failed" if episode.first_success is None else "success"
         cause = self.failure.cause if self.failure is not None and ended == "failed" else None
@@ -54,7 +54,7 @@ class Heading:
         return known | {"ended": ended, "cause": cause, "at": at, "seconds": at * episode.step_time}
 
     def ended(self, episode: RecordedEpisode) -> str:
-        """Return how it ended, in a few words."""
+        """Return how the episode ended, in a few words."""
         if episode.first_success is not None:
             return f"SUCCESS at {episode.at(episode.first_success)} of {len(episode)}"
         if self.failure is None:
@@ -62,33 +62,33 @@ class Heading:
         return f"FAILED: {self.failure.cause}, {CAUSES[self.failure.cause]}"
 
 
-def decisive_step(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None) -> int:
+def decisive_step(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None = None) -> int:
     """Return the step to look at first: the failure's, else the first success, else the last.
 
-    It is the step of a ghost's success if the ghost has not parted at that step, or is gone.
+    It is the step of a ghost's success if the ghost has not parted at that step, or if that step is not shown.
     """
-    (_, last), seen = telling_steps(heading, episode, ghost), _decisive(heading, episode)
-    if ghost is None or ghost.episode.first_success is None or ghost.parts_at(episode) < seen <= last:
-        return seen
+    (_, last), step = shown_steps(heading, episode, ghost), _own_decisive_step(heading, episode)
+    if ghost is None or ghost.episode.first_success is None or ghost.parts_at(episode) < step <= last:
+        return step
     return min(ghost.episode.first_success, last)
 
 
-def _decisive(heading: Heading, episode: RecordedEpisode) -> int:
+def _own_decisive_step(heading: Heading, episode: RecordedEpisode) -> int:
     if heading.failure is not None and episode.first_success is None:
         return min(heading.failure.at, len(episode))
     return len(episode) if episode.first_success is None else episode.first_success
 
 
-def telling_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None) -> tuple[int, int]:
-    """Return the first and last step to show: up to a success, around the step at which a failure is seen, or all.
+def shown_steps(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None = None) -> tuple[int, int]:
+    """Return the first and last step to show: up to a success, around the step at which a failure shows, or all.
 
-    With a ghost, they begin where the two part and, if the failure is seen much later, end with the ghost's success.
+    With a ghost, they begin where the two part and, if the failure shows much later, end with the ghost's success.
     """
-    at, length = _decisive(heading, episode), len(episode)
+    at, length = _own_decisive_step(heading, episode), len(episode)
     if ghost is not None:
-        first, seen = max(0, ghost.parts_at(episode) - AFTER_SUCCESS), min(at + AFTER_SUCCESS, length)
+        first, failed = max(0, ghost.parts_at(episode) - AFTER_SUCCESS), min(at + AFTER_SUCCESS, length)
         end = min((ghost.episode.first_success or len(ghost.episode)) + AFTER_SUCCESS, length)
-        return first, max(end, seen if seen - first <= LONGEST else 0, min(first + 2 * AROUND_FAILURE, length))
+        return first, max(end, failed if failed - first <= LONGEST else 0, min(first + 2 * AROUND_FAILURE, length))
     if episode.first_success is not None:
         return 0, min(at + AFTER_SUCCESS, length)
     if heading.failure is None:
@@ -97,97 +97,93 @@ def telling_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecor
     return first, min(first + 2 * AROUND_FAILURE, length)
 
 
-def drawn_steps(heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None) -> NDArray[np.int64]:
-    """Return the steps at which the scene is drawn: those to show, few others, the decisive one, and the last."""
-    first, last = telling_steps(heading, episode, ghost)
-    every, stride = np.arange(len(episode)), 1 if last - first <= AROUND_FAILURE else 2
-    drawn = (every >= first) & (every <= last) & (every % stride == 0) | (every % SELDOM == 0)
+def drawn_steps(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None) -> NDArray[np.int64]:
+    """Return the steps at which the scene is drawn: the shown ones, a few others, the decisive one, and the last."""
+    first, last = shown_steps(heading, episode, ghost)
+    steps, stride = np.arange(len(episode)), 1 if last - first <= AROUND_FAILURE else 2
+    drawn = (steps >= first) & (steps <= last) & (steps % stride == 0) | (steps % SPARSE == 0)
     drawn[[min(decisive_step(heading, episode, ghost), len(episode) - 1), -1]] = True
     return np.flatnonzero(drawn)
 
 
-def verdict(
-    heading: Heading, episode: RecordedEpisode, ghost: MendedRecording | None = None, small: bool = False
-) -> str:
+def verdict(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None = None, small: bool = False) -> str:
     """Return the verdict in Markdown, with a ``small`` heading or a large one."""
     lines = [f"{len(episode)} steps"] if episode.success is None else [heading.ended(episode)]
     if episode.success is not None and episode.success.any():
         if not episode.success[-1]:
-            held = int(episode.success.sum())
-            lines.append(f"It did not last: the task was done in {held} steps, but not in the last one.")
+            done = int(episode.success.sum())
+            lines.append(f"It did not last: the task was done in {done} steps, but not in the last one.")
     elif heading.failure is not None:
-        lines += _why(heading.failure, episode)
+        lines += _reasons(heading.failure, episode)
     elif episode.success is not None:
-        lines += _facts(episode)
+        lines += _observations(episode)
     if ghost is not None:
         end, parting = ghost.episode.first_success, ghost.parts_at(episode)
         ended = "does not succeed" if end is None else f"succeeds at {episode.at(end)}"
         lines.insert(1, f"**The blue ghost**, with {ghost.by}, {ended}; they part at **t = {parting}**.")
-    # Line after line: in a small window, paragraphs would not fit.
+    # Single line breaks, since paragraphs would not fit into a small window.
     head = f"**{lines[0]}**  \n" if small else f"#### {lines[0]}\n\n"
     return head + "  \n".join([*lines[1:], " · ".join(heading.parts())]) + "\n"
 
 
-def _why(failure: Failure, episode: RecordedEpisode) -> list[str]:
+def _reasons(failure: Failure, episode: RecordedEpisode) -> list[str]:
     lines = [failure.why] if failure.why else []
     if failure.also is not None:
         lines.append(f"Also: {failure.also}, {CAUSES[failure.also]}.")
     seen = f"Seen at {episode.at(failure.at)} of {len(episode)}"
     if failure.step is not None and failure.step < len(episode.steps):
         seen += f", in {_step(episode, failure.step)}"
-    useless = [replaced_text(part) for part, worked in failure.counterfactuals.items() if not worked]
-    helped = f" Replacing {' or '.join(useless)} did not help." if useless else ""
-    return [*lines, f"{seen}.{helped}"]
+    useless = [replaced_text(part) for part, succeeded in failure.counterfactuals.items() if not succeeded]
+    useless_text = f" Replacing {' or '.join(useless)} did not help." if useless else ""
+    return [*lines, f"{seen}.{useless_text}"]
 
 
-def _facts(episode: RecordedEpisode) -> list[str]:
+def _observations(episode: RecordedEpisode) -> list[str]:
+    """Describe a failed episode without an attributed cause: its last active step, distance, conditions never true."""
     if episode.active is None or not episode.steps:
         return []
-    facts = []
+    lines = []
     last = int(episode.active[-1])
-    if last == NOBODY:
-        facts.append("At the end no single plan step was active.")
+    if last == NO_STEP:
+        lines.append("At the end no single plan step was active.")
     else:
         steps = int((episode.active == last).sum())
-        facts.append(f"At the end {_step(episode, last)}, was active, as in {steps} of {len(episode)} steps.")
+        lines.append(f"At the end {_step(episode, last)}, was active, as in {steps} of {len(episode)} steps.")
         pose = episode.target_poses[last] if episode.target_poses else None
         if pose is not None and not pose.relative:
             distance = np.where(episode.active == last, pose.distance, np.inf)
             nearest = int(distance.argmin())
-            facts.append(
+            lines.append(
                 f"It came within **{distance[nearest] * 100:.1f} cm** of its target, at "
                 f"{episode.at(nearest)}; at the end it was {pose.distance[-1] * 100:.1f} cm away."
             )
     answers = episode.answers
     never = [] if answers is None else [i for i in range(len(episode.steps)) if not answers[:, i].any()]
     if never:
-        facts.append("Never true: " + "; ".join(f"condition {i + 1}, “{episode.steps[i][0]}”" for i in never) + ".")
-    return facts
+        lines.append("Never true: " + "; ".join(f"condition {i + 1}, “{episode.steps[i][0]}”" for i in never) + ".")
+    return lines
 
 
 def _step(episode: RecordedEpisode, step: int) -> str:
     return f"plan step {step + 1}, **“{episode.steps[step][1]}”**"
 
 
-MARKS = {True: "✓", False: "✗", None: "·"}
-
-
 def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
-    """Log the plan in ``root``/plan, as a text in Markdown wherever truth or the active step change.
+    """Log the plan in ``root``/plan, as a text in Markdown at each step where a truth or the active step changes.
 
     Return the number of lines that it takes in a small window. If these are too many, conditions are shortened.
     """
     conditions = [condition for condition, _ in episode.steps]
-    if _lines(conditions, episode) > PLAN_LINES:
+    if _line_count(conditions, episode) > PLAN_LINES:
         conditions = list(episode.short_conditions)
-    active = np.full(len(episode), NOBODY) if episode.active is None else episode.active
+    active = np.full(len(episode), NO_STEP) if episode.active is None else episode.active
     answers = [answers for answers in (episode.qaf, episode.believed) if answers is not None]
-    changed = changes(np.concatenate([active[:, None], *answers], axis=1))
+    rows = changes(np.concatenate([active[:, None], *answers], axis=1))
     confidence = [] if episode.confidence is None else [f"*confidence {episode.confidence:.2f}*"]
     texts = []
-    for row in changed.tolist():
+    for row in rows.tolist():
         parts = list(confidence)
-        if episode.active is not None and episode.active[row] == NOBODY:
+        if episode.active is not None and episode.active[row] == NO_STEP:
             none = episode.answers is None or not episode.answers[row].any()
             parts.append(f"**{'No condition holds' if none else 'No step stands out'}: all steps mixed**")
         for step, (_, skill) in enumerate(episode.steps):
@@ -202,11 +198,11 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
                 parts += [line, f"\u2003\u2003{skill}"]
         texts.append("  \n".join(parts))
     documents = rr.TextDocument.columns(text=texts, media_type=[rr.MediaType.MARKDOWN] * len(texts))
-    stream.send_columns(f"{root}/plan", episode.times(changed), documents)
-    return _lines(conditions, episode)
+    stream.send_columns(f"{root}/plan", episode.times(rows), documents)
+    return _line_count(conditions, episode)
 
 
-def _lines(conditions: Sequence[str], episode: RecordedEpisode) -> int:
+def _line_count(conditions: Sequence[str], episode: RecordedEpisode) -> int:
     """Return the lines that a plan takes with these conditions, and the longest reason, in a small window."""
     answer = "  (evaluator: x)" if episode.believed is not None else ""
     texts = [f"x  1.  if {condition}{answer}" for condition in conditions] + [skill for _, skill in episode.steps]
@@ -214,21 +210,16 @@ def _lines(conditions: Sequence[str], episode: RecordedEpisode) -> int:
     return sum(-(-len(text) // LINE) for text in texts)
 
 
-def farthest(episode: RecordedEpisode) -> float:
-    """Return the largest distance to a skill's target, cm; 1 without targets."""
-    return 1.0 if episode.distance is None else max(1.0, 100 * float(np.nanmax(episode.distance)))
-
-
 def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
     """Log ``root``/action, /distance (cm), /reward, /skill_weights and /corrected, and return those that exist."""
-    rows, sent = np.arange(len(episode)), []
+    rows, logged = np.arange(len(episode)), []
 
     def send(name: str, values: NDArray[Any], names: Sequence[str], *color: Color, later: int = 0) -> None:
         colors = list(color) or [step_color(i) for i in range(len(names))]
         stream.log(f"{root}/{name}", rr.SeriesLines(names=names, colors=colors), static=True)
         columns = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
         stream.send_columns(f"{root}/{name}", episode.times(rows + later), columns)
-        sent.append(name)
+        logged.append(name)
 
     if numbers := episode.action.shape[1]:
         send("action", episode.action, action_names(episode.layout) if episode.layout else [*map(str, range(numbers))])
@@ -236,24 +227,25 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
         # One line in centimetres, in the colour of the active step.
         assert episode.active is not None
         steps = range(int(episode.active.max()) + 1)
-        colors = np.array([*map(step_color, steps), FALSE], np.uint8)[episode.active]  # NOBODY, -1, takes the last
+        colors = np.array([*map(step_color, steps), FALSE], np.uint8)[episode.active]  # NO_STEP, -1: the last colour
         columns = [*rr.Scalars.columns(scalars=distance * 100), *rr.SeriesLines.columns(colors=colors)]
         stream.send_columns(f"{root}/distance", episode.times(rows), columns)
-        sent.append("distance")
-    # A sparse reward is the success, which has a row in the timeline.
+        logged.append("distance")
+    # A sparse reward equals the success, which has a row in the timeline.
     reward: Any = episode.reward
     if reward is not None and not (episode.success is not None and np.array_equal(reward, episode.success)):
         send("reward", reward[:, None], ["reward"], STEEL, later=1)
     weights = episode.skill_weights
-    if weights is not None and bool(((weights > 1e-3) & (weights < 1 - 1e-3)).any()):  # else the timeline has them
+    if weights is not None and bool(((weights > 1e-3) & (weights < 1 - 1e-3)).any()):  # else the timeline shows them
         texts = [f" {skill}" for _, skill in episode.steps] or [""] * weights.shape[1]
         send("skill_weights", weights, [f"{i}{text}" for i, text in enumerate(texts, 1)])
     if episode.corrected is not None:
         send("corrected", episode.corrected[:, None], ["of the correction"])
-    return sent
+    return logged
 
 
 def action_names(layout: Layout) -> list[str]:
+    """Return the names of an action's A numbers: "dx", "dy", "dz" and "gripper", or an index."""
     names = [str(number) for number in range(layout.action_size)]
     if layout.displacement is not None:
         names[layout.displacement : layout.displacement + 3] = "dx", "dy", "dz"

@@ -1,4 +1,4 @@
-"""Opens recordings in rerun's viewer, or takes a picture of one without a screen."""
+"""Open recordings in rerun's viewer, in a window or a browser, or take a picture of one without a screen."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any, NamedTuple
+from urllib.parse import quote
 
-from lw_torchrl._util.checks import typed
+from lw_torchrl._util.checks import Natural, typed
 from lw_torchrl._util.files import AnyPath, replacing
 from lw_torchrl.record.entities import EPISODE_TIMELINE
 from lw_torchrl.record.rerun_logger import is_complete
@@ -29,7 +30,7 @@ REASONS = {
     r"render context|[Nn]o (graphics|wgpu) adapter|libvulkan": "no graphics driver was found. Without a GPU, install "
     "Vulkan's loader and Mesa's software driver (Debian: apt-get install libvulkan1 mesa-vulkan-drivers)",
     r"DISPLAY is set|EventLoopError|failed to open display": "there is no screen. Take a picture with --screenshot, "
-    "serve a page with --web, or write one with --html",
+    "or open the viewer in a browser with --web",
 }
 """Patterns in the output of a failed viewer, and the reason and remedy to report."""
 
@@ -40,12 +41,13 @@ def open_viewer(
     screenshot: AnyPath | None = None,
     window_size: str = "1400x900",
     *,
-    step: int | None = None,
+    step: Natural | None = None,
     episode: str | None = None,
+    web_port: Natural | None = None,
 ) -> None:
     """Open recordings in rerun's viewer and wait until it is closed; or save a picture of the viewer.
 
-    A recording that was not closed, since its run was killed or still writes, is shown as far as it was written, with
+    A recording that was not closed, since its program was killed or still runs, is shown as far as it was written, with
     a warning.
 
     Args:
@@ -55,18 +57,25 @@ def open_viewer(
         step: the step to open at; None for an episode's first success or failure, and a training's last step.
         episode: the tab to open at, by its title ("Metrics") or its episode's name, in the recordings that have it;
             None opens the first one.
+        web_port: serve rerun's web viewer at this port of 127.0.0.1 until Ctrl-C instead of opening a window, and print
+            its address; 0 picks a free port. It opens at the viewer's own default step.
 
     Raises:
         FileNotFoundError: there is no such file, or rerun's viewer is not installed.
+        ValueError: a file is not a rerun recording, or no recording has the episode.
         RuntimeError: the viewer ended with an error; the message says what to do about it.
 
     Example:
         >>> open_viewer("runs/demo", screenshot="rollout.png", episode="drawer-open", step=75)  # doctest: +SKIP
     """
+    from rerun.chunk import RrdReader
+
     paths = [path] if isinstance(path, (str, os.PathLike)) else path
-    recordings = [file for one in paths for file in find_recordings(one)]
+    recordings = [file for place in paths for file in find_recordings(place)]
     if screenshot is not None and Path(screenshot).suffix != ".png":
         raise ValueError(f"screenshot must end in '.png', got {str(screenshot)!r}")
+    if web_port is not None and (screenshot is not None or step is not None):
+        raise ValueError("web_port excludes screenshot and step")
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         files = [stack.enter_context(readable(recording)) for recording in recordings]
@@ -74,27 +83,37 @@ def open_viewer(
         openings: dict[str, Opening] = {}
         unknown: list[ValueError] = []
         for file in files:
-            reader, known, tabs = read_recording(file)
-            try:
-                openings[known.recording_id] = _opening(tabs, episode, step)
-            except ValueError as error:
-                unknown.append(error)
-                openings[known.recording_id] = _opening(tabs, None, None)
-            if tabs is not None and not reader.blueprints():  # it was never closed, and so has no layout
+            reader = RrdReader(file)
+            known, tabs, front, at = reader.recordings()[0], Tabs.read(reader), episode, step
+            if tabs is not None and episode is not None:
+                try:
+                    tabs.index(episode)
+                except ValueError as error:
+                    unknown.append(error)
+                    front = at = None
+            openings[known.recording_id] = Opening.of(tabs, front, at)
+            # A recording that was never closed has no layout; a web viewer's front tab is set by its layout.
+            if tabs is not None and (not reader.blueprints() or (web_port is not None and front is not None)):
                 layouts.append(folder / f"{known.recording_id}.rbl")
-                tabs.blueprint().save(known.application_id, str(layouts[-1]))
+                tabs.blueprint(front if web_port is not None else None).save(known.application_id, str(layouts[-1]))
         if len(unknown) == len(files):
             raise unknown[-1]
         port = str(free_port())
-        arguments: list[str | Path] = [*files, *layouts, "--port", port, "--window-size", window_size]
-        if screenshot is None:
-            process, output = stack.enter_context(rerun_process(*arguments))
+        arguments: list[str | Path] = [*files, *layouts, "--port", port]
+        if web_port is not None:
+            web = str(web_port or free_port())
+            process, output = stack.enter_context(rerun_process(*arguments, "--serve-web", "--web-viewer-port", web))
+            print(f"http://{LOCAL}:{web}/?url={quote(f'rerun+http://{LOCAL}:{port}/proxy', '')}", flush=True)
+        elif screenshot is None:
+            process, output = stack.enter_context(rerun_process(*arguments, "--window-size", window_size))
             with suppress(ConnectionError, TimeoutError):  # the window may have been closed at once
                 _go_to(_connect(process, port, len(openings)), openings)
-            if process.wait():
-                raise failure(output)
+        if screenshot is None:
+            with suppress(KeyboardInterrupt):
+                if process.wait():
+                    raise failure(output)
             return
-        process, output = stack.enter_context(rerun_process(*arguments, "--headless"))
+        process, output = stack.enter_context(rerun_process(*arguments, "--window-size", window_size, "--headless"))
         picture = stack.enter_context(replacing(screenshot))
         try:
             client = _connect(process, port, len(openings))
@@ -112,7 +131,7 @@ def find_recordings(path: AnyPath) -> list[Path]:
     recording = Path(path)
     if not recording.is_dir():
         if not recording.is_file():
-            raise FileNotFoundError(f"there is no recording {str(recording)!r}; give a .rrd file or a folder of some")
+            raise FileNotFoundError(f"no recording {str(recording)!r}; give a .rrd file or a folder of .rrd files")
         return [recording]
     recordings = [file for file in recording.glob("*.rrd") if not file.name.startswith(".")]
     if not recordings:
@@ -138,27 +157,20 @@ def readable(recording: Path) -> Iterator[Path]:
         yield copy
 
 
-def read_recording(file: Path) -> tuple[Any, Any, Tabs | None]:
-    """Return a reader of a recording, its ids and its tabs; None for another program's, which has its own layout."""
-    from rerun.chunk import RrdReader
-
-    reader = RrdReader(file)
-    return reader, reader.recordings()[0], Tabs.read(reader)
-
-
 class Opening(NamedTuple):
-    """The place to open a recording at: the index of a tab, a timeline and a step; None leaves the viewer's choice."""
+    """Where to open a recording: the index of a tab, a timeline and a step; None leaves the viewer's choice."""
 
     tab: int | None
     timeline: str | None
     step: int | None
 
-
-def _opening(tabs: Tabs | None, episode: str | None, step: int | None) -> Opening:
-    if tabs is None:
-        return Opening(None, None, step)
-    number = None if episode is None else tabs.index(episode)
-    return Opening(number, tabs.tab(episode).timeline, tabs.opening_step(episode) if step is None else step)
+    @classmethod
+    def of(cls, tabs: Tabs | None, episode: str | None, step: int | None) -> Opening:
+        """Return where to open a tab; another program's recording, without our tabs, has its own layout."""
+        if tabs is None:
+            return cls(None, None, step)
+        number = None if episode is None else tabs.index(episode)
+        return cls(number, tabs.tab(episode).timeline, tabs.opening_step(episode) if step is None else step)
 
 
 def _connect(process: subprocess.Popen[bytes], port: str, recordings: int) -> Any:
@@ -192,7 +204,7 @@ def _go_to(client: Any, openings: dict[str, Opening]) -> None:
         name = name or recording.current_timeline
         timeline = next((timeline for timeline in recording.timelines if timeline.name == name), None)
         if timeline is not None and timeline.end is not None:
-            if step is None:  # an episode's success and reward stand one step after its last row
+            if step is None:  # an episode's success and reward are one step after its last row
                 step = max(timeline.end - 1 if name == EPISODE_TIMELINE else timeline.end, timeline.start)
             client.set_time(name, sequence=step, play_state="paused", recording=recording.store_id)
     if len(openings) > 1:
@@ -202,7 +214,7 @@ def _go_to(client: Any, openings: dict[str, Opening]) -> None:
 
 def _take_picture(client: Any, picture: Path) -> None:
     """Save pictures until two in a row are the same: then everything is loaded and nothing moves."""
-    client.run_command("ui.toggle_top_panel")  # its messages lie over the views
+    client.run_command("ui.toggle_top_panel")  # its messages would cover the views
     before, deadline = b"", time.monotonic() + SETTLE_SECONDS
     while True:
         time.sleep(PAINT_SECONDS)
@@ -220,7 +232,7 @@ def rerun_program() -> str:
     """Return the path of rerun's program."""
     if override := os.environ.get("RERUN_CLI_PATH"):
         return override
-    package = find_spec("rerun_cli")  # a folder with the program; the module only starts it as a process of its own
+    package = find_spec("rerun_cli")  # a folder with the program; the module would start it in another process
     if package is None or package.origin is None:
         raise FileNotFoundError("rerun's viewer is not installed; pip install 'rerun-sdk>=0.41,<0.42'")
     name = {"win32": "rerun.exe", "darwin": "Rerun.app/Contents/MacOS/Rerun"}.get(sys.platform, "rerun")
@@ -254,7 +266,7 @@ def rerun_process(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[byt
 
 
 def failure(output: IO[bytes]) -> RuntimeError:
-    """Return the error that says why rerun's program ended, from its output."""
+    """Return an error with the reason why rerun's program ended, from its output."""
     output.seek(0)
     text = re.sub(r"\x1b\[[0-9;]*m", "", output.read().decode("utf-8", "replace"))  # without colours
     for pattern, reason in REASONS.items():

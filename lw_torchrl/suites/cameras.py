@@ -1,4 +1,4 @@
-"""Pictures of MuJoCo states by Meta-World's cameras, one OpenGL context for all models; and where their bodies are."""
+"""Camera images and poses of MuJoCo states; one OpenGL context serves all models."""
 
 from __future__ import annotations
 
@@ -18,18 +18,20 @@ from lw_torchrl._util.rendering import RENDER_LIBRARIES
 from lw_torchrl.suites.engine import BodyPoses, RowModel
 
 _FINGER = re.compile("finger|claw|pad")
-_ROLLED = ("corner", "corner2", "corner3", "corner4")  # Meta-World hangs them upside down
+_ROLLED = ("corner", "corner2", "corner3", "corner4")  # Meta-World mounts these upside down
 _MOST_GEOMS = 2000
-_LOOKS = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)  # a software renderer's time, fourfold
+# Shadows and reflections would take a software renderer four times as long.
+_SWITCHED_OFF = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
 
 
 def _open_gl() -> Any:
-    """Open OpenGL without a window: MUJOCO_GL's, which robosuite sets after MuJoCo's import, or EGL if headless."""
+    """Open an OpenGL context without a window, by the library in MUJOCO_GL, or else EGL without a display."""
+    # MuJoCo reads MUJOCO_GL at its import, but robosuite sets it later.
     headless = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     backend = os.environ.get("MUJOCO_GL", "").lower().strip() or ("egl" if headless else "")
     if backend == "egl":
         before = os.environ.get("PYOPENGL_PLATFORM")
-        from mujoco.egl import GLContext  # which says "egl" to processes started from here, too
+        from mujoco.egl import GLContext  # sets PYOPENGL_PLATFORM, which child processes would inherit
 
         if before is None:
             os.environ.pop("PYOPENGL_PLATFORM", None)
@@ -40,15 +42,15 @@ def _open_gl() -> Any:
 
 def _no_open_gl(error: Exception) -> ImportError:
     backend = os.environ.get("MUJOCO_GL", "").lower().strip()
-    need = RENDER_LIBRARIES.get(backend or "egl", "OpenGL and a display")
+    library = RENDER_LIBRARIES.get(backend or "egl", "OpenGL and a display")
     return ImportError(
-        f"pictures need OpenGL, which does not open with MUJOCO_GL={backend or '(unset)'}: install {need}, or start "
-        f"Python with MUJOCO_GL=egl or MUJOCO_GL=osmesa. Simulations and recordings need none. ({error})"
+        f"camera images need OpenGL, which does not open with MUJOCO_GL={backend or '(unset)'}: install {library}, or "
+        f"start Python with MUJOCO_GL=egl or MUJOCO_GL=osmesa. Simulations and recordings do not need it. ({error})"
     )
 
 
 _open: WeakSet[Cameras] = WeakSet()
-_processes: set[int] = set()  # that opened OpenGL: this one and those it was forked from
+_processes: set[int] = set()  # this process and its parents, if they opened OpenGL
 
 
 def _close_all() -> None:
@@ -57,32 +59,32 @@ def _close_all() -> None:
 
 
 class Cameras:
-    """Takes pictures, in any thread, one at a time; a model's meshes and textures are loaded at its first picture."""
+    """A renderer for one thread at a time; it loads a model's meshes and textures at the model's first image."""
 
     def __init__(self) -> None:
         if _processes - {os.getpid()}:
             raise RuntimeError(
-                "this process was forked from one that took pictures, and OpenGL's threads stayed there: start it with "
-                "mp_start_method='spawn', or take no picture before the fork"
+                "this process was forked from one that rendered, and OpenGL does not survive that: use "
+                "mp_start_method='spawn', or render nothing before the fork"
             )
         try:
             self._gl = _open_gl()
-        except Exception as error:  # each platform has its own, an AttributeError among them
+        except Exception as error:  # each platform raises another type
             raise _no_open_gl(error) from error
         if not _open:
             atexit.unregister(_close_all)
-            atexit.register(_close_all)  # before the platform ends, after which freeing a context is an error
+            atexit.register(_close_all)  # last, so that it runs before OpenGL's own cleanup
         _open.add(self)
         _processes.add(os.getpid())
         self._loaded: dict[str, tuple[Any, Any]] = {}
 
     def picture(self, shown: RowModel, data: Any, *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        """One picture of a state, (height, width, 3) uint8."""
+        """Return an image of a state, (height, width, 3) uint8."""
         self._gl.make_current()
         try:
             return self._picture(shown, data, camera, height, width)
         finally:
-            if type(self._gl).__module__ == "mujoco.egl":  # another thread may take the context
+            if type(self._gl).__module__ == "mujoco.egl":  # else no other thread could use the context
                 from OpenGL import EGL  # type: ignore[import-untyped]
 
                 EGL.eglReleaseThread()
@@ -104,12 +106,12 @@ class Cameras:
         place.fixedcamid = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, place, everything, view)
-        for look in _LOOKS:
-            view.flags[look] = 0
+        for flag in _SWITCHED_OFF:
+            view.flags[flag] = 0
         frame = mujoco.MjrRect(0, 0, width, height)
         pixels = np.empty((height, width, 3), dtype=np.uint8)
         mujoco.mjr_render(frame, view, context)
-        mujoco.mjr_readPixels(pixels, None, frame, context)  # the first line at the bottom
+        mujoco.mjr_readPixels(pixels, None, frame, context)  # from the bottom up
         return pixels[:, ::-1] if camera in _ROLLED else pixels[::-1]
 
     def close(self) -> None:
@@ -124,32 +126,32 @@ class Cameras:
 
 
 class SeenRows:
-    """What an engine has whose rows can be seen."""
+    """A base class of engines with camera images, models and poses of their rows."""
 
     _cameras: Cameras | None = None
-    _fingers: ClassVar[dict[str, NDArray[np.bool_]]] = {}  # by the model's file
+    _fingers: ClassVar[dict[str, NDArray[np.bool_]]] = {}  # for each model's file, which bodies are fingers
 
     def _seen(self, row: int) -> tuple[RowModel, Any]:
-        """A row's model, with the row's own places in it, and MuJoCo's data."""
+        """Return a row's model, with the row's own positions of bodies and sites, and its MuJoCo data."""
         raise NotImplementedError
 
     def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        """Pictures of the rows as they are now: (len(rows), height, width, 3) uint8, the first line on top."""
+        """Return images of the rows' present states, (len(rows), height, width, 3) uint8, from the top down."""
         cameras = self._cameras = self._cameras or Cameras()
         return np.stack([cameras.picture(*self._seen(row), camera=camera, height=height, width=width) for row in rows])
 
     def model(self, row: int) -> RowModel:
-        """The model of a row."""
+        """Return the model of a row."""
         return self._seen(row)[0]
 
     def poses(self, row: int) -> BodyPoses:
-        """Where all bodies of a row are now."""
+        """Return the present poses of all bodies of a row."""
         data = self._seen(row)[1]
         return BodyPoses(data.xpos.copy(), data.xquat.copy())
 
     def touched(self, row: int) -> str | None:
-        """What a finger of a row touches now, by the name of its outermost body, "nothing" for nothing; None where no
-        body is called a finger, a claw or a pad."""
+        """Return what a finger of a row touches, as the name of the outermost body, or "nothing"; None if the model has
+        no body called a finger, claw or pad."""
         (path, model), data = self._seen(row)
         if path not in self._fingers:
             names = [model.body(body).name for body in range(model.nbody)]

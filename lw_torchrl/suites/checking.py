@@ -1,4 +1,4 @@
-"""check_suite: whether a suite's numbers mean what its layout says, measured in its own simulator."""
+"""check_suite: measure in a suite's simulator whether its numbers mean what its layout says."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ from lw_torchrl.suites.engine import Engine, EngineStep
 from lw_torchrl.suites.suite import Suite
 
 Array = NDArray[np.float64]
-_Row = tuple[str, str, str, bool]
+_Row = tuple[str, str, str, bool]  # a Finding without its task
 _AXES = {"x": "right", "y": "away from the robot", "z": "up"}
-_STEPS, _COUNTED, _SHARE = 14, 4, 0.25  # of a movement, and of its last steps; a slow hand takes some to get going
-_SETTLING = 30
-_LAG, _CLOSING = 4, 13  # what is measured of Meta-World: steps that its hand goes on for, and that its fingers take
-_LOWEST = 0.15  # metres: where a hand that is pressed down is at most; Meta-World's is at 0.046
-_TABLE, _FLOATING = 0.02, 0.03  # metres: what "touching the table" allows; where a thing no longer seems meant to lie
+# A hand is measured over the last steps of a movement at a quarter of its speed: it takes some steps to get going.
+_STEPS, _COUNTED, _SHARE = 14, 4, 0.25
+_SETTLING = 30  # steps in which a gripper opens or closes
+_LAG, _CLOSING = 4, 13  # measured in Meta-World: steps that its hand moves on for, and that its gripper needs to close
+_LOWEST = 0.15  # metres: the greatest height of a hand that is pressed down; Meta-World's is at 0.046
+_TABLE, _FLOATING = 0.02, 0.03  # metres: below, an object touches the table; above, it is meant to be somewhere else
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A measurement in a task: its subject, its result, the layout's value, and whether they agree."""
+    """A measurement in a task: its subject, its result, the value that the layout requires, and whether they agree."""
 
     task: str
     what: str
@@ -40,36 +41,37 @@ class Finding:
 
 @typed
 def check_suite(suite: Suite, *, seed: int = 0) -> list[Finding]:
-    """Run a few steps of each task and compare what happens with the suite's layout; success is never looked at.
+    """Run a few steps of each task and compare the result with the suite's layout.
 
-    It checks the engine's answers, that a seed fixes an episode, that inactive rows rest, the numbers of the step
-    before, each axis of the displacement, how far the hand moves in a step (``reach``) and how long it goes on
-    afterwards, that objects stay while it moves, the gripper's opening and closing, whether these take no longer than
-    Meta-World's (``binary_gripper``), and how high objects rest above the table. It needs two rows of each task.
+    It checks the types and shapes that the engine returns, that a seed determines an episode, that inactive rows rest,
+    the numbers of the previous step, each axis of the displacement, how far the hand moves in a step (``reach``) and
+    for how long it moves on, that objects stay while it moves, that the gripper opens and closes, and no slower than
+    Meta-World's (``binary_gripper``), and how high objects rest above the table. It does not check success. The engine
+    runs two rows of each task.
 
     Returns:
         A :class:`Finding` for each measurement, in the order of the tasks.
 
     Example:
         >>> from lw_torchrl.suites import check_suite, load_suite
-        >>> all(one.right for one in check_suite(load_suite("fetch")) if one.task == "fetch/pick-and-place")
+        >>> all(finding.right for finding in check_suite(load_suite("fetch")) if finding.task == "fetch/pick-and-place")
         True
     """
-    found: list[Finding] = []
+    findings: list[Finding] = []
     heights: list[float] = []
     for task in suite.tasks:
         with closing(suite.make_engine([task, task], reward="sparse", num_threads=1)) as engine:
             bench = _Bench(suite, task, engine, seed)
-            found += [Finding(task, *row) for row in bench.rows()]
+            findings += [Finding(task, *row) for row in bench.rows()]
             heights += bench.heights
     if suite.layout.displacement is not None and min(heights, default=0.0) > _LOWEST:
         lowest = f"z = {min(heights) * 100:.1f} cm"
-        found.append(Finding("all", "the lowest of things and pressed hands", lowest, "z counts from the table", False))
-    return found
+        findings.append(Finding("all", "the lowest object or hand", lowest, "z is the height above the table", False))
+    return findings
 
 
 class _Bench:
-    """Two rows of a task: the first is moved, the second rests."""
+    """Two rows of a task: the first moves, the second rests."""
 
     def __init__(self, suite: Suite, task: str, engine: Engine, seed: int) -> None:
         self.suite, self.layout, self.engine, self.seed = suite, suite.layout, engine, seed
@@ -78,11 +80,10 @@ class _Bench:
         self.heights: list[float] = []
 
     def reset(self, seed: int | None = None) -> Array:
-        found = self.engine.reset([0], [self.seed if seed is None else seed])
-        return np.array(found)[0]
+        return np.array(self.engine.reset([0], [self.seed if seed is None else seed]))[0]
 
     def step(self, **effort: float) -> EngineStep:
-        """One step of the first row: ``x``, ``y`` or ``z`` of the displacement, and ``close``."""
+        """Step the first row with a displacement along ``x``, ``y`` or ``z`` and a gripper's effort ``close``."""
         layout, action = self.layout, np.zeros((2, self.layout.action_size), np.float32)
         if layout.displacement is not None:
             action[0, layout.displaced("check_suite")] = [effort.get(axis, 0.0) for axis in _AXES]
@@ -99,15 +100,15 @@ class _Bench:
             "a reset of one row of two": (one, lambda: self.engine.reset([0], [self.seed])),
             "a step": (f"EngineStep of {two}, (2,) float64, (2,) bool, (2,) bool", self.step),
         }
-        for what, (wanted, ask) in answers.items():
-            measured = _answer(ask())
+        for what, (wanted, call) in answers.items():
+            measured = _describe(call())
             yield what, measured, wanted, measured == wanted
             if measured != wanted:
                 return
         yield from self._episodes()
         yield from self._axes() if self.layout.displacement is not None else ()
         yield from self._gripper() if self.layout.gripper is not None else ()
-        yield from self._things()
+        yield from self._objects()
 
     def _episodes(self) -> Iterator[_Row]:
         layout, first = self.layout, self.reset()
@@ -117,18 +118,19 @@ class _Bench:
         self.reset(self.seed + 1)
         again = [self.reset(), *self.run(3, x=0.5)]
         same = np.array_equal(walk, again, equal_nan=True)
-        yield "a seed fixes the episode", "the same" if same else "other numbers", "the same", same
+        yield "a seed determines the episode", "same numbers" if same else "other numbers", "same numbers", same
         rested = self.step(x=0.5).observation[1]
         same = np.array_equal(rested, self.step(x=0.5).observation[1], equal_nan=True)
-        yield "a row that is not active", "rests" if same else "goes on", "rests", same
+        yield "a row that is not active", "rests" if same else "moves", "rests", same
         if layout.past is not None:
-            pairs = [(walk[0], walk[0]), *pairwise(walk)]  # after a reset, the step before is the same
+            pairs = [(walk[0], walk[0]), *pairwise(walk)]  # a reset repeats the present numbers as the previous ones
             kept = all(
                 np.array_equal(now[layout.a_step_before(part)], old[part])
                 for old, now in pairs
                 for part in layout.present
             )
-            yield "numbers of the step before", "those" if kept else "others", "those; after a reset, the present", kept
+            wanted = "those of the previous step; after a reset, the present ones"
+            yield "numbers of the previous step", "right" if kept else "others", wanted, kept
         gripper = self.task.objects[0].position
         place = tuple(range(self.hand.start, self.hand.stop))
         right = typed_position(gripper) == typed_position(place)
@@ -140,22 +142,21 @@ class _Bench:
             self.reset()
             self.run(2 * _STEPS, z=_SHARE)  # away from the table and what stands on it
             self.run(_STEPS)
-            way = self.run(_STEPS, **{name: _SHARE})
-            moved = (way[-1] - way[-1 - _COUNTED])[self.hand] / _COUNTED / _SHARE
-            told = ", ".join(f"{part * 100:.1f}" for part in moved)
+            path = self.run(_STEPS, **{name: _SHARE})
+            moved = (path[-1] - path[-1 - _COUNTED])[self.hand] / _COUNTED / _SHARE
+            measured = ", ".join(f"{part * 100:.1f}" for part in moved)
             right = moved.argmax() == axis and abs(moved[axis] - layout.reach) < 0.35 * layout.reach
             wanted = f"{layout.reach * 100:.1f} cm along {name}"
-            yield f"+{name} moves {_AXES[name]}", f"({told}) cm a step", wanted, bool(right)
-            for number, thing in enumerate(layout.things, 1):
-                went = float(np.abs(way[-1][thing.xyz] - way[0][thing.xyz]).max())
-                if went > 0.5 * np.abs(moved).max() * _SHARE * (_STEPS - 1):
-                    yield f"thing {number} as the hand moves", "goes along", "stays; in the table's frame", False
-            late.append((self.run(_STEPS)[-1] - way[-1])[self.hand][axis] / layout.reach / _SHARE)
+            yield f"+{name} moves {_AXES[name]}", f"({measured}) cm a step", wanted, bool(right)
+            for number, slot in enumerate(layout.things, 1):
+                shift = float(np.abs(path[-1][slot.xyz] - path[0][slot.xyz]).max())
+                if shift > 0.5 * np.abs(moved).max() * _SHARE * (_STEPS - 1):
+                    yield f"object {number} as the hand moves", "moves along", "stays; in the table's frame", False
+            late.append((self.run(_STEPS)[-1] - path[-1])[self.hand][axis] / layout.reach / _SHARE)
         self.reset()
         self.heights += [state[self.hand][2] for state in self.run(int(0.6 / layout.reach) + 1, z=-1.0)]
         slow = float(max(late))
-        wanted = f"{_LAG} steps or fewer, as Meta-World's"
-        yield "the hand goes on for", f"{slow:.1f} steps", wanted, slow < _LAG + 0.5
+        yield "the hand moves on for", f"{slow:.1f} steps", f"at most {_LAG}, as in Meta-World", slow < _LAG + 0.5
 
     def _gripper(self) -> Iterator[_Row]:
         layout = self.layout
@@ -164,9 +165,9 @@ class _Bench:
         closed = [state[layout.opening] for state in self.run(_SETTLING, close=1.0)]
         if max(opened) - min(closed) < 0.05:
             plan = None if self.suite.plans is None else self.suite.plans.get(self.task.name)
-            said = plan is not None and _asks_for_fingers(plan)
-            wanted = "0 to 1, since the plan asks whether it is both" if said else "that, or 0 to 1"
-            yield "gripper", "it does not move", wanted, not said
+            needed = plan is not None and _needs_fingers(plan)
+            wanted = "0 to 1, since the plan has conditions on both" if needed else "fixed, or 0 to 1"
+            yield "gripper", "it does not move", wanted, not needed
             return
         yield "an open gripper", f"{opened[-1]:.2f}", "at least 0.95", opened[-1] >= 0.95
         yield "a closed gripper", f"{min(closed):.2f}", "at most 0.7", min(closed) <= 0.7
@@ -174,27 +175,27 @@ class _Bench:
         wanted = f"fewer than Meta-World's {_CLOSING}" if layout.binary_gripper else "any"
         yield "steps to close", str(steps), wanted, not layout.binary_gripper or steps < _CLOSING
 
-    def _things(self) -> Iterator[_Row]:
+    def _objects(self) -> Iterator[_Row]:
         first = self.reset()
         for name, place in self.task.openings.items():
             yield f"opening of the {name}", f"{first[place]:.2f}", "from 0 to 1", bool(-0.05 <= first[place] <= 1.05)
         resting = self.run(5)[-1]
-        for number, thing in enumerate(self.layout.things, 1):
-            if not first[thing.xyz].any():
-                continue  # the task lacks it
-            self.heights.append(height := float(resting[thing.position + 2]))
-            wanted = f"{_TABLE * 100:.0f} cm or less where it lies on the table"
-            yield f"thing {number} rests at", f"z = {height * 100:.1f} cm", wanted, not _TABLE < height < _FLOATING
+        for number, slot in enumerate(self.layout.things, 1):
+            if not first[slot.xyz].any():
+                continue  # this task has no such object
+            self.heights.append(height := float(resting[slot.position + 2]))
+            wanted = f"at most {_TABLE * 100:.0f} cm if it lies on the table"
+            yield f"object {number} rests at", f"z = {height * 100:.1f} cm", wanted, not _TABLE < height < _FLOATING
 
 
-def _answer(found: Any) -> str:
-    """Describe what an engine returned by its shape and precision."""
-    if isinstance(found, EngineStep):
-        return f"EngineStep of {', '.join(map(_answer, found))}"
-    return f"{found.shape} {found.dtype}" if isinstance(found, np.ndarray) else type(found).__name__
+def _describe(answer: Any) -> str:
+    """Describe an engine's answer by its type, shape and dtype."""
+    if isinstance(answer, EngineStep):
+        return f"EngineStep of {', '.join(map(_describe, answer))}"
+    return f"{answer.shape} {answer.dtype}" if isinstance(answer, np.ndarray) else type(answer).__name__
 
 
-def _asks_for_fingers(plan: ConditionalPlan) -> bool:
-    """Whether conditions ask both whether the gripper is open and whether it is closed."""
-    asked = {clause.predicate for step in plan.steps for clause in step.condition.clauses if clause.object is None}
-    return {"open", "closed"} <= asked
+def _needs_fingers(plan: ConditionalPlan) -> bool:
+    """Return whether a plan has conditions on both an open and a closed gripper."""
+    clauses = [clause for step in plan.steps for clause in step.condition.clauses if clause.object is None]
+    return {"open", "closed"} <= {clause.predicate for clause in clauses}

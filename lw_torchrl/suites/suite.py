@@ -1,4 +1,4 @@
-"""Suite: the tasks of a simulator, what their numbers mean, and what simulates them."""
+"""Suite: the tasks of a simulator, their layout and words, and the engine that simulates them."""
 
 from __future__ import annotations
 
@@ -19,23 +19,24 @@ from lw_torchrl.suites.engine import Engine
 @typed_fields
 @dataclass(frozen=True)
 class Suite:
-    """Tasks of one simulator and robot, for everything that takes ``suite=``.
+    """The tasks of one simulator and robot, for every ``suite=`` argument.
 
     Attributes:
-        name: "fetch"; its tasks are called "fetch/push".
+        name: for example "fetch", whose tasks are called "fetch/push".
         layout: the layout of observations and actions.
-        tasks: full name to :class:`Task`, each of this layout.
+        tasks: full name to :class:`Task`, all of this layout.
         make_engine: ``(row_tasks, *, reward, num_threads) -> Engine``, with a row for each full name in ``row_tasks``;
             ``reward`` is "sparse" or "dense".
-        skills, plans: scripted skills by their text, and a plan for each task that has one; None for none.
+        skills, plans: scripted skills by their text, and plans by task; not every task needs one.
         make_expert: ``(tasks) -> actor``, a demonstrator that writes ``action`` (N, A) float32 in [-1, 1] and
-            ``unclipped_action``; None for the plans with their scripted skills.
-        max_steps, step_time: the default length of episodes, and seconds between two actions.
+            ``unclipped_action``; None if the plans with their scripted skills demonstrate.
+        max_steps: default length of episodes.
+        step_time: seconds between two actions.
 
     Raises:
-        ValueError: a task of another layout, or whose name does not begin with the suite's.
+        ValueError: a task has another layout, or a name that does not begin with the suite's.
 
-    Source: ours; as gymnasium's ``EnvSpec``, with words.
+    Source: ours; like gymnasium's ``EnvSpec``.
     """
 
     name: str
@@ -52,8 +53,8 @@ class Suite:
         for relation in self.layout.thresholds:
             check_choice(f"thresholds of layout {self.layout.name!r}", relation, PREDICATES)
         for name, task in self.tasks.items():
-            if not isinstance(task, Task) or task.name != name:
-                raise TypeError(f"tasks of suite {self.name!r} must map names to their Task, got {shown(task)}")
+            if task.name != name:
+                raise ValueError(f"tasks of suite {self.name!r} must map names to tasks, got {task.name!r} as {name!r}")
             if task.layout != self.layout:
                 raise ValueError(f"task {name!r} must have the layout of suite {self.name!r}, got {task.layout.name!r}")
             if self.name != "metaworld" and not name.startswith(f"{self.name}/"):
@@ -64,8 +65,8 @@ class Suite:
             object.__setattr__(self, "tasks", ReadOnlyDict(dict(sorted(self.tasks.items()))))
 
     def named_tasks(self, tasks: TaskList, own: Tasks | None = None) -> dict[str, Task]:
-        """Full task names, sorted, to the tasks that are meant: the suite's name for all of them, a name with or
-        without the suite's in front, a :class:`Task`, or a list of these. ``own`` tasks are known beside them."""
+        """Return tasks by their full names, sorted. ``tasks`` is the suite's name for all of them, a name with or
+        without the suite's in front, a :class:`Task`, or a list of these; names are also looked up in ``own``."""
         known = {**self.tasks, **own} if own else self.tasks
         if tasks == self.name:
             return dict(self.tasks)
@@ -79,7 +80,7 @@ class Suite:
         return f"{self.name}/{task}"
 
 
-def _check_suite(name: str, entry: Any) -> Suite:
+def _as_suite(name: str, entry: Any) -> Suite:
     suite = entry() if callable(entry) else entry
     if not isinstance(suite, Suite):
         raise TypeError(f"suite {name!r} must be a Suite, or a function that makes one, got {shown(entry)}")
@@ -87,12 +88,12 @@ def _check_suite(name: str, entry: Any) -> Suite:
 
 
 _SHIPPED = {name: f"lw_torchrl.suites.{name}:make_suite" for name in ("metaworld", "fetch")}
-SUITES = Registry("suite", "lw_torchrl.suites", _SHIPPED, _check_suite)
-"""The suites by name. Add yours to use it by name; nobody has to, since every ``suite=`` takes the object too."""
+SUITES = Registry("suite", "lw_torchrl.suites", _SHIPPED, _as_suite)
+"""Suites by name. Add yours to use it by name; every ``suite=`` also accepts the :class:`Suite`."""
 
 
 def load_suite(suite: str | Suite) -> Suite:
-    """Return the suite of a name, "fetch"; a :class:`Suite` is returned as it is.
+    """Return the suite of a name, such as "fetch"; a :class:`Suite` is returned as it is.
 
     Raises:
         ValueError: the name is unknown; the message lists the nearest names.
@@ -106,47 +107,46 @@ def load_suite(suite: str | Suite) -> Suite:
     if isinstance(suite, Suite):
         return suite
     if not isinstance(suite, str):
-        raise TypeError(f"suite must be a suite's name or a Suite, got {shown(suite)} ({type(suite).__name__})")
+        raise TypeError(f"suite must be a suite's name or a Suite, got {shown(suite)}")
     if suite not in SUITES:
-        raise ValueError(
-            f"{unknown_name('suite', suite, SUITES)} (yours is given as suite=, or has a name by lw.suites.SUITES["
-            f"{suite!r}] = ..., on the command line in a module that --import names)"
-        )
+        advice = f"pass your own Suite, or add it: lw.suites.SUITES[{suite!r}] = ... (in a module for --import)"
+        raise ValueError(f"{unknown_name('suite', suite, SUITES)} To use your own, {advice}")
     return SUITES[suite]
 
 
 def suite_name(task: str) -> str:
-    """The suite that a task's name begins with, or is; Meta-World's tasks have no suite in front."""
-    known = task in (*TASKS, "MT10", "MT50")  # else installed packages are asked
-    return task.partition("/")[0] if "/" in task or (not known and task in SUITES) else "metaworld"
+    """Return the suite that a task's name begins with, or is; Meta-World's tasks have no suite in front."""
+    # SUITES reads the entry points of all installed packages, which takes long: look at known names first.
+    is_metaworld = task in (*TASKS, "MT10", "MT50")
+    return task.partition("/")[0] if "/" in task or (not is_metaworld and task in SUITES) else "metaworld"
 
 
 def listed_tasks(tasks: Any) -> Any:
-    """The tasks as they were given, but an iterator as a list, which can be read twice."""
+    """Return an iterator as a list, which can be read twice, and anything else as it is."""
     return list(tasks) if isinstance(tasks, Iterator) else tasks
 
 
 def find_suite(tasks: Any, suite: str | Suite | None = None) -> Suite:
-    """The suite of some tasks: the given one, or the one that their names begin with; else Meta-World's.
+    """Return the given suite, or else the one that the tasks' names begin with; Meta-World without a prefix.
 
     Raises:
-        ValueError: names of several suites, or of a suite that is not known.
+        ValueError: the names are of several suites or of an unknown one.
     """
     if suite is not None:
         return load_suite(suite)
     listed = [tasks] if isinstance(tasks, (str, Task)) else list(tasks) if isinstance(tasks, Iterable) else []
-    names = {one.name if isinstance(one, Task) else one for one in listed if isinstance(one, (str, Task))}
-    prefixes = {suite_name(name) for name in names}
-    if len(prefixes) > 1:
-        raise ValueError(f"tasks must be of one suite, got tasks of {', '.join(sorted(prefixes))}")
-    return load_suite(next(iter(prefixes), "metaworld"))
+    names = {task.name if isinstance(task, Task) else task for task in listed if isinstance(task, (str, Task))}
+    suites = {suite_name(name) for name in names}
+    if len(suites) > 1:
+        raise ValueError(f"tasks must be of one suite, got tasks of {', '.join(sorted(suites))}")
+    return load_suite(next(iter(suites), "metaworld"))
 
 
 def known_suite(task: str) -> Suite | None:
-    """The suite in :data:`SUITES` that has a task of this name and is installed; None for a task of one's own."""
+    """Return the installed suite in :data:`SUITES` that has a task of this name; None for other tasks."""
     name = suite_name(task)
     try:
-        found = load_suite(name) if name in SUITES else None
+        suite = SUITES.get(name)
     except ImportError:
         return None
-    return found if found is not None and task in found.tasks else None
+    return suite if suite is not None and task in suite.tasks else None

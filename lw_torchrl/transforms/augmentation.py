@@ -99,7 +99,7 @@ class SwapUnmentioned(PlanAugmentation):
 
     Raises:
         ValueError: at call time, a missing key, a task without a plan, or the answers of other plans.
-        TypeError: it is given to an environment.
+        TypeError: use in an environment.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -168,7 +168,7 @@ class HideOpening(Augmentation):
         in_keys: another name for observation.
 
     Raises:
-        TypeError: it is given to an environment.
+        TypeError: use in an environment.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -211,7 +211,7 @@ class JitterTarget(PlanAugmentation):
 
     Raises:
         ValueError: the plans have no roles; or at call time, as for :class:`SwapUnmentioned`.
-        TypeError: it is given to an environment.
+        TypeError: use in an environment.
 
     Example:
         >>> import torch, lw_torchrl as lw

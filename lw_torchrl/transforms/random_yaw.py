@@ -90,7 +90,7 @@ class RandomYaw(PlanAugmentation):
 
     Raises:
         ValueError: a sample without observation or action, or, with plans, without their answers.
-        TypeError: it is given to an environment.
+        TypeError: use in an environment.
 
     Example:
         >>> import lw_torchrl as lw, torch

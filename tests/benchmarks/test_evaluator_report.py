@@ -37,7 +37,7 @@ def replay(tmp_path_factory):
     return lw.LanguageWorldExperienceReplay(root, label="executed")
 
 
-def test_a_report_has_the_calibration_of_every_answer(replay, tmp_path):
+def test_report_has_the_calibration_of_every_answer(replay, tmp_path):
     data = lw.training.LabelledQueries(replay, lw.training.QueryEvaluatorConfig(held_out_tasks=("reach",)))
     evaluator = lw.StateQueryEvaluator(PLANS, width=16, depth=1)
     bins = reliability(evaluator, data)

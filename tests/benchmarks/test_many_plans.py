@@ -23,7 +23,7 @@ def without(plan, step):
 MANY = [PLANS["push"], without(PLANS["push"], 0), PLANS["reach"], without(PLANS["push"], 1), PLANS["drawer-open"]]
 
 
-def test_each_plan_succeeds_as_in_evaluate():
+def test_success_of_each_plan_is_that_of_evaluate():
     successes = evaluate_plans(MANY, choose="first", noise_scale=0.3, num_envs=7, **SHORT)
     options = {"episodes_per_task": 3, "seed": 1_000, "max_steps": 60, "noise_scale": 0.3, "progress": False}
     for plan, success in zip(MANY, successes, strict=True):

@@ -58,7 +58,7 @@ def test_the_best_answer_is_chosen_and_counted_in_different_episodes():
     assert plan_comparison.PlanComparison([sound], {}).best_of("m", "chain_py") == 1.0
 
 
-def test_stopped_it_resumes_with_the_plans_that_are_left(answers, tmp_path, monkeypatch):
+def test_stopped_comparison_resumes_with_the_remaining_plans(answers, tmp_path, monkeypatch):
     kept = tmp_path / "success.json"
     whole = compare_plans(answers, **SHORT).to_json()
     monkeypatch.setattr(plan_comparison, "_SAVE_SECONDS", 0.0)
@@ -83,7 +83,7 @@ def test_stopped_it_resumes_with_the_plans_that_are_left(answers, tmp_path, monk
         compare_plans(answers, resume=kept, **SHORT | {"max_steps": 50})
 
 
-def test_the_command_writes_a_report_and_the_best_plans(tmp_path, capsys):
+def test_command_writes_a_report_and_the_best_plans(tmp_path, capsys):
     good = PLANS["drawer-open"]
     bad = lw.ConditionalPlan("drawer-open", good.steps[:1])  # it stays above the handle
     for attempt, plan in enumerate((bad, good, bad)):
@@ -101,6 +101,6 @@ def test_the_command_writes_a_report_and_the_best_plans(tmp_path, capsys):
     assert "answers without a plan: 1" in capsys.readouterr().out
 
 
-def test_a_report_has_both_figures(answers, tmp_path):
+def test_report_has_both_figures(answers, tmp_path):
     written = write_report(compare_plans(answers, **SHORT), tmp_path)
     assert [file.name for file in written] == ["results.json", "summary.md", "models.png", "formats.png", "best"]

@@ -38,19 +38,19 @@ def test_tasks_are_sorted_by_the_first_method(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["figure.png"]
 
 
-def test_the_band_spans_the_seeds(tmp_path):
+def test_band_spans_the_seeds(tmp_path):
     axes = plot_sorted_tasks({"PCBC": PCBC}, tmp_path / "figure.png").axes[0]
     corners = {tuple(corner) for corner in axes.collections[0].get_paths()[0].vertices.round(6).tolist()}
     assert {(0.0, 0.0), (0.0, 0.33), (1.0, 0.5), (1.0, 0.75), (2.0, 0.9), (2.0, 1.0)} <= corners
 
 
-def test_each_curve_can_be_sorted_for_itself(tmp_path):
+def test_each_curve_can_be_sorted_separately(tmp_path):
     figure = plot_sorted_tasks({"PCBC": PCBC, "DC": DC}, tmp_path / "figure.png", order="own")
     assert all(heights == sorted(heights) for heights in lines(figure).values())
     assert [label.get_text() for label in figure.axes[0].get_xticklabels()] == ["1", "2", "3"]
 
 
-def test_published_curves_are_dashed_and_say_what_they_are(tmp_path):
+def test_published_curves_are_dashed_and_labelled(tmp_path):
     ours = {task: [rate, 1.0] for task, rate in RATES.items()}
     curves = {"best": dict.fromkeys(RATES, 0.63), "last": RATES}
     figure = plot_sorted_tasks({"PCBC": ours}, tmp_path / "figure.png", published=curves)
@@ -85,7 +85,7 @@ def test_neither_labels_nor_legend_are_cut_or_overlap(tmp_path, tasks):
     assert min(box.y0 for box in ticks) >= legend.y1
 
 
-def test_a_summary_is_a_curve(tmp_path):
+def test_summary_is_a_curve(tmp_path):
     from_rates = plot_sorted_tasks({"PCBC": PCBC}, tmp_path / "a.png")
     from_summary = plot_sorted_tasks({"PCBC": summarize_rates(PCBC)}, tmp_path / "b.png")
     assert lines(from_rates) == lines(from_summary)
@@ -103,7 +103,7 @@ def test_a_summary_is_a_curve(tmp_path):
         ({"PCBC": PCBC}, {"published": {"last": {"push": 0.5}}}, r"published\['last'\] lacks the tasks"),
     ],
 )
-def test_wrong_curves_are_refused_before_a_file_is_written(tmp_path, curves, options, message):
+def test_wrong_curves_raise_before_a_file_is_written(tmp_path, curves, options, message):
     with pytest.raises(ValueError, match=message):
         plot_sorted_tasks(curves, tmp_path / "figure.png", **options)
     assert not list(tmp_path.iterdir())

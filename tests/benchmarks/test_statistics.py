@@ -37,20 +37,20 @@ def pairs(draw):
 
 
 @given(rates())
-def test_the_interquartile_mean_is_scipys(x):
+def test_interquartile_mean_is_scipys(x):
     assert interquartile_mean(x).value == pytest.approx(trim_mean(x, 0.25, axis=None))
 
 
 @settings(deadline=None)  # scipy's first call is slow
 @given(pairs())
-def test_the_probability_of_improvement_is_scipys(pair):
+def test_probability_of_improvement_is_scipys(pair):
     x, y = pair
     expected = mannwhitneyu(x, y, axis=0, method="asymptotic").statistic.mean() / (len(x) * len(y))
     assert probability_of_improvement(x, y).value == pytest.approx(expected)
 
 
 @given(pairs(), st.sampled_from(TWO), st.randoms(use_true_random=False))
-def test_an_order_of_the_seeds_does_not_matter_and_intervals_stay_in_range(pair, function, random):
+def test_order_of_seeds_does_not_matter_and_intervals_stay_in_range(pair, function, random):
     x, y = pair
     found = function(x, y)
     again = function(x[random.sample(range(len(x)), len(x))], y)
@@ -66,7 +66,7 @@ def test_an_order_of_the_seeds_does_not_matter_and_intervals_stay_in_range(pair,
 
 @settings(deadline=None)
 @given(rates(least_seeds=2), st.sampled_from([0.5, 0.95]))
-def test_the_interval_of_a_mean_is_scipys_student_interval_over_seeds(x, confidence):
+def test_interval_of_a_mean_is_scipys_student_interval_over_seeds(x, confidence):
     found, seeds = mean_rate(x, confidence=confidence), x.mean(1)
     error = seeds.std(ddof=1) / len(seeds) ** 0.5
     low, high = t.interval(confidence, len(seeds) - 1, seeds.mean(), error) if error else (seeds.mean(),) * 2
@@ -75,7 +75,7 @@ def test_the_interval_of_a_mean_is_scipys_student_interval_over_seeds(x, confide
 
 @settings(deadline=None)
 @given(pairs())
-def test_the_interval_of_a_difference_is_scipys_of_welchs_test(pair):
+def test_interval_of_a_difference_is_that_of_scipys_welch_test(pair):
     seeds = [x.mean(1) for x in pair]
     found = mean_difference(*pair)
     if min(map(len, seeds)) > 1 and min(x.std() for x in seeds) > 1e-9:
@@ -94,7 +94,7 @@ Q = 0.8 * P
 
 
 @pytest.mark.parametrize("seeds", [3, 5, 20])
-def test_intervals_hold_the_truth_in_95_of_100_cases(seeds):
+def test_intervals_contain_the_truth_in_95_of_100_cases(seeds):
     """Also with three seeds. 400 repeats make a standard error of 0.011."""
     x = lambda rng: rng.binomial(20, P, (seeds, 20)) / 20  # noqa: E731
     y = lambda rng: rng.binomial(20, Q, (seeds, 20)) / 20  # noqa: E731
@@ -103,7 +103,7 @@ def test_intervals_hold_the_truth_in_95_of_100_cases(seeds):
     assert difference == pytest.approx(0.95, abs=0.03)
 
 
-def test_the_interval_of_the_probability_of_improvement_holds_the_truth():
+def test_interval_of_the_probability_of_improvement_contains_the_truth():
     """X is uniform on [0.2, 1], Y on [0, 0.8]: Y is above X with probability 0.75² / 2."""
     found = holds(
         probability_of_improvement,
@@ -114,7 +114,7 @@ def test_the_interval_of_the_probability_of_improvement_holds_the_truth():
     assert found == pytest.approx(0.95, abs=0.04)
 
 
-def test_three_seeds_of_zero_shot():
+def test_interval_of_three_seeds():
     found = mean_rate([[0.762], [0.767], [0.790]])
     assert str(found) == "0.773 [0.736, 0.810]"
 
@@ -125,7 +125,7 @@ def test_tasks_solved_are_counted_at_the_threshold():
     assert count_solved([[0.5, 0.4]], threshold=0.5) == 1
 
 
-def test_an_estimate_reads_well_and_is_json():
+def test_estimate_is_text_and_json():
     assert str(Estimate(0.5, 0.4, 0.6)) == "0.500 [0.400, 0.600]"
     assert str(mean_rate([[0.5, 1.0]])) == "0.750"
     assert json.loads(json.dumps(mean_rate([[0.5, 1.0]]).to_json())) == {"value": 0.75, "low": None, "high": None}
@@ -143,7 +143,7 @@ def test_an_estimate_reads_well_and_is_json():
     ],
 )
 @pytest.mark.parametrize("function", [*ONE, count_solved])
-def test_wrong_rates_are_refused(function, given_rates, error, message):
+def test_wrong_rates_raise(function, given_rates, error, message):
     with pytest.raises(error, match=message):
         function(given_rates)
 
@@ -156,7 +156,7 @@ def test_methods_need_the_same_tasks(function):
         function([[0.5]], [[-1.0]])
 
 
-def test_a_wrong_threshold_or_confidence_is_refused():
+def test_wrong_threshold_or_confidence_raises():
     with pytest.raises(ValueError, match=r"confidence must be in \(0, 1\), got 95"):
         mean_rate([[0.5], [0.6]], confidence=95)
     with pytest.raises(ValueError, match=r"threshold must be in \(0, 1\], got 80"):

@@ -38,7 +38,7 @@ def test_results_and_rates_give_the_same_summary():
     assert summarize(list(RESULTS.values())).seeds == ("0", "1")
 
 
-def test_the_numbers_by_hand():
+def test_numbers_are_those_computed_by_hand():
     summary = summarize(RESULTS)
     assert summary.mean.value == pytest.approx(0.5)
     assert summary.solved == 1
@@ -49,7 +49,7 @@ def test_the_numbers_by_hand():
     assert summary.mean == mean_rate(summary.array)
 
 
-def test_one_evaluation_twice_and_other_plans_are_refused():
+def test_repeated_results_and_other_plans_raise():
     one, other = RESULTS.values()
     with pytest.raises(ValueError, match="different training seeds, 0 and 2 are one evaluation"):
         summarize([one, other, one])
@@ -79,7 +79,7 @@ def test_one_seed_has_no_interval():
     )
 )
 @example({"0": [0.0, 1e-151]})
-def test_it_is_json_and_consistent(rates):
+def test_summary_is_json_and_consistent(rates):
     summary = summarize_rates(rates)
     found = json.loads(json.dumps(summary.to_json(), allow_nan=False))
     assert {task: row["rates"] for task, row in found["tasks"].items()} == rates
@@ -89,7 +89,7 @@ def test_it_is_json_and_consistent(rates):
     assert found["solved"] == sum(row["mean"] >= 0.8 - 1e-9 for row in found["tasks"].values())
 
 
-def test_the_table():
+def test_table():
     lines = summarize(RESULTS).table().splitlines()
     assert lines[0].startswith("mean 0.500 [")
     assert lines[0].endswith("; 1 of 3 tasks >= 0.8; 2 seeds")
@@ -113,7 +113,7 @@ def test_the_table():
         ),
     ],
 )
-def test_results_that_cannot_be_averaged_are_refused(other, message):
+def test_results_that_cannot_be_averaged_raise(other, message):
     with pytest.raises(ValueError, match=message):
         summarize({3: RESULTS[3], 7: other})
 
@@ -129,6 +129,6 @@ def test_results_that_cannot_be_averaged_are_refused(other, message):
         ({"push": [0.5, 0.6]}, [1, "1"], r"seeds must be 2 different names, got \('1', '1'\)"),
     ],
 )
-def test_wrong_rates_are_refused(rates, seeds, message):
+def test_wrong_rates_raise(rates, seeds, message):
     with pytest.raises(ValueError, match=message):
         summarize_rates(rates, seeds=seeds)

@@ -1,4 +1,4 @@
-"""``lw-torchrl tasks``, ``query`` and ``check``, and your own tasks, skills and plans."""
+"""``lw-torchrl tasks``, ``query`` and ``check``, with shipped and custom tasks, skills and plans."""
 
 import json
 import re
@@ -29,9 +29,8 @@ def test_tasks_are_listed(capsys, monkeypatch):
     assert "50 tasks" in (whole := run(capsys, "tasks"))
     assert all(line == line.rstrip() for line in whole.splitlines())
     monkeypatch.setenv("COLUMNS", "20")
-    assert run(capsys, "tasks") == whole, "a pipe gets whole lines"
-    found = document(capsys, "tasks MT10")["tasks"]
-    assert [row["task"] for row in found] == list(lw.MT10)
+    assert run(capsys, "tasks") == whole, "lines in a pipe are not wrapped"
+    assert [row["task"] for row in document(capsys, "tasks MT10")["tasks"]] == list(lw.MT10)
 
 
 @pytest.mark.parametrize("width", [20, 100])
@@ -47,10 +46,10 @@ def test_a_task_is_shown_with_its_plan_queries_and_skills(capsys):
     assert str(lw.load_plans("MT10")["drawer-open"]).strip() in printed
     assert "place the gripper above the drawer handle" in printed
     assert "\n  the robot's gripper is near the drawer handle\n" in printed
-    found = document(capsys, "tasks drawer-open")
-    assert [one["query"] for one in found["task"]["queries"]] == list(lw.supported_queries("drawer-open"))
-    skill = lw.load_skills()[found["skills"][0]["skill"]].for_task("drawer-open")
-    assert found["skills"][0]["offset"] == [*skill.offset]
+    shown = document(capsys, "tasks drawer-open")
+    assert [row["query"] for row in shown["task"]["queries"]] == list(lw.supported_queries("drawer-open"))
+    skill = lw.load_skills()[shown["skills"][0]["skill"]].for_task("drawer-open")
+    assert shown["skills"][0]["offset"] == [*skill.offset]
 
 
 # ---- query
@@ -67,7 +66,7 @@ def state_after(task, step, seed=0):
 
 
 @pytest.mark.parametrize(("step", "seed"), [(0, 0), (40, 3)])
-def test_a_query_is_answered(capsys, step, seed):
+def test_a_query_is_answered_in_a_state(capsys, step, seed):
     state = state_after("pick-place", step, seed)
     for text in ("Is the gripper open?", "the gripper is not near the puck and above the target location"):
         parsed = lw.parse_query(text, "pick-place")
@@ -84,8 +83,8 @@ def test_without_a_text_all_queries_that_hold_are_listed(capsys):
     state = state_after("reach", 30)
     truths = lw.QueryProgram({"reach": queries})(state["observation"], state["task_id"])[0].tolist()
     assert listed == [str(query) for query, truth in zip(queries, truths, strict=True) if truth]
-    (told,) = document(capsys, "query reach", "is the gripper open?")["queries"]
-    assert told == {"query": "the robot's gripper is open", "holds": True}
+    (answer,) = document(capsys, "query reach", "is the gripper open?")["queries"]
+    assert answer == {"query": "the robot's gripper is open", "holds": True}
     assert "teapot" in fails(capsys, "query", "reach", "the gripper is near the teapot")
     assert "--step must be at most 500" in fails(capsys, "query", "reach", "--step", 501)
 
@@ -93,7 +92,7 @@ def test_without_a_text_all_queries_that_hold_are_listed(capsys):
 # ---- check
 
 
-def test_a_valid_plan_is_checked(capsys, tmp_path):
+def test_a_valid_plan_passes_the_check(capsys, tmp_path):
     path = tmp_path / "push.plan"
     path.write_text(PLAN)
     printed = run(capsys, "check", path)
@@ -103,7 +102,7 @@ def test_a_valid_plan_is_checked(capsys, tmp_path):
     assert (row["steps"], row["faults"], len(row["notes"])) == (2, [], 1)
 
 
-def test_every_fault_of_a_plan_is_named(capsys, tmp_path):
+def test_every_fault_of_a_plan_is_reported(capsys, tmp_path):
     path = tmp_path / "push.plan"
     faulty = PLAN.replace("is not near the puck", "is not near the pluck").replace("robot.shove(", "robott.shove(")
     path.write_text(faulty + "import os\n")
@@ -127,7 +126,7 @@ def test_the_shipped_files_are_valid(capsys, request):
     assert "50 tasks, valid" in run(capsys, "check", data / "tasks.toml")
 
 
-def test_your_own_tasks_skills_and_plans(capsys, tmp_path):
+def test_custom_tasks_skills_and_plans_are_checked(capsys, tmp_path):
     tasks, skills, plan = tmp_path / "tasks.toml", tmp_path / "skills.toml", tmp_path / "stack-cup.plan"
     tasks.write_text('[stack-cup]\ndescription = "Stack the cup."\nobjects.cup = "obs[4:7]"\n')
     skills.write_text('["lift the cup"]\ntarget = "cup"\n')
@@ -146,11 +145,10 @@ def test_your_own_tasks_skills_and_plans(capsys, tmp_path):
     assert "did you mean 'push'" in fails(capsys, "tasks", "psh", "--task-file", tasks)
 
 
-def test_of_several_plans_for_a_task_the_last_counts(capsys, tmp_path):
+def test_the_last_of_several_plans_for_a_task_is_used(capsys, tmp_path):
     (tmp_path / "push.plan").write_text(str(lw.load_plans("MT10")["push"]).replace("robot.place", "robot.bring"))
     assert "robot.bring" in run(capsys, "tasks", "push", "--plans", "MT10", tmp_path)
     assert "robot.bring" not in run(capsys, "tasks", "push", "--plans", tmp_path, "MT10")
     task = tmp_path / "tasks.toml"
     task.write_text('[reach]\ndescription = "Bring the hand to the ball."\nobjects.ball = "obs[36:39]"\n')
-    error = fails(capsys, "tasks", "reach", "--task-file", task)
-    assert "--plans: the shipped plan does not fit the reach of --task-file; name your own plan" in error
+    assert "--plans: the shipped plan does not fit" in fails(capsys, "tasks", "reach", "--task-file", task)

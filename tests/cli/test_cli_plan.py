@@ -1,4 +1,4 @@
-"""``lw-torchrl plan``: the prompt that asks a language model for a plan, and asking one."""
+"""``lw-torchrl plan``: prompts, generation, parsing and repair of plans."""
 
 import re
 
@@ -9,7 +9,7 @@ from fake_server import FakeServer, asked_for, completion, error, serving, shipp
 import lw_torchrl as lw
 
 
-def test_prompt_prints_what_plan_prompt_gives(capsys):
+def test_prompt_equals_that_of_plan_prompt(capsys):
     assert run(capsys, "plan", "prompt", "drawer-open", "--format", "chain_py") == lw.plan_prompt(
         "drawer-open", "chain_py"
     )
@@ -17,7 +17,7 @@ def test_prompt_prints_what_plan_prompt_gives(capsys):
     assert printed == lw.plan_prompt("push", "goal_md", vocabulary=True, plans=lw.load_plans("MT50"))
 
 
-def test_read_says_what_became_of_each_step(capsys, tmp_path):
+def test_read_shows_how_each_step_was_parsed(capsys, tmp_path):
     def rows(*arguments):
         lines = run(capsys, "plan", "read", *arguments).splitlines()
         return [re.split(r" {2,}", line) for line in lines[2:]]
@@ -34,9 +34,9 @@ def test_read_says_what_became_of_each_step(capsys, tmp_path):
         robot.be("careful")
 """
     )
-    found = rows(tmp_path / "coffee-pull.plan")
-    assert {tuple(row[:2]) for row in found} == {("coffee-pull", "completed, confidence 0.31")}
-    assert [row[2:4] for row in found] == [
+    steps = rows(tmp_path / "coffee-pull.plan")
+    assert {tuple(row[:2]) for row in steps} == {("coffee-pull", "completed, confidence 0.31")}
+    assert [row[2:4] for row in steps] == [
         ["put the gripper over a mug", "place the gripper above the mug rim"],
         ["grab it", "close the gripper around the mug rim"],
         ["bring the mug to the goal", "carry the mug to the target location"],
@@ -46,12 +46,12 @@ def test_read_says_what_became_of_each_step(capsys, tmp_path):
         ["bring the mug to the goal", "carry the mug to the target location"],
         ["be careful", "(dropped: cannot be parsed)"],
     ]
-    assert [row[-1] == "yes" for row in found] == [False] * 3 + [True] * 4 + [False]
+    assert [row[-1] == "yes" for row in steps] == [False] * 3 + [True] * 4 + [False]
     assert len({row[0] for row in rows("MT50")}) == 50
     assert {row[0] for row in rows("MT50", "--task", "soccer")} == {"soccer"}
 
 
-def test_plans_of_a_suite_s_tasks_are_read_and_checked(capsys, tmp_path):
+def test_plans_of_another_suite_are_read_and_checked(capsys, tmp_path):
     file = tmp_path / "mine.plan"
     plan = """# fetch/push: Push the puck to the target location.
 def fetch__push(robot):
@@ -61,20 +61,20 @@ def fetch__push(robot):
     file.write_text(plan)
     assert "mine.plan: 1 step, valid" in run(capsys, "check", file)
     assert "fetch/push" in run(capsys, "plan", "read", file)
-    assert {one["task"] for one in document(capsys, "plan read", "fetch")["plans"]} == {
+    assert {plan["task"] for plan in document(capsys, "plan read", "fetch")["plans"]} == {
         *lw.suites.SUITES["fetch"].tasks
     }
 
 
 @pytest.mark.parametrize("format", lw.PLAN_FORMATS)
-def test_read_takes_a_model_s_answer(capsys, tmp_path, format):
+def test_read_parses_answers_of_language_models(capsys, tmp_path, format):
     plan = lw.load_plans("MT10")["reach"]
     answer = tmp_path / format / "reach-2.txt"
     answer.parent.mkdir()
     answer.write_text(lw.encode_plan(plan, format))
-    told = document(capsys, "plan read", answer)
-    assert told["plans"] == [{"task": "reach", "source": "plan", "confidence": 1.0}]
-    assert [step["written"] for step in told["read"]] == [step.skill for step in plan.steps]
+    shown = document(capsys, "plan read", answer)
+    assert shown["plans"] == [{"task": "reach", "source": "plan", "confidence": 1.0}]
+    assert [step["written"] for step in shown["read"]] == [step.skill for step in plan.steps]
     answer.with_name("push-0.txt").write_text("I cannot help with that.")
     printed = run(capsys, "plan", "read", *answer.parent.iterdir(), "--out", tmp_path / "mine")
     assert "push-0.txt: no plan can be read, " in printed
@@ -99,22 +99,22 @@ def generate(address, folder, *more):
 
 
 def table(printed):
-    """The rows of the table, by task and format."""
+    """Return the rows of the printed table, by task and format."""
     cells = [line.split() for line in printed.splitlines()]
     return {tuple(row[:2]): row[2:] for row in cells if row[:1] in (["push"], ["reach"])}
 
 
 @pytest.mark.usefixtures("_no_key")
-def test_generate_writes_answers_and_says_what_became_of_them(capsys, tmp_path):
+def test_generate_writes_answers_and_counts_valid_plans(capsys, tmp_path):
     server = FakeServer(
         lambda body: completion("I will not", "length") if asked_for(body) == "reach" else shipped(body)
     )
     with serving(server) as address:
         asked = generate(address, tmp_path, "push", "reach", "--format", "chain_py", "basic_md")
         first, second = run(capsys, *asked), run(capsys, *asked)
-        told = document(capsys, "plan generate", *asked[2:])
+        shown = document(capsys, "plan generate", *asked[2:])
         constrained = run(capsys, *generate(address, tmp_path, "push", "--format", "basic_py", "--constrain"))
-    assert told["notes"] == [{"note": "it was cut off at max_tokens", "answers": 4}]
+    assert shown["notes"] == [{"note": "it was cut off at max_tokens", "answers": 4}]
     rows = table(first)
     assert rows["push", "chain_py"] == ["2", "2", "2", "2", "200", "20"]
     assert rows["reach", "basic_md"] == ["2", "0", "0", "2", "200", "20"]
@@ -131,7 +131,7 @@ def test_generate_writes_answers_and_says_what_became_of_them(capsys, tmp_path):
 
 
 @pytest.mark.usefixtures("_no_key")
-def test_generate_fails_in_one_line(capsys, tmp_path):
+def test_errors_of_generate_are_one_line(capsys, tmp_path):
     with serving(FakeServer(lambda body: error(404, "no such model"))) as address:
         assert "a/model" in fails(capsys, *generate(address, tmp_path, "push"))
     assert "push" in fails(capsys, *generate("http://x/v1", tmp_path, "psuh"))
@@ -143,7 +143,7 @@ def test_generate_fails_in_one_line(capsys, tmp_path):
 
 
 @pytest.mark.usefixtures("_no_key")
-def test_repair_tells_the_model_and_shows_how_each_round_fared(capsys, tmp_path):
+def test_repair_asks_again_and_shows_the_success_of_each_round(capsys, tmp_path):
     def learns(body):
         told = any(message["role"] == "assistant" for message in body["messages"])
         return shipped(body) if told else completion("I would rather", "length")
@@ -152,16 +152,16 @@ def test_repair_tells_the_model_and_shows_how_each_round_fared(capsys, tmp_path)
         where = ("--out", tmp_path / "plans", "--cache", tmp_path / "kept", "--episodes", 1)
         command = ("plan", "repair", "reach", "--model", "m", "--base-url", address, "--rounds", 2, *where)
         printed = run(capsys, *command)
-        told = document(capsys, "plan repair", *command[2:])
-    assert told["plans"] == [{"task": "reach", "attempt": 0, "success": [0.0, 1.0]}]
+        shown = document(capsys, "plan repair", *command[2:])
+    assert shown["plans"] == [{"task": "reach", "attempt": 0, "success": [0.0, 1.0]}]
     assert ["reach", "0", "0%", "100%"] in [line.split() for line in printed.splitlines()]
     assert "1 answer: it was cut off at max_tokens" in printed
     assert (tmp_path / "plans/m-round1/chain_py/reach-0.py").is_file()
 
 
 @pytest.mark.usefixtures("_no_key")
-def test_repair_begins_with_the_answers_that_generate_wrote_and_replaces_none(capsys, tmp_path):
-    """Whatever --seed generate had; asked for are those that are missing, with the model's seed."""
+def test_repair_reuses_the_answers_of_generate(capsys, tmp_path):
+    """Answers with any --seed of generate are reused; only missing answers are requested."""
     server = FakeServer(lambda body: completion(f"I cannot, for the {len(server.requests)}th time."))
     where = ("--out", tmp_path / "plans", "--cache", tmp_path / "kept", "--model", "m")
     options = ("--episodes", 1, "--rounds", 1, *where)
@@ -173,7 +173,7 @@ def test_repair_begins_with_the_answers_that_generate_wrote_and_replaces_none(ca
         assert len(server.requests) == 2
         assert [message["content"] for message in server.requests[1]["messages"]][2] == text
         assert first.read_text() == text
-        assert "1 first answer, 0 asked now" in printed
+        assert "1 first answer, 0 requested now" in printed
         assert printed.endswith(f"written to {tmp_path / 'plans/m'}, {tmp_path / 'plans/m-round1'}\n")
         more = ("plan", "repair", "reach", "--base-url", address, "--attempts", 2, *options)
         assert "seed (7, now None)" in fails(capsys, *more)

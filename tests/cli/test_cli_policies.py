@@ -1,4 +1,4 @@
-"""``lw-torchrl train``, ``evaluate``, ``info`` and ``demo``: what they print and write, and that they resume."""
+"""``lw-torchrl train``, ``evaluate``, ``info`` and ``demo``: their output, files, and resuming."""
 
 from __future__ import annotations
 
@@ -68,8 +68,7 @@ def test_the_baseline_is_trained_and_evaluated(capsys, demos, tmp_path):
     run(capsys, "train", demos, "--out", path, "--method", "dc", *TINY)
     assert isinstance(lw.load_actor(path), lw.DescriptorConditionedActor)
     assert [row["task"] for row in document(capsys, "evaluate", path, *SHORT)["tasks"]] == ["push", "reach"]
-    error = fails(capsys, "evaluate", path, "--attribute", *SHORT)
-    assert "attribute" in error
+    assert "attribute" in fails(capsys, "evaluate", path, "--attribute", *SHORT)
 
 
 def test_evaluate_writes_result_figure_and_recording(capsys, policy, tmp_path):
@@ -89,20 +88,20 @@ def test_evaluate_writes_result_figure_and_recording(capsys, policy, tmp_path):
     assert again.episodes == result.episodes
 
 
-def test_evaluate_runs_the_tasks_of_the_training(capsys, policy, tmp_path):
+def test_evaluate_runs_the_demonstrated_tasks_by_default(capsys, policy, tmp_path):
     printed = run(capsys, "evaluate", policy, *SHORT)
     assert printed.startswith("evaluating 2 tasks of the policy's 10; choose others by --tasks\n")
     assert [line.split()[0] for line in printed.splitlines()[2:]] == ["push", "reach", "mean"]
-    found = document(capsys, "evaluate", policy, "--plans", "MT10", *SHORT, "--attribute")
-    assert len(found["tasks"]) == len(found["failures"]) == 10
-    assert found["config"]["max_steps"] == 5
+    shown = document(capsys, "evaluate", policy, "--plans", "MT10", *SHORT, "--attribute")
+    assert len(shown["tasks"]) == len(shown["failures"]) == 10
+    assert shown["config"]["max_steps"] == 5
     assert "plans lack sweep-into" in fails(capsys, "evaluate", policy, "--tasks", "sweep-into")
     assert "is the seed of the demonstrations" in fails(capsys, "evaluate", policy, "--seed", 0)
 
 
 def test_experts_and_scripted_plans_are_evaluated(capsys, tmp_path):
-    found = document(capsys, "evaluate", "expert", "--tasks", "reach", "--episodes", 2, "--stop-at-success")
-    assert found["mean_success"] == 1.0
+    shown = document(capsys, "evaluate", "expert", "--tasks", "reach", "--episodes", 2, "--stop-at-success")
+    assert shown["mean_success"] == 1.0
     out = tmp_path / "scripted"
     args = ("scripted", "--tasks", "reach", "push", "--episodes", 2, "--noise", 0, "--out", out)
     printed = run(capsys, "evaluate", *args)
@@ -111,7 +110,7 @@ def test_experts_and_scripted_plans_are_evaluated(capsys, tmp_path):
     assert lw.EvaluationResult.load(out / "results.json").success_once == {"push": 1.0, "reach": 1.0}
     use = json.loads((out / "plan_use.json").read_text())
     assert len(use["push"]["chosen"]) == len(lw.load_plans("MT10")["push"].steps)
-    (reach,) = document(capsys, "evaluate", "scripted", "--tasks", "reach", *SHORT, "--select", "mix")["tasks"]
+    (reach,) = document(capsys, "evaluate", "scripted", "--tasks", "reach", *SHORT)["tasks"]
     assert [*reach["steps"][0]] == ["skill", "true", "chosen", "stuck"]
     assert document(capsys, "evaluate", "wrong", "--tasks", "push", *SHORT)["mean_success"] == 0.0
 
@@ -149,7 +148,7 @@ def kill_when(forks, ready, timeout=120):
 
 
 @pytest.mark.slow
-def test_the_quick_demo_killed_twice_ends_and_then_does_nothing_twice(forks, tmp_path):
+def test_the_quick_demo_resumes_after_kills_and_repeats_nothing(forks, tmp_path):
     config, out = replace(QUICK, training_steps=200, episodes_per_task=2), tmp_path / "demo"
     shorter = f"""
 from dataclasses import replace
@@ -213,9 +212,12 @@ demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episode
 def test_a_demo_of_another_configuration_is_not_overwritten(capsys, tmp_path):
     (tmp_path / "config.json").write_text(json.dumps({**vars(QUICK), "training_steps": 7}))
     before = (tmp_path / "config.json").read_bytes()
-    with pytest.raises(SystemExit) as caught:
-        main(["demo", "--quick", "--out", str(tmp_path)])
-    assert caught.value.code == 2
-    assert "holds a demo with another configuration" in capsys.readouterr().err
+    assert "another configuration" in fails(capsys, "demo", "--quick", "--out", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
     assert (tmp_path / "config.json").read_bytes() == before
+
+
+def test_two_processes_cannot_write_one_demo(capsys, tmp_path, holding):
+    holding(tmp_path / "demo", folder=True)
+    assert "another process is writing to" in fails(capsys, "demo", "--quick", "--out", tmp_path / "demo")
+    assert [path.name for path in (tmp_path / "demo").iterdir()] == [".lock"]

@@ -79,7 +79,7 @@ def weights(trainer):
     return {name: value.detach().cpu() for name, value in trainer.actor.named_parameters()}
 
 
-def test_what_one_waits_for_is_noted():
+def test_waits_are_recorded():
     here = torch.arange(6.0)
     WAITS.clear()
     there = here.to(PRETEND)
@@ -108,7 +108,7 @@ def test_what_one_waits_for_is_noted():
     ("actor", "sampler", "turned"),
     [(a, "balanced", False) for a in ACTORS] + [("plan", s, s == "uniform") for s in SAMPLERS if s != "balanced"],
 )
-def test_a_step_waits_for_nothing_and_is_the_cpus(demos, actor, sampler, turned):
+def test_step_waits_for_nothing_and_equals_the_cpus(demos, actor, sampler, turned):
     trainer = make_trainer(demos, "pretend", actor, sampler, turned)
     assert trainer.device == PRETEND
     assert {p.device for p in trainer.actor.parameters()} == {PRETEND}
@@ -122,7 +122,7 @@ def test_a_step_waits_for_nothing_and_is_the_cpus(demos, actor, sampler, turned)
     assert_same(weights(trainer), weights(cpu))
 
 
-def test_a_batch_is_wholly_on_the_device(demos):
+def test_batch_is_on_the_device(demos):
     ours, cpu = make_replay(demos, "pretend", "co-learning"), make_replay(demos, None, "co-learning")
     for replay in (ours, cpu):
         replay.set_rng(torch.Generator().manual_seed(3))
@@ -133,7 +133,7 @@ def test_a_batch_is_wholly_on_the_device(demos):
     assert (batch.cpu() == expected).all()
 
 
-def test_rows_on_the_cpu_go_over(demos):
+def test_rows_on_the_cpu_are_copied_to_the_device(demos):
     rows = make_replay(demos, None)[:].select("observation", "task_id", "qaf", "qaf_plan", "action")
     mine = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows)))
     mine.extend(rows)
@@ -143,7 +143,7 @@ def test_rows_on_the_cpu_go_over(demos):
     assert [loss.item() for loss in losses] == [cpu.step().item() for _ in losses]
 
 
-def test_rows_that_are_there_want_a_sampler_of_ours(demos):
+def test_rows_on_the_device_need_one_of_our_samplers(demos):
     rows = make_replay(demos, None)[:].select("observation", "task_id", "qaf", "qaf_plan", "action")
     mine = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows), device=PRETEND))
     mine.extend(rows)
@@ -160,7 +160,7 @@ def make_stack(demos, device, checkpoint=None, actor="plan", **config):
     return StackedBehavioralCloning(actors, replays, replace(CONFIG, **config), **options)
 
 
-def test_many_at_once_wait_for_nothing(demos):
+def test_stacked_trainings_wait_for_nothing(demos):
     stack = make_stack(demos, "pretend")
     losses = quiet_steps(stack)
     assert len(COPIES) == 3 * 3
@@ -185,7 +185,7 @@ def test_losses_are_read_every_100_steps(demos, tmp_path):
 
 
 @pytest.mark.parametrize("many", [False, True])
-def test_nan_is_found_with_its_step_and_not_written(demos, tmp_path, many):
+def test_nan_is_reported_with_its_step_and_not_written(demos, tmp_path, many):
     path = tmp_path / "c.safetensors"
     make = make_stack if many else make_trainer
     trainer = make(demos, "pretend", checkpoint=path, steps=30, checkpoint_every=10)
@@ -210,7 +210,7 @@ def test_nan_is_found_with_its_step_and_not_written(demos, tmp_path, many):
 
 
 @pytest.mark.parametrize("many", [False, True])
-def test_it_carries_on_bit_for_bit_where_it_was_begun(demos, tmp_path, many):
+def test_training_resumes_bit_for_bit_on_the_same_device(demos, tmp_path, many):
     make = make_stack if many else make_trainer
     options = {"actor": "noisy plan", "steps": 12, "checkpoint_every": 5}
 
@@ -237,7 +237,7 @@ def test_it_carries_on_bit_for_bit_where_it_was_begun(demos, tmp_path, many):
 
 
 @pytest.mark.parametrize(("begun", "ended"), [("pretend", "cpu"), ("cpu", "pretend")])
-def test_elsewhere_it_carries_on_and_says_so(demos, tmp_path, begun, ended):
+def test_training_resumes_on_another_device_with_a_warning(demos, tmp_path, begun, ended):
     path = tmp_path / "c.safetensors"
     first = make_trainer(demos, begun, checkpoint=path)
     for _ in range(7):
@@ -250,7 +250,7 @@ def test_elsewhere_it_carries_on_and_says_so(demos, tmp_path, begun, ended):
     assert [second.step().item() for _ in range(3)] == [first.step().item() for _ in range(3)]
 
 
-def test_a_file_from_there_is_loaded_here(demos, tmp_path):
+def test_file_written_on_the_device_is_loaded_on_the_cpu(demos, tmp_path):
     trainer = make_trainer(demos, "pretend", checkpoint=tmp_path / "c.safetensors")
     trainer.train()
     lw.save_actor(trainer.actor, tmp_path / "p.safetensors")
@@ -261,7 +261,7 @@ def test_a_file_from_there_is_loaded_here(demos, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["plan", "description", "scripted", "ensemble", "evaluator"])
-def test_an_evaluation_there_is_the_cpus(kind):
+def test_evaluation_equals_the_cpus(kind):
     class Guess(lw.QueryEvaluator):
         def logits(self, observation, task_id):
             return observation[..., :1].expand(*task_id.shape, self.plans.num_steps)
@@ -301,7 +301,7 @@ def make_state(rows=3):
         ("qaf", 2.0, "qaf must be bool, or numbers from 0 to 1"),
     ],
 )
-def test_what_is_wrong_is_refused_without_waiting(key, value, problem):
+def test_wrong_values_raise_without_waiting(key, value, problem):
     actor = ACTORS["plan"]().to(PRETEND)
     actor(make_state())
     state = make_state()
@@ -321,7 +321,7 @@ def test_what_is_wrong_is_refused_without_waiting(key, value, problem):
         assert WAITS == []
 
 
-def test_draws_are_the_trainers_alone(demos):
+def test_random_draws_are_the_trainers(demos):
     def drawn():
         there = MODULE.state
         return torch.get_rng_state(), there
@@ -339,7 +339,7 @@ def test_draws_are_the_trainers_alone(demos):
     assert [again.step().item() for _ in range(3)] == losses
 
 
-def test_names_of_devices(demos):
+def test_device_names(demos):
     from lw_torchrl._util.devices import check_device
 
     for name in ("auto", "pretend", "pretend:0", PRETEND):
@@ -353,7 +353,7 @@ def test_names_of_devices(demos):
 @pytest.mark.parametrize(
     ("name", "condition"), [*((name, "plan") for name in LOSSES), ("SAC", "description"), ("IQL", "one-hot")]
 )
-def test_a_loss_that_is_made_there_is_the_cpus(name, condition):
+def test_loss_made_on_the_device_equals_the_cpus(name, condition):
     """With all its networks, their copies, targets and tables; its state comes back."""
     here, actor, value = make_loss(name, condition)
     batch = ready(name, make_batch(), actor, value)
@@ -374,7 +374,7 @@ def test_a_loss_that_is_made_there_is_the_cpus(name, condition):
     assert torch.equal(total(other, batch), expected)
 
 
-def test_rows_ahead_are_there_too(demos):
+def test_prefetched_rows_are_on_the_device(demos):
     options = {"label": "executed", "n_steps": 3, "gamma": 0.9}
     here, there = (lw.LanguageWorldExperienceReplay(demos, device=where, **options) for where in (None, "pretend"))
     for replay in (here, there):
@@ -383,7 +383,7 @@ def test_rows_ahead_are_there_too(demos):
 
 
 @pytest.mark.parametrize("name", ["bc", "advantage", "value"])  # copies of critics are drawn where they are
-def test_any_loss_over_a_buffer_waits_for_nothing_and_is_the_cpus(demos, name):
+def test_losses_over_a_buffer_wait_for_nothing_and_equal_the_cpus(demos, name):
     def trainer(device):
         loss = offline.make_loss(name, noise=0.0, device=device)
         return lw.OfflineTrainer(loss, offline.make_replay(demos, device=device), offline.CONFIG, progress=False)
@@ -398,7 +398,7 @@ def test_any_loss_over_a_buffer_waits_for_nothing_and_is_the_cpus(demos, name):
         assert loss.item() == pytest.approx(cpu.step().item(), rel=1e-5)
 
 
-def test_an_environment_is_where_it_is_put():
+def test_environment_is_on_its_device():
     def parts():
         return Compose(lw.QAFTransform(PLANS), lw.CorruptQAF(PLANS, every=2, delay=1, flip=0.3), FallbackTurns())
 
@@ -419,7 +419,7 @@ def test_an_environment_is_where_it_is_put():
     assert (found[1] == found[2]).all()
 
 
-def test_augmentations_are_where_the_rows_are():
+def test_augmentations_are_on_the_rows_device():
     plans = lw.canonical_plans(PLANS, fallback=True)
     augmented = Compose(
         lw.QAFTransform(plans),

@@ -21,7 +21,7 @@ needs_no_gpu = pytest.mark.skipif(torch.accelerator.is_available(), reason="need
 
 
 @pytest.mark.slow
-def test_on_a_pretend_device_nobody_waits():
+def test_pretend_device_is_never_waited_for():
     paths = [str(HERE), *(str(HERE.parent / room) for room in ("training", "objectives")), *sys.path]
     done = subprocess.run(
         [
@@ -43,7 +43,7 @@ def test_on_a_pretend_device_nobody_waits():
     assert " passed" in done.stdout
 
 
-def test_the_cpu_is_there():
+def test_cpu_is_available():
     assert check_device("device", "cpu") == check_device("device", torch.device("cpu")) == CPU
     assert device_of(torch.nn.Module()) == CPU
 
@@ -57,13 +57,13 @@ def test_the_cpu_is_there():
         (0, TypeError, "device must be a device's name, got 0"),
     ],
 )
-def test_what_is_no_device_is_refused(given, error, said):
+def test_wrong_devices_raise(given, error, said):
     with pytest.raises(error, match=said):
         check_device("device", given)
 
 
 @needs_no_gpu
-def test_without_a_gpu_there_is_the_cpu(demos, tmp_path):
+def test_auto_is_the_cpu_without_a_gpu(demos, tmp_path):
     assert check_device("device", "auto") == CPU
     actor, replay = lw.PlanConditionedActor(PLANS), make_replay(demos)
     for refused in (
@@ -91,7 +91,7 @@ def test_without_a_gpu_there_is_the_cpu(demos, tmp_path):
         ),
     ],
 )
-def test_the_command_line_says_so(demos, tmp_path, monkeypatch, capsys, command, said):
+def test_command_line_names_a_wrong_device(demos, tmp_path, monkeypatch, capsys, command, said):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as caught:
         main([str(demos) if one == "DEMOS" else one for one in command])
@@ -101,7 +101,7 @@ def test_the_command_line_says_so(demos, tmp_path, monkeypatch, capsys, command,
 
 
 @pytest.mark.slow
-def test_the_command_line_trains_and_evaluates_there(demos, tmp_path, capsys):
+def test_command_line_trains_and_evaluates_on_the_device(demos, tmp_path, capsys):
     out = tmp_path / "p.safetensors"
     main(["train", str(demos), "--out", str(out), "--steps", "3", "--batch-size", "10", "--device", "auto"])
     main(["evaluate", str(out), "--episodes", "1", "--stop-at-success", "--device", "auto"])
@@ -121,7 +121,7 @@ def make_replay(demos, device=None):
 
 
 @needs_a_gpu
-def test_on_a_gpu_nobody_waits(demos, tmp_path):
+def test_gpu_is_never_waited_for(demos, tmp_path):
     """As on the pretend device, by CUDA's own word; what is drawn is the same, what is summed nearly so."""
     config = lw.BehavioralCloningConfig(steps=8, batch_size=10)
     losses = {}

@@ -229,5 +229,5 @@ def test_mujoco_gl_may_be_set_after_mujoco_is_imported():
     program = "import mujoco, os\nos.environ['MUJOCO_GL'] = 'egl'  # as robosuite does\n" + _RENDER
     environment = {name: value for name, value in os.environ.items() if name != "MUJOCO_GL"}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
-    assert "pictures need OpenGL" not in done.stdout + done.stderr
+    assert "camera images need OpenGL" not in done.stdout + done.stderr
     assert not done.returncode

@@ -1,4 +1,4 @@
-"""attribute_failures: planted faults are found, and what cannot be told is undecided."""
+"""attribute_failures finds planted faults, and reports undecided causes as undecided."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from torch import nn
 import lw_torchrl as lw
 from lw_torchrl.envs.episodes import FinishedEpisode
 from lw_torchrl.evaluation import attribute_failures
-from lw_torchrl.evaluation.diagnose.counterfactuals import Counterfactuals, own_evaluators, with_true_answers
-from lw_torchrl.evaluation.diagnose.decision import choose_pair, decide
-from lw_torchrl.evaluation.diagnose.findings import ActiveStep, PlanDeparts, WrongAnswers
-from lw_torchrl.evaluation.diagnose.scripts import attended
+from lw_torchrl.evaluation.diagnose.attribution import choose_pair, decide
+from lw_torchrl.evaluation.diagnose.counterfactuals import Counterfactuals
+from lw_torchrl.evaluation.diagnose.failure import ActiveStep, PlanDeparts, WrongAnswers
+from lw_torchrl.evaluation.diagnose.replacements import attended, own_evaluators, with_true_answers
 from lw_torchrl.evaluation.diagnose.states import ScriptComparison, chosen, last_stay_start, stall_step
 from lw_torchrl.record.rollouts import simulate_again
 from lw_torchrl.transforms.qaf import plan_program
@@ -46,7 +46,7 @@ def evaluated(actor, episodes=1, **options):
     return lw.evaluate(actor, episodes_per_task=episodes, **how)
 
 
-def clumsy(step=1):
+def faulty_skill(step=1):
     table = dict(lw.load_skills())
     text = PLANS[TASK].steps[step].skill
     x, y, z = table[text].offset
@@ -54,21 +54,21 @@ def clumsy(step=1):
     return lw.ScriptedSkillActor(PLANS, skills=table)
 
 
-def hopeless():
+def faulty_plans():
     """A plan that never goes down to the handle."""
     pairs = [(str(step.condition), step.skill) for step in PLANS[TASK].steps]
     pairs[1] = (pairs[1][0], pairs[0][1])
     return lw.Plans({TASK: lw.ConditionalPlan.from_pairs(TASK, pairs)})
 
 
-def lie(tensordict):
+def wrong_answers(tensordict):
     answers = tensordict.get("qaf").clone()
     answers[..., 1] ^= True
     return tensordict.set("qaf", answers)
 
 
-class Lie(lw.QueryEvaluator):
-    """The same lie, inside a policy."""
+class WrongEvaluator(lw.QueryEvaluator):
+    """The same wrong answers, by an evaluator inside a policy."""
 
     def __init__(self, plans):
         super().__init__(plans)
@@ -83,8 +83,8 @@ class Lie(lw.QueryEvaluator):
 # ---- planted faults
 
 
-def test_a_clumsy_skill_and_the_step_it_is_in():
-    [failure] = evaluated(clumsy(), reference=REFERENCE).failures
+def test_a_faulty_skill_is_found_with_its_step():
+    [failure] = evaluated(faulty_skill(), reference=REFERENCE).failures
     assert (failure.cause, failure.also, failure.step) == ("skill", None, 1)
     assert failure.counterfactuals == {"skill": True, "plan": False}
     assert isinstance(failure.finding, ActiveStep)
@@ -95,7 +95,7 @@ def test_a_clumsy_skill_and_the_step_it_is_in():
 
 
 class Weak(lw.ScriptedSkillActor):
-    """One whose hand hardly rises or sinks: in all steps, or in one."""
+    """A policy whose hand hardly rises or sinks, in all steps or in one."""
 
     def __init__(self, plans, step=None):
         super().__init__(plans)
@@ -103,8 +103,8 @@ class Weak(lw.ScriptedSkillActor):
 
     def forward(self, tensordict):
         action = super().forward(tensordict).get("action").clone()
-        there = True if self.step is None else tensordict.get("skill_weights")[:, self.step] > 0.5
-        action[:, 2] = torch.where(torch.as_tensor(there), 0.05 * action[:, 2], action[:, 2])
+        weak = True if self.step is None else tensordict.get("skill_weights")[:, self.step] > 0.5
+        action[:, 2] = torch.where(torch.as_tensor(weak), 0.05 * action[:, 2], action[:, 2])
         return tensordict.set("action", action)
 
     def with_plans(self, plans):
@@ -112,8 +112,8 @@ class Weak(lw.ScriptedSkillActor):
 
 
 @pytest.mark.parametrize(("step", "cause"), [(None, "actuation"), (1, "skill")])
-def test_a_motion_that_is_wrong_in_all_steps_is_no_skill(step, cause):
-    """Only one step has far to go on that axis, so a script in it mends either."""
+def test_a_motion_that_is_wrong_in_all_steps_is_not_a_skills_fault(step, cause):
+    """Only one step moves far on that axis, so a script in that step repairs either fault."""
     plans = lw.Plans({"plate-slide-side": lw.load_plans("MT50")["plate-slide-side"]})
     [failure] = evaluated(Weak(plans, step), tasks="plate-slide-side", max_steps=120).failures
     assert failure.cause == cause
@@ -122,33 +122,33 @@ def test_a_motion_that_is_wrong_in_all_steps_is_no_skill(step, cause):
     assert ("the motion is as wrong in other steps" in failure.why) == (step is None)
 
 
-def test_a_fault_is_looked_for_in_other_steps():
+def test_other_steps_are_searched_for_the_same_fault():
     wanted = torch.randn(60, 3, generator=torch.Generator().manual_seed(0)).clamp(-1.0, 1.0)
     noise = 0.05 * torch.randn(60, 3, generator=torch.Generator().manual_seed(1))
     active = (torch.arange(60) >= 30).long()
     here = (active == 0).unsqueeze(-1)
 
-    def told(fault):
+    def in_other_steps(fault):
         in_all = ScriptComparison(fault(wanted) + noise, wanted, active).in_other_steps(0)
         in_one = ScriptComparison(torch.where(here, fault(wanted), wanted) + noise, wanted, active).in_other_steps(0)
         return in_all, in_one
 
-    assert told(lambda action: action * torch.tensor([-1.0, 1.0, 1.0])) == (True, False), "a factor"
-    assert told(lambda action: action + torch.tensor([0.0, 0.4, 0.0])) == (True, False), "a shift"
-    assert told(torch.zeros_like) == (True, False), "at rest"
-    assert told(lambda action: action.roll(1, 0)) == (None, None), "neither"
-    nothing = torch.where(here, wanted, 0.0)
-    hidden = ScriptComparison(nothing * -1.0, nothing, active).in_other_steps(0)
-    assert hidden is None, "a factor does not show where the script does nothing"
+    assert in_other_steps(lambda action: action * torch.tensor([-1.0, 1.0, 1.0])) == (True, False), "a factor"
+    assert in_other_steps(lambda action: action + torch.tensor([0.0, 0.4, 0.0])) == (True, False), "a shift"
+    assert in_other_steps(torch.zeros_like) == (True, False), "at rest"
+    assert in_other_steps(lambda action: action.roll(1, 0)) == (None, None), "neither"
+    still = torch.where(here, wanted, 0.0)
+    hidden = ScriptComparison(still * -1.0, still, active).in_other_steps(0)
+    assert hidden is None, "a factor does not show where the script is at rest"
     assert ScriptComparison(noise, wanted, torch.zeros(60)).in_other_steps(0) is None, "there are no others"
 
 
-def test_a_gripper_that_is_wrong_is_told_from_a_motion_that_is_not_quite_the_script_s():
-    """Motion that is a little off fails with the gripper open; scripts for either part mend that."""
+def test_a_wrong_gripper_is_distinguished_from_a_slightly_wrong_motion():
+    """A slightly wrong motion fails only because the gripper is open, so scripts for either part repair it."""
     active = torch.zeros(20, dtype=torch.int64)
     wanted = torch.tensor([0.5, 0.0, 0.0, 1.0]).expand(20, 4)
 
-    def told(motion, effort):
+    def mending(motion, effort):
         done = torch.tensor([motion, 0.0, 0.0, effort]).expand(20, 4)
         tried = Counterfactuals.__new__(Counterfactuals)
         tried.plans, tried.step, tried.with_script = PLANS, {}, {}
@@ -156,22 +156,22 @@ def test_a_gripper_that_is_wrong_is_told_from_a_motion_that_is_not_quite_the_scr
         tried.comparisons = {(TASK, 0): ScriptComparison(done, wanted, active)}
         return tried.mending(SimpleNamespace(which=(TASK, 0), truth=torch.ones(20, 1)))
 
-    assert told(0.4, -1.0) == ["gripper"]
-    assert told(-0.5, 0.9) == ["actuation"]
-    assert told(-0.5, -1.0) == told(0.4, 0.9) == ["gripper", "actuation"], "both are, or neither is"
+    assert mending(0.4, -1.0) == ["gripper"]
+    assert mending(-0.5, 0.9) == ["actuation"]
+    assert mending(-0.5, -1.0) == mending(0.4, 0.9) == ["gripper", "actuation"], "both are wrong, or neither"
 
 
-def test_a_plan_that_leads_astray():
-    [failure] = evaluated(lw.ScriptedSkillActor(hopeless()), reference=REFERENCE).failures
+def test_a_faulty_plan_is_found_with_its_step():
+    [failure] = evaluated(lw.ScriptedSkillActor(faulty_plans()), reference=REFERENCE).failures
     assert (failure.cause, failure.step) == ("plan", 1)
-    assert failure.counterfactuals == {"plan": True}, "its skills are the scripts, so there is none to replace"
+    assert failure.counterfactuals == {"plan": True}, "its skills are the scripts, so none is replaced"
     assert failure.evidence["plan_departs_late"] > 0.5
     assert isinstance(failure.finding, PlanDeparts)
     assert (failure.finding.step, failure.finding.late) == (1, True)
 
 
-def test_a_lie_and_the_condition_it_is_about():
-    [failure] = evaluated(lw.ScriptedSkillActor(PLANS), evaluator=lie, reference=REFERENCE).failures
+def test_wrong_answers_are_found_with_their_condition():
+    [failure] = evaluated(lw.ScriptedSkillActor(PLANS), evaluator=wrong_answers, reference=REFERENCE).failures
     assert (failure.cause, failure.step) == ("query", 1)
     assert failure.counterfactuals["query"] is True
     assert failure.finding == WrongAnswers(1, str(PLANS[TASK].steps[1].condition), STEPS, STEPS, 0)
@@ -179,43 +179,44 @@ def test_a_lie_and_the_condition_it_is_about():
     assert failure.evidence["answers_wrong"] == 1.0
 
 
-def test_two_faults_at_once_are_both_named():
-    [failure] = evaluated(clumsy(), evaluator=lie).failures
+def test_two_faults_at_once_are_both_found():
+    [failure] = evaluated(faulty_skill(), evaluator=wrong_answers).failures
     assert (failure.cause, failure.also) == ("query", "skill")
     assert failure.counterfactuals["query + skill"] is True
     assert not any(bit for name, bit in failure.counterfactuals.items() if "+" not in name)
     assert "Neither the true answers nor scripted skills is enough" in failure.why
 
 
-def test_what_lacks_time_alone_is_out_of_time():
+def test_an_episode_that_lacks_only_time_is_out_of_time():
     [failure] = evaluated(lw.ScriptedSkillActor(PLANS), max_steps=45).failures
     assert (failure.cause, failure.counterfactuals, failure.at) == ("out of time", {"time": True}, 44)
 
 
-def test_what_nothing_mends_is_undecided():
-    [failure] = evaluated(lw.ScriptedSkillActor(hopeless())).failures
+def test_an_episode_that_no_replacement_repairs_is_undecided():
+    [failure] = evaluated(lw.ScriptedSkillActor(faulty_plans())).failures
     assert (failure.cause, failure.also, failure.counterfactuals) == ("undecided", None, {"time": False})
     assert failure.mended is None
 
 
-def test_the_rule_alone_runs_nothing_and_is_weaker():
+def test_without_an_actor_the_rule_judges_the_states():
     episodes = []
-    lw.evaluate(clumsy(), tasks=TASK, episodes_per_task=1, also_record=RECORDED, on_episode=episodes.append, **RUN)
+    run = {"tasks": TASK, "episodes_per_task": 1, "also_record": RECORDED, "on_episode": episodes.append, **RUN}
+    lw.evaluate(faulty_skill(), **run)
     [alone] = attribute_failures(episodes, PLANS, seed=SEED)
     assert (alone.cause, alone.counterfactuals) == ("undecided", {})
     [judged] = attribute_failures(episodes, PLANS, reference=REFERENCE, seed=SEED)
     assert judged.cause in ("skill", "plan")
     steps = episodes[0].steps
-    lied = steps.clone().set("qaf", ~steps["qaf"])
-    [found] = attribute_failures([FinishedEpisode(TASK, 0, lied)], PLANS, seed=SEED)
-    assert (found.cause, found.evidence["answers_wrong"]) == ("query", 1.0)
+    wrong = steps.clone().set("qaf", ~steps["qaf"])
+    [failure] = attribute_failures([FinishedEpisode(TASK, 0, wrong)], PLANS, seed=SEED)
+    assert (failure.cause, failure.evidence["answers_wrong"]) == ("query", 1.0)
 
 
-def test_a_hole_in_the_plan_is_no_skill_s_fault():
-    """Where no condition holds, networks attend to all steps: scripts in their place would fill the hole."""
+def test_a_gap_in_the_plan_is_not_a_skills_fault():
+    """Where no condition holds, networks attend to all steps: scripts instead of them would hide the gap."""
     pairs = [(str(step.condition), step.skill) for step in PLANS[TASK].steps]
-    holed = lw.Plans({TASK: lw.ConditionalPlan.from_pairs(TASK, pairs[1:])})
-    [failure] = evaluated(still(plans=holed)).failures
+    plans = lw.Plans({TASK: lw.ConditionalPlan.from_pairs(TASK, pairs[1:])})
+    [failure] = evaluated(still(plans=plans)).failures
     assert (failure.cause, failure.counterfactuals) == ("undecided", {"time": False})
     assert failure.evidence["no_condition_late"] == 1.0
 
@@ -224,7 +225,7 @@ def test_a_hole_in_the_plan_is_no_skill_s_fault():
 
 
 class Still(lw.PlanConditionedActor):
-    """One whose hand does not move."""
+    """A policy whose hand does not move."""
 
     def forward(self, tensordict):
         tensordict = super().forward(tensordict)
@@ -240,22 +241,22 @@ ENSEMBLE = pytest.param(lambda actor: lw.modules.ActorEnsemble([actor, still()])
 
 
 @pytest.mark.parametrize("wrapped", [lambda actor: actor, ENSEMBLE])
-def test_a_network_s_skills_are_replaced_and_its_mode_stays(wrapped):
+def test_a_networks_skills_are_replaced_and_its_mode_stays(wrapped):
     actor = wrapped(still()).train()
     actor.get_submodule(next(name for name, _ in actor.named_modules() if name)).eval()
     modes = [module.training for module in actor.modules()]
     [failure] = evaluated(actor).failures
-    found = {"skill": False, "gripper": False, "actuation": True}
-    assert (failure.cause, failure.counterfactuals) == ("actuation", found), "its hand rests in every step"
+    tried = {"skill": False, "gripper": False, "actuation": True}
+    assert (failure.cause, failure.counterfactuals) == ("actuation", tried), "its hand rests in every step"
     assert [module.training for module in actor.modules()] == modes
 
 
-def test_an_evaluator_inside_a_policy_is_replaced_by_the_truth():
-    actor = TensorDictSequential(Lie(PLANS), still())
+def test_an_evaluator_inside_a_policy_is_replaced_by_exact_answers():
+    actor = TensorDictSequential(WrongEvaluator(PLANS), still())
     true = with_true_answers(actor)
     assert true is not actor
     assert len(own_evaluators(true)) == len(own_evaluators(actor)) == 1
-    assert isinstance(actor[0], Lie)
+    assert isinstance(actor[0], WrongEvaluator)
     state = rollout().exclude("next")
     exact = lw.PlanConditionedActor(PLANS)(lw.QAFTransform(PLANS)(state.copy()))["skill_weights"]
     assert torch.allclose(true(state.copy())["skill_weights"], exact)
@@ -264,11 +265,11 @@ def test_an_evaluator_inside_a_policy_is_replaced_by_the_truth():
     assert (failure.cause, failure.also) == ("query", "skill")
 
 
-def test_a_policy_that_cannot_carry_out_the_reference_is_told():
+def test_a_policy_that_cannot_follow_the_reference_causes_a_warning():
     class Fixed(nn.Module):
         def __init__(self):
             super().__init__()
-            self.actor, self.plans = lw.ScriptedSkillActor(hopeless()), hopeless()
+            self.actor, self.plans = lw.ScriptedSkillActor(faulty_plans()), faulty_plans()
             self.in_keys, self.out_keys = self.actor.in_keys, self.actor.out_keys
 
         def forward(self, tensordict):
@@ -280,7 +281,7 @@ def test_a_policy_that_cannot_carry_out_the_reference_is_told():
 
 
 class Completing(lw.ScriptedSkillActor):
-    """One that carries out more steps than the plans that it is given have."""
+    """A policy that adds a step to each plan that it is given."""
 
     def with_plans(self, plans):
         pairs = [(str(step.condition), step.skill) for step in lw.Plans(plans)[TASK].steps]
@@ -288,24 +289,24 @@ class Completing(lw.ScriptedSkillActor):
         return Completing(lw.Plans({TASK: longer}), skills=self._skills)
 
 
-def test_a_policy_that_completes_the_reference_is_replaced_with_what_it_carries_out():
-    actor = Completing(hopeless(), skills=clumsy(step=2)._skills)
+def test_a_policy_may_complete_the_reference():
+    actor = Completing(faulty_plans(), skills=faulty_skill(step=2)._skills)
     [failure] = evaluated(actor, reference=REFERENCE).failures
     assert {failure.cause, failure.also} == {"plan", "skill"}
     assert len(failure.mended.plan.steps) == failure.mended.steps["skill_weights"].shape[1] == 4
 
 
-# ---- the same whatever runs beside
+# ---- reproducibility
 
 
-def test_failures_hang_on_neither_environments_nor_order():
-    actor = clumsy()
+def test_failures_do_not_depend_on_the_number_of_environments():
+    actor = faulty_skill()
     result = evaluated(actor, episodes=2, reference=REFERENCE)
     assert evaluated(actor, episodes=2, reference=REFERENCE, num_envs=1).failures == result.failures
     assert [failure.episode for failure in result.failures] == [0, 1]
 
 
-# ---- what decides
+# ---- the decision
 
 
 @pytest.mark.parametrize(
@@ -327,7 +328,7 @@ def test_the_replacement_that_fixes_most_decides(cause, shares, null):
     assert decide([*shares], shares, null).cause == cause
 
 
-def test_of_two_causes_the_certain_one_comes_first_or_the_one_that_mends_more():
+def test_of_two_causes_wrong_answers_come_first_else_the_one_that_repairs_more():
     assert choose_pair(["query + skill"], {"skill": 0.9}) == ("query", "skill", "query + skill")
     assert choose_pair(["plan + skill"], {}) == ("plan", "skill", "plan + skill")
     assert choose_pair(["plan + skill"], {"policy": 0.2}) == ("skill", "plan", "plan + skill")
@@ -335,36 +336,36 @@ def test_of_two_causes_the_certain_one_comes_first_or_the_one_that_mends_more():
     assert choose_pair(["query"], {}) is None
 
 
-def test_the_step_in_force():
+def test_the_active_step_has_most_attention():
     weights = torch.tensor([[0.4999, 0.5, 0.0001], [1 / 3] * 3, [0.5, 0.5, 0.0], [1.0, 0.0, 0.0]])
     steps = torch.arange(3) < torch.tensor([[3], [3], [2], [1]])
     assert attended(weights, steps).tolist() == [1, -1, -1, 0]
     answers = torch.tensor([[False, True, True], [False, False, False], [False, False, True]])
     assert chosen(answers, 3).tolist() == [1, 2, 2]
-    assert chosen(answers, 2).tolist() == [1, 1, 1], "what is beyond the last step is none"
+    assert chosen(answers, 2).tolist() == [1, 1, 1], "columns after the last step are ignored"
 
 
-def test_a_stay_is_seen_where_the_hand_gets_no_further():
+def test_a_step_stalls_where_the_hand_stands_still():
     observation = torch.zeros(60, 39)
     observation[:, 0] = torch.cat((torch.arange(25) * 0.02, torch.full((35,), 0.5)))  # at rest from state 25 on
     active = torch.cat((torch.zeros(20), torch.ones(40))).long()
     seen = SimpleNamespace(active=active, steps=TensorDict(observation=observation, batch_size=[60]))
     assert stall_step(seen, 1) == 25
-    assert stall_step(seen, 0) == 0, "it moves all the while"
+    assert stall_step(seen, 0) == 0, "it moves all the time"
 
 
-def test_a_stay_may_be_left_for_a_while():
+def test_a_stay_may_be_interrupted_briefly():
     states = torch.zeros(100, dtype=torch.bool)
     states[[3, 40, 60, 61, 80]] = True
     assert last_stay_start(states) == 40
     assert last_stay_start(torch.zeros(5, dtype=torch.bool)) == 4
 
 
-# ---- what is refused
+# ---- refused
 
 
 def rollout(steps=3, **changed):
-    found = TensorDict(
+    rollout = TensorDict(
         {
             "observation": torch.zeros(steps, 39),
             "task_id": torch.full((steps,), lw.task_id(TASK)),
@@ -374,8 +375,8 @@ def rollout(steps=3, **changed):
         [steps],
     )
     for key, value in changed.items():
-        found = found.exclude(key) if value is None else found.set(key, value)
-    return found
+        rollout = rollout.exclude(key) if value is None else rollout.set(key, value)
+    return rollout
 
 
 @pytest.mark.parametrize(
@@ -383,44 +384,40 @@ def rollout(steps=3, **changed):
     [
         ([rollout(observation=None)], "observation"),
         ([rollout(episode=None)], "episode"),
-        ([rollout(episode=torch.tensor([0, 0, 1]))], r"rollouts\[0\] must be one episode, got 2: split them"),
-        ([rollout(task_id=torch.zeros(3, dtype=torch.int64))], r"rollouts\[0\] must be of one task that plans has"),
-        ([rollout(), rollout()], r"rollouts\[1\] is episode 0 of 'drawer-open' again"),
-        ([torch.zeros(3)], r"rollouts\[0\] must be a finished episode, or a TensorDict of batch \(T,\), got Tensor"),
+        ([rollout(episode=torch.tensor([0, 0, 1]))], r"rollouts\[0\] must be one episode"),
+        ([rollout(task_id=torch.zeros(3, dtype=torch.int64))], r"rollouts\[0\] must be of one task"),
+        ([rollout(), rollout()], r"rollouts\[1\] is episode 0"),
+        ([rollout()[0]], r"rollouts\[0\] must be a finished episode"),
     ],
 )
-def test_rollouts_that_are_none_are_named(rollouts, message):
+def test_wrong_rollouts_are_refused(rollouts, message):
     with pytest.raises(ValueError, match=message):
         attribute_failures(rollouts, PLANS, seed=0)
 
 
 def test_an_episode_of_another_seed_is_refused():
-    with pytest.raises(ValueError, match=r"rollouts: episode 0 of 'drawer-open' does not begin as episode 0 of seed=0"):
-        attribute_failures([rollout()], PLANS, actor=clumsy(), seed=0, max_steps=5, progress=False)
+    with pytest.raises(ValueError, match=r"rollouts: episode 0 of 'drawer-open' .* seed=0"):
+        attribute_failures([rollout()], PLANS, actor=faulty_skill(), seed=0, max_steps=5, progress=False)
 
 
-def test_other_arguments_that_are_wrong_are_named():
+def test_arguments_that_do_not_fit_together_are_refused():
     with pytest.raises(ValueError, match="plans differ from the actor's own for drawer-open"):
-        attribute_failures([rollout()], hopeless(), actor=clumsy(), seed=0)
-    with pytest.raises(ValueError, match="noise_scale"):
-        attribute_failures([rollout()], PLANS, seed=0, noise_scale=-1.0)
-    with pytest.raises(ValueError, match="max_steps"):
-        attribute_failures([rollout()], PLANS, seed=0, max_steps=0)
-    with pytest.raises(ValueError, match="attribute must be False for an actor without plans"):
+        attribute_failures([rollout()], faulty_plans(), actor=faulty_skill(), seed=0)
+    with pytest.raises(ValueError, match="attribute=True needs plans"):
         evaluated(lw.ExpertActor(TASK))
-    with pytest.raises(ValueError, match="reference is for attribute=True"):
-        evaluated(clumsy(), attribute=False, reference=REFERENCE)
+    with pytest.raises(ValueError, match="reference"):
+        evaluated(faulty_skill(), attribute=False, reference=REFERENCE)
 
 
-def test_where_nothing_failed_there_is_nothing_to_say():
+def test_without_failed_episodes_there_are_no_failures():
     assert attribute_failures([], PLANS, seed=0) == []
     result = evaluated(lw.ScriptedSkillActor(PLANS))
     assert result.failures == ()
     assert result.success_once == {TASK: 1.0}
 
 
-def test_the_mended_episode_is_kept_and_can_be_simulated_again():
-    [failure] = evaluated(lw.ScriptedSkillActor(hopeless()), reference=REFERENCE).failures
+def test_the_repaired_episode_is_kept_and_can_be_simulated_again():
+    [failure] = evaluated(lw.ScriptedSkillActor(faulty_plans()), reference=REFERENCE).failures
     mended = failure.mended
     assert (mended.by, mended.plan) == ("plan", REFERENCE[TASK])
     success = mended.steps["next", "success"].flatten().tolist()

@@ -1,4 +1,4 @@
-"""The shipped policy, model cards, and policies in folders and on the Hub, which is replaced by a fake."""
+"""The shipped policy, model cards, and policies in folders and on a fake Hub."""
 
 from __future__ import annotations
 
@@ -22,13 +22,12 @@ SHIPPED = "few-shot-mt50"
 def result():
     config = {"tasks": ["push", "reach"], "episodes_per_task": 2, "seed": 5, "noise_scale": 0.1}
     config |= {"stop_at_success": True, "max_steps": 500}
-    ran = [("push", 0, True), ("push", 1, True), ("reach", 0, True), ("reach", 1, False)]
-    return EvaluationResult(
-        config, tuple(EpisodeResult(task, n, won, 9 if won else None, None, None) for task, n, won in ran)
-    )
+    rows = [("push", 0, True), ("push", 1, True), ("reach", 0, True), ("reach", 1, False)]
+    episodes = (EpisodeResult(task, k, success, 9 if success else None, None, None) for task, k, success in rows)
+    return EvaluationResult(config, tuple(episodes))
 
 
-def test_a_policy_is_shipped_and_acts():
+def test_the_shipped_policy_succeeds():
     actor = lw.load_actor(SHIPPED)
     assert isinstance(actor, lw.PlanConditionedActor)
     assert actor.tasks == lw.MT50
@@ -36,20 +35,20 @@ def test_a_policy_is_shipped_and_acts():
     run = read_description(SHIPPED)["run"]
     assert (run["setting"], run["preset"], run["seed"]) == ("few-shot", "one-network", 0)
     tasks = ["button-press", "drawer-close"]
-    found = lw.evaluate(actor, tasks=tasks, episodes_per_task=2, seed=7, stop_at_success=True, progress=False)
-    assert found.mean_success == 1.0
+    result = lw.evaluate(actor, tasks=tasks, episodes_per_task=2, seed=7, stop_at_success=True, progress=False)
+    assert result.mean_success == 1.0
     assert actor.stochastic().out_keys[-1] == "action_log_prob"
 
 
-def test_a_file_of_that_name_comes_first(tmp_path, monkeypatch):
+def test_a_file_with_the_shipped_policys_name_takes_precedence(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     lw.save_actor(lw.DescriptorConditionedActor("reach", decoder=lw.modules.MLPDecoder(width=8)), tmp_path / SHIPPED)
     assert lw.load_actor(SHIPPED).tasks == ("reach",)
-    with pytest.raises(FileNotFoundError, match=r"did you mean the shipped policy 'few-shot-mt50'\?"):
+    with pytest.raises(FileNotFoundError, match="did you mean the shipped policy 'few-shot-mt50'"):
         lw.load_actor("few-shot-mt5")
 
 
-def test_a_card_says_what_the_file_and_the_evaluation_say(result):
+def test_a_card_describes_the_file_and_the_evaluation(result):
     card = policy_card(SHIPPED, result, repo="me/mine")
     assert (card.data.library_name, card.data.pipeline_tag) == ("lw_torchrl", "robotics")
     assert card.data.eval_results[0].metric_value == 0.75
@@ -73,7 +72,7 @@ def test_the_shipped_policys_card_has_its_own_result_and_citation():
     assert all(name in card for name in re.findall(r"family-names: (\w+)", cited))
 
 
-def test_a_policy_that_says_little_has_a_card(result, tmp_path):
+def test_a_policy_without_metadata_has_a_card(result, tmp_path):
     path = tmp_path / "a: [b] 'c.safetensors"
     member = lw.DescriptorConditionedActor("reach", decoder=lw.modules.MLPDecoder(width=8))
     lw.save_actor(lw.modules.ActorEnsemble([member, member]), path)
@@ -81,27 +80,27 @@ def test_a_policy_that_says_little_has_a_card(result, tmp_path):
     assert "Not measured." in str(card)
     assert "`ActorEnsemble` of 2 networks" in str(card)
     assert card.data.eval_results is None
-    with pytest.raises(ValueError, match="result must be of the policy's tasks, it does not know push"):
+    with pytest.raises(ValueError, match=r"result .* push"):
         policy_card(path, result)
 
 
-def same(one, other):
-    ours, found = one.state_dict(), other.state_dict()
-    return ours.keys() == found.keys() and all(torch.equal(ours[name], found[name]) for name in ours)
+def has_same_weights(actor, other):
+    first, second = actor.state_dict(), other.state_dict()
+    return first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first)
 
 
-def test_a_folder_holds_a_policy_and_its_card(result, tmp_path):
+def test_a_policy_and_its_card_are_saved_in_a_folder(result, tmp_path):
     save_pretrained(SHIPPED, tmp_path / "mine", result)
     assert (tmp_path / "mine" / "policy.safetensors").read_bytes() == policy_file(SHIPPED).read_bytes()
     assert (tmp_path / "mine" / "README.md").read_text("utf-8") == str(policy_card(SHIPPED, result))
-    assert same(lw.from_pretrained(tmp_path / "mine"), lw.load_actor(SHIPPED))
+    assert has_same_weights(lw.from_pretrained(tmp_path / "mine"), lw.load_actor(SHIPPED))
     with pytest.raises(FileNotFoundError, match=r"policy\.safetensors"):
         lw.from_pretrained(tmp_path)
-    with pytest.raises(ValueError, match=r"must be a folder or a repository, got the file .*; use lw\.load_actor"):
+    with pytest.raises(ValueError, match="source must be a folder or a repository"):
         lw.from_pretrained(tmp_path / "mine" / "policy.safetensors")
 
 
-def test_a_policy_goes_to_the_hub_and_comes_back(result, tmp_path, monkeypatch):
+def test_a_policy_is_uploaded_to_the_hub_and_loaded_from_it(result, tmp_path, monkeypatch):
     calls = []
 
     class Api:
@@ -126,10 +125,10 @@ def test_a_policy_goes_to_the_hub_and_comes_back(result, tmp_path, monkeypatch):
     monkeypatch.setattr(huggingface_hub, "hf_hub_download", download)
     assert lw.evaluation.push_to_hub(SHIPPED, "me/mine", result, private=True, token="t") == "hub:me/mine"
     assert "lw.from_pretrained('me/mine')" in (tmp_path / "README.md").read_text("utf-8")
-    assert same(lw.from_pretrained("me/mine", revision="v1"), lw.load_actor(SHIPPED))
+    assert has_same_weights(lw.from_pretrained("me/mine", revision="v1"), lw.load_actor(SHIPPED))
     assert calls == ["t", ("me/mine", True, True), ("me/mine", "v1")]
-    with pytest.raises(FileNotFoundError, match="there is no folder 'me/other', and no such policy on the Hub: 404"):
+    with pytest.raises(FileNotFoundError, match=r"source: .*'me/other'.*404"):
         lw.from_pretrained("me/other")
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(ImportError, match=r"need the extra \[hub\]: pip install 'lw_torchrl\[hub\]'"):
+    with pytest.raises(ImportError, match=r"lw_torchrl\[hub\]"):
         lw.from_pretrained("me/mine")

@@ -1,9 +1,9 @@
-"""evaluate: exactly the episodes asked for, the same whatever runs beside them, and true in Meta-World's own envs."""
+"""evaluate runs exactly the requested episodes, bit for bit on any number of environments, as Meta-World's own envs."""
 
 from __future__ import annotations
 
+import itertools
 import re
-from itertools import product
 
 import numpy as np
 import pytest
@@ -42,12 +42,12 @@ def by_episode(result):
     return {(e.task, e.episode): e for e in result.episodes}
 
 
-def assert_same(found, expected):
-    """The same episodes with the very same actions."""
-    found, expected = by_episode(found), by_episode(expected)
-    assert found == expected
+def assert_same(result, expected):
+    """Assert that two results have the same episodes, with actions that are equal bit for bit."""
+    episodes, expected = by_episode(result), by_episode(expected)
+    assert episodes == expected
     for key in expected:
-        assert torch.equal(found[key].actions, expected[key].actions), key
+        assert torch.equal(episodes[key].actions, expected[key].actions), key
 
 
 # ---- which episodes
@@ -56,7 +56,7 @@ def assert_same(found, expected):
 @pytest.mark.parametrize("num_envs", [None, 5])
 def test_exactly_k_episodes_of_each_task(num_envs):
     result = run(ExpertActor(["push", "reach"]), ["reach", "push"], num_envs=num_envs, max_steps=4)
-    assert [(e.task, e.episode) for e in result.episodes] == list(product(["push", "reach"], range(3)))
+    assert [(e.task, e.episode) for e in result.episodes] == list(itertools.product(["push", "reach"], range(3)))
     assert all(e.actions.shape == (4, 4) and e.actions.dtype == torch.float32 for e in result.episodes)
     assert result.config["tasks"] == ["push", "reach"]
     assert result.config["seed"] == SEED
@@ -68,24 +68,24 @@ def test_exactly_k_episodes_of_each_task(num_envs):
 
 @pytest.fixture(scope="module")
 def alone():
-    """A policy's run with two rows only."""
+    """An evaluation of two tasks in two environments."""
     return run(make_actor(), ["drawer-open", "push"], num_envs=2)
 
 
 @pytest.mark.parametrize("num_envs", [None, 5, 66])
 def test_the_number_of_environments_changes_no_bit(alone, num_envs):
-    """66 rows are more than a block."""
+    """66 rows are more than one block."""
     assert_same(run(make_actor(), ["drawer-open", "push"], num_envs=num_envs), alone)
 
 
-def test_the_tasks_beside_change_no_bit(alone):
-    beside = by_episode(run(make_actor(), ["drawer-open", "push", "reach", "window-open"], num_envs=9))
+def test_other_tasks_change_no_bit(alone):
+    others = by_episode(run(make_actor(), ["drawer-open", "push", "reach", "window-open"], num_envs=9))
     for key, episode in by_episode(alone).items():
-        assert torch.equal(beside[key].actions, episode.actions)
-        assert beside[key] == episode
+        assert torch.equal(others[key].actions, episode.actions)
+        assert others[key] == episode
 
 
-def test_more_episodes_begin_with_the_same(alone):
+def test_more_episodes_begin_with_the_same_ones(alone):
     more = by_episode(run(make_actor(), "push", episodes_per_task=5))
     for key, episode in by_episode(alone).items():
         if key[0] == "push":
@@ -96,17 +96,17 @@ def test_another_engine_of_the_same_physics_changes_no_bit(alone):
     assert_same(run(make_actor(), ["drawer-open", "push"], engine=MetaWorldEngine, num_threads=2), alone)
 
 
-def test_a_plain_function_and_the_baseline_are_run_the_same_way():
+def test_a_plain_function_runs_as_a_module_does():
     actor = DescriptorConditionedActor("MT10").eval()
-    one = run(actor, "reach", num_envs=1, max_steps=15)
-    assert_same(run(lambda state: actor(state), "reach", num_envs=3, max_steps=15), one)
-    assert_same(run(actor, "reach", num_envs=3, max_steps=15), one)
+    expected = run(actor, "reach", num_envs=1, max_steps=15)
+    assert_same(run(lambda state: actor(state), "reach", num_envs=3, max_steps=15), expected)
+    assert_same(run(actor, "reach", num_envs=3, max_steps=15), expected)
 
 
-# ---- what is executed
+# ---- executed actions
 
 
-def test_the_noise_is_the_episodes_own_and_clipped():
+def test_the_noise_depends_on_the_episode_and_is_clipped():
     def still(state):
         return state.set("action", torch.full((*state.batch_size, 4), 0.9))
 
@@ -125,27 +125,24 @@ def test_actions_out_of_range_are_recorded_as_executed():
     assert all(e.actions.tolist() == [[1.0, -1.0, 0.5, 1.0]] * 5 for e in result.episodes)
 
 
-def replay(env, task, episode, actions):
-    """Success at each step in Meta-World's own environment."""
-    env.seed(episode_seed(task, SEED, episode))
-    env.reset()
-    return [bool(env.step(action.numpy())[4]["success"]) for action in actions]
-
-
-def assert_true_in_metaworld(result):
+def assert_equal_in_metaworld(result):
+    """Run the recorded actions in Meta-World's own environments and compare the success at each step."""
     envs = {task: make_metaworld_env(task) for task in result.config["tasks"]}
     for e in result.episodes:
-        found = replay(envs[e.task], e.task, e.episode, e.actions)
-        assert any(found) == e.success, (e.task, e.episode)
-        assert (found.index(True) + 1 if any(found) else None) == e.first_success
+        env = envs[e.task]
+        env.seed(episode_seed(e.task, SEED, e.episode))
+        env.reset()
+        success = [bool(env.step(action.numpy())[4]["success"]) for action in e.actions]
+        assert any(success) == e.success, (e.task, e.episode)
+        assert (success.index(True) + 1 if any(success) else None) == e.first_success
         if e.success_at_end is not None:
-            assert found[-1] == e.success_at_end
-            assert sum(found) == e.episode_return
+            assert success[-1] == e.success_at_end
+            assert sum(success) == e.episode_return
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A policy that opens drawers, sometimes."""
+    """A policy that sometimes opens drawers."""
     root = tmp_path_factory.mktemp("demos") / "demos"
     collect_demonstrations(
         ["drawer-open", "reach"], episodes_per_task=4, root=root, max_steps=150, noise_scale=(0, 0.2), progress=False
@@ -160,26 +157,26 @@ def trained(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(trained):
-    """The trained policy's run."""
+    """The trained policy's evaluation, with whole episodes."""
     return run(trained, ["drawer-open", "reach"], episodes_per_task=4, max_steps=150, num_envs=6)
 
 
 @pytest.mark.slow
-def test_a_trained_policys_actions_give_the_same_success_in_meta_worlds_own_environments(whole):
-    assert whole.mean_success > 0, "the test wants successes"
-    assert_true_in_metaworld(whole)
+def test_a_trained_policys_actions_succeed_equally_in_metaworlds_own_environments(whole):
+    assert whole.mean_success > 0, "the test needs successes"
+    assert_equal_in_metaworld(whole)
 
 
 @pytest.mark.slow
-def test_on_every_mt10_task_the_recorded_actions_give_the_same_success():
+def test_the_experts_actions_succeed_equally_in_metaworlds_own_environments():
     result = run(ExpertActor("MT10"), "MT10", episodes_per_task=2, max_steps=500, num_envs=13)
     assert [e.success for e in result.episodes].count(True) >= 15
     assert {e.success_at_end for e in result.episodes} == {True, False}
-    assert_true_in_metaworld(result)
+    assert_equal_in_metaworld(result)
 
 
 @pytest.mark.parametrize("num_envs", [None, pytest.param(3, marks=pytest.mark.slow)])
-def test_stopping_at_success_changes_nothing_of_the_any_step_success(trained, whole, num_envs):
+def test_stopping_at_success_does_not_change_the_success_rate(trained, whole, num_envs):
     options = dict(episodes_per_task=4, max_steps=150, stop_at_success=True, num_envs=num_envs)
     stopped = run(trained, ["drawer-open", "reach"], **options)
     assert stopped.success_once == whole.success_once
@@ -193,10 +190,10 @@ def test_stopping_at_success_changes_nothing_of_the_any_step_success(trained, wh
     assert set(stopped.success_at_end.values()) == set(stopped.mean_return.values()) == {None}
     assert any(e.success for e in whole.episodes)
     if num_envs is not None:
-        assert_true_in_metaworld(stopped)
+        assert_equal_in_metaworld(stopped)
 
 
-def test_the_dense_reward_is_summed():
+def test_the_return_is_the_sum_of_dense_rewards():
     sparse = run(ExpertActor("reach"), "reach", max_steps=60)
     dense = run(ExpertActor("reach"), "reach", max_steps=60, reward="dense")
     for one, other in zip(sparse.episodes, dense.episodes, strict=True):
@@ -213,61 +210,57 @@ def test_the_dense_reward_is_summed():
 # ---- how the actor is run
 
 
-class Watched(nn.Module):
+class Recorder(nn.Module):
+    """A policy that records the mode in which it is called."""
+
     def __init__(self, value=0.1):
         super().__init__()
-        self.seen, self.value = [], value
+        self.calls, self.value = [], value
 
     def forward(self, observation):
-        self.seen.append((self.training, torch.is_grad_enabled(), exploration_type(), tuple(observation.shape)))
+        self.calls.append((self.training, torch.is_grad_enabled(), exploration_type(), tuple(observation.shape)))
         return torch.full((len(observation), 4), self.value)
 
 
 @pytest.mark.parametrize("training", [True, False])
 def test_the_actor_runs_in_eval_mode_and_its_mode_is_restored(training):
-    actor = TensorDictModule(Watched(), in_keys=["observation"], out_keys=["action"]).train(training)
+    actor = TensorDictModule(Recorder(), in_keys=["observation"], out_keys=["action"]).train(training)
     run(actor, "reach", max_steps=3)
     assert actor.training is training
     assert actor.module.training is training
-    assert {seen[:3] for seen in actor.module.seen} == {(False, False, ExplorationType.DETERMINISTIC)}
-    assert len({seen[3] for seen in actor.module.seen}) == 1, "every forward pass has the same number of rows"
+    assert {call[:3] for call in actor.module.calls} == {(False, False, ExplorationType.DETERMINISTIC)}
+    assert len({call[3] for call in actor.module.calls}) == 1, "every forward pass has the same number of rows"
 
 
-def test_the_mode_is_restored_after_an_error_too():
-    actor = TensorDictModule(Watched(torch.nan), in_keys=["observation"], out_keys=["action"]).train()
+@pytest.mark.parametrize("noise_scale", [0.0, 0.1])
+def test_a_nan_action_is_an_error_that_restores_the_mode(noise_scale):
+    actor = TensorDictModule(Recorder(torch.nan), in_keys=["observation"], out_keys=["action"]).train()
     with pytest.raises(ValueError, match=r"NaN.*'reach', seed 1000, episode 0, step 0"):
-        run(actor, "reach", noise_scale=0.0)
+        run(actor, "reach", noise_scale=noise_scale)
     assert actor.training
-    with pytest.raises(ValueError, match="NaN"):
-        run(actor, "reach", noise_scale=0.1)
 
 
 def test_an_unstable_simulation_is_a_failed_episode(monkeypatch):
-    step = VectorizedEngine.step
-    count = [0]
+    step, steps = VectorizedEngine.step, itertools.count(1)
 
-    def upset(self, *arguments):
+    def unstable(self, *arguments):
         result = step(self, *arguments)
-        count[0] += 1
-        if count[0] == 4:
-            result.fault[1] = True
+        result.fault[1] |= next(steps) == 4
         return result
 
-    monkeypatch.setattr(VectorizedEngine, "step", upset)
+    monkeypatch.setattr(VectorizedEngine, "step", unstable)
     expert = ExpertActor("reach")
-    with pytest.warns(
-        UserWarning, match="row 1: its simulation became unstable, in task 'reach', seed 1000, episode 1"
-    ):
+    with pytest.warns(UserWarning, match="unstable, in task 'reach', seed 1000, episode 1"):
         result = evaluate(expert, tasks="reach", episodes_per_task=3, seed=1000, num_envs=3, progress=False)
     assert [episode.success for episode in result.episodes] == [True, False, True]
 
 
-def test_neither_feature_noise_nor_the_global_generator_plays_a_part():
+def test_results_do_not_depend_on_feature_noise_or_the_global_generator():
     noisy, exact = (make_actor(features=ObservationFeatures(noise=noise)) for noise in (0.5, 0.0))
     torch.manual_seed(1)
-    found = run(noisy.train(), "reach", max_steps=10)
+    result = run(noisy.train(), "reach", max_steps=10)
     torch.manual_seed(2)
-    assert_same(found, run(exact.eval(), "reach", max_steps=10))
+    assert_same(result, run(exact.eval(), "reach", max_steps=10))
 
 
 # ---- plans
@@ -277,12 +270,12 @@ def other_plan(task="reach"):
     return ConditionalPlan.from_pairs(task, [("the gripper is open", "move the gripper to the reach target")])
 
 
-def test_plans_that_differ_from_the_actors_own_are_an_error():
+def test_plans_that_differ_from_the_actors_own_are_refused():
     with pytest.raises(ValueError, match=r"plans differ from the actor's own for reach; .*with_plans"):
         run(make_actor(), "reach", plans={**PLANS, "reach": other_plan()})
 
 
-def test_the_actors_own_plans_may_be_given_again():
+def test_the_actors_own_plans_may_be_passed():
     own = run(make_actor(), "reach", max_steps=8)
     assert_same(run(make_actor(), "reach", max_steps=8, plans=PLANS), own)
     assert_same(run(make_actor(), "reach", max_steps=8, plans={"reach": PLANS["reach"]}), own)
@@ -294,7 +287,7 @@ def test_an_actor_with_other_plans_is_evaluated_on_them():
     assert not torch.equal(other.episodes[0].actions, own.episodes[0].actions)
 
 
-def test_plans_for_an_actor_that_has_none():
+def test_an_actor_without_plans_receives_the_answers_for_given_plans():
     seen = []
 
     def policy(state):
@@ -306,43 +299,36 @@ def test_plans_for_an_actor_that_has_none():
     assert seen[0].shape[-1] == PLANS.num_steps
 
 
-def test_a_task_without_a_plan_is_named():
+def test_a_task_without_a_plan_is_refused():
     with pytest.raises(ValueError, match="plans lack sweep-into"):
         run(make_actor(), ["reach", "sweep-into"])
     with pytest.raises(ValueError, match="plans lack push"):
         run(lambda state: state, "push", plans={"reach": PLANS["reach"]})
 
 
-# ---- bad input
+# ---- refused
 
 
 @pytest.mark.parametrize(
-    ("changed", "message"),
+    ("argument", "changed"),
     [
-        (dict(tasks="raech"), "reach"),
-        (dict(episodes_per_task=0), "episodes_per_task must be at least 1, got 0"),
-        (dict(noise_scale=-1.0), "noise_scale must be finite and at least 0"),
-        (dict(noise_scale=float("nan")), "noise_scale"),
-        (dict(num_envs=0), "num_envs must be at least 1, got 0"),
-        (dict(tasks=["push", "reach"], num_envs=1), "num_envs must be at least the number of tasks, 2, got 1"),
-        (dict(max_steps=0), "max_steps must be at least 1"),
-        (dict(reward="sparce"), "reward must be one of .*did you mean 'sparse'"),
-        (dict(engine="mujoco"), "engine must be one of"),
-        (dict(num_threads=0), "num_threads must be at least 1"),
+        ("reach", dict(tasks="raech")),
+        ("num_envs must be at least the number of tasks", dict(tasks=["push", "reach"], num_envs=1)),
+        ("engine", dict(engine="mujoco")),
     ],
 )
-def test_wrong_arguments_are_named(changed, message):
-    with pytest.raises(ValueError, match=message):
+def test_arguments_that_do_not_fit_are_refused(argument, changed):
+    with pytest.raises(ValueError, match=argument):
         run(ExpertActor(["push", "reach"]), **{"tasks": "reach", **changed})
 
 
 @pytest.mark.parametrize("action", [torch.zeros(64, 3), torch.zeros(64, 4, dtype=torch.float64), torch.zeros(64, 1, 4)])
-def test_an_actor_that_gives_no_action_of_ours_is_refused(action):
+def test_actions_of_another_shape_or_dtype_are_refused(action):
     with pytest.raises(ValueError, match=r"action must be float32 of shape \(1, 4\)"):
         run(lambda state: state.set("action", action), "reach", num_envs=1)
 
 
-def test_a_policys_own_list_of_tasks_is_obeyed():
+def test_tasks_that_the_policy_does_not_list_are_refused():
     class Still(nn.Module):
         tasks = ("drawer-open", "reach")
 
@@ -350,34 +336,31 @@ def test_a_policys_own_list_of_tasks_is_obeyed():
             return tensordict.set("action", torch.zeros(*tensordict.batch_size, 4))
 
     assert run(Still(), "reach", max_steps=2, episodes_per_task=1).success_once == {"reach": 0.0}
-    with pytest.raises(ValueError, match=r"tasks must be among the actor's, drawer-open, reach; .* not made for: push"):
+    with pytest.raises(ValueError, match=r"tasks must be among the actor's, drawer-open, reach; .* push"):
         run(Still(), ["push", "reach"], max_steps=2)
     for actor in (ExpertActor("push"), DescriptorConditionedActor("push")):
-        with pytest.raises(ValueError, match="not made for: reach"):
+        with pytest.raises(ValueError, match=r"tasks must be among the actor's, push; .* reach"):
             run(actor, "reach")
 
 
-@pytest.mark.parametrize(
-    ("key", "said"),
-    [("skill_weight", "'skill_weight'; did you mean 'skill_weights'"), (("next", "missing"), "('next', 'missing')")],
-)
-def test_a_key_that_nobody_writes_is_refused_before_the_first_step(monkeypatch, key, said):
+@pytest.mark.parametrize("key", ["skill_weight", ("next", "missing")])
+def test_a_key_that_nothing_writes_is_refused_before_the_first_step(monkeypatch, key):
     monkeypatch.setattr(LanguageWorldEnv, "_step", None)
-    with pytest.raises(ValueError, match=f"also_record must be one of .*'qaf', .*, got {re.escape(said)}"):
+    with pytest.raises(ValueError, match=f"also_record must be one of .*'qaf', .*, got {re.escape(repr(key))}"):
         run(make_actor(), "reach", also_record=["qaf", key])
 
 
 def test_keys_of_the_environment_and_of_the_actor_are_recorded():
-    seen = []
+    episodes = []
     keys = ["qaf", "skill_weights", ("next", "qaf"), ("next", "done"), ("next", "observation")]
-    run(make_actor(), "reach", also_record=keys, max_steps=3, episodes_per_task=1, on_episode=seen.append)
-    (finished,) = seen
+    run(make_actor(), "reach", also_record=keys, max_steps=3, episodes_per_task=1, on_episode=episodes.append)
+    (finished,) = episodes
     assert (finished.task, finished.episode) == ("reach", 0)
     assert finished.steps.batch_size == (3,)
     assert all(key in finished.steps.keys(True) for key in keys)
 
 
-def test_the_experts_succeed_and_the_untrained_do_not():
+def test_experts_succeed_more_often_than_an_untrained_policy():
     tasks = ["button-press-topdown", "reach"]
     good = run(ExpertActor(tasks), tasks, max_steps=120, episodes_per_task=2)
     bad = run(make_actor(), tasks, max_steps=120, episodes_per_task=2)

@@ -1,4 +1,4 @@
-"""attribute_failures blames nobody for what does not come again, and tells what was seen from what was done."""
+"""attribute_failures finds failures that do not recur, and distinguishes wrong observations from wrong actions."""
 
 import pytest
 import torch
@@ -7,8 +7,8 @@ from tensordict import TensorDict
 import lw_torchrl as lw
 from benchmarks.planted import Altered, Jammed, Sensor, fingers, moved_thing, scaled
 from lw_torchrl.evaluation import attribute_failures
-from lw_torchrl.evaluation.diagnose.findings import Difference, Misled
-from lw_torchrl.evaluation.diagnose.rerun import difference
+from lw_torchrl.evaluation.diagnose.counterfactuals import difference
+from lw_torchrl.evaluation.diagnose.failure import Difference, Misled
 from lw_torchrl.evaluation.diagnose.sentences import finding_text
 
 TASK, SEED = "drawer-open", 7
@@ -21,29 +21,29 @@ def scripted():
     return lw.ScriptedSkillActor(PLANS)
 
 
-def ran(actor, **options):
-    """Return its one episode."""
-    seen = []
-    how = {"tasks": TASK, "also_record": RECORDED, "on_episode": seen.append, **RUN, **options}
-    lw.evaluate(actor, episodes_per_task=1, stop_at_success=True, **how)
-    return seen
+def run(actor, **options):
+    """Return a list of one episode."""
+    episodes = []
+    options = {"tasks": TASK, "also_record": RECORDED, "on_episode": episodes.append, **RUN, **options}
+    lw.evaluate(actor, episodes_per_task=1, stop_at_success=True, **options)
+    return episodes
 
 
-def test_an_episode_that_was_cut_lacks_nothing_but_its_end():
-    [one] = ran(scripted())
-    assert one.first_success is not None
-    assert one.first_success > 30
-    [failure] = attribute_failures([one._replace(steps=one.steps[:30])], PLANS, actor=scripted(), **RUN)
+def test_an_episode_that_was_cut_before_its_success_is_not_reproducible():
+    [episode] = run(scripted())
+    assert episode.first_success is not None
+    assert episode.first_success > 30
+    [failure] = attribute_failures([episode._replace(steps=episode.steps[:30])], PLANS, actor=scripted(), **RUN)
     assert (failure.cause, failure.step, failure.counterfactuals) == ("not reproducible", None, {})
-    assert failure.finding == Difference("length", 29, 30, one.first_success)
-    assert failure.succeeds_at == one.first_success
-    assert f"the length: the rollout has 30 steps, the re-run {one.first_success}" in failure.why
+    assert failure.finding == Difference("length", 29, 30, episode.first_success)
+    assert failure.succeeds_at == episode.first_success
+    assert f"the rollout has 30 steps, the re-run {episode.first_success}" in failure.why
     assert failure.shares["nothing"] == 1.0
 
 
 @pytest.mark.parametrize("options", [{"evaluator": Jammed(1.0, 1.0, 0.1, 1.0)}, {"noise_scale": 1.0}])
-def test_another_environment_or_noise_is_nobody_s_fault(options):
-    [failure] = attribute_failures(ran(scripted(), **options), PLANS, actor=scripted(), **RUN)
+def test_a_failure_by_another_environment_or_noise_is_not_reproducible(options):
+    [failure] = attribute_failures(run(scripted(), **options), PLANS, actor=scripted(), **RUN)
     assert failure.cause == "not reproducible"
     assert (failure.finding.part, failure.finding.at) == ("actions", 0)
     assert failure.mended is None
@@ -54,31 +54,31 @@ def rollout(states, actions):
     return TensorDict(observation=steps, action=torch.tensor(actions)[:, None].expand(-1, 4), batch_size=[len(states)])
 
 
-def test_what_differs_between_two_runs():
-    one = rollout([0.0, 1.0, 2.0], [0.5, 0.5, 0.5])
-    assert difference(one, one) is None
-    assert difference(one[:2], one) == Difference("length", 1, 2, 3)
-    assert difference(rollout([0.0, 1.0, 3.0], [0.5, 0.5, 0.5]), one) == Difference("environment", 2)
-    found = difference(rollout([0.0, 1.0, 3.0], [0.5, 0.2, 0.5]), one)
-    assert found == Difference("actions", 1, size=pytest.approx(0.3))
-    assert "the executed actions, from step 1 on, there by 0.3" in finding_text(found)
-    found = difference(rollout([0.0, 3.0], [0.5, 0.5]).exclude("action"), one)
-    assert found == Difference("states", 1)
-    assert "holds no actions" in finding_text(found)
+def test_the_first_difference_between_two_runs_is_found():
+    again = rollout([0.0, 1.0, 2.0], [0.5, 0.5, 0.5])
+    assert difference(again, again) is None
+    assert difference(again[:2], again) == Difference("length", 1, 2, 3)
+    assert difference(rollout([0.0, 1.0, 3.0], [0.5, 0.5, 0.5]), again) == Difference("environment", 2)
+    actions = difference(rollout([0.0, 1.0, 3.0], [0.5, 0.2, 0.5]), again)
+    assert (actions.part, actions.at, actions.size) == ("actions", 1, pytest.approx(0.3))
+    assert "the executed actions, from step 1 on, there by 0.3" in finding_text(actions)
+    states = difference(rollout([0.0, 3.0], [0.5, 0.5]).exclude("action"), again)
+    assert states == Difference("states", 1)
+    assert "holds no actions" in finding_text(states)
 
 
 @pytest.mark.parametrize("inside", [True, False])
-def test_a_policy_that_is_shown_another_state_is_told(inside):
+def test_a_wrong_observation_is_found(inside):
     actor = Altered(scripted(), shown=moved_thing(0.1, 0.0)) if inside else scripted()
     evaluator = None if inside else Sensor(PLANS, 0.1)
-    run = {**RUN, "evaluator": evaluator}
-    [failure] = attribute_failures(ran(actor, evaluator=evaluator), PLANS, actor=actor, **run)
+    episodes = run(actor, evaluator=evaluator)
+    [failure] = attribute_failures(episodes, PLANS, actor=actor, evaluator=evaluator, **RUN)
     assert (failure.cause, failure.counterfactuals) == ("perception", {"perception": True})
     assert isinstance(failure.finding, Misled)
     assert failure.finding.error == pytest.approx(0.1, abs=1e-3)
     assert "was off by up to 0.1" in failure.why
     assert failure.mended.by == "perception"
-    assert not any(module._forward_pre_hooks for module in actor.modules()), "nothing stays on the policy"
+    assert not any(module._forward_pre_hooks for module in actor.modules()), "no hook stays on the policy"
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_a_policy_that_is_shown_another_state_is_told(inside):
         pytest.param("push", scaled(0.05, 0.05, 0.05, 0.0), "policy", marks=pytest.mark.slow),
     ],
 )
-def test_the_part_of_the_action_that_is_wrong(task, done, cause):
+def test_the_wrong_part_of_the_action_is_found(task, done, cause):
     plans = lw.Plans({task: lw.load_plans("MT10")[task]})
     actor = Altered(lw.ScriptedSkillActor(plans), done=done)
     result = lw.evaluate(actor, tasks=task, episodes_per_task=1, stop_at_success=True, attribute=True, **RUN)
@@ -99,7 +99,7 @@ def test_the_part_of_the_action_that_is_wrong(task, done, cause):
     assert "a plain re-run 0%" in failure.why
 
 
-def test_a_policy_without_plans_is_told_of_no_step():
+def test_a_failure_of_a_policy_without_plans_has_no_step():
     torch.manual_seed(0)
     actor = lw.DescriptorConditionedActor(TASK, condition="one-hot", decoder=lw.modules.MLPDecoder(width=8, depth=1))
     result = lw.evaluate(

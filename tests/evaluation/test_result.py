@@ -1,8 +1,9 @@
-"""EvaluationResult: the statistics by hand, and a file that is whole or refused."""
+"""EvaluationResult: statistics, tables, failures, and a file that is whole or refused."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from datetime import UTC, datetime
 from hashlib import sha256
 
@@ -14,7 +15,8 @@ from mutations import mutated
 
 import lw_torchrl
 from lw_torchrl._util.reproducibility import package_versions
-from lw_torchrl.evaluation import EpisodeResult, EvaluationResult
+from lw_torchrl.evaluation import EpisodeResult, EvaluationResult, Failure, plot_failures
+from lw_torchrl.evaluation.diagnose.failure import ActiveStep, Difference, WrongAnswers
 
 CONFIG = {
     "tasks": ["push", "reach", "sweep"],
@@ -41,13 +43,37 @@ def make_result():
 
 
 def stopped():
-    """An evaluation that stopped at success."""
+    """A result of an evaluation with stop_at_success=True."""
     episodes = [EpisodeResult("reach", 0, True, 9, None, None), EpisodeResult("reach", 1, False, None, None, None)]
     config = {**CONFIG, "tasks": ["reach"], "episodes_per_task": 2, "stop_at_success": True}
     return EvaluationResult(config, tuple(episodes))
 
 
-def test_the_statistics_by_hand():
+WRONG = WrongAnswers(2, "the gripper is open", 40, 500, 31)
+FAILURES = (
+    Failure("push", 1, 0, "query", "skill", 2, 31, WRONG, replaced="query + skill", succeeds_at=90,
+            evidence={"wrong": 0.4}, counterfactuals={"query": False, "query + skill": True}, shares={"nothing": 0.0}),
+    Failure("push", 1, 1, "undecided", None, None, 499, ActiveStep(0, "push", 9, 100), suspect="skill"),
+    Failure("reach", 1, 1, "skill", None, 0, 0, ActiveStep(0, "reach", 100, 100, 0.1), counterfactuals={"skill": True}),
+)  # fmt: skip
+
+
+def attributed(failures=FAILURES):
+    """A result with the causes of its failures."""
+    episodes = [
+        EpisodeResult("push", 0, False, None, False, 0.0),
+        EpisodeResult("push", 1, False, None, False, 0.0),
+        EpisodeResult("reach", 0, True, 4, True, 496.0),
+        EpisodeResult("reach", 1, False, None, False, 0.0),
+    ]
+    config = {**CONFIG, "tasks": ["push", "reach"], "episodes_per_task": 2}
+    return EvaluationResult(config, tuple(episodes), failures=failures)
+
+
+# ---- statistics, tables and figures
+
+
+def test_the_statistics_equal_those_by_hand():
     result = make_result()
     assert result.success_once == {"push": pytest.approx(2 / 3), "reach": 1.0, "sweep": 0.0}
     assert result.success_at_end == {"push": pytest.approx(1 / 3), "reach": 1.0, "sweep": 0.0}
@@ -56,34 +82,75 @@ def test_the_statistics_by_hand():
     assert result.mean_success == pytest.approx(5 / 9)
 
 
-def test_what_a_stopped_episode_does_not_know_is_none():
+def test_statistics_that_a_stopped_episode_lacks_are_none():
     result = stopped()
-    assert result.success_once == {"reach": 0.5}
-    assert result.first_success == {"reach": 9.0}
+    assert (result.success_once, result.first_success) == ({"reach": 0.5}, {"reach": 9.0})
     assert result.success_at_end == result.mean_return == {"reach": None}
 
 
-@pytest.mark.parametrize("make", [make_result, stopped])
-def test_it_reads_back(tmp_path, make):
-    result = make()
-    result.save(tmp_path / "runs" / "results.json")
-    found = EvaluationResult.load(tmp_path / "runs" / "results.json")
-    assert found == result
-    assert found.success_once == result.success_once
-    assert found.first_success == result.first_success
-    found.save(tmp_path / "again.json")
-    assert (tmp_path / "again.json").read_bytes() == (tmp_path / "runs" / "results.json").read_bytes()
+def test_the_table_shows_every_task():
+    lines = make_result().table().splitlines()
+    assert len(lines) == 5
+    assert lines[1].split() == ["push", "0.67", "0.33", "16"]
+    assert lines[3].split() == ["sweep", "0.00", "0.00", "-"]
+    assert lines[4].split() == ["mean", "0.56", "0.44", "-"]
+    assert stopped().table().splitlines()[1].split() == ["reach", "0.50", "-", "9"]
 
 
-def test_the_file_can_be_read_by_anyone(tmp_path):
+def test_the_failure_table_counts_causes():
+    assert attributed().failure_table().splitlines() == [
+        "task       failed  query  skill  undecided",
+        "push       2 of 2      1      0          1",
+        "reach      1 of 2      0      1          0",
+        "all        3 of 4      1      1          1",
+    ]
+
+
+def test_the_failure_figure_has_a_bar_for_each_task_that_failed(tmp_path):
+    axes = plot_failures(attributed(), tmp_path / "failures.png", title="a policy").axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["reach", "push"]
+    widths = [[bar.get_width() for bar in bars] for bars in axes.containers]
+    assert widths == [[0, 1], [1, 0], [0, 1]], "query, skill, undecided"
+    assert axes.get_title() == "a policy\n3 of 4 episodes failed"
+    assert plot_failures(attributed(())).axes[0].get_title() == "0 of 4 episodes failed"
+    assert (tmp_path / "failures.png").stat().st_size > 1000
+    with pytest.raises(ValueError, match="path"):
+        plot_failures(attributed(), tmp_path / "failures.txt")
+
+
+@pytest.mark.parametrize("show", [EvaluationResult.failure_table, plot_failures])
+def test_failures_that_were_not_attributed_cannot_be_shown(show):
+    with pytest.raises(ValueError, match="attribute=True"):
+        show(make_result())
+
+
+# ---- files
+
+
+DIFFERENCE = replace(FAILURES[0], finding=Difference("actions", 3, size=0.5))
+RESULTS = [make_result(), stopped(), attributed(), attributed((DIFFERENCE, *FAILURES[1:]))]
+
+
+@pytest.mark.parametrize("result", RESULTS)
+def test_a_saved_result_reads_back(tmp_path, result):
+    first, second = tmp_path / "runs" / "results.json", tmp_path / "again.json"
+    result.save(first)
+    loaded = EvaluationResult.load(first)
+    assert loaded == result
+    assert (loaded.success_once, loaded.first_success) == (result.success_once, result.first_success)
+    loaded.save(second)
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_the_file_is_plain_json(tmp_path):
     make_result().save(tmp_path / "results.json")
-    found = json.loads((tmp_path / "results.json").read_text())
-    assert found["config"] == CONFIG
-    assert found["success_once"]["reach"] == 1.0
-    assert found["first_success"]["sweep"] is None
-    assert found["mean_success_once"] == pytest.approx(5 / 9)
-    assert len(found["episodes"]) == 9
-    assert found["episodes"][0] == {
+    content = json.loads((tmp_path / "results.json").read_text())
+    assert content["config"] == CONFIG
+    assert (content["success_once"]["reach"], content["first_success"]["sweep"]) == (1.0, None)
+    assert content["mean_success_once"] == pytest.approx(5 / 9)
+    assert "failures" not in content
+    assert len(content["episodes"]) == 9
+    assert content["episodes"][0] == {
         "task": "push",
         "episode": 0,
         "success": True,
@@ -93,125 +160,145 @@ def test_the_file_can_be_read_by_anyone(tmp_path):
     }
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_the_error_for_a_missing_file_names_it(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"path: no result file .*nowhere.json"):
         EvaluationResult.load(tmp_path / "nowhere.json")
 
 
 def change(**entries):
-    return lambda found: found.update(entries)
+    return lambda content: content.update(entries)
 
 
 def edit(number, **entries):
-    return lambda found: found["episodes"][number].update(entries)
+    return lambda content: content["episodes"][number].update(entries)
 
 
 def configure(**entries):
-    return lambda found: found["config"].update(entries)
+    return lambda content: content["config"].update(entries)
 
 
 DAMAGE = {
-    "a success that is 5": edit(0, success=5),
-    "a success that is 1": edit(0, success=1),
+    "success is 5": edit(0, success=5),
+    "success is 1": edit(0, success=1),
     "an episode twice": edit(1, episode=0),
-    "an episode more than once in full": lambda found: found["episodes"].append(found["episodes"][0]),
-    "a missing episode": lambda found: found["episodes"].pop(),
-    "an empty list of episodes": change(episodes=[]),
-    "no tasks and no episodes": lambda found: (found["config"].update(tasks=[]), found.update(episodes=[])),
-    "an episode that is negative": edit(0, episode=-1),
-    "an episode that is true": edit(1, episode=True),
+    "a whole episode twice": lambda content: content["episodes"].append(content["episodes"][0]),
+    "a missing episode": lambda content: content["episodes"].pop(),
+    "no episodes": change(episodes=[]),
+    "no tasks and no episodes": lambda content: (content["config"].update(tasks=[]), content.update(episodes=[])),
+    "a negative episode": edit(0, episode=-1),
+    "episode is true": edit(1, episode=True),
     "an episode of another task": edit(0, task="drawer-open"),
-    "a task that is none": edit(0, task=["push"]),
-    "a first success of 0": edit(0, first_success=0),
-    "a first success past the end": edit(0, first_success=501),
+    "task is a list": edit(0, task=["push"]),
+    "first success is 0": edit(0, first_success=0),
+    "a first success after the end": edit(0, first_success=501),
     "a first success without success": edit(2, first_success=7),
     "a success without its first": edit(0, first_success=None),
-    "a first success that is a float": edit(0, first_success=10.0),
-    "a success at the end alone": edit(2, success_at_end=True),
-    "a success at the end that is a text": edit(0, success_at_end="yes"),
-    "a return that is a text": edit(0, episode_return="4.0"),
+    "first success is a float": edit(0, first_success=10.0),
+    "a success only at the end": edit(2, success_at_end=True),
+    "success at the end is a string": edit(0, success_at_end="yes"),
+    "return is a string": edit(0, episode_return="4.0"),
     "a return of 400 digits": edit(0, episode_return=10**400),
-    "a return that is nan": edit(0, episode_return=float("nan")),
-    "a task twice in config": lambda found: found["config"]["tasks"].append("push"),
-    "tasks that are a text": configure(tasks="push"),
-    "tasks that are numbers": configure(tasks=[1, 2]),
-    "tasks of success_once that are others": lambda found: found["success_once"].pop("push"),
-    "a number of episodes that is another": configure(episodes_per_task=4),
-    "a number of episodes that is true": configure(episodes_per_task=True),
-    "a seed that is a text": configure(seed="1"),
-    "a noise that is negative": configure(noise_scale=-0.1),
-    "a number of steps that is null": configure(max_steps=None),
-    "a stop that is a number": configure(stop_at_success=0),
-    "no seed": lambda found: found["config"].pop("seed"),
-    "an origin that is a text": change(origin="mine"),
-    "a version that is a list": change(version=[[1]]),
+    "return is nan": edit(0, episode_return=float("nan")),
+    "a task twice in config": lambda content: content["config"]["tasks"].append("push"),
+    "tasks is a string": configure(tasks="push"),
+    "tasks are numbers": configure(tasks=[1, 2]),
+    "other tasks in success_once": lambda content: content["success_once"].pop("push"),
+    "another number of episodes": configure(episodes_per_task=4),
+    "number of episodes is true": configure(episodes_per_task=True),
+    "seed is a string": configure(seed="1"),
+    "negative noise": configure(noise_scale=-0.1),
+    "max_steps is null": configure(max_steps=None),
+    "stop_at_success is a number": configure(stop_at_success=0),
+    "no seed": lambda content: content["config"].pop("seed"),
+    "origin is a string": change(origin="mine"),
+    "version is a list": change(version=[[1]]),
     "another format": change(format="minari"),
     "another version": change(version=2),
-    "no configuration": lambda found: found.pop("config"),
-    "an unknown entry": lambda found: found["episodes"][0].update(colour="red"),
-    "a missing entry": lambda found: found["episodes"][0].pop("success"),
-    "episodes of another kind": change(episodes=[1, 2]),
-    "a configuration of another kind": change(config=[]),
-    "a task without episodes": lambda found: found["config"]["tasks"].append("drawer-open"),
+    "no config": lambda content: content.pop("config"),
+    "an unknown entry": lambda content: content["episodes"][0].update(colour="red"),
+    "a missing entry": lambda content: content["episodes"][0].pop("success"),
+    "episodes are numbers": change(episodes=[1, 2]),
+    "config is a list": change(config=[]),
+    "a task without episodes": lambda content: content["config"]["tasks"].append("drawer-open"),
 }
 
 
+def damaged_file(path, result, damage):
+    result.save(path)
+    content = json.loads(path.read_text())
+    damage(content)
+    path.write_text(json.dumps(content))
+    return path
+
+
 @pytest.mark.parametrize("name", DAMAGE)
-def test_a_wrong_file_is_refused_and_left_alone(tmp_path, name):
-    path = tmp_path / "results.json"
-    make_result().save(path)
-    found = json.loads(path.read_text())
-    DAMAGE[name](found)
-    path.write_text(json.dumps(found))
+def test_a_damaged_file_is_refused_and_left_unchanged(tmp_path, name):
+    path = damaged_file(tmp_path / "results.json", make_result(), DAMAGE[name])
     before = path.read_bytes()
     with pytest.raises(ValueError, match=r"results.json' is not a result of lw_torchrl.evaluation version 1"):
         EvaluationResult.load(path)
     assert path.read_bytes() == before
 
 
+DAMAGED_FAILURES = {
+    "task": ["sweep", 3, None],
+    "seed": [2, True, 1.0],
+    "episode": [-1, 0.0, 7],
+    "cause": ["luck", None, []],
+    "also": ["query", "undecided", 1],
+    "step": [-1, 1.5, True],
+    "at": [-1, 500, None],
+    "finding": [3, "he fell", {}, {"kind": "Luck"}, {"kind": "WrongAnswers"}],
+    "suspect": ["luck", 3],
+    "replaced": ["luck", 3],
+    "rival": ["luck", True],
+    "succeeds_at": [0, "1"],
+    "scripted_step": [-1, 0.5],
+    "evidence": [[], {"x": "1"}, {"x": 1e301}, {"x": True}, {"x": 1, "y": True}],
+    "counterfactuals": [[], {"luck": True}, {"query": 1}, {"": True}, {"query": True, "plan": 1}],
+    "shares": [[], {"x": "1"}, {"x": True}],
+}
+WRONG_FINDINGS = {"step": -1, "condition": 3, "states": None, "of": 0, "first": 1.5, "more": 1}
+FINDINGS = {name: {"kind": "WrongAnswers", **vars(WRONG), name: value} for name, value in WRONG_FINDINGS.items()}
+CASES = [*((name, value) for name, values in DAMAGED_FAILURES.items() for value in values)]
+CASES += [("finding", finding) for finding in FINDINGS.values()]
+
+
+@pytest.mark.parametrize(("name", "value"), CASES)
+def test_a_damaged_failure_is_refused(tmp_path, name, value):
+    damage = lambda content: content["failures"][0].update({name: value})  # noqa: E731
+    path = damaged_file(tmp_path / "results.json", attributed(), damage)
+    with pytest.raises(ValueError, match=name if name not in ("task", "episode") else r"failures|task|episode"):
+        EvaluationResult.load(path)
+
+
+@pytest.mark.parametrize("failures", [{}, [3], [{}], FAILURES[:2], (*FAILURES, FAILURES[0])])
+def test_there_must_be_one_failure_for_each_failed_episode(tmp_path, failures):
+    content = [each.to_json() for each in failures] if isinstance(failures, tuple) else failures
+    path = damaged_file(tmp_path / "results.json", attributed(()), change(failures=content))
+    with pytest.raises(ValueError, match=r"[Ff]ailure"):
+        EvaluationResult.load(path)
+
+
+def test_an_undecided_failure_has_no_second_cause():
+    with pytest.raises(ValueError, match="also"):
+        replace(FAILURES[1], also="skill")
+
+
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_a_file_of_another_shape_is_refused_or_holds_together(tmp_path, data):
+def test_a_mutated_file_is_refused_or_consistent(tmp_path, data):
     path = tmp_path / "results.json"
     stopped().save(path)
     path.write_text(json.dumps(data.draw(mutated(json.loads(path.read_text())))))
     try:
-        found = EvaluationResult.load(path)
+        result = EvaluationResult.load(path)
     except ValueError:
         return
-    assert 0 <= found.mean_success <= 1
-    found.table()
-    found.save(path)
-    assert EvaluationResult.load(path) == found
-
-
-def test_our_version_is_that_of_the_code_that_runs(monkeypatch):
-    # An old editable install reports the version that it was installed with.
-    monkeypatch.setattr("lw_torchrl._util.reproducibility.version", lambda name: "0.0.1")
-    found = package_versions()
-    assert found["lw_torchrl"] == lw_torchrl.__version__
-    assert found["torch"] == "0.0.1"
-
-
-def test_it_says_where_it_came_from(tmp_path):
-    checkpoint = tmp_path / "policy.safetensors"
-    checkpoint.write_bytes(b"weights")
-    before = datetime.now(UTC).replace(microsecond=0)
-    make_result().save(tmp_path / "results.json", checkpoint=checkpoint, plans="0123abcd")
-    found = EvaluationResult.load(tmp_path / "results.json")
-    assert before <= datetime.fromisoformat(found.origin["date"]) <= datetime.now(UTC)
-    assert found.origin["versions"] == package_versions()
-    assert found.origin["checkpoint"] == {"path": str(checkpoint), "sha256": sha256(b"weights").hexdigest()}
-    assert found.origin["plans"] == "0123abcd"
-    assert found == make_result(), "where it came from is no part of what was measured"
-    make_result().save(tmp_path / "plain.json")
-    assert EvaluationResult.load(tmp_path / "plain.json").origin.keys() == {"date", "versions"}
-    content = json.loads((tmp_path / "plain.json").read_text())
-    (tmp_path / "old.json").write_text(json.dumps({key: content[key] for key in content if key != "origin"}))
-    assert EvaluationResult.load(tmp_path / "old.json").origin == {}
-    with pytest.raises(FileNotFoundError, match="nowhere"):
-        make_result().save(tmp_path / "other.json", checkpoint=tmp_path / "nowhere.safetensors")
-    assert not (tmp_path / "other.json").exists()
+    assert 0 <= result.mean_success <= 1
+    result.table()
+    result.save(path)
+    assert EvaluationResult.load(path) == result
 
 
 NESTED = b'{"format": ' + b"[" * 100_000 + b"]" * 100_000 + b"}"
@@ -227,18 +314,28 @@ def test_a_file_that_is_not_a_result_is_refused(tmp_path, name):
         EvaluationResult.load(tmp_path / "results.json")
 
 
-def test_numbers_that_are_none_are_not_written(tmp_path):
-    episode = EpisodeResult("reach", 0, True, 1, True, float("nan"))
-    result = EvaluationResult({**CONFIG, "tasks": ["reach"]}, (episode,))
-    with pytest.raises(ValueError, match="JSON"):
-        result.save(tmp_path / "results.json")
-    assert not list(tmp_path.iterdir())
+def test_the_recorded_version_is_that_of_the_running_code(monkeypatch):
+    monkeypatch.setattr(
+        "lw_torchrl._util.reproducibility.version", lambda name: "0.0.1"
+    )  # as an old editable install says
+    versions = package_versions()
+    assert versions["lw_torchrl"] == lw_torchrl.__version__
+    assert versions["torch"] == "0.0.1"
 
 
-def test_the_table_shows_every_task():
-    lines = make_result().table().splitlines()
-    assert len(lines) == 5
-    assert lines[1].split() == ["push", "0.67", "0.33", "16"]
-    assert lines[3].split() == ["sweep", "0.00", "0.00", "-"]
-    assert lines[4].split() == ["mean", "0.56", "0.44", "-"]
-    assert stopped().table().splitlines()[1].split() == ["reach", "0.50", "-", "9"]
+def test_the_file_records_its_origin(tmp_path):
+    checkpoint = tmp_path / "policy.safetensors"
+    checkpoint.write_bytes(b"weights")
+    before = datetime.now(UTC).replace(microsecond=0)
+    make_result().save(tmp_path / "results.json", checkpoint=checkpoint, plans="0123abcd")
+    loaded = EvaluationResult.load(tmp_path / "results.json")
+    assert before <= datetime.fromisoformat(loaded.origin["date"]) <= datetime.now(UTC)
+    assert loaded.origin["versions"] == package_versions()
+    assert loaded.origin["checkpoint"] == {"path": str(checkpoint), "sha256": sha256(b"weights").hexdigest()}
+    assert loaded.origin["plans"] == "0123abcd"
+    assert loaded == make_result(), "the origin is not compared"
+    damaged_file(tmp_path / "old.json", make_result(), lambda content: content.pop("origin"))
+    assert EvaluationResult.load(tmp_path / "old.json").origin == {}
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        make_result().save(tmp_path / "other.json", checkpoint=tmp_path / "nowhere.safetensors")
+    assert not (tmp_path / "other.json").exists()

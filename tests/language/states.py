@@ -1,4 +1,4 @@
-"""States to ask queries about: random ones near the thresholds, and those of Meta-World's own episodes."""
+"""States for queries, random ones near the thresholds and those of Meta-World's episodes; relations one by one."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from lw_torchrl.language.queries import supported_queries
+from lw_torchrl.language.relations import RELATIONS
 from lw_torchrl.language.tasks import MT50, TASKS, task_id
 
 RANDOM, REAL = 200, 100  # states of each task
@@ -89,3 +90,17 @@ def all_tasks():
         [torch.from_numpy(random_states(MT50[i], seed=3, n=30))[row % 30] for row, i in enumerate(ids.tolist())]
     )
     return queries, states, ids
+
+
+def comparison_holds(part, d):
+    """Return whether a Comparison of d is true: (..., 3) metres to (...) bool."""
+    values = [d[..., "xyz".index(axis)] + (part.raise_z if axis == "z" else 0.0) for axis in part.axes]
+    value = torch.stack([x.square() for x in values]).sum(0).sqrt() if part.length else values[0]
+    if part.sense == "<":
+        return value < part.threshold
+    return value > part.threshold if part.sense == ">" else value <= part.threshold
+
+
+def relation_holds(relation, first, second):
+    """Return whether a relation is true of two positions: (..., 3) float, metres, to (...) bool."""
+    return torch.stack([comparison_holds(part, first - second) for part in RELATIONS[relation]]).all(0)

@@ -1,4 +1,4 @@
-"""Canonical plans: what anyone's words become, when a plan keeps its own steps, and that nothing looks at our plans."""
+"""Canonical plans: the roles of steps, when a plan keeps its own steps, and independence of the shipped plans."""
 
 import inspect
 from dataclasses import replace
@@ -9,9 +9,17 @@ from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from lw_torchrl.language import canonical, roles, step_parser
-from lw_torchrl.language.canonical import MIN_CONFIDENCE, canonical_plan, explain_canonical, fallback_plan
-from lw_torchrl.language.objects import GOAL, GRIPPER
-from lw_torchrl.language.roles import mark_objects, role_vectors
+from lw_torchrl.language.canonical import (
+    MIN_CONFIDENCE,
+    canonical_plan,
+    canonical_plans,
+    explain_canonical,
+    fallback_plan,
+)
+from lw_torchrl.language.objects import GOAL, GRIPPER, NamedObject
+from lw_torchrl.language.plan_files import parse_plan
+from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
+from lw_torchrl.language.roles import StepRole, mark_objects, role_vectors
 from lw_torchrl.language.step_parser import parse_steps
 from lw_torchrl.language.tasks import first_object, role_object
 
@@ -27,13 +35,12 @@ def roles_of(plan):
     return [step.role for step in canonical_plan(plan).steps]
 
 
+def meanings(plan):
+    return [(role.verb, role.moved, role.target, role.manner, role.direction) for role in roles_of(plan)]
+
+
 def without_roles(plan):
-    return replace(plan, steps=[replace(step, role=None) for step in plan.steps], confidence=None)
-
-
-def read_one(task, condition, text):
-    (found,) = parse_steps(plan_of(task, (condition, text)))
-    return found
+    return replace(plan, steps=tuple(replace(step, role=None) for step in plan.steps), confidence=None)
 
 
 @pytest.mark.parametrize(
@@ -57,9 +64,9 @@ def read_one(task, condition, text):
         ("reach", "gripper is open", "stay at the target", "hold", G, GOAL, None),
     ],
 )  # fmt: skip
-def test_a_step_says_its_verb_things_and_direction(task, condition, text, verb, moved, target, direction):
-    found = read_one(task, condition, text)
-    assert (found.verb, found.moved, found.target, found.direction) == (verb, moved, target, direction)
+def test_the_verb_objects_and_direction_of_a_step(task, condition, text, verb, moved, target, direction):
+    (step,) = parse_steps(plan_of(task, (condition, text)))
+    assert (step.verb, step.moved, step.target, step.direction) == (verb, moved, target, direction)
 
 
 GRASP = ("gripper is near the stick handle and gripper is open", "close the gripper around the stick")
@@ -76,28 +83,29 @@ HELD = "gripper is near the stick handle and gripper is closed"
         (HELD, "move the gripper over the goal", "stick", GOAL),
     ],
 )
-def test_what_is_held_goes_where_words_or_conditions_say(condition, text, moved, target):
-    *_, found = parse_steps(plan_of("stick-pull", GRASP, (condition, text)))
-    assert (found.moved, found.target) == (moved, target if target != GOAL else "target location")
+def test_a_held_object_moves_to_the_target_in_the_words_or_the_condition(condition, text, moved, target):
+    *_, step = parse_steps(plan_of("stick-pull", GRASP, (condition, text)))
+    assert (step.moved, step.target) == (moved, target)
 
 
-def test_the_point_that_a_condition_compares_is_what_is_moved():
-    roles = roles_of(OWN["assembly"])
-    assert [(role.verb, role.moved, role.target) for role in roles[3:]] == [("carry", "wrench ring", "peg")] * 2
-
-
-def test_over_a_wall_is_on_the_way_to_the_goal():
-    roles = roles_of(OWN["push-wall"])
-    assert [(role.verb, role.moved, role.target) for role in roles[3:]] == [("carry", "puck", GOAL)] * 2
+@pytest.mark.parametrize(
+    ("task", "step"),
+    [
+        ("assembly", ("carry", "wrench ring", "peg")),  # the point that the condition compares
+        ("push-wall", ("carry", "puck", GOAL)),  # over the wall is on the way to the goal
+    ],
+)
+def test_the_last_steps_of_a_shipped_plan(task, step):
+    assert [(role.verb, role.moved, role.target) for role in roles_of(OWN[task])[3:]] == [step] * 2
 
 
 @pytest.mark.parametrize("task", OWN)
-def test_shipped_plans_are_read_and_their_canonical_form_is_a_plan(task):
+def test_shipped_plans_are_parsed_and_their_canonical_form_is_a_plan(task):
     for plan in (OWN[task], MT10_SKILLS[task]):
         report = explain_canonical(plan)
         assert report.source in ("plan", "completed")
         assert not report.left_out
-        assert lw.language.plans.parse_plan(str(report.plan)) == without_roles(report.plan)
+        assert parse_plan(str(report.plan)) == without_roles(report.plan)
         for role in roles_of(plan):
             for name in role.objects:
                 role_object(plan.definition, name)
@@ -108,18 +116,16 @@ def test_the_canonical_form_of_a_canonical_plan_is_itself(task):
     plan = canonical_plan(OWN[task])
     again = canonical_plan(without_roles(plan))
     assert without_roles(again) == without_roles(plan)
-    assert [(r.verb, r.moved, r.target, r.direction) for r in roles_of(again)] == [
-        (r.verb, r.moved, r.target, r.direction) for r in roles_of(plan)
-    ]
+    assert meanings(again) == meanings(plan)
 
 
-def test_nothing_of_a_plan_comes_from_the_shipped_plans_or_skills():
+def test_the_parser_does_not_use_the_shipped_plans_or_skills():
     for module in (canonical, step_parser, roles):
         source = inspect.getsource(module)
         assert not any(name in source for name in ("load_plans", "load_skills", "skills_for", "usual_goal"))
 
 
-def test_a_plan_that_leaves_states_out_is_completed():
+def test_a_plan_that_misses_states_is_completed():
     steps = [
         ("the gripper is not above the mug", "place the gripper above the mug"),
         ("the gripper is near the mug", "place the mug at goal"),
@@ -144,7 +150,7 @@ def test_a_plan_without_a_motion_becomes_the_fallback_plan():
     assert canonical_plan(without_roles(fallback)).confidence == 1.0
 
 
-def test_what_cannot_be_read_is_left_out_by_name():
+def test_an_unreadable_step_is_left_out_by_name():
     steps = [*((str(s.condition), s.skill) for s in OWN["push"].steps), ("the gripper is closed", "be careful")]
     report = explain_canonical(plan_of("push", *steps))
     assert report.left_out == ("be careful",)
@@ -153,7 +159,7 @@ def test_what_cannot_be_read_is_left_out_by_name():
     }  # fmt: skip
 
 
-def test_ones_own_task_has_its_own_things(tmp_path):
+def test_objects_of_a_custom_task(tmp_path):
     (tmp_path / "tasks.toml").write_text("""
 [stack-cup]
 description = "Put the cup on the saucer."
@@ -167,17 +173,12 @@ points."cup rim" = { object = "cup", offset = [0.0, 0.0, 0.05] }
         ("gripper is near the cup rim", "grab the cup"),
         ("gripper is near the cup rim and gripper is closed", "lift the cup onto the saucer"),
     ]
-    found = parse_steps(plan_of(tasks["stack-cup"], *steps))
-    assert [(one.target, one.moved) for one in found] == [("cup", G), ("cup", G), ("saucer", "cup")]
+    parsed = parse_steps(plan_of(tasks["stack-cup"], *steps))
+    assert [(step.target, step.moved) for step in parsed] == [("cup", G), ("cup", G), ("saucer", "cup")]
 
 
-def test_a_hand_goes_to_the_thing_that_is_named_where_a_task_has_no_goal_and_no_first_object(tmp_path):
-    (tmp_path / "tasks.toml").write_text("""
-[touch-second]
-description = "Touch the second block."
-objects.block = "obs[11:14]"
-""")
-    task = lw.load_tasks(tmp_path / "tasks.toml")["touch-second"]
+def test_the_hand_goes_to_the_only_object_in_a_task_without_goal_and_first_object():
+    task = lw.Task("touch-second", "Touch it.", (NamedObject(G, (0, 1, 2)), NamedObject("block", (11, 12, 13))))
     plan = plan_of(task, ("the gripper is not near the block", "move the gripper to the block"))
     assert [(role.verb, role.target) for role in roles_of(plan)] == [("reach", "block")]
     fallback = roles_of(fallback_plan(task))
@@ -189,7 +190,6 @@ words = st.text("abcdefghijklmnopqrstuvwxyz '-.,0123456789", min_size=1, max_siz
 
 @given(st.sampled_from(sorted(OWN)), st.lists(st.tuples(st.integers(0, 5), words), min_size=1, max_size=6))
 def test_any_words_become_a_plan_that_covers_the_task(task, written):
-    """Whatever is written, there is a plan whose steps name objects of the task, and a confidence in [0, 1]."""
     own = OWN[task].steps
     steps = [(own[number % len(own)].condition, f"push {text}") for number, text in written]
     plan = canonical_plan(plan_of(task, *steps))
@@ -211,16 +211,105 @@ def test_the_order_of_clauses_does_not_matter(random, task):
     assert [step.skill for step in report.plan.steps] == [step.skill for step in other.plan.steps]
 
 
-def test_marks_are_of_the_longest_name():
+def test_the_longest_name_is_marked():
     task = OWN["drawer-open"].definition
     assert mark_objects("Pull the drawer handle, then the drawer", task) == "pull <drawer handle>, then <drawer handle>"
     assert first_object(OWN["reach"].definition) is None
 
 
-def test_a_hand_that_is_told_to_go_to_itself_goes_to_the_thing():
-    """As a small model put it."""
+def test_the_hand_cannot_be_its_own_target():
     far, over = "the gripper is not above the plate edge", "the gripper is above the plate edge"
+    # As a small model wrote it.
     written = (far, "set the plate with the gripper above it"), (over, "lower the gripper onto the plate")
     report = explain_canonical(plan_of("plate-slide-back", *written, (over, "pull the plate to the target location")))
     assert report.source == "completed"
     assert {role.target for role in roles_of(report.plan) if role.moved == GRIPPER} == {"plate edge"}
+
+
+# ---- roles
+
+CANONICAL = canonical_plans(OWN, fallback=True)
+DIAL = CANONICAL["dial-turn"]
+
+
+def test_canonical_plans_are_plans_with_roles():
+    assert CANONICAL.has_roles
+    assert not OWN.has_roles
+    assert CANONICAL.task_ids == OWN.task_ids == {task: lw.task_id(task) for task in lw.MT50}
+    assert all(step.skill == step.role.skill for plan in CANONICAL.values() for step in plan.steps)
+
+
+@pytest.mark.parametrize("plans", [CANONICAL, OWN], ids=["roles", "none"])
+def test_roles_and_confidence_are_kept_in_json(plans):
+    again = Plans.from_json(plans.to_json())
+    assert again == plans
+    assert [plan.confidence for plan in again.values()] == [plan.confidence for plan in plans.values()]
+    assert again.numbers == plans.numbers
+
+
+def test_the_json_of_a_plan_without_roles_is_its_text():
+    assert OWN["push"].to_json() == {"plan": str(OWN["push"])}
+
+
+def test_roles_do_not_change_which_queries_are_answered():
+    bare = Plans([without_roles(plan) for plan in CANONICAL.values()])
+    assert bare != CANONICAL
+    assert bare.numbers == CANONICAL.numbers
+
+
+def test_canonical_plans_are_not_parsed_again():
+    assert canonical_plans(CANONICAL) == CANONICAL
+    assert canonical_plan(canonical_plan(OWN["push"]), fallback=True) == canonical_plan(OWN["push"], fallback=True)
+
+
+def test_the_fallback_plan_follows_the_steps_of_the_plan():
+    own = canonical_plan(OWN["dial-turn"])
+    assert DIAL.steps[: len(own.steps)] == own.steps
+    assert [step.role.fallback for step in DIAL.steps] == [False] * len(own.steps) + [True] * 4
+    assert [step.role.verb for step in DIAL.steps[-4:]] == ["approach", "descend", "close", "move"]
+
+
+def test_the_fallback_plan_has_no_fallback():
+    wrong = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "ponder")])
+    plan = canonical_plan(wrong, fallback=True)
+    assert not any(step.role.fallback for step in plan.steps)
+    assert plan.confidence == 0.0
+
+
+def test_a_role_names_the_objects_of_a_step():
+    (step,) = lw.ConditionalPlan.from_pairs("push", [("gripper is open", "put the puck at the target location")]).steps
+    task = lw.TASKS["push"]
+    assert step.mentions(task) == {"robot's gripper", "puck", "target location"}
+    role = StepRole("push", "robot's gripper", "puck", "push", "goal")
+    assert replace(step, skill="nudge it", role=role).mentions(task) == {"robot's gripper", "puck", "target location"}
+    role = replace(role, direction="left")
+    assert replace(step, skill="nudge it", role=role).mentions(task) == {"robot's gripper", "puck"}
+
+
+def test_vectors_of_roles_have_a_one_for_verb_and_manner_each():
+    vectors = role_vectors([step.role for step in DIAL.steps])
+    assert {sum(vector) for vector in vectors} == {2.0}
+    assert len({tuple(vector) for vector in vectors}) > 3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"roles": []}, "one entry for each"),
+        ({"confidence": 2}, "confidence"),
+        ({"confidence": "high"}, "confidence"),
+        ({"more": 1}, "must be like"),
+        ({"roles": {"verb": "juggle"}}, "verb"),
+        ({"roles": {"direction": "north"}}, "direction"),
+        ({"roles": {"target": "moon"}}, "object of task 'dial-turn'"),
+        ({"roles": {"confidence": None}}, "confidence"),
+        ({"roles": {"colour": "red"}}, "role must be a table"),
+    ],
+)
+def test_broken_json_is_refused(change, message):
+    row = DIAL.to_json()
+    roles = change.get("roles")
+    if isinstance(roles, dict):
+        change = {"roles": [row["roles"][0] | roles, *row["roles"][1:]]}
+    with pytest.raises(PlanError, match=message):
+        ConditionalPlan.from_json("dial-turn", row | change)

@@ -2,22 +2,42 @@
 
 import json
 import random
+import tomllib
+from pathlib import Path
 from time import thread_time
+from typing import NamedTuple
 
 import pytest
-from answers import ANSWERS, GRIPPER
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from benchmarks.decoding import mutated
 from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.formats.structured import read_structured, write_structured
 from lw_torchrl.language.nearest import StepMapper
 from lw_torchrl.language.plan_decoding import decode_as, without_thoughts
 from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.planners.prompts import read_structured, write_structured
 
+GRIPPER = "the robot's gripper is"
 formats = st.sampled_from(list(lw.PLAN_FORMATS))
+
+
+class Answer(NamedTuple):
+    """A row of answers.toml: an answer as models write it, and the expected reading."""
+
+    task: str
+    format: str
+    text: str
+    steps: list[list[str]]  # the conditions as queries, and the skills as they are written
+    notes: list[str] = []  # parts of notes, each with its line
+    reason: str = ""
+
+
+ANSWERS = {
+    name: Answer(**row)
+    for name, row in tomllib.loads((Path(__file__).parent / "answers.toml").read_text("utf-8")).items()
+}
 
 
 def decoded(name):
@@ -59,7 +79,7 @@ def test_what_a_model_thinks_first_is_left_out_though_it_be_longer(opening):
     text = f"{opening}\nFirst I thought:\n{draft}\nNo.</think>\n{final}"
     found = lw.decode_plan(text, "push", "chain_py")
     assert found.plan.steps == plans["push"].steps[:2]
-    assert [str(note) for note in found.notes] == ["line 1: thinks aloud; that is left out"]
+    assert [str(note) for note in found.notes] == ["line 1: a thought is left out"]
     assert found.steps[0].line > text[: text.index("</think>")].count("\n")
 
 
@@ -68,7 +88,7 @@ def test_thoughts_without_an_answer_are_no_plan():
     found = lw.decode_plan(f"Well.\n<think>\n{draft}", "push", "chain_py")
     assert found.plan is None
     assert "no steps" in found.reason
-    assert [str(note) for note in found.notes][1:] == ["line 2: thinks aloud; that is left out, and is cut off there"]
+    assert [str(note) for note in found.notes][1:] == ["line 2: a thought is left out, and cut off there"]
 
 
 @pytest.mark.parametrize(
@@ -89,7 +109,7 @@ def test_thoughts_are_marked_in_many_ways(before, after):
     draft, final = (lw.encode_plan(lw.ConditionalPlan("push", plans["push"].steps[:n]), "chain_py") for n in (3, 2))
     found = lw.decode_plan(f"{before.format(draft)}{final}{after.format(draft)}", "push", "chain_py")
     assert found.plan.steps == plans["push"].steps[:2]
-    assert "thinks aloud" in str(found.notes[0])
+    assert "a thought is left out" in str(found.notes[0])
 
 
 @pytest.mark.parametrize("tag", ["</think>", "# </think>", "# <think>", "# done </think>", "# [/THINK]"])
@@ -186,7 +206,7 @@ def test_what_models_call_things(condition, query):
     found = lw.decode_plan(f'if check("{condition}"):\n    robot.push("puck")', "push", "basic_py")
     assert str(found.plan.steps[0].condition) == query
     assert found.steps[0].condition_distance == 0.0
-    assert f"is taken for {query!r}" in str(found.notes[0])
+    assert f"is read as {query!r}" in str(found.notes[0])
 
 
 @pytest.mark.parametrize(
@@ -315,4 +335,4 @@ def test_long_texts_take_no_more_than_their_length(text, format):
 def test_of_more_steps_than_a_plan_has_the_rest_is_left_out():
     found = lw.decode_plan("if check('gripper open'):\n robot.a()\n" * 1_500, "push", "basic_py")
     assert len(found.plan.steps) == len(found.steps) == 1_000
-    assert "line 2001: begins what is more than 1000 steps; 500 are left out" in map(str, found.notes)
+    assert "line 2001: the plan has more than 1000 steps; 500 are left out" in map(str, found.notes)

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from plan_texts import conditional_plans, queries
 
 import lw_torchrl as lw
-from lw_torchrl.language.plans import ConditionalPlan, PlanStep, parse_plan
+from lw_torchrl.language.plan_files import parse_plan
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep
 from lw_torchrl.language.queries import parse_query
 
 NINE = [f"{style}_{container}" for style in ("basic", "chain", "goal") for container in ("py", "py_md", "md")]

@@ -1,139 +1,126 @@
-"""Conditional plans made by hand: checked, and kept in one spelling."""
+"""Conditional plans: checked and kept in one spelling; their goals, and mappings of them."""
 
+import dataclasses
 import time
 
 import pytest
+import torch
 from hypothesis import given, settings
 from plan_texts import DRAWER, conditional_plans, plan
+from states import relation_holds
 
+import lw_torchrl as lw
 from lw_torchrl.language.objects import GRIPPER
-from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, as_plans, parse_plan
+from lw_torchrl.language.plan_files import parse_plan
+from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans, PlanStep, as_plans, usual_goal
 from lw_torchrl.language.queries import Clause, Query, QueryError, parse_query
+
+OPEN = parse_query("gripper open", "push")
+DRAWER_NEAR = parse_query("gripper near drawer handle", "drawer-open")
 
 
 @settings(deadline=None)
 @given(conditional_plans())
-def test_a_plan_is_in_canonical_spelling(given):
-    assert ConditionalPlan(given.task, given.steps) == given
-    for step in given.steps:
+def test_a_plan_is_in_canonical_spelling(drawn):
+    assert ConditionalPlan(drawn.task, drawn.steps) == drawn
+    for step in drawn.steps:
         assert step.skill == " ".join(step.skill.split())
         assert isinstance(step.condition, Query)
 
 
 @pytest.mark.parametrize(
-    ("given", "skill"),
+    ("written", "skill"),
     [
         ("push the puck", "push the puck"),
         ("push puck", "push the puck"),
         ("  push\n the   puck ", "push the puck"),
-        ("let_go the puck", "let go the puck"),
         ("let_go puck", "let go the puck"),
         ("_let__go_ puck", "let go the puck"),
         ('say "hello" to the \\ puck', 'say "hello" to the \\ puck'),
-        ("don't", None),
-        ("pick-up the puck", None),
-        ("3 steps forward", None),
-        ("", None),
-        (" \n", None),
-        ("_", None),
-        ("(push)", None),
-        ("# push", None),
+        *(
+            (wrong, None)
+            for wrong in ("don't", "pick-up the puck", "3 steps forward", "", " \n", "_", "(push)", "# push")
+        ),
     ],
 )
-def test_a_skill_is_kept_in_canonical_spelling_or_refused(given, skill):
+def test_a_skill_is_kept_in_canonical_spelling_or_refused(written, skill):
     if skill is None:
-        with pytest.raises(PlanError, match="step 1 of plan 'push': skill must begin with a plain word"):
-            plan("push", ("gripper open", given))
+        with pytest.raises(PlanError, match="step 1 of plan 'push': skill"):
+            plan("push", ("gripper open", written))
     else:
-        kept = plan("push", ("gripper open", given))
+        kept = plan("push", ("gripper open", written))
         assert kept.steps[0].skill == skill
         assert parse_plan(str(kept)) == kept
 
 
 def test_a_condition_is_kept_in_canonical_spelling():
-    for condition in ("Gripper open?", Query((Clause("gripper", "open"),)), Query((Clause(GRIPPER, "open"),))):
-        step = ConditionalPlan("push", (PlanStep(condition, "push the puck"),)).steps[0]
-        assert step.condition == Query((Clause(GRIPPER, "open"),))
+    for condition in (Query((Clause("gripper", "open"),)), Query((Clause(GRIPPER, "open"),))):
+        assert ConditionalPlan("push", (PlanStep(condition, "push the puck"),)).steps[0].condition == OPEN
 
 
-def test_reasons_play_no_part_in_equality():
-    step = PlanStep(parse_query("gripper open", "push"), "push the puck", "so")
-    assert ConditionalPlan("push", (step,)) == plan()
-    assert hash(ConditionalPlan("push", (step,))) == hash(plan())
+def test_reasons_do_not_count_for_equality():
+    same = ConditionalPlan("push", (PlanStep(OPEN, "push the puck", "so"),))
+    assert same == plan()
+    assert hash(same) == hash(plan())
 
 
 @pytest.mark.parametrize(
-    ("task", "steps", "error", "says"),
+    ("task", "steps", "error", "message"),
     [
-        ("push", (), PlanError, "at least one step"),
-        ("psuh", (PlanStep("gripper open", "push"),), ValueError, "'push'"),
-        (3, (PlanStep("gripper open", "push"),), TypeError, "task"),
-        ("push", (("gripper open", "push"),), TypeError, "step 1"),
-        ("push", (PlanStep("gripper open", "push"), None), TypeError, "step 2"),
-        ("push", (PlanStep(None, "push"),), TypeError, "string"),
-        ("push", (PlanStep("gripper open", "push"), PlanStep("gripper flies", "push")), PlanError, "step 2"),
-        ("push", (PlanStep(parse_query("gripper near drawer handle", "drawer-open"), "x"),), PlanError, "step 1"),
-        ("push", (PlanStep(Query(()), "push"),), PlanError, "step 1"),
+        ("push", (), PlanError, "1 to 1000 steps, got 0"),
+        ("push", plan().steps * 1001, PlanError, "1 to 1000 steps, got 1001"),
+        ("psuh", plan().steps, ValueError, "'push'"),
+        ("push", (PlanStep(OPEN, "push"), None), TypeError, "step"),
+        ("push", (PlanStep(DRAWER_NEAR, "x"),), PlanError, "step 1"),
+        ("push", (PlanStep(OPEN, "push"), PlanStep(Query(()), "push")), PlanError, "step 2"),
+        (
+            "push",
+            (PlanStep(OPEN, "x", goal=parse_query("gripper near drawer handle", "drawer-open")),),
+            PlanError,
+            "step 1",
+        ),
     ],
 )
-def test_a_plan_by_hand_is_checked(task, steps, error, says):
-    with pytest.raises(error, match=says):
+def test_a_faulty_plan_is_refused(task, steps, error, message):
+    with pytest.raises(error, match=message):
         ConditionalPlan(task, steps)
 
 
-def test_a_step_has_a_text_for_its_skill():
-    with pytest.raises(TypeError, match="skill must be a string, got None"):
-        PlanStep("gripper open", None)
-
-
-def test_from_pairs_takes_any_spelling_and_refuses_the_rest():
+def test_from_pairs_accepts_any_spelling_and_refuses_the_rest():
     assert plan("push", ("Is the gripper open?", "push puck")) == plan("push", ("gripper open", "push the puck"))
-    with pytest.raises(PlanError, match="at least one step"):
-        ConditionalPlan.from_pairs("push", [])
     with pytest.raises(QueryError, match="nearest query"):
         plan("push", ("the gripper flies", "push"))
     with pytest.raises(ValueError, match="did you mean 'push'"):
         ConditionalPlan.from_pairs("psuh", [("gripper open", "push")])
 
 
-def test_steps_in_a_list_make_the_same_plan():
-    assert ConditionalPlan("push", list(plan().steps)) == plan()
-    assert {ConditionalPlan("push", list(plan().steps)), plan()} == {plan()}
-
-
-def test_plans_are_a_sorted_mapping():
+def test_plans_are_a_sorted_immutable_mapping():
     drawer = parse_plan(DRAWER)
-    found = Plans([plan(), drawer])
-    assert list(found) == ["drawer-open", "push"]
-    assert len(found) == 2
-    assert found["push"] == plan()
-    assert found == {"push": plan(), "drawer-open": drawer}
-    assert found.num_steps == 3
-    assert found.skills == (
+    plans = Plans([plan(), drawer])
+    assert list(plans) == ["drawer-open", "push"]
+    assert plans == {"push": plan(), "drawer-open": drawer}
+    assert plans.num_steps == 3
+    assert plans.skills == (
         "lower the gripper around the drawer handle",
         "place the gripper above the drawer handle",
         "pull back",
         "push the puck",
     )
-    assert as_plans(found) is found
-    assert as_plans(dict(found)) == found
+    assert as_plans(plans) is plans
+    assert as_plans(dict(plans)) == plans
     with pytest.raises(TypeError):
-        found["reach"] = plan("reach", ("gripper open", "reach"))
+        plans["reach"] = plan("reach", ("gripper open", "reach"))
 
 
-def test_plans_name_what_is_wrong():
-    with pytest.raises(PlanError, match="at least one plan"):
-        Plans({})
-    with pytest.raises(PlanError, match=r"plans\['reach'\] is a plan for another task, 'push'"):
-        Plans({"reach": plan()})
-    with pytest.raises(PlanError, match="one plan for each task"):
-        Plans([plan(), plan()])
-    with pytest.raises(TypeError, match=r"ConditionalPlan|a mapping or a list"):
-        Plans({"push": "def push(robot):"})
-    for wrong in (plan(), [plan()], "push", None):
-        with pytest.raises(TypeError, match="plans must map"):
-            as_plans(wrong)
-    with pytest.raises(PlanError, match="plans lack reach, soccer; they cover push"):
+def test_faulty_plans_are_refused():
+    for wrong, message in (
+        ({}, "at least one plan"),
+        ([plan(), plan()], "one for each task"),
+        ({"reach": plan()}, r"plans\['reach'\].*'push'"),
+    ):
+        with pytest.raises(PlanError, match=message):
+            Plans(wrong)
+    with pytest.raises(PlanError, match="reach, soccer; they cover push"):
         Plans([plan()]).require(["reach", "push", "soccer"])
     Plans([plan()]).require(["push"])
 
@@ -142,7 +129,71 @@ def test_plans_name_what_is_wrong():
 def test_long_texts_take_time_in_proportion(unit):
     skill = "place " + unit * (500_000 // len(unit))
     start = time.process_time()
-    found = ConditionalPlan.from_pairs("push", [("the gripper is open", skill)]).steps[0].skill
+    long = ConditionalPlan.from_pairs("push", [("the gripper is open", skill)]).steps[0].skill
     assert time.process_time() - start < 5
     few = ConditionalPlan.from_pairs("push", [("the gripper is open", "place " + unit * 20)]).steps[0].skill
-    assert found.startswith(few.rstrip(","))
+    assert long.startswith(few.rstrip(","))
+
+
+# ---- goals
+
+SKILLS = lw.load_skills()
+WITH_GOAL = sorted(text for text, skill in SKILLS.items() if skill.goal)
+CARRIED = {"move the peg in line with the hole", "push the peg into the hole"}  # the hand moves and takes the peg along
+
+
+def is_true(clause, at, skill):
+    if clause.object is None:
+        truth = {"open": -1.0, "closed": 1.0}[clause.predicate] == (skill.gripper > 0) - (skill.gripper < 0)
+    else:
+        truth = relation_holds(clause.predicate, at[clause.subject], at[clause.object]).item()
+    return truth != clause.negated
+
+
+def test_every_skill_of_mt10_has_a_goal():
+    assert all(goal is not None for plan in lw.load_plans("MT10").values() for goal in plan.goals)
+    assert len(WITH_GOAL) >= 100
+
+
+@pytest.mark.parametrize("text", [text for text in WITH_GOAL if text not in CARRIED])
+def test_a_goal_is_true_where_its_skill_comes_to_rest(text):
+    checked = 0
+    for task in lw.TASKS.values():
+        goal = usual_goal(text, task)
+        if goal is None or not SKILLS[text].suits(task):
+            continue
+        skill = SKILLS[text].for_task(task)
+        at = task.positions(torch.arange(39.0) * 0.37 % 1.1 + torch.arange(39.0) % 3)  # objects far from each other
+        moved = task.object(skill.moved)
+        shift = at[skill.target] + torch.tensor(skill.offset) - at[skill.moved]
+        for named in task.objects:  # the points on the moved object move, too
+            if named.position == moved.position and named.position != task.object(skill.target).position:
+                at[named.name] = at[named.name] + shift
+        assert all(is_true(clause, at, skill) for clause in goal.clauses), (task.name, str(goal))
+        checked += 1
+    assert checked
+
+
+def test_a_plan_has_the_usual_goals_of_its_skills():
+    steps = ("gripper open", "place gripper above puck"), ("gripper closed", "dance")
+    assert [step.goal for step in plan("push", *steps).steps] == [None, None]
+    assert [str(goal) for goal in plan("push", *steps).goals] == ["the robot's gripper is above the puck", "None"]
+
+
+def test_a_step_s_own_goal_replaces_the_usual_one():
+    near = parse_query("the gripper is near the puck", "push")
+    usual = ConditionalPlan("push", (PlanStep(OPEN, "place the gripper above the puck"),))
+    own = ConditionalPlan("push", (PlanStep(OPEN, "place the gripper above the puck", goal=near),))
+    same = ConditionalPlan("push", (PlanStep(OPEN, "place gripper above puck", goal=usual.goals[0]),))
+    assert own != usual == same
+    assert own.goals == (near,)
+    assert same.steps[0].goal is None
+    assert 'goal="the robot\'s gripper is near the puck")' in str(own)
+
+
+def test_a_task_without_the_goal_s_objects_has_no_usual_goal():
+    skill, task = "place the gripper above the plate", lw.load_plans("MT50")["plate-slide-back"].definition
+    assert usual_goal(skill, task) is not None
+    bare = dataclasses.replace(task, objects=task.objects[:2])
+    assert usual_goal(skill, bare) is None
+    assert ConditionalPlan.from_pairs(bare, [("gripper open", skill)]).goals == (None,)

@@ -5,8 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from relation_truth import relation_holds
-from states import random_states
+from states import random_states, relation_holds
 
 from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.language.queries import parse_query, supported_queries

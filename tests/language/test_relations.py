@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from relation_truth import comparison_holds, relation_holds
+from states import comparison_holds, relation_holds
 
 from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.plans import ConditionalPlan

@@ -12,7 +12,7 @@ import torch
 import lw_torchrl as lw
 from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.objects import GRIPPER, NamedObject
-from lw_torchrl.language.plans import parse_plan
+from lw_torchrl.language.plan_files import parse_plan
 from lw_torchrl.language.queries import parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.tasks import (

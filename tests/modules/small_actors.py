@@ -15,7 +15,7 @@ FALLBACK = lw.canonical_plans(PLANS, fallback=True)
 
 
 def letters(texts):
-    """A text encoder that counts vowels."""
+    """Return text vectors that count vowels."""
     return torch.tensor([[float(text.count(letter)) for letter in "aeiou"] for text in texts])
 
 
@@ -66,7 +66,7 @@ ACTORS = {
 
 
 def make_rows(*shape, plans=PLANS, seed=0, answered=True):
-    """Random states of the plans' tasks; ``qaf`` is random too, but none is true beyond a plan's last step."""
+    """Return random states of the plans' tasks, with random ``qaf``, which is false beyond a plan's last step."""
     generator = torch.Generator().manual_seed(seed)
     names = list(plans)
     chosen = torch.randint(len(names), tuple(shape), generator=generator)
@@ -83,7 +83,7 @@ def make_rows(*shape, plans=PLANS, seed=0, answered=True):
 
 
 def rows_for(actor, *shape, seed=0):
-    """States with exact answers, as ``actor`` reads them."""
+    """Return states with exact answers, as ``actor`` reads them."""
     rows = make_rows(*shape, plans=m.plans_of(actor) or PLANS, seed=seed, answered=False)
     transform = m.transform_of(actor)
     return rows if transform is None else transform(rows)
@@ -91,3 +91,17 @@ def rows_for(actor, *shape, seed=0):
 
 def action_of(actor, rows):
     return actor(rows.copy())["action"]
+
+
+def assert_a_logit_for_each_step(evaluator, rows):
+    """Check an evaluator's logits for 64 rows, the size of evaluation's blocks, in any order and shape."""
+    logits = evaluator(rows.clone())["qaf_logits"]
+    assert logits.shape == (64, evaluator.plans.num_steps)
+    assert logits.dtype == torch.float32
+    for row, task in enumerate(rows["task_id"].tolist()):
+        steps = len(evaluator.plans[lw.MT50[task]].steps)
+        assert (logits[row, :steps].abs() <= 31).all()
+        assert (logits[row, steps:] == -1e4).all()
+    order = torch.randperm(64, generator=torch.Generator().manual_seed(1))
+    assert torch.equal(evaluator(rows[order])["qaf_logits"], logits[order])
+    assert torch.equal(evaluator(rows.reshape(4, 16))["qaf_logits"].reshape(64, -1), logits)

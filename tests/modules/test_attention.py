@@ -32,21 +32,21 @@ def weights(qaf, task_ids):
     return PlanAttention(PLANS)(TensorDict({"qaf": qaf, "task_id": task_ids}, task_ids.shape))["skill_weights"]
 
 
-def test_the_softmax_by_hand():
-    found = weights([[True, False, True, False], [False, True, False, False]], [PUSH, REACH])
+def test_weights_are_the_softmax_by_hand():
+    output = weights([[True, False, True, False], [False, True, False, False]], [PUSH, REACH])
     high, low = math.exp(5), math.exp(-5)
     push = [high, low, high, low]
     expected = [[x / sum(push) for x in push], [low / (high + low), high / (high + low), 0, 0]]
-    torch.testing.assert_close(found, torch.tensor(expected))
-    assert found.dtype == torch.float32
+    torch.testing.assert_close(output, torch.tensor(expected))
+    assert output.dtype == torch.float32
 
 
 def test_without_a_true_condition_attention_is_uniform():
-    found = weights(torch.zeros(3, 4, dtype=torch.bool), [PUSH, REACH, SWEEP])
-    torch.testing.assert_close(found, torch.tensor([[0.25] * 4, [0.5, 0.5, 0, 0], [1.0, 0, 0, 0]]))
+    output = weights(torch.zeros(3, 4, dtype=torch.bool), [PUSH, REACH, SWEEP])
+    torch.testing.assert_close(output, torch.tensor([[0.25] * 4, [0.5, 0.5, 0, 0], [1.0, 0, 0, 0]]))
 
 
-def test_the_gradient_reaches_soft_truth_but_not_padding():
+def test_gradient_reaches_soft_truth_but_not_padding():
     qaf = torch.full((1, 4), 0.5, requires_grad=True)
     weights(qaf, [REACH])[0, 0].backward()
     assert qaf.grad[0, 0] > 0
@@ -60,13 +60,13 @@ def test_weights_sum_to_one_over_the_real_steps_for_any_leading_shape(shape, see
     generator = torch.Generator().manual_seed(seed)
     task_ids = torch.tensor(list(LENGTH))[torch.randint(3, tuple(shape), generator=generator)]
     qaf = torch.rand(*shape, 4, generator=generator)
-    found = weights(qaf if soft else qaf > 0.5, task_ids)
-    assert found.shape == (*shape, 4)
-    torch.testing.assert_close(found.sum(-1), torch.ones(tuple(shape)))
+    output = weights(qaf if soft else qaf > 0.5, task_ids)
+    assert output.shape == (*shape, 4)
+    torch.testing.assert_close(output.sum(-1), torch.ones(tuple(shape)))
     lengths = task_ids.clone().apply_(LENGTH.get)
     padding = torch.arange(4) >= lengths.unsqueeze(-1)
-    assert (found[padding] == 0).all()
-    assert (found[~padding] > 0).all()
+    assert (output[padding] == 0).all()
+    assert (output[~padding] > 0).all()
 
 
 def test_a_task_without_a_plan_is_named():
@@ -74,27 +74,27 @@ def test_a_task_without_a_plan_is_named():
         weights(torch.zeros(3, 4), [task_id("lever-pull"), REACH, task_id("box-close")])
 
 
-@pytest.mark.parametrize("wrong", [-1, 50, 1000])
-def test_a_task_id_that_does_not_exist_is_named(wrong):
-    with pytest.raises(ValueError, match=f"task_id.*{wrong}"):
+@pytest.mark.parametrize("wrong", [-1, 50, 1000, 4.0])
+def test_unknown_task_ids_are_refused(wrong):
+    with pytest.raises(ValueError, match="task_id"):
         weights(torch.zeros(2, 4), [REACH, wrong])
 
 
 @pytest.mark.parametrize("shape", [(2, 3), (2, 5), (2, 1, 4)])
 def test_qaf_of_another_shape_is_refused(shape):
-    with pytest.raises(ValueError, match=r"qaf must have shape \(2, 4\).*QAFTransform the same plans"):
+    with pytest.raises(ValueError, match="qaf"):
         weights(torch.zeros(shape), [REACH, PUSH])
 
 
 def test_a_plain_mapping_is_accepted_as_plans():
     plan = make_plan("reach", 2)
-    found = PlanAttention({"reach": plan})(TensorDict(qaf=torch.zeros(2), task_id=torch.tensor(REACH)))
-    assert found["skill_weights"].tolist() == [0.5, 0.5]
+    output = PlanAttention({"reach": plan})(TensorDict(qaf=torch.zeros(2), task_id=torch.tensor(REACH)))
+    assert output["skill_weights"].tolist() == [0.5, 0.5]
 
 
 @pytest.mark.parametrize("wrong", [math.nan, 100.0, -0.1, math.inf])
 def test_soft_truth_outside_0_to_1_is_refused(wrong):
-    with pytest.raises(ValueError, match="qaf must be bool, or numbers from 0 to 1"):
+    with pytest.raises(ValueError, match="qaf"):
         weights(torch.tensor([[0.5, wrong, 0.0, 0.0]]), [REACH])
     assert weights(torch.tensor([[0.0, 1.0, 0.0, 0.0]]), [REACH]).sum() == 1
 
@@ -103,10 +103,10 @@ def test_soft_truth_outside_0_to_1_is_refused(wrong):
 @given(st.lists(st.floats(-20, 20, width=32), min_size=5, max_size=5), st.lists(st.booleans(), min_size=4, max_size=4))
 def test_attend_is_a_softmax_over_the_mask(logits, mask):
     logits, mask = torch.tensor(logits), torch.tensor([*mask, True])
-    found = attend(logits, mask)
-    torch.testing.assert_close(found[mask], logits[mask].softmax(-1))
-    assert not found[~mask].any()
-    torch.testing.assert_close(attend(logits + 3.0, mask), found)
+    output = attend(logits, mask)
+    torch.testing.assert_close(output[mask], logits[mask].softmax(-1))
+    assert not output[~mask].any()
+    torch.testing.assert_close(attend(logits + 3.0, mask), output)
 
 
 def test_a_wider_qaf_is_read_if_qaf_plan_shows_the_same_plan():
@@ -121,7 +121,7 @@ def test_a_wider_qaf_is_read_if_qaf_plan_shows_the_same_plan():
     scripted = lw.ScriptedSkillActor(two)
     assert torch.equal(scripted(wide.clone())["action"], scripted(narrow)["action"])
     for module in (attention, scripted):
-        with pytest.raises(ValueError, match="qaf must have shape"):
+        with pytest.raises(ValueError, match="qaf"):
             module(wide.exclude("qaf_plan"))
     assert lw.PlanConditionedQValue(two)(wide.set("action", torch.zeros(5, 4)))["state_action_value"].shape == (5, 1)
 
@@ -134,14 +134,14 @@ def test_fallback_steps_have_their_own_turns(turn):
     rows = TensorDict(qaf=torch.rand(8, plans.num_steps), task_id=torch.full((8,), PUSH), batch_size=[8])
     if turn is not None:
         rows["turn"] = torch.full((8,), turn)
-    found = attention(rows)["skill_weights"][:, : len(plans["push"].steps)]
+    output = attention(rows)["skill_weights"][:, : len(plans["push"].steps)]
     fallback = torch.tensor([step.role.fallback for step in plans["push"].steps])
     active = fallback if (turn or 0) % 2 else ~fallback
-    torch.testing.assert_close(found[:, active].sum(-1), torch.ones(8))
-    assert not found[:, ~active].any()
+    torch.testing.assert_close(output[:, active].sum(-1), torch.ones(8))
+    assert not output[:, ~active].any()
 
 
-def test_it_follows_other_plans_with_the_same_keys():
+def test_with_plans_keeps_the_keys():
     attention = PlanAttention(PLANS, in_keys=["truth", ("words", "task")], out_keys=["weights"])
     other = attention.with_plans(Plans([make_plan("reach", 3)]))
     assert (other.in_keys, other.out_keys) == (attention.in_keys, ["weights"])

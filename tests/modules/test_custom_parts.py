@@ -1,4 +1,4 @@
-"""Custom parts: put in by two lines, trained, saved, and loaded in a new process."""
+"""Custom parts: trained, saved, and loaded in a new process; parts that cannot be saved or used are refused."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ print(actor(rows.clone())["action"].flatten().tolist())
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_is_trained_saved_and_loaded_in_a_new_process(kind, tmp_path):
+def test_custom_part_is_trained_saved_and_loaded_in_a_new_process(kind, tmp_path):
     actor, batch = make(kind), make_batch()
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(len(batch)), batch_size=8)
     replay.extend(batch)
@@ -67,6 +67,8 @@ def test_it_is_trained_saved_and_loaded_in_a_new_process(kind, tmp_path):
     path = tmp_path / "policy.safetensors"
     lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=path, progress=False).train()
     assert all(not torch.equal(value, before[name]) for name, value in actor.named_parameters())
+    if kind == "more features":
+        assert actor.features.parts[0].mean.any(), "statistics are fitted inside of Concat too"
     rows = batch.exclude("action").memmap(tmp_path / "rows")
     command = [sys.executable, "-c", PROGRAM, str(path), kind, str(tmp_path / "rows")]
     here = Path(__file__).parent
@@ -75,18 +77,8 @@ def test_it_is_trained_saved_and_loaded_in_a_new_process(kind, tmp_path):
         command, capture_output=True, text=True, timeout=240, env={**os.environ, "PYTHONPATH": search}
     )
     assert done.returncode == 0, done.stderr
-    found = torch.tensor(json.loads(done.stdout)).reshape(len(batch), 4)
-    torch.testing.assert_close(found, action_of(actor.eval(), rows.clone()))
-
-
-def test_statistics_are_fitted_for_custom_parts_too():
-    actor, batch = make("more features"), make_batch()
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(len(batch)), batch_size=8)
-    replay.extend(batch)
-    lw.BehavioralCloningTrainer(
-        actor, replay, lw.BehavioralCloningConfig(steps=1, batch_size=8), progress=False
-    ).train()
-    assert actor.features.parts[0].mean.any()
+    output = torch.tensor(json.loads(done.stdout)).reshape(len(batch), 4)
+    torch.testing.assert_close(output, action_of(actor.eval(), rows.clone()))
 
 
 class Plain(nn.Module):
@@ -106,38 +98,33 @@ class Plain(nn.Module):
         ({"features": Plain()}, "trunk.features", "Plain"),
     ],
 )
-def test_a_part_that_cannot_be_saved_is_named_with_the_way_out(options, name, kind, tmp_path):
+def test_error_names_the_part_that_cannot_be_saved(options, name, kind, tmp_path):
     actor = make_actor(**options)
-    message = rf"{name} is a {kind}, which cannot be saved: give it an attribute config, a dict of its constructor's"
-    for refused in (
-        lambda: lw.save_actor(actor, tmp_path / "policy.safetensors"),
-        lambda: lw.modules.describe(actor),
-    ):
-        with pytest.raises(TypeError, match=message):
-            refused()
+    for save in (lambda: lw.save_actor(actor, tmp_path / "policy.safetensors"), lambda: lw.modules.describe(actor)):
+        with pytest.raises(TypeError, match=rf"{name} is a {kind}.*config"):
+            save()
     assert not list(tmp_path.iterdir())
 
 
-def test_an_assigned_part_is_saved_or_refused(tmp_path):
+def test_assigned_part_is_saved_or_refused(tmp_path):
     path, actor, rows = tmp_path / "policy.safetensors", make_actor(), make_rows(4)
     actor.decoder = Plain()
-    with pytest.raises(TypeError, match=r"decoder.network is a Plain, which cannot be saved"):
+    with pytest.raises(TypeError, match=r"decoder\.network"):
         lw.save_actor(actor, path)
     actor.decoder = Gated(5)
     lw.save_actor(actor, path)
     assert torch.equal(action_of(lw.load_actor(path), rows), action_of(actor, rows))
     actor.decoder = MLPDecoder(width=4)
     actor.decoder.network._options["width"] = 5  # a config that is not the network's
-    with pytest.raises(ValueError, match="its description does not rebuild it"):
+    with pytest.raises(ValueError, match="description"):
         lw.save_actor(actor, path)
 
 
-def test_no_module_is_imported_because_a_file_names_it(tmp_path, monkeypatch):
+def test_loading_never_imports_a_module_that_a_file_names(tmp_path, monkeypatch):
     path = tmp_path / "policy.safetensors"
     lw.save_actor(make("decoder"), path)
     monkeypatch.delitem(sys.modules, "users_parts")
-    message = r"the class 'users_parts:Gated' is not known here: import users_parts first.*parts=\[Gated\]"
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=r"users_parts:Gated.*import users_parts.*parts=\[Gated\]"):
         lw.load_actor(path)
     assert "users_parts" not in sys.modules
     rows = make_rows(4)
@@ -145,21 +132,11 @@ def test_no_module_is_imported_because_a_file_names_it(tmp_path, monkeypatch):
     assert action_of(lw.load_actor(path, parts=[Gated]), rows).shape == (4, 4)
 
 
-def test_all_unknown_classes_are_named_at_once(tmp_path, monkeypatch):
-    path, names = tmp_path / "policy.safetensors", r"'users_parts:\w+', 'users_parts:\w+'"
-    lw.save_actor(make_actor(features=Pictures(), decoder=Gated(6)), path)
-    monkeypatch.delitem(sys.modules, "users_parts")
-    message = rf"the classes {names} are not known here: import users_parts first.*parts=\[Pictures, Gated\]"
-    with pytest.raises(ValueError, match=message):
-        lw.load_actor(path)
-    assert type(lw.load_actor(path, parts=[Pictures, Gated]).decoder.network) is Gated
-
-
-def test_a_class_of_a_script_is_passed_by_hand(tmp_path, monkeypatch):
+def test_class_of_a_script_is_passed_as_parts(tmp_path, monkeypatch):
     path = tmp_path / "policy.safetensors"
     monkeypatch.setattr(Gated, "__module__", "__main__")
     lw.save_actor(make("decoder"), path)
-    with pytest.raises(ValueError, match=r"'__main__:Gated' is not known here: pass parts=\[Gated\]"):
+    with pytest.raises(ValueError, match=r"__main__:Gated.*parts=\[Gated\]"):
         lw.load_actor(path)
     assert type(lw.load_actor(path, parts=[Gated]).decoder.network) is Gated
 
@@ -171,23 +148,23 @@ def test_plain_features_state_their_width_so_the_actor_is_saved_and_made_stochas
     assert lw.load_actor(tmp_path / "policy.safetensors").stochastic().out_keys[-1] == "action_log_prob"
 
 
-def test_what_cannot_be_a_part_is_refused_when_it_is_given():
+def test_unsuitable_parts_are_refused():
     actor = lw.PlanConditionedActor(PLANS)
-    with pytest.raises(AttributeError, match="has the parts attention, mixer, features, decoder, and no skill_encoder"):
+    with pytest.raises(AttributeError, match="no skill_encoder"):
         actor.skill_encoder = nn.Linear(384, 16)
-    with pytest.raises(ValueError, match=r"decoder must return actions \(B, 4\) from \(B, 120\), got \(1, 1\)"):
+    with pytest.raises(ValueError, match="decoder"):
         lw.PlanConditionedActor(PLANS, decoder=nn.LazyLinear(1))
     decoder = TensorDictModule(nn.Linear(64, 4), ["skill_latent"], ["action"])
-    with pytest.raises(ValueError, match="out_keys: a TensorDict module has its own"):
+    with pytest.raises(ValueError, match="out_keys"):
         lw.PlanConditionedActor(PLANS, decoder=decoder, out_keys=["move"])
-    with pytest.raises(ValueError, match="out_keys must not be among in_keys"):
+    with pytest.raises(ValueError, match="out_keys"):
         actor.in_keys = ["truth", "task_id", "action"]
 
 
-def test_a_decoder_that_returns_too_few_tensors_is_named():
+def test_decoder_that_returns_too_few_tensors_is_refused():
     actor = lw.PlanConditionedActor(PLANS, decoder=nn.LazyLinear(4), out_keys=["loc", "scale"])
     assert list(actor.spec.keys()) == ["action"]
-    with pytest.raises(ValueError, match="decoder must return a tensor for each of loc, scale, it returned 1"):
+    with pytest.raises(ValueError, match="decoder"):
         actor(qaf=torch.zeros(1, 6), task_id=torch.tensor([lw.task_id("reach")]), observation=torch.rand(1, 39))
 
 

@@ -1,4 +1,4 @@
-"""Descriptions of modules as JSON: what they hold, and that they rebuild every kind of module."""
+"""Descriptions of modules as JSON, from which every kind of module is rebuilt."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NOT_SAVED = {"value", "mixed actions"}  # the last has lazy layers
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if name not in NOT_SAVED])
-def test_it_is_rebuilt_with_the_same_names_and_keys(name):
+def test_rebuilt_module_has_the_same_names_and_keys(name):
     module = MODULES[name]()
     again = from_description(json.loads(json.dumps(describe(module))))
     assert type(again) is type(module)
@@ -39,17 +39,17 @@ def test_it_is_rebuilt_with_the_same_names_and_keys(name):
     assert describe(again) == describe(module)
 
 
-@pytest.mark.parametrize("name", ACTORS)
-def test_an_actor_is_saved_and_loaded_to_the_bit(name, tmp_path):
-    actor = ACTORS[name]().eval()
+@pytest.mark.parametrize("name", [*ACTORS, "transferred"])
+def test_saved_and_loaded_actor_gives_the_same_bits(name, tmp_path):
+    actor = MODULES[name]().eval()
     lw.save_actor(actor, tmp_path / "policy.safetensors")
     loaded = lw.load_actor(tmp_path / "policy.safetensors")
-    found, expected = (each(rows_for(actor, 6)) for each in (loaded, actor))
+    output, expected = (each(rows_for(actor, 6)) for each in (loaded, actor))
     assert (type(loaded), loaded.training) == (type(actor), False)
-    assert all(torch.equal(found[key], expected[key]) for key in actor.out_keys)
+    assert all(torch.equal(output[key], expected[key]) for key in actor.out_keys)
 
 
-def test_a_description_says_what_the_actor_is_made_of():
+def test_description_holds_classes_options_and_plans():
     described = describe(make_actor(decoder=small_decoder(width=9)))
     assert described["class"] == "PlanConditionedActor"
     assert lw.Plans.from_json(described["plans"][0]) == PLANS
@@ -57,13 +57,7 @@ def test_a_description_says_what_the_actor_is_made_of():
     assert (decoder["class"], decoder["options"]["width"]) == ("MLPDecoder", 9)
 
 
-def test_canonical_plans_keep_their_roles():
-    plans = from_description(json.loads(json.dumps(describe(ACTORS["fallback"]())))).plans
-    assert plans.has_roles
-    assert any(step.role.fallback for step in plans["push"].steps)
-
-
-def test_keys_are_kept(tmp_path):
+def test_saved_actor_keeps_its_keys(tmp_path):
     keys = [("words", "qaf"), ("words", "task"), "state"]
     actor = make_actor(in_keys=keys, out_keys=[("agent", "action")])
     lw.save_actor(actor, tmp_path / "policy.safetensors")
@@ -72,43 +66,43 @@ def test_keys_are_kept(tmp_path):
     assert loaded.out_keys[-1] == ("agent", "action")
 
 
-def test_sequences_and_layers_of_pytorch_need_no_config():
+def test_pytorch_layers_and_sequences_need_no_config():
     layers = nn.Sequential(nn.Linear(39, 8, bias=False), nn.LayerNorm(8), nn.ELU(0.5), nn.Dropout(0.1), nn.Linear(8, 4))
     part = TensorDictModule(layers, in_keys=[("robot", "state")], out_keys=[("other", "action")])
     actor = TensorDictSequential(part, make_actor())
     again = from_description(json.loads(json.dumps(describe(actor))))
     assert (str(again[0]), again.in_keys) == (str(actor[0]), actor.in_keys)
-    with pytest.raises(TypeError, match=r"1.0 is a Conv2d, which cannot be saved"):
+    with pytest.raises(TypeError, match=r"1\.0 is a Conv2d"):
         describe(nn.Sequential(nn.Linear(3, 3), nn.Sequential(nn.Conv2d(1, 1, 1))))
 
 
-def test_the_text_encoder_is_passed_to_the_parts():
+def test_text_encoder_is_passed_to_the_parts():
     actor = make_actor(text_encoder=letters)
     again = from_description(describe(actor), text_encoder=letters)
     assert torch.equal(again.mixer.vectors, actor.mixer.vectors)
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "name"),
     [
-        (lambda d: 3, "a description must have class, options and plans, got 3"),
-        (lambda d: {**d, "plans": None}, "a description must have class, options and plans"),
-        (lambda d: {**d, "class": 3}, "a part must have a class"),
-        (lambda d: {**d, "class": "describe"}, "the class 'describe' is not known here"),
-        (lambda d: {**d, "class": "os:system"}, "the class 'os:system' is not known here"),
-        (lambda d: {**d, "class": "torch.nn:Conv2d"}, "'torch.nn:Conv2d' is not known here"),
-        (lambda d: {**d, "options": []}, "options of a PlanConditionedActor must be a table"),
-        (lambda d: {**d, "class": "Sequential"}, "parts of a Sequential must be a list or a table"),
-        (lambda d: {**d, "options": {**d["options"], "trunk": {"code": "1"}}}, "a value must be a module, plans"),
+        (lambda d: 3, "description"),
+        (lambda d: {**d, "plans": None}, "description"),
+        (lambda d: {**d, "class": 3}, "class"),
+        (lambda d: {**d, "class": "describe"}, "'describe'"),
+        (lambda d: {**d, "class": "os:system"}, "'os:system'"),
+        (lambda d: {**d, "class": "torch.nn:Conv2d"}, "'torch.nn:Conv2d'"),
+        (lambda d: {**d, "options": []}, "options"),
+        (lambda d: {**d, "class": "Sequential"}, "parts"),
+        (lambda d: {**d, "options": {**d["options"], "trunk": {"code": "1"}}}, "value"),
     ],
 )
-def test_a_description_that_is_wrong_is_refused(change, message):
-    with pytest.raises(ValueError, match=message):
+def test_wrong_descriptions_are_refused(change, name):
+    with pytest.raises(ValueError, match=name):
         from_description(change(describe(make_actor())))
 
 
-def test_values_that_are_not_json_are_named():
+def test_error_names_the_value_that_is_not_json():
     actor = make_actor()
     actor.decoder.network._options["width"] = {1, 2}
-    with pytest.raises(TypeError, match=r"decoder.network.width must be JSON, plans, a task, a layout or a module"):
+    with pytest.raises(TypeError, match=r"decoder\.network\.width"):
         describe(actor)

@@ -20,7 +20,7 @@ OURS = [each for name, each in zip(SHARED, NAMES, strict=True) if name not in SE
 
 
 class Deployed(nn.Module):
-    """Observation and task to the action."""
+    """A policy with its queries, from observation and task to the action."""
 
     def __init__(self, actor):
         super().__init__()
@@ -43,7 +43,7 @@ def make_rows(rows):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_exported_it_gives_the_same_bits_at_every_number_of_rows(name):
+def test_exported_policy_gives_the_same_bits_for_any_number_of_rows(name):
     module = Deployed(ACTORS[name]().eval())
     run = exported(module).module()
     for number in (2, 7, 64):
@@ -55,8 +55,7 @@ def test_exported_it_gives_the_same_bits_at_every_number_of_rows(name):
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_the_bare_actor_is_exported(name):
-    """By name, and by position, which TorchRL's own TensorDictSequential does not support."""
+def test_bare_actor_is_exported_by_name_and_by_position(name):
     actor = ACTORS[name]().eval()
     queries = lw.QAFTransform(lw.modules.plans_of(actor) or PLANS)
     read = queries(TensorDict(dict(zip(("observation", "task_id"), make_rows(7), strict=True)), [7]))
@@ -67,14 +66,14 @@ def test_the_bare_actor_is_exported(name):
     any_rows = (tuple({0: torch.export.Dim("rows")} for _ in tensors),)
     by_place = torch.export.export(actor, tensors, dynamic_shapes=any_rows).module()
     fewer = by_place(*(tensor[:3] for tensor in tensors))
-    for found, rows in ((by_name, 7), (by_place(*tensors), 7), (fewer, 3)):
-        found = found if isinstance(found, tuple) else (found,)
+    for output, rows in ((by_name, 7), (by_place(*tensors), 7), (fewer, 3)):
+        output = output if isinstance(output, tuple) else (output,)
         expected = actor(read[:rows].clone()) if rows < 7 else written
-        assert all(torch.equal(one, expected[key]) for one, key in zip(found, actor.out_keys, strict=True))
+        assert all(torch.equal(one, expected[key]) for one, key in zip(output, actor.out_keys, strict=True))
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_compiled_it_is_one_graph(name):
+def test_policy_compiles_to_one_graph(name):
     torch._dynamo.reset()  # all share one forward, which is compiled eight times at most
     module = Deployed(ACTORS[name]().eval())
     compiled = torch.compile(module, fullgraph=True, backend="eager", dynamic=True)
@@ -87,7 +86,7 @@ def test_compiled_it_is_one_graph(name):
 @pytest.mark.skipif(not (shutil.which("c++") or shutil.which("g++")), reason="needs a C++ compiler")
 @pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning", "ignore:.*torch.jit:DeprecationWarning")  # PyTorch's own
 @pytest.mark.parametrize("name", ["plan", "description"])
-def test_compiled_ahead_of_time_it_gives_the_same_but_for_rounding(name, tmp_path):
+def test_ahead_of_time_compiled_policy_differs_only_by_rounding(name, tmp_path):
     """Compiled kernels are fused, so sums are made in another order: the last bits differ."""
     module = Deployed(ACTORS[name]().eval())
     with torch.no_grad():

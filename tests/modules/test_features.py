@@ -26,35 +26,35 @@ def random_observation(*shape, seed=0):
     return torch.rand(*shape, 39, generator=torch.Generator().manual_seed(seed))
 
 
-def test_the_differences_by_hand():
+def test_differences_by_hand():
     observation = random_observation()
     hand, one, two, goal = (observation[i : i + 3] for i in (0, 4, 11, 36))
-    found = differences(observation)
+    output = differences(observation)
     plain = torch.cat([one - hand, two - hand, goal - hand, two - one, goal - one, goal - two])
-    torch.testing.assert_close(found[:18], plain)
-    torch.testing.assert_close(found[18:36], torch.tanh(plain / 0.02))
-    torch.testing.assert_close(found[36:54], torch.tanh(plain / 0.1))
-    assert torch.equal(found[54:], observation[2:4])
+    torch.testing.assert_close(output[:18], plain)
+    torch.testing.assert_close(output[18:36], torch.tanh(plain / 0.02))
+    torch.testing.assert_close(output[36:54], torch.tanh(plain / 0.1))
+    assert torch.equal(output[54:], observation[2:4])
 
 
 def test_differences_to_an_absent_object_are_zero():
     observation = random_observation(2)
     observation[0, 11:14] = 0
-    found = differences(observation)[:, :18].reshape(2, 6, 3)
-    assert found[0].abs().sum(-1).eq(0).tolist() == [False, True, False, True, False, True]
-    assert not found[1].abs().sum(-1).eq(0).any()
+    output = differences(observation)[:, :18].reshape(2, 6, 3)
+    assert output[0].abs().sum(-1).eq(0).tolist() == [False, True, False, True, False, True]
+    assert not output[1].abs().sum(-1).eq(0).any()
 
 
 @pytest.mark.parametrize(
     ("kind", "width"), [("raw", 39), ("differences", 56), ("relative", 54), ("both", 95), ("opening", 1), ("none", 0)]
 )
 @pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
-def test_every_kind_has_its_width_on_any_leading_shape(kind, width, shape):
+def test_width_of_every_kind_for_any_leading_shape(kind, width, shape):
     features = ObservationFeatures(kind)
-    found = features(random_observation(*shape))
+    output = features(random_observation(*shape))
     assert features.width == width
-    assert found.shape == (*shape, width)
-    assert found.dtype == torch.float32
+    assert output.shape == (*shape, width)
+    assert output.dtype == torch.float32
 
 
 @pytest.mark.parametrize(("kind", "same"), [("raw", False), ("differences", False), ("relative", True)])
@@ -72,9 +72,9 @@ def test_fitted_rows_have_mean_zero_and_deviation_one(kind):
     features = ObservationFeatures(kind)
     observation = random_observation(40, 25)
     fit(features, observation)
-    found = features(observation).reshape(-1, features.width)
-    torch.testing.assert_close(found.mean(0), torch.zeros(features.width), atol=1e-4, rtol=0)
-    torch.testing.assert_close(found.std(0, unbiased=False), torch.ones(features.width), atol=1e-3, rtol=0)
+    output = features(observation).reshape(-1, features.width)
+    torch.testing.assert_close(output.mean(0), torch.zeros(features.width), atol=1e-4, rtol=0)
+    torch.testing.assert_close(output.std(0, unbiased=False), torch.ones(features.width), atol=1e-3, rtol=0)
 
 
 def test_a_constant_feature_is_centred_and_not_amplified():
@@ -94,7 +94,7 @@ def test_outliers_are_clamped():
     assert features(torch.full((1, 39), 1e6)).tolist() == [[10.0] * 39]
 
 
-def test_noise_in_training_mode_has_its_deviation_and_is_gone_in_eval_mode():
+def test_noise_is_added_only_in_training_mode():
     torch.manual_seed(0)
     observation = random_observation(50, 50)
     features = ObservationFeatures("raw", noise=0.3)
@@ -108,15 +108,10 @@ def test_noise_in_training_mode_has_its_deviation_and_is_gone_in_eval_mode():
 
 
 @pytest.mark.parametrize(
-    ("observation", "said"),
-    [
-        (torch.zeros(2, 38), r"float32 of shape \(2, 38\)"),
-        (torch.zeros(()), r"shape \(\)"),
-        (torch.zeros(2, 39, dtype=torch.int64), "torch.int64"),
-    ],
+    "observation", [torch.zeros(2, 38), torch.zeros(()), torch.zeros(2, 39, dtype=torch.int64)], ids=str
 )
-def test_wrong_observations_are_refused(observation, said):
-    with pytest.raises(ValueError, match=rf"observation must be float32 of shape \(..., 39\), got .*{said}"):
+def test_wrong_observations_are_refused(observation):
+    with pytest.raises(ValueError, match="observation must be float32"):
         ObservationFeatures()(observation)
 
 
@@ -132,9 +127,9 @@ def test_observations_that_are_not_finite_are_refused(wrong, kind, call):
     assert features.mean.isfinite().all()
 
 
-def test_no_rows_have_no_statistics():
+def test_fitting_to_no_rows_is_refused():
     for kind in ("differences", "none"):
-        with pytest.raises(ValueError, match="rows to fit features to must be at least one, got 0"):
+        with pytest.raises(ValueError, match="rows"):
             fit(ObservationFeatures(kind), random_observation(0))
 
 
@@ -148,7 +143,7 @@ def test_weights_count_as_copies_of_rows():
     torch.testing.assert_close(weighted.std, copied.std)
 
 
-def test_it_is_the_same_in_another_layout_only_if_it_means_the_same():
+def test_only_features_with_the_same_meaning_transfer_to_another_layout():
     fetch = load_suite("fetch").plans
     plans = lw.load_plans("MT10")
     features = ObservationFeatures("opening", 0.1)
@@ -157,14 +152,14 @@ def test_it_is_the_same_in_another_layout_only_if_it_means_the_same():
     assert (other.layout, other.noise) == (fetch.layout, 0.1)
     assert other.mean is features.mean
     assert features.with_plans(plans) is features
-    with pytest.raises(ValueError, match=r"features 'raw' of layout 'metaworld' do not transfer to 'fetch'"):
+    with pytest.raises(ValueError, match="transfer"):
         ObservationFeatures("raw").with_plans(fetch)
 
 
 # ---- Concat
 
 
-def test_parts_are_concatenated_and_keep_their_noise():
+def test_concatenated_features_keep_their_noise():
     plans = lw.load_plans("MT10")
     parts = ObservationFeatures("raw", 0.5), FocusFeatures(plans)
     module = Concat(*parts)
@@ -175,16 +170,16 @@ def test_parts_are_concatenated_and_keep_their_noise():
         batch_size=[4],
     )
     assert (module.in_keys, module.width) == (["observation", "skill_weights", "task_id"], 39 + 18)
-    found = module.eval()(rows.copy())
-    assert set(found.keys()) == {*rows.keys(), "features"}
+    output = module.eval()(rows.copy())
+    assert set(output.keys()) == {*rows.keys(), "features"}
     for part, columns in zip(parts, (slice(39), slice(39, None)), strict=True):
-        assert torch.equal(found["features"][:, columns], part(rows.copy())["features"])
-    noisy = module.train()(rows.copy())["features"] - found["features"]
+        assert torch.equal(output["features"][:, columns], part(rows.copy())["features"])
+    noisy = module.train()(rows.copy())["features"] - output["features"]
     assert noisy[:, :39].all()
     assert not noisy[:, 39:].any()
 
 
-def test_any_modules_of_other_keys_are_concatenated():
+def test_concat_of_modules_with_other_keys():
     pictures = TensorDictModule(nn.Flatten(), in_keys=["pixels"], out_keys=["seen"])
     module = Concat(ObservationFeatures("opening"), pictures, out_keys=[("net", "input")])
     rows = TensorDict(observation=random_observation(2), pixels=torch.rand(2, 3, 2), batch_size=[2])
@@ -196,7 +191,7 @@ def test_any_modules_of_other_keys_are_concatenated():
             Concat(*wrong)
 
 
-def test_custom_features_only_say_what_they_compute():
+def test_custom_features_only_implement_compute():
     class Height(Features):
         width = 1
 

@@ -1,11 +1,11 @@
-"""ImageQueryEvaluator: what it sees, what it can tell, and that it is part of a policy like any other."""
+"""ImageQueryEvaluator: what its network sees, and its place in a policy."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-from evaluator_rows import assert_a_logit_for_each_step
 from pictures import why_no_pictures
+from small_actors import assert_a_logit_for_each_step, letters
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
@@ -17,10 +17,6 @@ from lw_torchrl.modules import IMAGE_ENCODERS
 TASKS = ("drawer-open", "reach")
 PLANS = lw.Plans({task: lw.load_plans("MT10")[task] for task in TASKS})
 SMALL = {"height": 16, "width": 24, "hidden": 8, "depth": 1}
-
-
-def letters(texts):
-    return torch.tensor([[float(text.count(letter)) for letter in "abdefghilnoprstuw"] for text in texts])
 
 
 def make(plans=PLANS, seed=0, **options):
@@ -43,62 +39,57 @@ def states(rows=10, shape=(16, 48)):
     )
 
 
-def test_a_logit_for_each_step_whatever_the_order_and_shape_of_rows():
-    evaluator, found = make(), states(64)
-    assert_a_logit_for_each_step(evaluator, found)
+def test_logits_of_each_step_for_rows_in_any_order_and_shape():
+    assert_a_logit_for_each_step(make(), states(64))
 
 
-def test_it_sees_each_cameras_picture_and_nothing_of_the_observation():
-    evaluator, found = make(), states()
-    logits = evaluator(found.clone())["qaf_logits"]
-    other = found.clone().set("observation", torch.zeros(10, 39))
+def test_logits_depend_on_every_picture_and_not_on_the_observation():
+    evaluator, output = make(), states()
+    logits = evaluator(output.clone())["qaf_logits"]
+    other = output.clone().set("observation", torch.zeros(10, 39))
     assert torch.equal(evaluator(other)["qaf_logits"], logits)
     for part in (slice(0, 24), slice(24, 48)):
-        other = found.clone()
+        other = output.clone()
         other["pixels"][:, :, part] = 0
         assert not torch.equal(evaluator(other)["qaf_logits"], logits)
 
 
-def test_it_points_within_each_picture():
-    evaluator, found = make(), states()
+def test_attention_is_a_distribution_over_each_picture():
+    evaluator, output = make(), states()
     with torch.no_grad():
-        places, seen = evaluator.network.places(found["pixels"], evaluator.network.names.weight)
+        places, seen = evaluator.network.places(output["pixels"], evaluator.network.names.weight)
     assert places.shape == (10, len(evaluator.names), 4)
     assert seen.shape == (10, 2, len(evaluator.names), 8, 12)
     assert torch.allclose(seen.sum((-1, -2)), torch.ones(()))
-    swapped = found["pixels"].unflatten(-2, (2, 24)).flip(-3).flatten(-3, -2)
+    swapped = output["pixels"].unflatten(-2, (2, 24)).flip(-3).flatten(-3, -2)
     with torch.no_grad():
         _, other = evaluator.network.places(swapped, evaluator.network.names.weight)
     assert torch.allclose(other, seen.flip(1), atol=1e-6)
 
 
-def test_a_thing_that_moves_in_the_picture_is_pointed_at():
-    """A key that answers to red alone: the mean of its softmax is where the red square is."""
-    evaluator = make(cameras="corner")
-    network = evaluator.network
+def test_attention_follows_an_object_in_the_picture():
+    """A key that matches only red: its attention is where the red square is."""
     IMAGE_ENCODERS["red"] = lambda: nn.AvgPool2d(2)
     try:
-        torch.manual_seed(0)
-        red = lw.modules.ImageQueryEvaluator(PLANS, cameras="corner", encoder="red", **SMALL)
+        network = make(cameras="corner", encoder="red").network
     finally:
         del IMAGE_ENCODERS["red"]
-    assert network.key.weight.shape[1] == 32
     with torch.no_grad():
-        red.network.key.weight.zero_()
-        red.network.key.weight[0, 0] = 50.0
-        things = torch.zeros(1, 32)
-        things[0, 0] = 10.0
+        network.key.weight.zero_()
+        network.key.weight[0, 0] = 50.0
+        objects = torch.zeros(1, 32)
+        objects[0, 0] = 10.0
         pixels = torch.zeros(2, 16, 24, 3, dtype=torch.uint8)
         pixels[0, 2:4, 4:6, 0] = 255
         pixels[1, 12:14, 20:22, 0] = 255
-        _, seen = red.network.places(pixels, things)
+        _, seen = network.places(pixels, objects)
     assert seen[0, 0, 0].argmax() == 1 * 12 + 2
     assert seen[1, 0, 0].argmax() == 6 * 12 + 10
     assert (seen.amax((-1, -2)) > 0.99).all()
 
 
 @pytest.mark.filterwarnings("ignore:.*target_actor_network_params")
-def test_imitation_reaches_it_through_the_softmax():
+def test_gradient_of_imitation_reaches_every_weight():
     policy = make_policy(answers="hard").train()
     BCLoss(policy, loss_function="l2")(states())["loss_bc"].backward()
     for name, weight in policy[0].named_parameters():
@@ -106,7 +97,7 @@ def test_imitation_reaches_it_through_the_softmax():
         assert weight.grad.abs().sum() > 0 or name.endswith("bias"), name
 
 
-def test_a_policy_with_it_is_made_again_from_its_file(tmp_path):
+def test_saved_and_loaded_policy_with_evaluator_gives_the_same_bits(tmp_path):
     policy = make_policy().eval()
     lw.save_actor(policy, tmp_path / "policy.safetensors")
     again = lw.load_actor(tmp_path / "policy.safetensors", text_encoder=letters)
@@ -116,7 +107,7 @@ def test_a_policy_with_it_is_made_again_from_its_file(tmp_path):
     assert torch.equal(other(states())["qaf_logits"], policy[0](states())["qaf_logits"])
 
 
-def test_an_encoder_of_ones_own_stays_frozen():
+def test_custom_encoder_stays_frozen():
     def frozen():
         return nn.Sequential(nn.Conv2d(3, 4, 4, 4)).requires_grad_(False)
 
@@ -143,11 +134,11 @@ class TestActing:
     @pytest.mark.slow
     def test_results_do_not_depend_on_num_envs(self):
         actor = TensorDictSequential(make(), lw.PlanConditionedActor(PLANS))
-        found = [self.evaluated(actor, num_envs=n, num_threads=t) for n, t in ((2, 1), (4, 2))]
-        for one, other in zip(*found, strict=True):
+        output = [self.evaluated(actor, num_envs=n, num_threads=t) for n, t in ((2, 1), (4, 2))]
+        for one, other in zip(*output, strict=True):
             assert torch.equal(one, other)
 
-    def test_scripted_skills_on_it_and_any_policy_behind_it(self):
+    def test_evaluator_in_a_sequence_equals_evaluator_as_an_argument(self):
         evaluator = make(every=4)
         own = self.evaluated(TensorDictSequential(evaluator, lw.ScriptedSkillActor(PLANS)))
         behind = self.evaluated(lw.ScriptedSkillActor(PLANS), evaluator=evaluator)
@@ -155,7 +146,7 @@ class TestActing:
             assert torch.equal(one, other)
 
     @pytest.mark.slow
-    def test_failures_are_told_with_true_answers_in_its_place(self):
+    def test_failures_are_attributed_to_wrong_answers(self):
         result = lw.evaluate(
             TensorDictSequential(make(), lw.ScriptedSkillActor(PLANS)),
             tasks="drawer-open",

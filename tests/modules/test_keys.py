@@ -1,9 +1,8 @@
-"""in_keys and out_keys are obeyed by every module, as TorchRL's own do: also selected, or called with tensors."""
+"""in_keys and out_keys of every module, as TorchRL uses them: renamed, selected, called with tensors."""
 
 from __future__ import annotations
 
 import copy
-import inspect
 
 import pytest
 import torch
@@ -40,7 +39,7 @@ def make(kind, **keys):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_keys_are_obeyed(kind):
+def test_renamed_keys_are_read_and_written(kind):
     plain, rows = make(kind), state()
     read = [("agent", "in", str(number)) for number in range(len(plain.in_keys))]
     last = plain.out_keys if kind not in ("plan", "description") else ["action"]
@@ -51,20 +50,20 @@ def test_keys_are_obeyed(kind):
     assigned.in_keys = read
     for other, names in ((make(kind, in_keys=read, out_keys=written), written), (assigned, last)):
         assert (other.in_keys, other.out_keys[-len(last) :]) == (read, names)
-        found = other(moved.clone())
-        assert set(found.keys(True, True)) == {*read, *other.out_keys}
-        assert all(torch.equal(found[there], expected[here]) for here, there in zip(last, names, strict=True))
+        output = other(moved.clone())
+        assert set(output.keys(True, True)) == {*read, *other.out_keys}
+        assert all(torch.equal(output[there], expected[here]) for here, there in zip(last, names, strict=True))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_missing_key_is_named(kind):
+def test_error_names_the_missing_key(kind):
     module, rows = make(kind), state()
     for key in module.in_keys:
         with pytest.raises(ValueError, match=rf"needed, got .*; without {key}"):
             module(rows.exclude(key))
 
 
-def test_a_json_list_is_a_nested_key():
+def test_json_list_becomes_a_nested_key():
     assert as_keys("in_keys", [["a", "b"], "c"], ("x", "y")) == [("a", "b"), "c"]
 
 
@@ -82,12 +81,12 @@ def test_a_json_list_is_a_nested_key():
         lambda: lw.RandomYaw(0.1, out_keys=["action", "observation", "a", "b"]),
     ],
 )
-def test_nothing_writes_over_what_it_reads(make_one):
+def test_writing_over_an_input_is_refused(make_one):
     with pytest.raises(ValueError, match="out_keys must not be among in_keys"):
         make_one()
 
 
-# --- what TorchRL does with modules --------------------------------------------------------------------------------
+# --- how TorchRL uses modules --------------------------------------------------------------------------------------
 
 
 SMALL = dict(width=8, depth=1)
@@ -106,7 +105,7 @@ each_module = pytest.mark.parametrize("name", MODULES)
 
 
 def made(name):
-    """A module, what it reads of some rows, and what it writes."""
+    """Return a module, its inputs for some rows, and its outputs."""
     torch.manual_seed(0)
     module = MODULES[name]().eval()
     rows = rows_for(module, 3).update({"action": torch.rand(3, 4), "skill_weights": torch.rand(3, PLANS.num_steps)})
@@ -115,21 +114,21 @@ def made(name):
     return module, read, module(read.copy()).select(*module.out_keys)
 
 
-def as_tuple(found):
-    return found if isinstance(found, tuple) else (found,)
+def as_tuple(output):
+    return output if isinstance(output, tuple) else (output,)
 
 
 @each_module
-def test_selected_keys_hold_what_they_held_before(name):
+def test_select_out_keys(name):
     module, read, written = made(name)
     names = list(module.out_keys)
     for chosen in ([names[0]], [names[-1]], names[::-1]):
         assert module.select_out_keys(*chosen) is module
         assert (module.out_keys, module.out_keys_source) == (chosen, names)
         for one in (module, copy.deepcopy(module)):
-            found = one(read.copy())
-            assert set(found.keys(True, True)) == {*module.in_keys, *chosen}
-            assert all(torch.equal(found[key], written[key]) for key in chosen)
+            output = one(read.copy())
+            assert set(output.keys(True, True)) == {*module.in_keys, *chosen}
+            assert all(torch.equal(output[key], written[key]) for key in chosen)
         by_name = as_tuple(module(**read.to_dict()))
         assert all(torch.equal(one, written[key]) for one, key in zip(by_name, chosen, strict=True))
         module.reset_out_keys()
@@ -137,33 +136,33 @@ def test_selected_keys_hold_what_they_held_before(name):
 
 
 @each_module
-def test_selected_by_a_sequence(name):
+def test_selected_out_keys_of_a_sequence(name):
     module, read, written = made(name)
-    found = TensorDictSequential(module, selected_out_keys=[module.out_keys[-1]])(read.copy())
-    assert set(found.keys(True, True)) == {*module.in_keys, module.out_keys[-1]}
-    assert torch.equal(found[module.out_keys[-1]], written[module.out_keys[-1]])
+    output = TensorDictSequential(module, selected_out_keys=[module.out_keys[-1]])(read.copy())
+    assert set(output.keys(True, True)) == {*module.in_keys, module.out_keys[-1]}
+    assert torch.equal(output[module.out_keys[-1]], written[module.out_keys[-1]])
 
 
 @each_module
-def test_called_with_tensors(name):
+def test_call_with_tensors_by_position_and_by_name(name):
     module, read, written = made(name)
-    for found in (module(**read.to_dict()), module(*(read[key] for key in module.in_keys))):
-        assert all(torch.equal(one, written[key]) for one, key in zip(as_tuple(found), module.out_keys, strict=True))
+    for output in (module(**read.to_dict()), module(*(read[key] for key in module.in_keys))):
+        assert all(torch.equal(one, written[key]) for one, key in zip(as_tuple(output), module.out_keys, strict=True))
     with pytest.raises((TypeError, RuntimeError), match="observatoin"):
         module(observatoin=read[module.in_keys[0]])
 
 
 @pytest.mark.parametrize("name", [n for n in MODULES if not isinstance(MODULES[n](), TensorDictSequential)])
-def test_new_names_for_what_it_writes(name):
+def test_assigned_out_keys(name):
     module, read, written = made(name)
     names = list(module.out_keys)
     module.out_keys = [("other", key) for key in names]
-    found = module(read.copy())
-    assert all(torch.equal(found["other", key], written[key]) for key in names)
+    output = module(read.copy())
+    assert all(torch.equal(output["other", key], written[key]) for key in names)
 
 
 @each_module
-def test_what_is_there_is_skipped_if_asked(name):
+def test_skip_existing(name):
     module, read, written = made(name)
     there = read.copy().update(written.clone().zero_())
     with set_skip_existing(True):
@@ -174,20 +173,20 @@ def test_what_is_there_is_skipped_if_asked(name):
 
 @pytest.mark.parametrize("name", [name for name in MODULES if "normal" not in name])  # no distribution has no rows
 @pytest.mark.parametrize("rows", [(0,), (2, 0)])
-def test_no_rows(name, rows):
+def test_call_with_no_rows(name, rows):
     module, read, written = made(name)
-    found = module(TensorDict({key: value.new_zeros(*rows, *value.shape[1:]) for key, value in read.items()}, rows))
+    output = module(TensorDict({key: value.new_zeros(*rows, *value.shape[1:]) for key, value in read.items()}, rows))
     for key in module.out_keys:
-        assert (found[key].shape, found[key].dtype) == ((*rows, *written[key].shape[1:]), written[key].dtype)
+        assert (output[key].shape, output[key].dtype) == ((*rows, *written[key].shape[1:]), written[key].dtype)
 
 
-def test_estimators_skip_values_that_are_there():
+def test_value_estimators_skip_existing_values():
     value, rows = Value(plan_trunk(PLANS), **SMALL), state().unsqueeze(0)
     flag = torch.zeros(1, 3, 1, dtype=torch.bool)
     rows["state_value"] = torch.ones(1, 3, 1)
     rows["next"] = rows.copy().update({"reward": torch.ones(1, 3, 1), "done": flag, "terminated": flag})
-    found = GAE(gamma=0.5, lmbda=0.0, value_network=value, skip_existing=True)(rows)
-    assert torch.equal(found["advantage"], torch.full((1, 3, 1), 0.5)), "1 + 0.5 - 1"
+    output = GAE(gamma=0.5, lmbda=0.0, value_network=value, skip_existing=True)(rows)
+    assert torch.equal(output["advantage"], torch.full((1, 3, 1), 0.5)), "1 + 0.5 - 1"
 
 
 @pytest.mark.parametrize("name", ["ensemble", "decided", "scripted"])
@@ -200,11 +199,3 @@ def test_renamed_out_keys_are_saved_or_refused(name, tmp_path):
         return
     with pytest.raises(ValueError, match="in_keys or out_keys were changed later: pass them to its constructor"):
         lw.save_actor(actor, tmp_path / "policy.safetensors")
-
-
-def test_every_forward_of_ours_is_called_so():
-    for make_one in KINDS.values():
-        if isinstance(module := make_one(), TensorDictSequential):
-            continue
-        kinds = [p.kind for p in inspect.signature(module.forward).parameters.values()]
-        assert kinds == [inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD]

@@ -1,4 +1,4 @@
-"""Queries answered of other plans than the actor's, of the same number of steps, are refused where both meet."""
+"""Truth of other plans than the actor's, of the same number of steps, is refused wherever both meet."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STEPS = [
     ("the gripper is not above the puck", "place the gripper above the puck"),
     ("the gripper is above the puck", "lower the gripper around the puck"),
 ]
-REFUSED = r"qaf answers other plans than the actor's, for push; give QAFTransform the actor's plans"
+REFUSED = "qaf answers other plans.* push"
 
 
 def plans_of(pairs, *more):
@@ -46,7 +46,7 @@ def state(plans, rows=3):
 
 @pytest.mark.parametrize("other", OTHERS)
 @pytest.mark.parametrize("make", ACTORS)
-def test_in_a_loop_composed_by_hand(make, other):
+def test_actor_refuses_truth_of_other_plans(make, other):
     actor = ACTORS[make](PLANS)
     env = TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(OTHERS[other]))
     with pytest.raises(ValueError, match=REFUSED):
@@ -58,11 +58,11 @@ def test_in_a_loop_composed_by_hand(make, other):
 
 
 @pytest.mark.parametrize("make", ACTORS)
-def test_without_the_number_nothing_is_known(make):
+def test_without_plan_numbers_nothing_is_refused(make):
     ACTORS[make](PLANS)(state(OTHERS["another skill"]).exclude("qaf_plan"))
 
 
-def test_each_row_has_its_plans_number():
+def test_each_row_carries_the_number_of_its_plan():
     reach = lw.ConditionalPlan.from_pairs("reach", [("the gripper is open", "close the gripper")] * 2)
     both = plans_of(STEPS, reach)
     mixed = TensorDict(
@@ -77,7 +77,7 @@ def test_each_row_has_its_plans_number():
         lw.PlanConditionedActor(plans_of(STEPS, other))(mixed)
 
 
-def test_a_collector_and_a_replay_buffer_refuse():
+def test_refusal_in_a_collector_and_on_a_replay_buffer():
     actor, other = lw.PlanConditionedActor(PLANS), OTHERS["another skill"]
 
     def env():
@@ -93,7 +93,7 @@ def test_a_collector_and_a_replay_buffer_refuse():
     assert torch.equal(sample["next", "qaf_plan"], sample["qaf_plan"])
 
 
-def test_through_processes():
+def test_refusal_across_processes():
     def make():
         return TransformedEnv(lw.LanguageWorldEnv("push"), lw.QAFTransform(PLANS))
 
@@ -105,17 +105,17 @@ def test_through_processes():
 
 
 @pytest.mark.parametrize("make", ["actor", "scripted"])
-def test_beside_a_qaf_of_another_name(make):
+def test_refusal_with_renamed_qaf(make):
     truth, more = ("agent", "truth"), ("observation", "task_id")
     keys = [truth, *more[::-1]] if make == "actor" else [*more, truth]
     data = TensorDict(observation=torch.zeros(3, 39), task_id=torch.full((3,), lw.task_id("push"))).auto_batch_size_()
-    told = lw.QAFTransform(OTHERS["another skill"], out_keys=[("agent", "truth")])
-    assert told.out_keys == [("agent", "truth"), ("agent", "truth_plan")]
+    transform = lw.QAFTransform(OTHERS["another skill"], out_keys=[truth])
+    assert transform.out_keys == [truth, ("agent", "truth_plan")]
     with pytest.raises(ValueError, match=REFUSED):
-        ACTORS[make](PLANS, in_keys=keys)(told(data))
+        ACTORS[make](PLANS, in_keys=keys)(transform(data))
 
 
-def test_a_relation_that_means_something_else_since(monkeypatch):
+def test_refusal_after_a_relation_was_redefined(monkeypatch):
     before = lw.PlanConditionedActor(PLANS)
     monkeypatch.setitem(RELATIONS, "above", (Comparison("z", ">", 0.3),))
     with pytest.raises(ValueError, match=REFUSED):
@@ -123,7 +123,7 @@ def test_a_relation_that_means_something_else_since(monkeypatch):
     lw.PlanConditionedActor(PLANS)(state(PLANS))
 
 
-def test_under_vmap_over_the_rows_it_steps_aside():
+def test_vmap_over_rows_skips_the_check_and_over_weights_keeps_it():
     actor, data = lw.PlanConditionedActor(PLANS).eval(), state(OTHERS["another skill"])
     assert torch.vmap(lambda row: actor(row)["action"])(data.exclude("action")).shape == (3, 4)
     params = TensorDict.from_module(actor).expand(2).clone()
@@ -136,7 +136,7 @@ def test_under_vmap_over_the_rows_it_steps_aside():
         torch.vmap(act)(params)
 
 
-def test_compiled_it_refuses_when_it_is_run():
+def test_compiled_actor_refuses_at_run_time():
     actor = lw.PlanConditionedActor(PLANS).eval()
     act = torch.compile(lambda data: actor(data)["action"], backend="eager")
     assert act(state(PLANS)).shape == (3, 4)
@@ -148,7 +148,7 @@ def test_compiled_it_refuses_when_it_is_run():
         act(wrong)
 
 
-def test_under_vmap_an_unknown_task_is_no_task_of_the_actor():
+def test_unknown_task_under_vmap_is_refused():
     actor = lw.DescriptorConditionedActor(["reach", "push"]).eval()
     data = TensorDict(observation=torch.zeros(3, 39), task_id=torch.full((3,), lw.task_id("soccer")))
     with pytest.raises((IndexError, RuntimeError)):

@@ -40,7 +40,7 @@ def two_keys():
     return TensorDictSequential(scaled, TensorDictModule(nn.Linear(39, 16), ["scaled"], ["features"]))
 
 
-def test_features_that_write_more_than_one_key_leave_the_latent_in_its_place():
+def test_features_may_write_more_than_one_key():
     actor = lw.PlanConditionedActor(PLANS, features=two_keys())
     assert actor.decoder.in_keys == ["skill_latent", "features"]
     true = torch.zeros(2, PLANS.num_steps)
@@ -51,32 +51,32 @@ def test_features_that_write_more_than_one_key_leave_the_latent_in_its_place():
     assert Concat(two_keys()).eval()(observation=torch.zeros(2, 39)).shape == (2, 16)
 
 
-def test_parts_of_other_plans_are_refused():
-    with pytest.raises(ValueError, match="attention and features must follow the same plans"):
+def test_parts_with_different_plans_are_refused():
+    with pytest.raises(ValueError, match="attention and features"):
         lw.PlanConditionedActor(PLANS, features=FocusFeatures(REVERSED))
     actor = lw.PlanConditionedActor(PLANS)
-    with pytest.raises(ValueError, match="attention and mixer must follow the same plans"):
+    with pytest.raises(ValueError, match="attention and mixer"):
         actor.mixer = SkillMixer(REVERSED)
     policy = TensorDictSequential(lw.StateQueryEvaluator(REVERSED), lw.PlanConditionedActor(PLANS))
     with pytest.raises(ValueError, match="qaf answers other plans"):
         policy(observation=torch.zeros(2, 39), task_id=IDS)
 
 
-def test_an_evaluator_answers_instead_of_the_environment_of_other_plans():
+def test_evaluator_replaces_the_answers_of_an_environment_with_other_plans():
     canonical = lw.canonical_plans(PLANS)
     policy = TensorDictSequential(lw.StateQueryEvaluator(canonical), lw.PlanConditionedActor(canonical))
     rows = lw.QAFTransform(PLANS)(lw.LanguageWorldEnv(["push", "reach"]).reset())
     assert policy(rows)["action"].shape == (2, 4)
 
 
-def test_a_renamed_turn_is_followed():
+def test_transform_writes_a_renamed_turn():
     plans = lw.canonical_plans(PLANS, fallback=True)
     actor = lw.PlanConditionedActor(plans, in_keys=["qaf", "task_id", "my_turn", "observation"])
     assert "my_turn" in transform_of(actor)[1].out_keys
     assert actor.with_plans(plans).in_keys == actor.in_keys
 
 
-def test_renaming_an_ensembles_keys_leaves_what_a_member_writes_itself():
+def test_renamed_keys_of_an_ensemble_skip_what_a_member_writes_itself():
     member = TensorDictSequential(lw.StateQueryEvaluator(PLANS), lw.PlanConditionedActor(PLANS))
     ensemble = ActorEnsemble([member, lw.PlanConditionedActor(PLANS)])
     names = {"qaf": "truth"}
@@ -85,7 +85,7 @@ def test_renaming_an_ensembles_keys_leaves_what_a_member_writes_itself():
     assert ensemble.members[1].in_keys[0] == "truth"
 
 
-def test_with_plans_follows_a_moved_actor_and_leaves_the_modes_of_shared_modules():
+def test_with_plans_keeps_dtype_and_modes():
     actor = lw.PlanConditionedActor(PLANS).double().train()
     actor.decoder.eval()
     other = actor.with_plans(REVERSED)
@@ -95,11 +95,11 @@ def test_with_plans_follows_a_moved_actor_and_leaves_the_modes_of_shared_modules
     assert other(**{**inputs(), "observation": observation})[-1].dtype == torch.float64
 
 
-def test_a_part_must_write_what_the_next_ones_read():
+def test_part_must_write_what_later_parts_read():
     actor = lw.PlanConditionedActor(PLANS)
-    with pytest.raises(ValueError, match=r"features must write .*, which later parts read"):
+    with pytest.raises(ValueError, match="features"):
         actor.features = TensorDictModule(nn.Linear(39, 56), ["observation"], ["seen"])
-    with pytest.raises(ValueError, match="trunk must have at least two named parts"):
+    with pytest.raises(ValueError, match="trunk"):
         Value(TensorDictSequential(PlanAttention(PLANS), SkillMixer(PLANS)))
 
 
@@ -111,14 +111,14 @@ def test_a_part_must_write_what_the_next_ones_read():
         nn.Sequential(OrderedDict(a=nn.Linear(120, 4), b=(tanh := nn.Tanh()), c=nn.Linear(4, 4), d=tanh)),
     ],
 )
-def test_a_network_of_pytorchs_modules_is_described_with_what_it_computes(network):
+def test_description_of_pytorch_layers_keeps_their_arguments(network):
     actor = lw.PlanConditionedActor(PLANS, decoder=network).eval()
     again = from_description(describe(actor))
     again.load_state_dict(actor.state_dict())
     assert torch.equal(again.eval()(**inputs())[-1], actor(**inputs())[-1])
 
 
-def test_a_setting_that_was_changed_later_is_described():
+def test_description_holds_a_setting_that_was_changed_later():
     actor = lw.PlanConditionedActor(PLANS)
     actor.decoder.network.squash = False
     assert from_description(describe(actor)).decoder.network.squash is False
@@ -130,5 +130,5 @@ def test_features_in_a_sequence_follow_other_plans():
     assert other.features[0].plans == REVERSED
     lost = TensorDictModule(nn.Linear(39, 16), ["observation"], ["features"])
     lost.plans = PLANS
-    with pytest.raises(TypeError, match="TensorDictModule cannot follow other plans"):
+    with pytest.raises(TypeError, match="TensorDictModule"):
         lw.PlanConditionedActor(PLANS, features=lost).with_plans(REVERSED)

@@ -1,4 +1,4 @@
-"""PlanConditionedActor: what its parts write, mixing by hand, shared weights, learning, and refused input."""
+"""PlanConditionedActor: keys of its parts, mixing by hand, replaced parts, shared weights, learning."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import warnings
 
 import pytest
 import torch
-from small_actors import PLANS, action_of, letters, make_actor, make_role_actor, make_rows, rows_for, small_decoder
+from small_actors import PLANS, action_of, letters, make_actor, make_role_actor, make_rows, rows_for
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
@@ -15,7 +15,7 @@ from torchrl.objectives import BCLoss
 import lw_torchrl as lw
 from lw_torchrl.language.plans import ConditionalPlan, Plans
 from lw_torchrl.language.text import encode_texts
-from lw_torchrl.modules import Decode, MLPDecoder, ObservationFeatures, PlanAttention, SkillMixer
+from lw_torchrl.modules import Decode, ObservationFeatures, PlanAttention, SkillMixer
 
 
 def make_loss(actor):
@@ -26,7 +26,7 @@ def make_loss(actor):
 
 @pytest.mark.parametrize("kind", ["raw", "differences", "relative", "both"])
 @pytest.mark.parametrize("shape", [(), (5,), (3, 4)])
-def test_it_writes_the_documented_keys_on_any_leading_shape(kind, shape):
+def test_documented_keys_for_any_leading_shape(kind, shape):
     actor = make_actor(features=ObservationFeatures(kind))
     rows = make_rows(*shape)
     out = actor(rows.copy())
@@ -44,7 +44,7 @@ def test_it_writes_the_documented_keys_on_any_leading_shape(kind, shape):
     assert (out.select(*actor.in_keys) == rows).all()
 
 
-def test_its_parts_are_modules_that_can_be_called_alone():
+def test_parts_can_be_called_alone():
     actor, rows = make_actor(), make_rows(5)
     kinds = [type(part) for part in actor.module.values()]
     assert kinds == [PlanAttention, SkillMixer, ObservationFeatures, Decode]
@@ -56,7 +56,7 @@ def test_its_parts_are_modules_that_can_be_called_alone():
     assert torch.equal(actor.trunk(rows.copy())["skill_latent"], step_by_step["skill_latent"])
 
 
-def test_mixing_step_by_step_by_hand():
+def test_action_by_hand():
     actor, rows = make_actor(), make_rows(12)
     out = actor(rows.copy())
     for row in range(12):
@@ -71,7 +71,7 @@ def test_mixing_step_by_step_by_hand():
         torch.testing.assert_close(out["action"][row], actor.decoder.network(torch.cat((mixed, features), -1)))
 
 
-def test_it_sees_the_plans_that_it_is_given():
+def test_canonical_plans_and_the_refusal_of_others():
     assert make_actor().plans is PLANS
     canonical = lw.canonical_plans({"coffee-pull": lw.load_plans("MT50")["coffee-pull"]}, fallback=True)
     actor = make_role_actor(canonical)
@@ -83,14 +83,14 @@ def test_it_sees_the_plans_that_it_is_given():
     rows = rows_for(actor, 6)
     assert actor(rows.clone())["action"].shape == (6, 4)
     written = lw.QAFTransform(lw.load_plans("MT50"))(make_rows(6, plans=canonical, answered=False))
-    with pytest.raises(ValueError, match=r"for coffee-pull; .*: QAFTransform\(actor.plans\)"):
+    with pytest.raises(ValueError, match="coffee-pull"):
         actor(written)
 
 
 # ---- replaced parts
 
 
-def test_a_part_that_is_assigned_is_used():
+def test_assigned_part_is_used():
     actor, rows = make_actor(), make_rows(5)
     actor.decoder = net = nn.Sequential(nn.LazyLinear(4), nn.Tanh())
     assert (actor.decoder.network, type(actor.decoder)) == (net, Decode)
@@ -103,11 +103,11 @@ def test_a_part_that_is_assigned_is_used():
     assert not torch.equal(action_of(actor, rows), out["action"])
     actor.features = TensorDictModule(nn.Linear(3, 56), in_keys=["hand"], out_keys=["features"])
     assert actor.in_keys == ["qaf", "task_id", "hand"]
-    with pytest.raises(TypeError, match="decoder must be a module, got 3"):
+    with pytest.raises(TypeError, match="decoder"):
         actor.decoder = 3
 
 
-def test_a_decoder_may_have_other_out_keys():
+def test_decoder_with_other_out_keys():
     class Two(nn.Module):
         def forward(self, encoding):
             return encoding[..., :4], encoding[..., 4:8].exp()
@@ -117,7 +117,7 @@ def test_a_decoder_may_have_other_out_keys():
     assert (actor(make_rows(3))["d", "scale"] > 0).all()
 
 
-def test_assigned_in_keys_are_read():
+def test_assigned_in_keys():
     actor, rows = make_actor(), make_rows(4)
     expected = action_of(actor, rows)
     trunk = actor.trunk
@@ -125,12 +125,12 @@ def test_assigned_in_keys_are_read():
     moved = TensorDict({("plan", "truth"): rows["qaf"], ("robot", "state"): rows["observation"]}, [4])
     moved["task_id"] = rows["task_id"]
     assert torch.equal(action_of(actor, moved), expected)
-    with pytest.raises(ValueError, match=r"plan.*needed"):
+    with pytest.raises(ValueError, match="truth"):
         actor(rows.copy())
     assert trunk(rows.copy())["features"].shape == (4, 56), "a trunk that shares the parts reads its own names"
     queries = lw.modules.transform_of(actor)
     assert (queries.in_keys, queries.out_keys[0]) == ([("robot", "state"), "task_id"], ("plan", "truth"))
-    with pytest.raises(ValueError, match="in_keys must be a list of 3, in this order"):
+    with pytest.raises(ValueError, match="in_keys"):
         actor.in_keys = ["observation"]
 
 
@@ -145,22 +145,6 @@ def other_plans():
     return Plans([ConditionalPlan.from_pairs("reach", pairs), ConditionalPlan.from_pairs("sweep", pairs[:1])])
 
 
-def test_with_plans_shares_the_weights_both_ways():
-    actor = make_actor(text_encoder=letters)
-    other = actor.with_plans(other_plans())
-    ours, theirs = dict(actor.named_parameters()), dict(other.named_parameters())
-    assert ours.keys() == theirs.keys()
-    assert all(ours[name] is theirs[name] for name in ours)
-    rows = {actor: make_rows(4), other: make_rows(4, plans=other_plans())}
-    for trained in (actor, other):
-        before = [action_of(each, rows[each]) for each in (actor, other)]
-        optimizer = torch.optim.SGD(trained.parameters(), 0.1)
-        action_of(trained, rows[trained]).sum().backward()
-        optimizer.step()
-        optimizer.zero_grad()
-        assert not any(torch.allclose(action_of(each, rows[each]), old) for each, old in zip(rows, before, strict=True))
-
-
 @pytest.mark.parametrize("training", [True, False])
 def test_with_plans_keeps_statistics_and_mode(training):
     actor = make_actor(text_encoder=letters).train(training)
@@ -171,7 +155,7 @@ def test_with_plans_keeps_statistics_and_mode(training):
     assert torch.equal(other.features.mean, actor.features.mean)
 
 
-def test_the_saved_state_holds_no_tables_of_the_plans():
+def test_state_dict_holds_no_tables_of_the_plans():
     actor = make_actor(text_encoder=letters)
     assert actor.state_dict().keys() == actor.with_plans(other_plans()).state_dict().keys()
     parts = {name.rsplit(".", 2)[0].removeprefix("module.") for name in actor.state_dict()}
@@ -191,7 +175,7 @@ def make_batch(rows=64, seed=0):
     return state.set("action", torch.cat((target, target[:, :1] * 0), -1) * 0.8)
 
 
-def test_bc_loss_trains_it():
+def test_bc_loss_trains_the_actor_itself():
     actor = make_actor()
     loss, batch = make_loss(actor), make_batch()
     optimizer = torch.optim.Adam(loss.parameters(), 1e-2)
@@ -206,55 +190,3 @@ def test_bc_loss_trains_it():
     with torch.no_grad():
         error = (actor(batch.exclude("action"))["action"] - batch["action"]).square()
     assert error.mean() < 0.1, "the actor itself has learned, not a copy"
-
-
-def test_the_gradient_reaches_every_weight():
-    actor = make_actor()
-    make_loss(actor)(make_batch(256))["loss_bc"].backward()
-    for name, parameter in actor.named_parameters():
-        assert parameter.grad is not None, name
-        assert parameter.grad.abs().sum() > 0, name
-
-
-# ---- bad input
-
-
-def broken(key, change, rows=3):
-    state = make_rows(rows)
-    return TensorDict({**state, key: change(state[key])}, [rows])
-
-
-def poke(index, value):
-    def change(tensor):
-        tensor = tensor.clone()
-        tensor[index] = value
-        return tensor
-
-    return change
-
-
-@pytest.mark.parametrize(
-    ("key", "change", "message"),
-    [
-        ("observation", poke((1, 5), torch.nan), "observation must hold finite numbers"),
-        ("observation", poke((0, 0), torch.inf), "observation must hold finite numbers"),
-        ("observation", lambda x: x[:, :38], r"observation must be float32 of shape \(..., 39\).*\(3, 38\)"),
-        ("observation", lambda x: x.long(), "observation must be float32.*int64"),
-        ("qaf", lambda x: x[:, 1:], "qaf must have shape.*QAFTransform the same plans"),
-        ("qaf", lambda x: torch.cat((x, x), -1), "qaf must have shape"),
-        ("task_id", poke(0, lw.task_id("sweep-into")), "without a plan.*: sweep-into"),
-        ("task_id", poke(0, 50), "task_id.*50"),
-        ("task_id", poke(0, -1), "task_id.*-1"),
-        ("task_id", lambda x: x.float(), "task_id.*float32"),
-    ],
-)
-def test_wrong_input_is_named(key, change, message):
-    with pytest.raises(ValueError, match=message):
-        make_actor()(broken(key, change))
-
-
-def test_a_misspelt_option_is_refused():
-    with pytest.raises(TypeError, match="decodr"):
-        lw.PlanConditionedActor(PLANS, decodr=small_decoder())
-    with pytest.raises(TypeError, match="widht"):
-        MLPDecoder(widht=3)

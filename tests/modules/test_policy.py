@@ -1,4 +1,4 @@
-"""plans_of, tasks_of, layout_of, transform_of and with_plans: what other code may ask of any actor."""
+"""plans_of, tasks_of, layout_of, transform_of and with_plans on every kind of actor."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PLAIN = TensorDictModule(nn.Linear(39, 4), in_keys=["observation"], out_keys=["a
 
 
 @pytest.mark.parametrize("name", ACTORS)
-def test_every_actor_states_its_plans_tasks_and_layout(name):
+def test_plans_tasks_and_layout_of_every_actor(name):
     actor = ACTORS[name]()
     expected = {"roles": CANONICAL, "demonstrated": CANONICAL, "fallback": FALLBACK}.get(name, PLANS)
     expected = None if name in ("description", "one-hot", "normal") else expected
@@ -29,14 +29,14 @@ def test_every_actor_states_its_plans_tasks_and_layout(name):
     assert layout_of(actor) == METAWORLD
 
 
-def test_a_module_that_is_not_ours_states_nothing():
+def test_plain_module_has_no_plans_and_no_tasks():
     assert (plans_of(PLAIN), tasks_of(PLAIN), layout_of(PLAIN), transform_of(PLAIN)) == (None, None, METAWORLD, None)
     assert isinstance(transform_of(PLAIN, PLANS), QAFTransform)
     fetch = load_suite("fetch").plans
     assert layout_of(make_actor(fetch)) == fetch.layout
 
 
-def test_the_transform_writes_what_the_actor_reads():
+def test_transform_writes_what_the_actor_reads():
     assert transform_of(make_descriptor()) is None
     assert transform_of(ACTORS["evaluator"]()) is None
     fallback = transform_of(make_role_actor(FALLBACK))
@@ -60,15 +60,15 @@ def test_with_plans_shares_every_weight(name):
     assert (plans_of(other), other.training) == (lw.Plans(own), False)
     assert {id(one) for one in other.parameters()} == {id(one) for one in actor.parameters()}
     rows = make_rows(4, plans=lw.Plans(own), answered=False)
-    found = []
+    output = []
     for each in (actor, other):
         transform = transform_of(each)
-        found.append(each(rows.copy() if transform is None else transform(rows.copy()))["action"])
-    torch.testing.assert_close(*found)
+        output.append(each(rows.copy() if transform is None else transform(rows.copy()))["action"])
+    torch.testing.assert_close(*output)
 
 
 def test_actors_that_cannot_follow_other_plans_are_refused():
-    with pytest.raises(TypeError, match="with_plans needs an actor that follows plans, and this Descriptor"):
+    with pytest.raises(TypeError, match="with_plans"):
         with_plans(make_descriptor(), PLANS)
 
     class Mine(TensorDictModule):
@@ -76,13 +76,13 @@ def test_actors_that_cannot_follow_other_plans_are_refused():
 
     mine = Mine(nn.Linear(39, 4), in_keys=["observation"], out_keys=["action"])
     mine.plans = PLANS
-    with pytest.raises(TypeError, match=r"Mine cannot follow other plans: give it a method with_plans\(plans\)"):
+    with pytest.raises(TypeError, match="Mine"):
         with_plans(mine, PLANS)
     sequence = with_plans(TensorDictSequential(PLAIN, make_actor()), {"push": PLANS["push"]})
     assert sequence[0] is PLAIN
 
 
-def test_a_policy_that_makes_no_progress_comes_to_its_fallback_steps():
+def test_policy_without_progress_reaches_its_fallback_steps():
     actor, turns = make_role_actor(FALLBACK), []
     nn.init.zeros_([*actor.decoder.parameters()][-1])
     lw.evaluate(
@@ -98,13 +98,13 @@ def test_a_policy_that_makes_no_progress_comes_to_its_fallback_steps():
 
 
 @pytest.mark.parametrize("turn", [0, 1])
-def test_in_each_turn_it_acts_as_under_that_plan_alone(turn):
-    """The plan's own steps in even turns, the fallback plan's in odd ones."""
+def test_each_turn_acts_as_an_actor_of_only_that_plan(turn):
+    """Even turns use the plan's own steps, odd turns the fallback plan's."""
     from lw_torchrl.language.canonical import fallback_plan
 
     actor = make_role_actor(FALLBACK)
     alone = lw.Plans([fallback_plan(plan.definition) for plan in PLANS.values()]) if turn else CANONICAL
     other = actor.with_plans(alone)
     rows = make_rows(40, plans=PLANS, answered=False)
-    found = actor(transform_of(actor)(rows.copy()).set("turn", torch.full((40,), turn)))["action"]
-    torch.testing.assert_close(found, other(transform_of(other)(rows.copy()))["action"])
+    output = actor(transform_of(actor)(rows.copy()).set("turn", torch.full((40,), turn)))["action"]
+    torch.testing.assert_close(output, other(transform_of(other)(rows.copy()))["action"])

@@ -1,4 +1,4 @@
-"""Half and double precision, and gradients of single rows, of every kind of actor and critic."""
+"""Half and double precision, and gradients of single rows, for every kind of actor and critic."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MODULES = ACTORS | {
 @pytest.mark.parametrize("rows_too", [True, False], ids=["rows too", "float32 rows"])
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])
 @pytest.mark.parametrize("name", [name for name in MODULES if name != "scripted"])
-def test_in_another_precision_it_returns_the_same(name, dtype, rows_too):
+def test_other_precisions_give_nearly_the_same_output(name, dtype, rows_too):
     module = MODULES[name]().eval()
     rows = rows_for(module, 6).set("action", torch.rand(6, 4))
     key = "action" if "action" in module.out_keys else module.out_keys[-1]
@@ -26,16 +26,16 @@ def test_in_another_precision_it_returns_the_same(name, dtype, rows_too):
     cast = rows.copy()
     if rows_too:
         cast["observation"] = cast["observation"].to(dtype)
-    found = module.to(dtype)(cast)[key]
-    assert found.dtype == dtype
+    output = module.to(dtype)(cast)[key]
+    assert output.dtype == dtype
     if key == "action" and name == "decided":
-        found, expected = found[:, :3], expected[:, :3]
+        output, expected = output[:, :3], expected[:, :3]
     limit = 0.1 if dtype == torch.bfloat16 else 1e-4
-    torch.testing.assert_close(found.float(), expected, atol=limit, rtol=limit)
+    torch.testing.assert_close(output.float(), expected, atol=limit, rtol=limit)
 
 
 @pytest.mark.parametrize("make", [make_actor, make_descriptor])
-def test_gradients_of_single_rows_add_up(make):
+def test_gradients_of_single_rows_sum_to_the_batch_gradient(make):
     actor = make(decoder=small_decoder(), **{"plans" if make is make_actor else "tasks": PLANS})
     rows = make_rows(5)
     params = {name: weight.detach() for name, weight in actor.named_parameters()}

@@ -1,16 +1,21 @@
-"""A QueryEvaluator in front of a policy: soft and hard answers, other plans, and logits that are refused."""
+"""Query evaluators in front of a policy: soft and hard answers, clauses, other plans, wrong logits."""
 
 from __future__ import annotations
 
 import pytest
 import torch
+from small_actors import assert_a_logit_for_each_step, letters
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
 from torch.func import vmap
+from torchrl.objectives import BCLoss
 
 import lw_torchrl as lw
-from lw_torchrl.modules import with_plans
+from lw_torchrl.language.plans import PlanStep
+from lw_torchrl.language.relations import RELATIONS, Comparison
+from lw_torchrl.modules import transform_of, with_plans
+from lw_torchrl.modules.query_evaluator import conjunction
 
 PLANS = lw.load_plans("MT10")
 OTHER = lw.Plans([PLANS["push"]])
@@ -18,7 +23,7 @@ S = PLANS.num_steps
 
 
 class Network(lw.QueryEvaluator):
-    """A table for the plans, a network, and a statistic."""
+    """An evaluator with a table for the plans, a network, and a statistic."""
 
     def __init__(self, plans, width=5):
         super().__init__(plans)
@@ -32,7 +37,7 @@ class Network(lw.QueryEvaluator):
 
 
 class Answers(lw.QueryEvaluator):
-    """Returns any logits."""
+    """An evaluator that returns the logits of a function."""
 
     def __init__(self, plans, make, **options):
         super().__init__(plans, **options)
@@ -47,7 +52,7 @@ def state(rows=2):
     return TensorDict(observation=torch.rand(rows, 39), task_id=ids, batch_size=rows)
 
 
-def test_soft_answers_are_probabilities_and_hard_ones_have_their_gradient():
+def test_hard_answers_have_the_gradient_of_soft_ones():
     logits = torch.linspace(-8, 8, 2 * S).reshape(2, S).requires_grad_()
     soft = Answers(PLANS, lambda b: logits)(state())["qaf"]
     assert torch.equal(soft, logits.sigmoid())
@@ -57,7 +62,7 @@ def test_soft_answers_are_probabilities_and_hard_ones_have_their_gradient():
     assert torch.equal(torch.autograd.grad(hard.sum(), logits)[0], slope)
 
 
-def test_hard_answers_act_as_exact_truth_does():
+def test_hard_answers_act_as_exact_truth():
     class Truth(lw.QueryEvaluator):
         def logits(self, observation, task_id):
             rows = TensorDict(observation=observation, task_id=task_id, batch_size=task_id.shape)
@@ -68,24 +73,24 @@ def test_hard_answers_act_as_exact_truth_does():
     for answers in ("hard", "soft"):
         policy = TensorDictSequential(Truth(PLANS, answers=answers), actor)
         assert policy.in_keys == ["observation", "task_id"]
-        found = policy(rows.clone())
+        output = policy(rows.clone())
         for key in ("skill_weights", "action"):
-            assert torch.equal(found[key], expected[key]) is (answers == "hard"), key
+            assert torch.equal(output[key], expected[key]) is (answers == "hard"), key
 
 
-def test_a_constructor_that_does_not_accept_answers_stays_soft():
+def test_constructor_without_answers_is_always_soft():
     evaluator = Network(PLANS)
     assert (evaluator.answers, evaluator.config) == ("soft", {"width": 5})
-    with pytest.raises(TypeError, match="constructor of Network must accept answers=, got answers='hard'"):
+    with pytest.raises(TypeError, match="answers"):
         evaluator.answers = "hard"
     evaluator = lw.StateQueryEvaluator(PLANS, width=8)
     evaluator.answers = "hard"
     assert evaluator.with_plans(OTHER).answers == evaluator.config["answers"] == "hard"
-    with pytest.raises(ValueError, match="answers must be one of 'soft', 'hard', got 'firm'"):
+    with pytest.raises(ValueError, match="answers"):
         evaluator.answers = "firm"
 
 
-def test_with_plans_shares_its_weights_and_not_its_tables():
+def test_with_plans_shares_weights_but_not_tables():
     policy = TensorDictSequential(Network(PLANS), lw.PlanConditionedActor(PLANS)).eval()
     other = with_plans(policy, OTHER)
     assert {id(one) for one in policy.parameters()} == {id(one) for one in other.parameters()}
@@ -111,19 +116,129 @@ def test_weights_of_another_shape_are_refused():
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
-        (lambda b: torch.zeros(b, S - 1), ValueError, rf"of Answers must be \(B, {S}\).*got shape \(2, {S - 1}\)"),
-        (lambda b: torch.zeros(()), ValueError, r"must be \(B, .*got shape \(\)"),
-        (lambda b: torch.zeros(b + 1, S), RuntimeError, r"batch dimension mismatch"),
-        (lambda b: torch.zeros(b, S, dtype=torch.bool), TypeError, r"must be float32.*got torch.bool"),
+        (lambda b: torch.zeros(b, S - 1), ValueError, "logits of Answers"),
+        (lambda b: torch.zeros(()), ValueError, "logits of Answers"),
+        (lambda b: torch.zeros(b + 1, S), RuntimeError, "batch dimension mismatch"),
+        (lambda b: torch.zeros(b, S, dtype=torch.bool), TypeError, "logits of Answers"),
     ],
 )
-def test_other_logits_are_refused_by_name(make, error, message):
+def test_wrong_logits_are_refused(make, error, message):
     with pytest.raises(error, match=message):
         Answers(PLANS, make)(state())
 
 
-def test_double_precision_is_taken_and_rows_can_be_mapped_over():
+def test_double_precision_and_vmap_over_rows():
     evaluator = Answers(PLANS, lambda b: torch.zeros(b, S, dtype=torch.float64))
     assert evaluator(state())["qaf"].dtype == torch.float32
     batch = torch.stack([state(), state(), state()])
     assert vmap(evaluator.logits_of)(batch).shape == (3, 2, S)
+
+
+# --- evaluators of clauses -------------------------------------------------------------------------------------------
+
+
+def make(plans=PLANS, seed=0, **options):
+    torch.manual_seed(seed)
+    return lw.StateQueryEvaluator(plans, width=8, depth=1, **options)
+
+
+def make_policy(**options):
+    return TensorDictSequential(make(**options), lw.PlanConditionedActor(PLANS, text_encoder=letters)).eval()
+
+
+def states(rows=20, plans=PLANS):
+    generator = torch.Generator().manual_seed(0)
+    ids = torch.tensor([lw.task_id(task) for task in plans]).repeat(rows)[:rows]
+    return TensorDict(
+        observation=torch.rand(rows, 39, generator=generator) * 0.3,
+        task_id=ids,
+        action=torch.rand(rows, 4, generator=generator),
+        batch_size=rows,
+    )
+
+
+def test_logits_of_each_step_for_rows_in_any_order_and_shape():
+    assert_a_logit_for_each_step(make(), states(64))
+
+
+def test_logits_depend_only_on_positions_that_clauses_compare():
+    evaluator, output = make(), states()
+    logits = evaluator(output.clone())["qaf_logits"]
+    moved = output.clone()
+    moved["observation"][:, 7:11] += 1.0  # a quaternion, which no relation compares
+    assert torch.equal(evaluator(moved)["qaf_logits"], logits)
+
+
+def test_not_changes_the_sign_of_a_logit():
+    texts = ["the gripper is above the puck", "the gripper is not above the puck"]
+    steps = [PlanStep(lw.parse_query(text, "push"), "grasp the puck") for text in texts]
+    plans = lw.Plans([lw.ConditionalPlan("push", tuple(steps))])
+    logits = make(plans)(states(6, plans))["qaf_logits"]
+    assert torch.allclose(logits[:, 0], -logits[:, 1], atol=1e-5)
+    assert (logits[:, 0] != 0).all()
+
+
+def test_probability_of_a_conjunction_is_the_product():
+    logits = torch.tensor([[0.3, -1.2, 2.0], [29.0, 30.0, -30.0], [4.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    mask = torch.tensor([[True, True, True], [True, True, False], [True, False, False], [False, False, False]])
+    output = conjunction(logits, mask)
+    p = torch.where(mask, logits.double().sigmoid(), 1.0).prod(-1)
+    assert torch.allclose(output[:3].double(), p[:3].logit(), atol=1e-4)
+    assert output[3] > 29
+    assert torch.allclose(conjunction(logits[:, :1], mask[:, :1])[:3], logits[:3, 0], atol=1e-5)
+
+
+def test_conjunction_has_a_finite_gradient_everywhere():
+    logits = torch.tensor([[30.0, 30.0], [-30.0, -30.0], [0.0, 1.0]], requires_grad=True)
+    conjunction(logits, torch.tensor([[True, True], [True, True], [False, False]])).sum().backward()
+    assert logits.grad.isfinite().all()
+    assert (logits.grad[2] == 0).all()
+
+
+@pytest.mark.parametrize("answers", ["soft", "hard"])
+@pytest.mark.filterwarnings("ignore:.*target_actor_network_params")
+def test_gradient_of_imitation_reaches_the_evaluator(answers):
+    policy = make_policy(answers=answers).train()
+    loss = BCLoss(policy, loss_function="l2")
+    loss(states())["loss_bc"].backward()
+    output = dict(policy[0].named_parameters())
+    assert len(output) >= 3
+    for name, parameter in output.items():
+        assert parameter.grad is not None, name
+        assert parameter.grad.abs().sum() > 0, name
+
+
+def test_soft_answers_give_the_papers_attention():
+    policy, rows = make_policy(), states()
+    output = policy(rows)
+    steps = [len(PLANS[lw.MT50[task]].steps) for task in rows["task_id"].tolist()]
+    mask = torch.arange(PLANS.num_steps) < torch.tensor(steps)[:, None]
+    logits = torch.where(mask, 10 * output["qaf_logits"].sigmoid() - 5, -torch.inf)
+    assert torch.allclose(output["skill_weights"], logits.softmax(-1), atol=1e-6)
+
+
+def test_scripted_skills_act_on_an_evaluators_answers(tmp_path):
+    evaluator = make()
+    policy = TensorDictSequential(evaluator, lw.ScriptedSkillActor(PLANS))
+    assert policy.in_keys == ["observation", "task_id"]
+    assert transform_of(policy) is None
+    output = policy(states())
+    answers = evaluator(states())["qaf_logits"] > 0
+    by_truth = lw.ScriptedSkillActor(PLANS)(states().set("qaf", answers))
+    for key in ("action", "skill_weights"):
+        assert torch.equal(output[key], by_truth[key])
+    assert output["skill_weights"][:, 1:].any()
+    lw.save_actor(policy, tmp_path / "policy.safetensors")
+    assert torch.equal(lw.load_actor(tmp_path / "policy.safetensors")(states())["action"], output["action"])
+    other = with_plans(policy, lw.Plans([PLANS["push"]]))
+    assert other[0].network.predicates.weight is evaluator.network.predicates.weight
+
+
+def test_plans_with_an_unknown_relation_are_refused(monkeypatch):
+    made = make()
+    monkeypatch.setitem(RELATIONS, "beside", (Comparison("xyz", "<", 0.05),))
+    step = PlanStep(lw.parse_query("the gripper is beside the puck", "push"), "grasp the puck")
+    plans = lw.Plans([lw.ConditionalPlan("push", (step,))])
+    with pytest.raises(ValueError, match="predicate"):
+        made.with_plans(plans)
+    assert "beside" in make(plans).predicates

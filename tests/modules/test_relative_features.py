@@ -1,4 +1,4 @@
-"""FocusFeatures and RoleFeatures: relative positions by hand, contacts of demonstrations, turned scenes."""
+"""FocusFeatures and RoleFeatures: relative positions by hand, contacts from demonstrations, turned scenes."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def focus_of(task, *conditions):
 
 
 def compared(focus, observation, weights=None):
-    """The positions (B, 2, 3), metres, of the first and the last clause."""
+    """Return the positions of the first and the last clause, (B, 2, 3) metres."""
     weights = torch.ones(len(observation), 1) if weights is None else weights
-    found = focus(observation, weights, torch.full((len(observation),), lw.task_id(next(iter(focus.plans)))))
-    assert found.shape == (len(observation), 18)
-    return found[:, :6].reshape(-1, 2, 3) / 10
+    output = focus(observation, weights, torch.full((len(observation),), lw.task_id(next(iter(focus.plans)))))
+    assert output.shape == (len(observation), 18)
+    return output[:, :6].reshape(-1, 2, 3) / 10
 
 
 @pytest.fixture
@@ -55,27 +55,27 @@ def observation():
     return torch.randn(5, 39, generator=torch.Generator().manual_seed(0))
 
 
-def test_the_first_and_the_last_clause_with_two_objects(observation):
+def test_focus_shows_the_first_and_the_last_clause_with_two_objects(observation):
     condition = "the gripper is above the puck and the gripper is open and the puck is near the target location"
-    found = compared(focus_of("push", condition), observation)
-    torch.testing.assert_close(found[:, 0], observation[:, OBJECT] - observation[:, HAND])
-    torch.testing.assert_close(found[:, 1], observation[:, GOAL] - observation[:, OBJECT])
-    found = compared(focus_of("push", "the gripper is not above the puck"), observation)
-    assert torch.equal(found[:, 0], found[:, 1])
+    output = compared(focus_of("push", condition), observation)
+    torch.testing.assert_close(output[:, 0], observation[:, OBJECT] - observation[:, HAND])
+    torch.testing.assert_close(output[:, 1], observation[:, GOAL] - observation[:, OBJECT])
+    output = compared(focus_of("push", "the gripper is not above the puck"), observation)
+    assert torch.equal(output[:, 0], output[:, 1])
     assert not compared(focus_of("push", "the gripper is open"), observation).any()
 
 
-def test_points_have_offsets_and_fixed_places(observation):
-    found = compared(focus_of("hammer", "the hammer head is near the nail"), observation)
+def test_focus_on_points_with_offsets_and_fixed_places(observation):
+    output = compared(focus_of("hammer", "the hammer head is near the nail"), observation)
     head = observation[:, OBJECT] + torch.tensor([0.16, 0.06, 0.0])
-    torch.testing.assert_close(found[:, 0], observation[:, SECOND] - head)
-    found = compared(focus_of("bin-picking", "the gripper is near the other bin"), observation)
-    torch.testing.assert_close(found[:, 0], torch.tensor([0.12, 0.7, 0.02]) - observation[:, HAND])
+    torch.testing.assert_close(output[:, 0], observation[:, SECOND] - head)
+    output = compared(focus_of("bin-picking", "the gripper is near the other bin"), observation)
+    torch.testing.assert_close(output[:, 0], torch.tensor([0.12, 0.7, 0.02]) - observation[:, HAND])
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**31))
-def test_steps_are_mixed_by_attention(seed):
+def test_focus_mixes_steps_by_attention(seed):
     generator = torch.Generator().manual_seed(seed)
     observation = torch.randn(4, 39, generator=generator)
     weights = torch.rand(4, 2, generator=generator).softmax(-1)
@@ -85,16 +85,16 @@ def test_steps_are_mixed_by_attention(seed):
     torch.testing.assert_close(mixed, weights[:, 0, None, None] * each[0] + weights[:, 1, None, None] * each[1])
 
 
-def test_positions_are_squashed_at_two_scales(observation):
+def test_focus_squashes_positions_at_two_scales(observation):
     focus = focus_of("push", "the gripper is above the puck")
-    found = focus(observation, torch.ones(5, 1), torch.full((5,), lw.task_id("push")))
-    position = found[:, :6] / 10
-    torch.testing.assert_close(found[:, 6:12], torch.tanh(position / 0.02))
-    torch.testing.assert_close(found[:, 12:], torch.tanh(position / 0.1))
+    output = focus(observation, torch.ones(5, 1), torch.full((5,), lw.task_id("push")))
+    position = output[:, :6] / 10
+    torch.testing.assert_close(output[:, 6:12], torch.tanh(position / 0.02))
+    torch.testing.assert_close(output[:, 12:], torch.tanh(position / 0.1))
 
 
 @pytest.mark.parametrize("kind", [FocusFeatures, RoleFeatures])
-def test_any_leading_shape_and_noise_while_training(kind):
+def test_any_leading_shape_and_noise_in_training_mode(kind):
     features = kind(CANONICAL, noise=0.1).eval()
     rows = TensorDict(
         observation=torch.randn(2, 3, 39),
@@ -108,13 +108,13 @@ def test_any_leading_shape_and_noise_while_training(kind):
     assert not torch.equal(features.train()(rows.copy())["features"], once)
 
 
-def test_an_actor_sees_the_positions_of_its_own_plans():
+def test_actor_sees_the_positions_of_its_own_plans():
     own = Plans([PLANS["push"], PLANS["reach"]])
     actor = make_actor(own, features=Concat(ObservationFeatures(), FocusFeatures(own)))
     other = actor.with_plans(PLANS)
     for each in (actor, other):
-        found = each(rows_for(each, 4))
-        assert (found["features"].shape, found["action"].shape) == ((4, 56 + 18), (4, 4))
+        output = each(rows_for(each, 4))
+        assert (output["features"].shape, output["action"].shape) == ((4, 56 + 18), (4, 4))
     assert other.decoder is actor.decoder
     assert other.features.parts[1].plans == PLANS
 
@@ -127,7 +127,7 @@ def roles_of(plans=CANONICAL, **options):
 
 
 def in_step(plans, task, step, number=5, seed=0):
-    """Random observations with all attention on one step of a task's plan, as ``positions`` reads them."""
+    """Return random observations with all attention on one step, as ``positions`` reads them."""
     observation = torch.randn(number, 39, generator=torch.Generator().manual_seed(seed))
     weights = torch.zeros(number, plans.num_steps)
     weights[:, step] = 1.0
@@ -135,7 +135,7 @@ def in_step(plans, task, step, number=5, seed=0):
 
 
 def written(roles, seen, **more):
-    """The features (B, 12) of what :func:`in_step` returned."""
+    """Return the features (B, 12) of inputs from :func:`in_step`."""
     observation, weights, rows = seen
     ids = torch.tensor([lw.task_id(task) for task in roles.tables.index.tasks])[rows]
     rows = TensorDict(observation=observation, skill_weights=weights, task_id=ids, batch_size=[len(ids)])
@@ -148,7 +148,7 @@ def rows_of(plans, seen):
 
 
 def test_plans_without_roles_are_refused():
-    with pytest.raises(ValueError, match=r"plans must have roles for RoleFeatures; use lw.canonical_plans\(plans\)"):
+    with pytest.raises(ValueError, match="plans must have roles"):
         RoleFeatures(PLANS)
 
 
@@ -161,7 +161,7 @@ def test_plans_without_roles_are_refused():
         ("peg-unplug-side", 3, lambda o: o[:, 36:39] - o[:, 4:7]),  # the goal, which that task has no name for
     ],
 )
-def test_the_position_is_from_what_is_moved_to_the_target(task, step, way):
+def test_position_points_from_the_moved_object_to_the_target(task, step, way):
     seen, roles = in_step(ZERO_SHOT, task, step), roles_of(ZERO_SHOT)
     roles.demonstrated.fill_(True)
     torch.testing.assert_close(roles.positions(*seen)[:, 0], way(seen[0]))
@@ -172,13 +172,13 @@ def test_the_position_is_from_what_is_moved_to_the_target(task, step, way):
     [("push", 0, (0.0, 0.0, 0.0)), ("drawer-open", 2, (0.0, -1.0, 0.0)), ("window-open", 2, (1.0, 0.0, 0.0)),
      ("window-open", 0, (1.0, 0.0, 0.0)), ("button-press-topdown", 2, (0.0, 0.0, -1.0))],
 )  # fmt: skip
-def test_a_step_shows_its_direction(task, step, direction):
+def test_direction_of_a_step(task, step, direction):
     roles, seen = roles_of(), in_step(CANONICAL, task, step)
     assert torch.equal(roles.directions(*seen), torch.tensor(direction).expand(5, 3))
     assert torch.equal(written(roles, seen)[:, 9:], torch.tensor(direction).expand(5, 3))
 
 
-def test_toward_the_goal_is_from_the_object_and_turns_with_the_scene():
+def test_direction_to_the_goal_starts_at_the_object_and_turns_with_the_scene():
     pairs = [
         ("gripper is not near the puck", "lower the gripper beside the puck"),
         ("gripper is near the puck", "push the puck to the target location"),
@@ -197,7 +197,7 @@ def test_toward_the_goal_is_from_the_object_and_turns_with_the_scene():
     assert not roles.directions(observation, weights, rows).any(), "it is there already"
 
 
-def test_an_object_that_is_moved_up_has_a_target_there():
+def test_object_that_is_lifted_has_a_target_above_it():
     pairs = [
         ("gripper is not near the puck", "lower the gripper around the puck"),
         ("gripper is near the puck and gripper is open", "close the gripper around the puck"),
@@ -210,7 +210,7 @@ def test_an_object_that_is_moved_up_has_a_target_there():
     assert not roles_of(plans).directions(*seen).any()
 
 
-def test_beyond_25_cm_only_the_direction_is_visible():
+def test_position_is_clipped_at_25_cm():
     roles = roles_of()
     observation, *rest = in_step(CANONICAL, "push", 0)
     observation[:, :3] = observation[:, 4:7] + torch.tensor([0.3, -0.4, 0.0])
@@ -223,25 +223,25 @@ def test_beyond_25_cm_only_the_direction_is_visible():
 
 
 def carried(beside, below):
-    """One row in which the puck is carried, at a distance beside its target and below it, metres."""
+    """Return one row in which the puck is carried, some metres beside and below its target."""
     observation, weights, rows = in_step(CANONICAL, "push", 3, number=1)
     observation[:, 4:7] = observation[:, 36:39] - torch.tensor([beside, 0.0, below])
     return observation, weights, rows
 
 
 @pytest.mark.parametrize(
-    ("beside", "below", "wanted"),
+    ("beside", "below", "expected"),
     [
-        (0.2, 0.0, (0.0, 0.0, 0.15)),  # far away: first straight up
+        (0.2, 0.0, (0.0, 0.0, 0.15)),  # far away: straight up first
         (0.2, -0.13, (0.2, 0.0, 0.02)),  # high: to the side
         (0.2, -0.11, (0.1, 0.0, 0.04)),  # in between: both
         (0.02, -0.15, (0.02, 0.0, -0.15)),  # over it: down
         (0.0, 0.0, (0.0, 0.0, 0.0)),
     ],
 )
-def test_without_demonstrations_a_carried_object_is_lifted_first(beside, below, wanted):
+def test_without_demonstrations_a_carried_object_is_lifted_first(beside, below, expected):
     roles, seen = roles_of(), carried(beside, below)
-    torch.testing.assert_close(roles.positions(*seen)[0, 0], torch.tensor(wanted), atol=1e-5, rtol=0)
+    torch.testing.assert_close(roles.positions(*seen)[0, 0], torch.tensor(expected), atol=1e-5, rtol=0)
     roles.fit(rows_of(CANONICAL, in_step(CANONICAL, "push", 0)))
     assert roles.demonstrated.tolist() == [task == "push" for task in roles.tables.index.tasks]
     torch.testing.assert_close(roles.positions(*seen)[0, 0], torch.tensor((beside, 0.0, below)), atol=1e-5, rtol=0)
@@ -262,7 +262,7 @@ def demonstrations(task):
     return rows.select("observation", "task_id", "action")
 
 
-def test_contacts_are_where_the_hand_is_when_it_acts():
+def test_contact_is_the_hand_position_while_it_acts():
     roles, rows = roles_of(), demonstrations("drawer-open")
     roles.fit(rows)
     attended = PlanAttention(CANONICAL)(lw.QAFTransform(CANONICAL)(rows.copy()))["skill_weights"]
@@ -281,14 +281,14 @@ def test_contacts_are_where_the_hand_is_when_it_acts():
     torch.testing.assert_close(at_contact, torch.zeros_like(at_contact), atol=1e-5, rtol=0)
 
 
-def test_a_button_that_is_pressed_from_above_has_no_contact():
+def test_button_pressed_from_above_has_no_contact():
     roles = roles_of()
     roles.fit(demonstrations("button-press-topdown"))
     assert not roles.contact.any()
     assert roles.demonstrated.sum() == 1
 
 
-def test_contacts_move_neither_carried_objects_nor_named_points():
+def test_contacts_affect_neither_carried_objects_nor_named_points():
     roles = roles_of(ZERO_SHOT)
     roles.contact.fill_(1.0)
     roles.demonstrated.fill_(True)
@@ -299,7 +299,7 @@ def test_contacts_move_neither_carried_objects_nor_named_points():
 
 
 @pytest.mark.parametrize(("task", "step"), [("push", 0), ("peg-insert-side", 4), ("drawer-open", 2)])
-def test_a_turned_scene_turns_the_way_fixed_places_and_contacts_too(task, step):
+def test_turned_scene_turns_positions_fixed_places_and_contacts(task, step):
     """The hole of peg-insert-side has a fixed x, which no turned observation holds."""
     roles = roles_of()
     roles.contact.copy_(torch.rand(roles.contact.shape))
@@ -315,7 +315,7 @@ def test_a_turned_scene_turns_the_way_fixed_places_and_contacts_too(task, step):
     torch.testing.assert_close(after[:, 2], before[:, 2])
 
 
-def test_the_buffer_s_jitter_and_tilt_move_the_position():
+def test_target_offset_moves_the_position():
     roles, seen = roles_of(), in_step(CANONICAL, "drawer-open", 2)
     offset = torch.full((5, 3), 0.01)
     plain, moved = written(roles, seen), written(roles, seen, target_offset=offset)
@@ -331,7 +331,7 @@ def make_replay(task="drawer-open"):
     return replay
 
 
-def test_training_takes_contacts_and_they_are_saved_with_the_policy(tmp_path):
+def test_training_fits_contacts_and_the_policy_file_holds_them(tmp_path):
     actor, replay = make_role_actor(), make_replay()
     replay.append_transform(transform_of(actor))
     config = lw.BehavioralCloningConfig(steps=2, batch_size=8)
@@ -371,7 +371,7 @@ def test_actors_with_the_same_weights_share_contacts_whichever_is_fitted():
 
 
 @pytest.mark.filterwarnings("ignore:No target network updater")
-def test_contacts_that_a_loss_or_a_file_brings_are_shared_too():
+def test_contacts_fitted_in_a_loss_or_loaded_are_shared():
     actor, replay, row = make_role_actor(), make_replay(), row_of(ZERO_SHOT, "drawer-open")
     wider = actor.with_plans(ZERO_SHOT).features
     critic = lw.PlanConditionedQValue(ZERO_SHOT, features=actor.with_plans(ZERO_SHOT).features, width=8, depth=1)
@@ -389,9 +389,9 @@ def test_contacts_that_a_loss_or_a_file_brings_are_shared_too():
 @pytest.mark.parametrize("features", [FocusFeatures(CANONICAL), RoleFeatures(CANONICAL)])
 def test_wrong_observations_are_refused(features):
     weights, ids = torch.ones(2, CANONICAL.num_steps), torch.full((2,), lw.task_id("push"))
-    with pytest.raises(ValueError, match=r"observation must be float32 of shape \(..., 39\), got .*\(2, 40\)"):
+    with pytest.raises(ValueError, match="observation"):
         features(torch.zeros(2, 40), weights, ids)
-    with pytest.raises(ValueError, match="observation must hold finite numbers"):
+    with pytest.raises(ValueError, match="observation"):
         features(torch.full((2, 39), torch.nan), weights, ids)
 
 
@@ -399,7 +399,7 @@ def test_training_without_contacts_is_refused():
     replay, actor = make_replay(), make_role_actor()
     replay.append_transform(transform_of(actor))
     config = lw.BehavioralCloningConfig(steps=1, batch_size=8, normalize=False)
-    with pytest.raises(ValueError, match=r"call lw.training.fit_normalization\(actor, replay\)"):
+    with pytest.raises(ValueError, match="fit_normalization"):
         lw.BehavioralCloningTrainer(actor, replay, config, progress=False)
     fit_normalization(actor, replay)
     lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()

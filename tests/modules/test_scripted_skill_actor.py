@@ -1,4 +1,4 @@
-"""ScriptedSkillActor: which step it takes, and that plans of MT10 are carried out."""
+"""ScriptedSkillActor: which step acts, and the plans of MT10 carried out."""
 
 import pytest
 import torch
@@ -12,7 +12,7 @@ PUSH = lw.task_id("push")
 
 
 def acting(select, qaf, **options):
-    """The actor's weights and actions in as many random states of push as there are rows of ``qaf``."""
+    """Return the actor's weights and actions, and those of each skill, in a random state of push for each row."""
     n = len(qaf)
     torch.manual_seed(0)
     state = TensorDict(
@@ -26,21 +26,21 @@ def acting(select, qaf, **options):
 TRUE = [[True, False, False, False], [False, True, True, False], [False, False, False, False], [True, True, True, True]]
 
 
-def test_first_takes_the_first_true_step_and_the_last_where_none_is():
+def test_first_true_step_acts_or_the_last_if_none_is_true():
     weights, action, each = acting("first", TRUE)
     assert weights.argmax(-1).tolist() == [0, 1, 3, 0]
     assert weights.sum(-1).tolist() == [1.0] * 4
     assert torch.equal(action, each[torch.arange(4), weights.argmax(-1)])
 
 
-def test_mix_takes_equal_parts_of_the_true_steps():
+def test_mix_averages_the_true_steps():
     weights, action, each = acting("mix", TRUE)
     assert weights[1].tolist() == [0.0, 0.5, 0.5, 0.0]
     assert weights[2].tolist() == [0.0, 0.0, 0.0, 1.0]
     assert torch.allclose(action[1], (each[1, 1] + each[1, 2]) / 2)
 
 
-def test_random_takes_any_true_step_equally_often_and_hangs_on_its_seed():
+def test_random_step_is_uniform_over_true_steps_and_depends_on_the_seed():
     qaf = [[False, True, True, True]] * 3000
     weights, _, _ = acting("random", qaf, seed=3)
     counts = weights.sum(0).tolist()
@@ -59,29 +59,15 @@ def test_soft_truth_is_true_above_a_half(select):
     assert weights[2].tolist() == [0.0, 0.0, 0.0, 1.0]
 
 
-def test_a_task_without_a_plan_is_named():
-    actor = lw.ScriptedSkillActor({"push": PLANS["push"]})
-    state = {"observation": torch.zeros(1, 39), "task_id": torch.tensor([0]), "qaf": torch.ones(1, 4).bool()}
-    with pytest.raises(ValueError, match=r"tasks without a plan.*: assembly"):
-        actor(TensorDict(state, [1]))
-
-
 def test_padding_gets_no_weight():
-    plans = lw.load_plans("MT10")
-    env_steps = plans.num_steps
-    state = TensorDict(
-        {
-            "observation": torch.rand(10, 39),
-            "task_id": torch.tensor([lw.task_id(task) for task in lw.MT10]),
-            "qaf": torch.zeros(10, env_steps, dtype=torch.bool),
-        },
-        [10],
-    )
-    weights = lw.ScriptedSkillActor(plans)(state)["skill_weights"]
-    assert weights.argmax(-1).tolist() == [len(plans[task].steps) - 1 for task in lw.MT10]
+    ids = torch.tensor([lw.task_id(task) for task in lw.MT10])
+    qaf = torch.zeros(10, PLANS.num_steps, dtype=torch.bool)
+    state = TensorDict(observation=torch.rand(10, 39), task_id=ids, qaf=qaf, batch_size=[10])
+    weights = lw.ScriptedSkillActor(PLANS)(state)["skill_weights"]
+    assert weights.argmax(-1).tolist() == [len(PLANS[task].steps) - 1 for task in lw.MT10]
 
 
-def test_it_carries_out_the_plans_of_mt10():
+def test_plans_of_mt10_succeed():
     result = lw.evaluate(
         lw.ScriptedSkillActor(PLANS),
         tasks="MT10",
@@ -94,19 +80,13 @@ def test_it_carries_out_the_plans_of_mt10():
     assert result.mean_success >= 0.98, result.table()
 
 
-def test_other_plans_and_ones_own_skills(tmp_path):
+def test_custom_skills_and_other_plans(tmp_path):
     path = tmp_path / "skills.toml"
     path.write_text('["stay put"]\ntarget = "robot\'s gripper"\n')
     plan = lw.ConditionalPlan.from_pairs("reach", [("the gripper is open", "stay put")])
     actor = lw.ScriptedSkillActor({"reach": plan}, skills=lw.load_skills(path))
-    state = TensorDict(
-        {
-            "observation": torch.rand(1, 39),
-            "task_id": torch.tensor([lw.task_id("reach")]),
-            "qaf": torch.ones(1, 1).bool(),
-        },
-        [1],
-    )
+    ids = torch.tensor([lw.task_id("reach")])
+    state = TensorDict(observation=torch.rand(1, 39), task_id=ids, qaf=torch.ones(1, 1).bool(), batch_size=[1])
     assert not actor(state)["action"].any()
     assert actor.with_plans({"reach": plan}).plans == actor.plans
 

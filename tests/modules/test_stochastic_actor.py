@@ -1,4 +1,4 @@
-"""StochasticActor: TorchRL's sampling on our trunks, made of a trained actor."""
+"""StochasticActor: TorchRL's sampling on our trunks, as a copy of a trained actor."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import pytest
 import torch
 from small_actors import (
     CANONICAL,
-    PLANS,
-    letters,
     make_actor,
     make_descriptor,
     make_role_actor,
@@ -25,7 +23,7 @@ from lw_torchrl.modules import Concat, FocusFeatures, ObservationFeatures, RoleF
 
 
 def trained(kind="plan", **options):
-    """A deterministic actor with statistics and noisy features."""
+    """Return a deterministic actor with fitted statistics and noisy features."""
     if kind == "plan":
         actor = make_actor(features=ObservationFeatures(noise=0.3), **options)
     else:
@@ -51,7 +49,7 @@ by_distribution = pytest.mark.parametrize("distribution", ["tanh_normal", "norma
 @by_kind
 @by_distribution
 @pytest.mark.parametrize("shape", [(), (5,), (2, 3)])
-def test_it_writes_the_documented_keys(kind, distribution, shape):
+def test_documented_keys_and_log_probabilities(kind, distribution, shape):
     actor, rows = make(kind, distribution), make_rows(*shape)
     assert isinstance(actor, ProbabilisticTensorDictSequential)
     out = drawn(actor, rows)
@@ -68,7 +66,7 @@ def test_it_writes_the_documented_keys(kind, distribution, shape):
 
 
 @by_distribution
-def test_it_draws_only_under_exploration(distribution):
+def test_actions_are_drawn_only_under_exploration(distribution):
     actor, rows = make(distribution=distribution), make_rows(5)
     assert torch.equal(actor(rows.clone())["action"], actor(rows.clone())["action"])
     assert not torch.equal(drawn(actor, rows)["action"], actor(rows.clone())["action"])
@@ -81,7 +79,7 @@ def test_it_draws_only_under_exploration(distribution):
 
 @by_kind
 @by_distribution
-def test_it_is_a_copy_whose_mode_is_the_actors_action(kind, distribution):
+def test_copy_has_the_actors_action_as_mode(kind, distribution):
     before, rows = trained(kind), make_rows(5)
     actor = before.stochastic(distribution, init_std=0.2)
     torch.testing.assert_close(actor(rows.clone())["action"], before(rows.clone())["action"])
@@ -92,7 +90,7 @@ def test_it_is_a_copy_whose_mode_is_the_actors_action(kind, distribution):
     assert all(torch.equal(old, new) for old, new in zip(weights, before.parameters(), strict=True))
 
 
-def test_no_noise_changes_the_likelihoods():
+def test_feature_noise_is_off_in_likelihoods():
     features = Concat(ObservationFeatures(noise=0.2), FocusFeatures(CANONICAL, 0.2), RoleFeatures(CANONICAL, 0.2))
     before = make_actor(CANONICAL, features=features)
     actor, rows = before.stochastic().train(), make_rows(50, plans=CANONICAL)
@@ -101,17 +99,7 @@ def test_no_noise_changes_the_likelihoods():
     assert [part.noise for part in before.features.parts] == [0.2, 0.2, 0.2]
 
 
-@by_distribution
-def test_it_is_saved_and_loaded(distribution, tmp_path):
-    actor, rows = make(distribution=distribution, init_std=0.7), make_rows(5)
-    lw.save_actor(actor, tmp_path / "policy.safetensors")
-    loaded = lw.load_actor(tmp_path / "policy.safetensors")
-    out, expected = loaded(rows.clone()), actor.eval()(rows.clone())
-    assert all(torch.equal(out[key], expected[key]) for key in actor.out_keys)
-    assert loaded.distribution == distribution
-
-
-def test_a_nested_action_keeps_its_place(tmp_path):
+def test_nested_action_key(tmp_path):
     actor = make(out_keys=[("agent", "action")])
     keys = [("agent", name) for name in ("loc", "scale", "action", "action_log_prob")]
     assert actor.out_keys[-4:] == keys
@@ -120,27 +108,20 @@ def test_a_nested_action_keeps_its_place(tmp_path):
     assert lw.load_actor(tmp_path / "policy.safetensors").out_keys == actor.out_keys
 
 
-def test_other_plans_share_the_weights():
-    actor = make(text_encoder=letters)
-    other = actor.with_plans({"push": PLANS["push"]})
-    assert {id(one) for one in other.parameters()} == {id(one) for one in actor.parameters()}
-    assert other(make_rows(3, plans=other.plans))["action"].shape == (3, 4)
-
-
-def test_what_has_no_gaussian_copy_is_refused():
-    with pytest.raises(TypeError, match=r"stochastic\(\) needs an MLPDecoder, this actor has Linear.*ProbabilisticAct"):
+def test_actors_without_a_gaussian_copy_are_refused():
+    with pytest.raises(TypeError, match="MLPDecoder"):
         make_actor(decoder=nn.LazyLinear(4)).stochastic()
     bare = make_actor(decoder=small_decoder(squash=False))
-    with pytest.raises(ValueError, match="'tanh_normal' squashes actions, and this actor does not; use 'normal'"):
+    with pytest.raises(ValueError, match="distribution"):
         bare.stochastic("tanh_normal")
     assert bare.stochastic("normal")(make_rows(2))["action"].shape == (2, 4)
-    with pytest.raises(ValueError, match="distribution must be one of 'tanh_normal', 'normal', got 'gauss'"):
+    with pytest.raises(ValueError, match="distribution"):
         bare.stochastic("gauss")
-    with pytest.raises(ValueError, match="init_std must be above"):
+    with pytest.raises(ValueError, match="init_std"):
         make_actor().stochastic(init_std=0.0)
 
 
-def test_it_is_evaluated_and_collects():
+def test_evaluation_and_collection():
     actor = make().eval()
     result = lw.evaluate(actor, tasks="push", episodes_per_task=1, seed=1_000, max_steps=5, progress=False)
     assert result.mean_success == 0.0
@@ -151,7 +132,7 @@ def test_it_is_evaluated_and_collects():
     assert data["action_log_prob"].shape == (2, 4)
 
 
-def test_v_trace_accepts_it():
+def test_v_trace_accepts_the_actor():
     actor = make()
     rows = drawn(actor, make_rows(6)).detach().reshape(1, 6)
     flag = torch.zeros(1, 6, 1, dtype=torch.bool)
@@ -162,7 +143,7 @@ def test_v_trace_accepts_it():
     assert loss(rows)["loss_objective"].isfinite()
 
 
-def test_contacts_are_copied_too():
+def test_contacts_are_copied():
     before = make_role_actor()
     before.features.contact.fill_(0.1)
     actor = before.stochastic()

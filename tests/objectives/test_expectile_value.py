@@ -1,4 +1,4 @@
-"""The value by expectile regression: against sums written out by hand, and TorchRL's own."""
+"""ExpectileValueLoss: against sums by hand, and TorchRL's estimator and IQL loss."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
-from torch import nn
+from test_losses import COMPILING, PLANS, SMALL
 from torchrl.objectives import IQLLoss, SoftUpdate, ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
@@ -17,8 +16,6 @@ import lw_torchrl as lw
 from lw_torchrl.modules import ObservationFeatures, Value, descriptor_trunk
 from lw_torchrl.training import fit_normalization
 
-PLANS = lw.load_plans("MT10")
-SMALL = dict(width=16, depth=1)
 CRITICS = {
     "plan": lambda ensemble, **more: lw.PlanConditionedValue(PLANS, ensemble=ensemble, **SMALL, **more),
     "description": lambda ensemble, **more: Value(descriptor_trunk("MT10", **more), ensemble=ensemble, **SMALL),
@@ -26,7 +23,7 @@ CRITICS = {
 
 
 def make_loss(kind="plan", ensemble=2, seed=0, gamma=0.9, **options):
-    """A loss whose targets differ from what it trains, as in the midst of a training."""
+    """Return a loss whose target network differs from its network, as during training."""
     torch.manual_seed(seed)
     features = ObservationFeatures(noise=options.pop("noise", 0.0))
     loss = lw.objectives.ExpectileValueLoss(CRITICS[kind](ensemble, features=features), **options)
@@ -53,8 +50,8 @@ def make_batch(rows=12, seed=0, steps=True):
     return lw.QAFTransform(PLANS)(batch.auto_batch_size_(1))
 
 
-def says(loss, params, state):
-    """(B, E): what the network with these parameters says of states."""
+def values_of(loss, params, state):
+    """Return the network's values of states with these parameters, (B, E)."""
     network = copy.deepcopy(loss.value_network)
     params.data.to_module(network)
     key = "state_values" if len(network.heads) > 1 else "state_value"
@@ -63,9 +60,9 @@ def says(loss, params, state):
 
 
 def by_hand(loss, batch, gamma=0.9, expectile=0.7):
-    """The loss, the mean value, the priorities and the advantages, row after row."""
-    values = says(loss, loss.value_network_params, batch)
-    now, following = (says(loss, loss.target_value_network_params, s) for s in (batch, batch["next"]))
+    """Return the loss, the mean value, the priorities and the advantages, computed row by row."""
+    values = values_of(loss, loss.value_network_params, batch)
+    now, following = (values_of(loss, loss.target_value_network_params, s) for s in (batch, batch["next"]))
     total, priorities, advantages = 0.0, [], []
     for row in range(len(batch)):
         n = int(batch["steps_to_next_obs"][row]) if "steps_to_next_obs" in batch.keys() else 1
@@ -81,60 +78,38 @@ def by_hand(loss, batch, gamma=0.9, expectile=0.7):
 @pytest.mark.parametrize("steps", [True, False])
 @pytest.mark.parametrize("ensemble", [1, 2, 3])
 @pytest.mark.parametrize("kind", CRITICS)
-def test_it_is_what_is_written_by_hand(kind, ensemble, steps):
+def test_loss_by_hand(kind, ensemble, steps):
     for expectile in (0.3, 0.7, 1.0):
         loss, batch = make_loss(kind, ensemble, expectile=expectile), make_batch(steps=steps)
-        wanted, value, priorities, advantages = by_hand(loss, batch, expectile=expectile)
-        found = loss(batch)
-        np.testing.assert_allclose(found["loss_value"].item(), wanted, rtol=1e-5)
-        np.testing.assert_allclose(found["value"].item(), value, rtol=1e-5)
+        expected, value, priorities, advantages = by_hand(loss, batch, expectile=expectile)
+        result = loss(batch)
+        np.testing.assert_allclose(result["loss_value"].item(), expected, rtol=1e-5)
+        np.testing.assert_allclose(result["value"].item(), value, rtol=1e-5)
         np.testing.assert_allclose(batch["td_error"].numpy(), priorities, rtol=1e-4, atol=1e-7)
         np.testing.assert_allclose(loss.advantage(batch).numpy(), advantages, rtol=1e-4, atol=1e-6)
-        assert not found["value"].requires_grad
+        assert not result["value"].requires_grad
         assert not batch["td_error"].requires_grad
 
 
-def test_features_see_the_angle_by_which_a_row_was_turned():
-    plans = lw.load_plans("MT10")
-    critic = lw.PlanConditionedValue(plans, features=lw.modules.FocusFeatures(plans), **SMALL)
+def test_features_read_the_angle_of_a_turned_row():
+    critic = lw.PlanConditionedValue(PLANS, features=lw.modules.FocusFeatures(PLANS), **SMALL)
     loss = lw.objectives.ExpectileValueLoss(critic, delay_value=False).make_value_estimator(gamma=0.9)
     turned = lw.RandomYaw(1.0)(make_batch().set("action", torch.zeros(12, 4)))
     assert loss(turned.copy())["value"] == critic(turned.copy())["state_value"].mean()
     assert loss(turned.exclude("observation_yaw"))["value"] != loss(turned)["value"]
 
 
-def test_it_is_iqls_expectile_of_td0s_target():
-    """One network, no targets apart: TorchRL's own parts, put together."""
+def test_loss_is_iqls_expectile_of_the_td0_target():
     loss, batch = make_loss(ensemble=1, delay_value=False), make_batch()
     estimator = TD0Estimator(gamma=0.9, value_network=loss.get_stateful_net("value_network"))
-    wanted = estimator(batch.copy())
-    torch.testing.assert_close(loss.advantage(batch), wanted["advantage"])
-    diff = wanted["value_target"] - wanted["state_value"]
+    expected = estimator(batch.copy())
+    torch.testing.assert_close(loss.advantage(batch), expected["advantage"])
+    diff = expected["value_target"] - expected["state_value"]
     torch.testing.assert_close(loss(batch)["loss_value"], IQLLoss.loss_value_diff(diff, 0.7).mean())
 
 
-def test_it_finds_the_expectile_of_what_followed():
-    """Rows that end, of one state and many rewards: V goes where the expectile's own condition holds."""
-    rewards = torch.rand(200, 1, generator=torch.Generator().manual_seed(0))
-    ended = torch.ones(200, 1, dtype=torch.bool)
-    batch = TensorDict(
-        one=torch.ones(200, 1), next=TensorDict(one=torch.ones(200, 1), reward=rewards, done=ended, terminated=ended)
-    ).auto_batch_size_(1)
-    network = TensorDictModule(nn.Linear(1, 1, bias=False), in_keys=["one"], out_keys=["state_value"])
-    loss = lw.objectives.ExpectileValueLoss(network, expectile=0.9, delay_value=False).make_value_estimator(gamma=0.9)
-    optimizer = torch.optim.SGD(loss.parameters(), lr=0.5)
-    for _ in range(300):
-        optimizer.zero_grad()
-        loss(batch)["loss_value"].backward()
-        optimizer.step()
-    value = loss(batch)["value"]
-    above, below = (rewards - value).clamp(min=0).sum(), (value - rewards).clamp(min=0).sum()
-    torch.testing.assert_close(0.9 * above, 0.1 * below, rtol=1e-3, atol=1e-3)
-    assert value > rewards.mean() + 0.1
-
-
 @pytest.mark.parametrize("kind", CRITICS)
-def test_gradients_reach_what_is_trained_and_no_target(kind):
+def test_gradients_reach_every_parameter_but_no_target(kind):
     loss, batch = make_loss(kind), make_batch()
     loss(batch)["loss_value"].backward()
     assert all(p.grad.abs().sum() > 0 for p in loss.parameters())
@@ -144,26 +119,22 @@ def test_gradients_reach_what_is_trained_and_no_target(kind):
     assert not loss.advantage(batch).requires_grad
 
 
-@pytest.mark.filterwarnings(  # what PyTorch warns of when it compiles
-    "ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning",
-    "ignore:.*LeafSpec:FutureWarning",
-    "ignore:.*torch.jit:DeprecationWarning",
-)
+@COMPILING
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", CRITICS)
-def test_compiled_it_is_one_graph_with_the_same_gradients(kind):
+def test_compiled_loss_is_one_graph_with_the_same_gradients(kind):
     torch._dynamo.reset()
-    loss, found = make_loss(kind), []
+    loss, result = make_loss(kind), []
     for run in (loss, torch.compile(loss, fullgraph=True, backend="eager")):
         loss.zero_grad()
         batch = make_batch()
         value = run(batch)["loss_value"]
         value.backward()
-        found.append([value.detach(), batch["td_error"], *(p.grad.clone() for p in loss.parameters())])
-    assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+        result.append([value.detach(), batch["td_error"], *(p.grad.clone() for p in loss.parameters())])
+    assert all(torch.equal(one, other) for one, other in zip(*result, strict=True))
 
 
-def test_keys_by_other_names_nested_ones_too():
+def test_renamed_and_nested_keys():
     keys = [("agent", "task_id"), ("agent", "observation")]
     names = {"value": ("agent", "v"), "values": ("agent", "vs"), "reward": ("agent", "gain"), "priority": "urgency"}
     names |= {"done": ("agent", "over"), "terminated": ("agent", "dead"), "steps_to_next_obs": ("agent", "n")}
@@ -195,27 +166,19 @@ def test_keys_by_other_names_nested_ones_too():
     assert torch.equal(again(renamed)["loss_value"], plain(batch)["loss_value"])
 
 
-def test_its_keys_are_enough():
-    """Dispatch, of tensors instead of a tensordict."""
+def test_call_with_tensors_of_in_keys():
     loss, batch = make_loss("description", 1), make_batch(steps=False)
     given = {"_".join(key) if isinstance(key, tuple) else key: batch[key] for key in loss.in_keys}
     assert set(given) == {
         *("observation", "task_id", "next_observation", "next_task_id", "next_reward", "next_done", "next_terminated")
     }
     value, mean = loss(**given)
-    wanted = loss(batch)
-    assert torch.equal(value, wanted["loss_value"])
-    assert torch.equal(mean, wanted["value"])
+    expected = loss(batch)
+    assert torch.equal(value, expected["loss_value"])
+    assert torch.equal(mean, expected["value"])
 
 
-def test_weights_of_a_prioritized_sampler_count():
-    loss, batch = make_loss(), make_batch()
-    weights = torch.rand(12, generator=torch.Generator().manual_seed(1))
-    wanted = sum(w * loss(batch[i : i + 1])["loss_value"] for i, w in enumerate(weights)) / weights.sum()
-    torch.testing.assert_close(loss(batch.clone().set("priority_weight", weights))["loss_value"], wanted)
-
-
-def test_noise_on_features_is_in_the_loss_alone():
+def test_feature_noise_is_in_the_loss_but_not_in_advantages():
     loss, batch = make_loss(noise=0.3), make_batch()
     assert loss.value_network.training
     assert loss(batch)["loss_value"] != loss(batch)["loss_value"]
@@ -229,7 +192,7 @@ def test_noise_on_features_is_in_the_loss_alone():
     assert loss(batch)["loss_value"] != loss(batch)["loss_value"]
 
 
-def test_what_it_is_given_keeps_its_keys():
+def test_input_gains_only_td_error():
     loss, batch = make_loss(), make_batch()
     before = batch.clone()
     loss.advantage(batch)
@@ -241,23 +204,23 @@ def test_what_it_is_given_keeps_its_keys():
 
 def test_other_estimators():
     loss, batch = make_loss(), make_batch()
-    wanted = loss.advantage(batch)
-    assert torch.equal(loss.make_value_estimator("td0", gamma=0.9).advantage(batch), wanted)
-    given_one = TD0Estimator(gamma=0.9, value_network=None)
-    assert torch.equal(loss.make_value_estimator(given_one).advantage(batch), wanted)
-    with pytest.raises(NotImplementedError, match=r"TDLambda.*Supported value types: ..TD0"):
+    expected = loss.advantage(batch)
+    assert torch.equal(loss.make_value_estimator("td0", gamma=0.9).advantage(batch), expected)
+    custom = TD0Estimator(gamma=0.9, value_network=None)
+    assert torch.equal(loss.make_value_estimator(custom).advantage(batch), expected)
+    with pytest.raises(NotImplementedError, match="TDLambda"):
         loss.make_value_estimator(ValueEstimators.TDLambda)
 
 
-def test_by_default_a_step_is_discounted_by_099():
+def test_default_discount_is_099():
     loss = lw.objectives.ExpectileValueLoss(CRITICS["plan"](2), delay_value=False)
     batch = make_batch()
-    wanted = copy.deepcopy(loss).make_value_estimator(gamma=0.99).advantage(batch)
-    assert torch.equal(loss.advantage(batch), wanted)
+    expected = copy.deepcopy(loss).make_value_estimator(gamma=0.99).advantage(batch)
+    assert torch.equal(loss.advantage(batch), expected)
 
 
 @pytest.mark.parametrize("kind", CRITICS)
-def test_on_a_buffers_rows_of_n_steps(tmp_path, kind):
+def test_n_step_rows_of_a_buffer(tmp_path, kind):
     lw.collect_demonstrations(["reach", "push"], episodes_per_task=2, root=tmp_path / "d", max_steps=60, progress=False)
     replay = lw.LanguageWorldExperienceReplay(
         tmp_path / "d", label="executed", n_steps=5, gamma=0.9, transform=lw.QAFTransform(PLANS), batch_size=32
@@ -266,21 +229,21 @@ def test_on_a_buffers_rows_of_n_steps(tmp_path, kind):
     fit_normalization(loss, replay)
     batch = replay.sample()
     assert batch["steps_to_next_obs"].max() == 5
-    wanted, _, _, advantages = by_hand(loss, batch)
+    expected, _, _, advantages = by_hand(loss, batch)
     np.testing.assert_allclose(loss.advantage(batch).numpy(), advantages, rtol=1e-3, atol=1e-5)
-    np.testing.assert_allclose(loss(batch)["loss_value"].item(), wanted, rtol=1e-4)
+    np.testing.assert_allclose(loss(batch)["loss_value"].item(), expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_reduced_otherwise(weighted):
-    batch, found = make_batch(), {}
+def test_reductions(weighted):
+    batch, result = make_batch(), {}
     if weighted:
         batch["priority_weight"] = torch.rand(12, generator=torch.Generator().manual_seed(0))
     for reduction in ("none", "sum", "mean", None):
-        found[reduction] = make_loss(reduction=reduction)(batch.copy())["loss_value"]
+        result[reduction] = make_loss(reduction=reduction)(batch.copy())["loss_value"]
     one_by_one = [make_loss()(batch[row : row + 1].exclude("priority_weight"))["loss_value"] for row in range(12)]
     weights = batch["priority_weight"] if weighted else torch.ones(12)
-    torch.testing.assert_close(found["none"], torch.stack(one_by_one) * weights)
-    torch.testing.assert_close(found["sum"], found["none"].sum())
-    torch.testing.assert_close(found["mean"], found["sum"] / weights.sum())
-    assert torch.equal(found["mean"], found[None])
+    torch.testing.assert_close(result["none"], torch.stack(one_by_one) * weights)
+    torch.testing.assert_close(result["sum"], result["none"].sum())
+    torch.testing.assert_close(result["mean"], result["sum"] / weights.sum())
+    assert torch.equal(result["mean"], result[None])

@@ -1,4 +1,4 @@
-"""Every loss of TorchRL with our actors and critics, as they are: no adapter, no patch."""
+"""Every loss of TorchRL with our actors and critics, without adapters or patches."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def make_batch(rows=24, seed=0):
 
 
 def ready(name, batch, actor, value):
-    """What the loss reads beside demonstrations: what the actor did, and the advantage."""
+    """Add what on-policy losses read: the actor's own actions, and the advantage."""
     if name in ON_POLICY:
         with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             actor(batch)
@@ -158,18 +158,18 @@ def test_gradients_reach_every_parameter_and_a_step_lowers_the_loss(name, condit
 
 @pytest.mark.parametrize("distribution", ["tanh_normal", "normal"])
 @pytest.mark.parametrize("name", [*STOCHASTIC, *ON_POLICY])
-def test_with_either_distribution_the_loss_is_finite_at_the_bounds(name, distribution):
+def test_loss_is_finite_at_the_action_bounds(name, distribution):
     loss, actor, value = make_loss(name, "plan", distribution)
     batch = ready(name, make_batch(), actor, value)
     if name not in ON_POLICY:
         batch["action"] = batch["action"].sign()
-    found = total(loss, batch)
-    found.backward()
-    assert found.isfinite()
+    result = total(loss, batch)
+    result.backward()
+    assert result.isfinite()
     assert all(p.grad.isfinite().all() for p in trained(loss).values())
 
 
-ABOUT_ITSELF = pytest.mark.filterwarnings(  # what PyTorch warns of when it compiles
+COMPILING = pytest.mark.filterwarnings(  # PyTorch warns about itself when it compiles
     "ignore:torch._dynamo.config.inline_inbuilt_nn_modules:FutureWarning",
     "ignore:.*LeafSpec:FutureWarning",
     "ignore:.*Function.* should not be instantiated",  # by TorchRL's tanh
@@ -178,14 +178,14 @@ ABOUT_ITSELF = pytest.mark.filterwarnings(  # what PyTorch warns of when it comp
 QUICK = ("BC",)  # to compile; the others take five to ten seconds each
 ONE_FAST = ["plan", *(pytest.param(condition, marks=pytest.mark.slow) for condition in ("description", "one-hot"))]
 TYPICAL = (*QUICK, "DT", "TD3", "SAC", "IQL", "PPO")
-ONE_GRAPH = [name for name in LOSSES if name != "PPO, KL"]  # whose coefficient hangs on the divergence of each batch
+ONE_GRAPH = [name for name in LOSSES if name != "PPO, KL"]  # its coefficient depends on the divergence of each batch
 ALL = "LW_TORCHRL_COMPILE_ALL" in os.environ  # the 54, about ten minutes
 
 
-@ABOUT_ITSELF
+@COMPILING
 @pytest.mark.parametrize("condition", ONE_FAST)
 @pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in ONE_GRAPH])
-def test_compiled_it_is_one_graph_with_the_same_gradients(name, condition):
+def test_compiled_loss_is_one_graph_with_the_same_gradients(name, condition):
     if name not in (TYPICAL if condition == "plan" else TYPICAL[:2]) and not ALL:
         pytest.skip("LW_TORCHRL_COMPILE_ALL compiles every loss on every condition")
     torch._dynamo.reset()
@@ -194,16 +194,16 @@ def test_compiled_it_is_one_graph_with_the_same_gradients(name, condition):
     gradients = []
     for run in (loss, torch.compile(loss, fullgraph=True, backend="eager")):
         loss.zero_grad()
-        found = total(run, batch)
-        found.backward()
-        gradients.append([found.detach(), *(p.grad.clone() for p in trained(loss).values())])
+        result = total(run, batch)
+        result.backward()
+        gradients.append([result.detach(), *(p.grad.clone() for p in trained(loss).values())])
     assert all(torch.equal(one, other) for one, other in zip(*gradients, strict=True))
 
 
-@ABOUT_ITSELF
+@COMPILING
 @pytest.mark.slow
 @pytest.mark.parametrize("condition", CONDITIONS)
-def test_compiled_to_kernels_it_is_the_same_but_for_rounding(condition):
+def test_compiled_kernels_differ_only_by_rounding(condition):
     torch._dynamo.reset()
     loss, _, _ = make_loss("BC", condition, noise=0.0)
     expected = total(loss, make_batch())
@@ -213,7 +213,7 @@ def test_compiled_to_kernels_it_is_the_same_but_for_rounding(condition):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("condition", CONDITIONS)
 @pytest.mark.parametrize("name", LOSSES)
-def test_it_goes_to_a_gpu_and_comes_back(name, condition):
+def test_loss_moves_to_a_gpu_and_back(name, condition):
     loss, actor, value = make_loss(name, condition)
     batch = ready(name, make_batch(), actor, value)
     expected = total(loss, batch)
@@ -230,14 +230,14 @@ def test_it_goes_to_a_gpu_and_comes_back(name, condition):
 
 
 @pytest.mark.parametrize("name", ["SAC", "IQL", "TD3", "CQL", "REDQ"])
-def test_noise_on_the_features_is_drawn_for_each_critic(name):
+def test_each_critic_draws_its_own_feature_noise(name):
     loss, _, _ = make_loss(name, "plan", noise=0.1)
     assert total(loss, make_batch()).isfinite()
     assert loss.vmap_randomness == "different"
 
 
 @pytest.mark.parametrize("name", ["SAC", "IQL", "TD3", "CQL"])
-def test_with_and_without_vmap_it_is_the_same(name):
+def test_loss_with_and_without_vmap_is_the_same(name):
     with_vmap, _, _ = make_loss(name, "plan")
     without, _, _ = make_loss(name, "plan")
     without.load_state_dict(with_vmap.state_dict())
@@ -250,8 +250,8 @@ CRITICS = ("DDPG", "TD3", "TD3+BC", "SAC", "REDQ", "CrossQ", "IQL", "CQL", "demo
 
 
 @pytest.mark.parametrize("name", CRITICS)
-def test_every_critic_sees_how_many_steps_lie_between(name):
-    """Where the reward is 0 and the end far, a target is the next value by the discount to the power of the steps."""
+def test_targets_are_discounted_by_the_number_of_steps(name):
+    """Without rewards, a target is the next value times the discount to the power of the steps."""
     loss, _, _ = make_loss(name, "plan")
     estimator, seen = loss.value_estimator, []
     estimate = type(estimator).value_estimate
@@ -269,8 +269,8 @@ def test_every_critic_sees_how_many_steps_lie_between(name):
     torch.testing.assert_close(seen[0], 0.9 ** steps.float())
 
 
-def test_the_ratio_is_one_before_an_update():
-    """Clipping included: the environment leaves the action as it was drawn."""
+def test_ppo_ratio_is_one_before_an_update():
+    """Also with clipping, since the environment leaves the action as it was drawn."""
     from torchrl.envs import TransformedEnv
 
     for distribution in ("tanh_normal", "normal"):
@@ -284,21 +284,21 @@ def test_the_ratio_is_one_before_an_update():
         if distribution == "normal":
             assert (data["action"].abs() > 1).any()
         data = GAE(gamma=0.9, lmbda=0.9, value_network=value)(data)
-        found = ClipPPOLoss(actor, value, normalize_advantage=False)(data.reshape(-1))
-        assert found["clip_fraction"] == 0
-        torch.testing.assert_close(found["ESS"], torch.tensor(1.0))
-        torch.testing.assert_close(found["kl_approx"], torch.tensor(0.0), atol=1e-6, rtol=0)
+        result = ClipPPOLoss(actor, value, normalize_advantage=False)(data.reshape(-1))
+        assert result["clip_fraction"] == 0
+        torch.testing.assert_close(result["ESS"], torch.tensor(1.0))
+        torch.testing.assert_close(result["kl_approx"], torch.tensor(0.0), atol=1e-6, rtol=0)
 
 
-def test_a_shared_trunk_is_trained_by_both():
+def test_shared_trunk_is_trained_by_actor_and_critic():
     actor = make_actor("plan", "tanh_normal")
     value = Value(actor.trunk, **SMALL)
     assert value.trunk.module["mixer"] is actor.module["mixer"]
     batch = ready("PPO", make_batch(), actor, value)
     loss = ClipPPOLoss(actor, value, separate_losses=False)
-    found = loss(batch)
+    result = loss(batch)
     shared = actor.module["mixer"].encoder[0].weight
     names = [name for name, p in loss.named_parameters() if p.shape == shared.shape and p.requires_grad]
     assert len(names) == 1
-    found["loss_critic"].backward()
+    result["loss_critic"].backward()
     assert dict(loss.named_parameters())[names[0]].grad.abs().sum() > 0

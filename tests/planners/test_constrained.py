@@ -10,11 +10,9 @@ from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.formats.structured import read_structured, write_structured
 from lw_torchrl.planners import plan_schema
-from lw_torchrl.planners.answer_files import read_reply
-from lw_torchrl.planners.chat import Reply
-from lw_torchrl.planners.prompts import passes
+from lw_torchrl.planners.answer_files import Reply, read_reply
+from lw_torchrl.planners.prompts import passes, read_structured, write_structured
 
 OTHER_WORDS = lw.load_plans("MT50", skills="MT10")
 PUSH = plan_schema("push")
@@ -171,7 +169,7 @@ def test_the_whole_steps_of_a_cut_off_answer_are_kept():
     answer = read_reply(Reply(text[:-40], "length"), lw.TASKS["push"], "basic_py", schema=PUSH)
     assert len(answer.decoded.plan.steps) == len(PLANS["push"].steps) - 1
     assert "it was cut off at max_tokens" in answer.notes
-    assert "ends or is no JSON from here" in str(answer.decoded.notes[-1])
+    assert "ends or is not JSON from here" in str(answer.decoded.notes[-1])
 
 
 def test_json_in_a_fence_with_sentences_is_read():

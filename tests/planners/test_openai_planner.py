@@ -11,7 +11,7 @@ import pytest
 from fake_server import PLANS, Failure, FakeServer, asked_for, completion, error, shipped
 
 import lw_torchrl as lw
-from lw_torchrl.planners import PlannerError, Tokens, chat
+from lw_torchrl.planners import PlannerError, Tokens, openai_planner
 
 KEY = "sk-a-secret-of-the-tests"
 
@@ -60,7 +60,7 @@ def test_cached_answers_are_not_requested_again(ask):
 def test_everything_that_determines_an_answer_is_in_the_cache_s_key():
     def path(task="push", format="chain_py", attempt=0, **options):
         planner = lw.OpenAIPlanner("m", **{"base_url": "http://127.0.0.1:1/v1", **options})
-        return planner.cache.path(planner.request(lw.TASKS[task], format, attempt))
+        return planner.cache_path(planner.request(lw.TASKS[task], format, attempt))
 
     others = [
         {"task": "reach"}, {"format": "goal_md"}, {"attempt": 1}, {"base_url": "http://127.0.0.1:2/v1"}, {"seed": 1},
@@ -105,7 +105,11 @@ FAILURES = {
         "answer within 0.4 s, asked 1 time",
         "longer",
     ),
-    "a large reply": (Failure(200, completion("x" * chat.REPLY_LIMIT)), "larger than 4 MiB", "fewer max_tokens"),
+    "a large reply": (
+        Failure(200, completion("x" * openai_planner.REPLY_LIMIT)),
+        "larger than 4 MiB",
+        "fewer max_tokens",
+    ),
 }
 
 

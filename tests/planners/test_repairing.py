@@ -7,7 +7,7 @@ from fake_server import PLANS, FakeServer, asked_for, completion, serving
 
 import lw_torchrl as lw
 from lw_torchrl.language.formats import PLAN_FORMATS
-from lw_torchrl.language.formats.structured import write_structured
+from lw_torchrl.planners.prompts import write_structured
 from lw_torchrl.planners.repairing import check_plan, plan_facts, repair_plans
 
 NEVER = "the robot's gripper is open and the robot's gripper is closed"
@@ -122,8 +122,8 @@ def test_the_model_is_told_that_its_json_was_cut_off(planner):
         (repair,) = repair_plans(model, first, rounds=1, episodes=1, enough=1.0, progress=False)
     facts = server.requests[1]["messages"][-1]["content"]
     assert "The answer is too long: it was cut off at max_tokens." in facts
-    assert "In the answer, line 1: the answer ends or is no JSON from here" in facts
-    assert "ends or is no JSON from here" in str(repair.checks[0])
+    assert "In the answer, line 1: the answer ends or is not JSON from here" in facts
+    assert "ends or is not JSON from here" in str(repair.checks[0])
 
 
 def test_answers_and_facts_must_agree(planner):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import socket
 import uuid
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import torch
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
@@ -25,7 +28,7 @@ PLAN = SimpleNamespace(steps=[SimpleNamespace(condition=parse_query(c, "push"), 
 
 
 def make_rollout(length=20, columns=3, seed=0):
-    """Random numbers in the shapes of design.md; the columns beyond the plan's two steps are padding."""
+    """Return random numbers in a rollout's shapes; the columns beyond the plan's two steps are padding."""
     generator = torch.Generator().manual_seed(seed)
     qaf = torch.rand(length, columns, generator=generator) > 0.5
     qaf[:, len(STEPS) :] = False
@@ -45,7 +48,7 @@ def make_rollout(length=20, columns=3, seed=0):
 
 
 def run(tasks, length, *, seed=5, plans=None, skills=None):
-    """A rollout (tasks, T) of scripted skills, or without plans of experts."""
+    """Return a rollout (tasks, T) of scripted skills, or without plans of experts."""
     base = lw.LanguageWorldEnv(tasks, seed=seed, num_threads=1, max_steps=length)
     if plans is None:
         env, actor = base, lw.ExpertActor(tasks)
@@ -70,7 +73,7 @@ def record(path, *rollouts, **kwargs):
 
 
 class Recording:
-    """The columns of a recording, by entity and component."""
+    """A recording's columns, by entity and component."""
 
     def __init__(self, path):
         self.reader = RrdReader(path)
@@ -87,7 +90,7 @@ class Recording:
         return {entity for entity, _ in self.columns}
 
     def values(self, entity, component):
-        """One row for each time: a list of instances."""
+        """Return a list of instances for each time."""
         return [row for _, rows in self.columns[entity, component] for row in rows]
 
     def array(self, entity, component):
@@ -96,26 +99,28 @@ class Recording:
     def times(self, entity, component, timeline="step"):
         return np.concatenate([times[timeline] for times, _ in self.columns[entity, component]]).tolist()
 
+    def is_static(self, entity, component):
+        times, _ = self.columns[entity, component][0]
+        return "step" not in times
+
     def text(self, entity):
         return self.values(entity, "TextDocument:text")[0][0]
 
     def at(self, entity, component, step):
-        """The instances that the viewer shows at a step: the static ones, or the latest."""
-        (times, *_), rows = self.times_or_none(entity, component), self.values(entity, component)
-        return rows[-1] if times is None else rows[np.searchsorted(times, step, side="right") - 1]
+        """Return the instances that the viewer shows at a step: the static ones, or the latest."""
+        rows = self.values(entity, component)
+        if self.is_static(entity, component):
+            return rows[-1]
+        return rows[np.searchsorted(self.times(entity, component), step, side="right") - 1]
 
     def in_frame(self, entity, frame, part, step):
-        """A part of the pose of a frame, one of those that the entity has, at a step."""
+        """Return a part of the pose of one of an entity's frames at a step."""
         steps, frames = (self.times(entity, "Transform3D:child_frame"), self.values(entity, "Transform3D:child_frame"))
         rows = [i for i, (at, of) in enumerate(zip(steps, frames, strict=True)) if of == [frame] and at <= step]
         return self.values(entity, f"Transform3D:{part}")[max(rows, key=lambda row: steps[row])][0]
 
-    def times_or_none(self, entity, component):
-        first, _ = self.columns[entity, component][0]
-        return (self.times(entity, component) if "step" in first else None,)
-
     def states(self, entity, length, first=0):
-        """The state at each of ``length`` steps, unrolled from its changes."""
+        """Return the state at each of ``length`` steps, unrolled from its changes."""
         steps = self.times(entity, "StateChange:state")
         states = [row[0] for row in self.values(entity, "StateChange:state")]
         assert (steps[-1], states[-1]) == (first + length, "")
@@ -123,17 +128,17 @@ class Recording:
         return [states[i] for i in at]
 
     def saved_tabs(self):
-        """The names of the tabs that the recording lists."""
+        """Return the names of the tabs that the recording lists."""
         return [tab.name for tab in Tabs.read(self.reader).tabs()]
 
     def tabs(self):
-        """The names of the tabs, which are as many as rerun's layout has."""
+        """Return the names of the tabs, as many as rerun's layout has."""
         names = self.saved_tabs()
         assert len(names) == len(self.shown_tabs())
         return names
 
     def shown_tabs(self):
-        """The titles in rerun's own layout, and of what stands in each tab."""
+        """Return the titles in rerun's own layout, and the titles of each tab's views."""
         values = self.blueprint()
         (root,) = values["viewport", "root_container"]
         contents = values.get((f"container/{uuid.UUID(bytes=bytes(root))}", "contents"), [])
@@ -147,7 +152,7 @@ class Recording:
         return values.get((path.strip("/"), "display_name"), [""])[0]
 
     def blueprint(self):
-        """The values of rerun's layout, by entity and field."""
+        """Return the values of rerun's layout, by entity and field."""
         values = {}
         for chunk in self.reader.stream(store=self.reader.blueprints()[-1]):
             rows = chunk.to_record_batch()
@@ -156,3 +161,19 @@ class Recording:
                     if value:
                         values[chunk.entity_path.strip("/"), name.partition(":")[2]] = value
         return values
+
+
+@contextmanager
+def skip_without_graphics_driver():
+    try:
+        yield
+    except RuntimeError as error:
+        if "no graphics driver" in str(error):
+            pytest.skip("no graphics driver")
+        raise
+
+
+def listens(port):
+    """Return whether a server on this machine accepts connections."""
+    with socket.socket() as client:
+        return not client.connect_ex(("127.0.0.1", port))

@@ -1,4 +1,4 @@
-"""Episodes in a recording: what is logged can be read back exactly, and a wrong rollout is named."""
+"""Episodes in a recording: logged data is read back exactly, and errors name the wrong column."""
 
 from __future__ import annotations
 
@@ -15,42 +15,42 @@ from lw_torchrl.language.queries import Clause, Query
 from lw_torchrl.language.relations import TOUCHING
 from lw_torchrl.record import RerunLogger
 from lw_torchrl.record.page import EVENLY, NONE_HOLDS
-from lw_torchrl.record.recorded_episode import NOBODY, RecordedEpisode, short_condition
+from lw_torchrl.record.recorded_episode import NO_STEP, RecordedEpisode, short_condition
 from lw_torchrl.record.scene import ROBOT_EYE, name_offsets
 from lw_torchrl.record.tabs import Tabs
 
 ROWS = [f"/e1/{i}_" + short_condition(step.condition).replace(" ", "_") for i, step in enumerate(PLAN.steps, 1)]
 
 
-def test_an_episode_survives_exactly(tmp_path):
+def test_an_episode_is_read_back_exactly(tmp_path):
     rollout = make_rollout()
-    found = record(tmp_path / "a.rrd", rollout)
+    recording = record(tmp_path / "a.rrd", rollout)
 
     for name, position in make_objects(rollout).items():
         entity = "/push/scene/objects/" + name.replace("'", "\\'").replace(" ", "\\ ")
-        np.testing.assert_array_equal(found.array(entity, "Points3D:positions")[:, 0], position.numpy())
-    goal = found.array("/push/scene/goal", "Points3D:positions")[:, 0]
+        np.testing.assert_array_equal(recording.array(entity, "Points3D:positions")[:, 0], position.numpy())
+    goal = recording.array("/push/scene/goal", "Points3D:positions")[:, 0]
     np.testing.assert_array_equal(goal, rollout["observation"][:, 36:39].numpy())
-    hand = found.array("/push/scene/gripper", "Transform3D:translation")[:, 0]
+    hand = recording.array("/push/scene/gripper", "Transform3D:translation")[:, 0]
     np.testing.assert_array_equal(hand, rollout["observation"][:, :3].numpy())
-    np.testing.assert_array_equal(found.array("/push/action", "Scalars:scalars"), rollout["action"].double())
-    weights = found.array("/push/skill_weights", "Scalars:scalars")
+    np.testing.assert_array_equal(recording.array("/push/action", "Scalars:scalars"), rollout["action"].double())
+    weights = recording.array("/push/skill_weights", "Scalars:scalars")
     np.testing.assert_array_equal(weights, rollout["skill_weights"][:, :2].double())
-    reward = found.array("/push/reward", "Scalars:scalars")
+    reward = recording.array("/push/reward", "Scalars:scalars")
     np.testing.assert_array_equal(reward, rollout["next", "reward"].double())
 
     for i, row in enumerate(ROWS):
         expected = ["true" if held else "false" for held in rollout["qaf"][:, i]]
-        assert found.states(row, 20) == expected
-    assert found.states("/e1/0_verdict", 20, first=1) == ["not yet"] * 10 + ["success"] * 10
-    assert found.times("/push/action", "Scalars:scalars") == list(range(20))
-    assert found.times("/push/reward", "Scalars:scalars") == list(range(1, 21))
-    seconds = found.times("/push/action", "Scalars:scalars", "time")
+        assert recording.states(row, 20) == expected
+    assert recording.states("/e1/0_verdict", 20, first=1) == ["not yet"] * 10 + ["success"] * 10
+    assert recording.times("/push/action", "Scalars:scalars") == list(range(20))
+    assert recording.times("/push/reward", "Scalars:scalars") == list(range(1, 21))
+    seconds = recording.times("/push/action", "Scalars:scalars", "time")
     assert [int(second) for second in seconds[:3]] == [0, 12_500_000, 25_000_000]
     lanes = {"0_verdict", "0b_plan_step", *(row[4:] for row in ROWS), "gripper"}
-    assert {entity[4:] for entity in found.entities() if entity.startswith("/e1/")} == lanes
+    assert {entity[4:] for entity in recording.entities() if entity.startswith("/e1/")} == lanes
     opening = ["open" if width > 0.75 else "closed" for width in rollout["observation"][:, 3].tolist()]
-    assert found.states("/e1/gripper", 20) == opening
+    assert recording.states("/e1/gripper", 20) == opening
 
 
 def test_the_plan_follows_the_cursor(tmp_path):
@@ -58,11 +58,11 @@ def test_the_plan_follows_the_cursor(tmp_path):
     rollout["qaf"][:2, :2] = torch.tensor([[True, False], [False, True]])
     rollout["skill_weights"] = torch.softmax(rollout["qaf"] * 10.0 - 5.0, -1)
     rollout["skill_weights"][:, 2] = 0.0
-    found = record(tmp_path / "a.rrd", rollout)
-    steps = found.times("/push/plan", "TextDocument:text")
-    texts = [row[0] for row in found.values("/push/plan", "TextDocument:text")]
+    recording = record(tmp_path / "a.rrd", rollout)
+    steps = recording.times("/push/plan", "TextDocument:text")
+    texts = [row[0] for row in recording.values("/push/plan", "TextDocument:text")]
     qaf = rollout["qaf"][:, :2].tolist()
-    # A text wherever something changes, and nowhere else.
+    # There is a text at each change, and nowhere else.
     assert steps == [t for t in range(20) if t == 0 or qaf[t] != qaf[t - 1]]
     (first, one), (second, two) = STEPS
     assert f"**✓  1.  if {first}**" in texts[0]
@@ -72,42 +72,42 @@ def test_the_plan_follows_the_cursor(tmp_path):
     assert f"**→ {two}**" in texts[1]
 
 
-def test_the_active_step_has_a_timeline(tmp_path):
+def test_the_active_step_has_a_lane(tmp_path):
     rollout = make_rollout()
-    found = record(tmp_path / "a.rrd", rollout)
+    recording = record(tmp_path / "a.rrd", rollout)
     names = [f"{i} {skill}" for i, (_, skill) in enumerate(STEPS, 1)]
-    assert found.values("/push/skill_weights", "SeriesLines:names") == [names]
-    states = Tabs.read(found.reader).pages["push"].states
+    assert recording.values("/push/skill_weights", "SeriesLines:names") == [names]
+    states = Tabs.read(recording.reader).pages["push"].states
     assert [states[state][0] for state in ("0", "1", NONE_HOLDS, EVENLY)] == [*names, NONE_HOLDS, EVENLY]
-    for row, state in enumerate(found.states("/e1/0b_plan_step", 20)):
+    for row, state in enumerate(recording.states("/e1/0b_plan_step", 20)):
         weights, truth = rollout["skill_weights"][row, :2], rollout["qaf"][row, :2]
         even = EVENLY if truth.any() else NONE_HOLDS
         assert state == (even if weights[0] == weights[1] else str(int(weights.argmax())))
 
 
-def test_attention_that_is_never_soft_has_no_curve(tmp_path):
+def test_one_hot_attention_has_no_curve(tmp_path):
     rollout = make_rollout()
     rollout["skill_weights"] = torch.nn.functional.one_hot(torch.arange(20) % 2, 3).float()
-    found = record(tmp_path / "a.rrd", rollout)
-    assert "/push/skill_weights" not in found.entities()
-    assert found.states("/e1/0b_plan_step", 20) == ["0", "1"] * 10
+    recording = record(tmp_path / "a.rrd", rollout)
+    assert "/push/skill_weights" not in recording.entities()
+    assert recording.states("/e1/0b_plan_step", 20) == ["0", "1"] * 10
 
 
-def test_a_learned_evaluators_truth_stands_beside(tmp_path):
+def test_wrong_answers_of_a_learned_evaluator_are_marked(tmp_path):
     rollout = make_rollout()
     rollout["qaf_logits"] = torch.where(rollout["qaf"], 3.0, -3.0)
     rollout["qaf_logits"][5:, 0] *= -1
-    found = record(tmp_path / "a.rrd", rollout)
+    recording = record(tmp_path / "a.rrd", rollout)
     exact = ["true" if true else "false" for true in rollout["qaf"][:, 0]]
     wrong = {"true": "true, answered false", "false": "false, answered true"}
-    assert found.states(ROWS[0], 20) == exact[:5] + [wrong[true] for true in exact[5:]]
-    texts = [row[0] for row in found.values("/push/plan", "TextDocument:text")]
+    assert recording.states(ROWS[0], 20) == exact[:5] + [wrong[true] for true in exact[5:]]
+    texts = [row[0] for row in recording.values("/push/plan", "TextDocument:text")]
     assert ["(evaluator:" in text for text in texts] == [
-        step >= 5 for step in found.times("/push/plan", "TextDocument:text")
+        step >= 5 for step in recording.times("/push/plan", "TextDocument:text")
     ]
 
 
-def test_fingers_follow_the_opening(tmp_path):
+def test_fingers_follow_the_grippers_opening(tmp_path):
     rollout = make_rollout(2)
     rollout["observation"][:, 3] = torch.tensor([0.0, 1.0])
     centers = record(tmp_path / "a.rrd", rollout).array("/push/scene/gripper/fingers", "Boxes3D:centers")
@@ -115,66 +115,65 @@ def test_fingers_follow_the_opening(tmp_path):
     assert apart[1] - apart[0] == pytest.approx(0.1)
 
 
-def test_what_is_absent_is_left_out(tmp_path):
+def test_missing_columns_are_left_out(tmp_path):
     rollout = make_rollout(5).select("observation", "action")
     rollout["observation"][:, 36:39] = 0.0
-    found = record(tmp_path / "a.rrd", rollout, plan=None, objects={})
-    roots = {entity.split("/")[2] for entity in found.entities() if entity.startswith("/push/")}
+    recording = record(tmp_path / "a.rrd", rollout, plan=None, objects={})
+    roots = {entity.split("/")[2] for entity in recording.entities() if entity.startswith("/push/")}
     assert roots == {"scene", "action", "verdict"}
-    assert not any("goal" in entity for entity in found.entities())
-    gripper = found.array("/push/scene/objects/robot\\'s\\ gripper", "Points3D:positions")[:, 0]
+    assert not any("goal" in entity for entity in recording.entities())
+    gripper = recording.array("/push/scene/objects/robot\\'s\\ gripper", "Points3D:positions")[:, 0]
     np.testing.assert_array_equal(gripper, rollout["observation"][:, :3].numpy())
 
 
 def test_without_a_plan_every_column_is_numbered(tmp_path):
-    found = record(tmp_path / "a.rrd", make_rollout(5), plan=None)
-    assert found.values("/push/skill_weights", "SeriesLines:names") == [["1", "2", "3"]]
-    assert "/e1/3_condition" in found.entities()
+    recording = record(tmp_path / "a.rrd", make_rollout(5), plan=None)
+    assert recording.values("/push/skill_weights", "SeriesLines:names") == [["1", "2", "3"]]
+    assert "/e1/3_condition" in recording.entities()
     rollout = make_rollout(5).exclude("skill_weights")
     rollout["qaf"] = torch.zeros(5, 3, dtype=torch.bool)
-    found = record(tmp_path / "b.rrd", rollout, plan=None)
-    assert found.values("/e1/0b_plan_step", "StateChange:state") == [[NONE_HOLDS], [""]]
+    recording = record(tmp_path / "b.rrd", rollout, plan=None)
+    assert recording.values("/e1/0b_plan_step", "StateChange:state") == [[NONE_HOLDS], [""]]
 
 
 def test_a_goal_that_is_an_object_has_one_label(tmp_path):
     rollout = make_rollout(5)
     objects = {"target location": rollout["observation"][:, 36:39]}
-    found = record(tmp_path / "a.rrd", rollout, objects=objects)
-    assert "/push/scene/goal" not in found.entities()
-    assert found.values("/push/scene/objects/target\\ location", "Points3D:labels")[0] == ["target location"]
+    recording = record(tmp_path / "a.rrd", rollout, objects=objects)
+    assert "/push/scene/goal" not in recording.entities()
+    assert recording.values("/push/scene/objects/target\\ location", "Points3D:labels")[0] == ["target location"]
 
 
-def test_the_active_step():
+def test_active_step_has_the_largest_weight_or_the_first_true_condition():
     rollout = make_rollout(3, columns=2)
     rollout["skill_weights"] = torch.tensor([[0.9, 0.1], [0.5, 0.5], [0.2, 0.8]])
-    assert RecordedEpisode.from_rollout(rollout, {}, PLAN).active.tolist() == [0, NOBODY, 1]
+    assert RecordedEpisode.from_rollout(rollout, {}, PLAN).active.tolist() == [0, NO_STEP, 1]
     rollout["qaf"] = torch.tensor([[True, True], [False, True], [False, False]])
     without = RecordedEpisode.from_rollout(rollout.exclude("skill_weights"), {}, PLAN)
-    assert without.active.tolist() == [0, 1, NOBODY]
+    assert without.active.tolist() == [0, 1, NO_STEP]
     assert RecordedEpisode.from_rollout(rollout.exclude("skill_weights", "qaf"), {}, PLAN).active is None
 
 
-def test_several_episodes_and_their_names(tmp_path):
+def test_episodes_have_different_names(tmp_path):
     first, second = make_rollout(5, seed=1), make_rollout(7, seed=2)
     with RerunLogger(tmp_path / "a.rrd") as logger:
         names = [
             logger.log_episode(rollout, task="push", objects=make_objects(rollout), name=name)
             for rollout, name in ((first, None), (second, None), (first, "best so far"))
         ]
-        with pytest.raises(ValueError, match="is empty or reserved"):
-            logger.log_episode(first, task="push", objects={}, name="push-2")
-        with pytest.raises(ValueError, match="is empty or reserved"):
-            logger.log_episode(first, task="push", objects={}, name="metrics")
+        for wrong in ("push-2", "metrics", " "):
+            with pytest.raises(ValueError, match="name"):
+                logger.log_episode(first, task="push", objects={}, name=wrong)
     assert names == ["push", "push-2", "best so far"]
-    found = Recording(tmp_path / "a.rrd")
+    recording = Recording(tmp_path / "a.rrd")
     for root, rollout in (("/push", first), ("/push-2", second), ("/best\\ so\\ far", first)):
-        np.testing.assert_array_equal(found.array(f"{root}/action", "Scalars:scalars"), rollout["action"].double())
+        np.testing.assert_array_equal(recording.array(f"{root}/action", "Scalars:scalars"), rollout["action"].double())
 
 
 def test_the_layout_is_in_the_file(tmp_path):
-    found = record(tmp_path / "a.rrd", make_rollout())
-    (store,) = found.reader.blueprints()
-    chunks = found.reader.stream(store=store)
+    recording = record(tmp_path / "a.rrd", make_rollout())
+    (store,) = recording.reader.blueprints()
+    chunks = recording.reader.stream(store=store)
     text = " ".join(f"{chunk.entity_path} {chunk.to_record_batch()}" for chunk in chunks)
     views = ("Scene", "Verdict", "Plan", "Skill weights", "Action", "/push/scene/trails/puck", "push · success at 11")
     assert all(view in text for view in views)
@@ -183,14 +182,14 @@ def test_the_layout_is_in_the_file(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda r: r.exclude("observation"), r"must have the key 'observation' \(20×39\), got \['action'"),
-        (lambda r: r[None], r"batch size \(T,\) with T >= 1, got \(1, 20\); take one episode"),
-        (lambda r: r.set("observation", torch.rand(20, 38)), r"'observation'\] must have shape 20×39, got 20×38"),
-        (lambda r: r.set("action", torch.full((20, 4), float("nan"))), r"'action'\] must be finite, .* row 0"),
-        (lambda r: r.set("qaf_logits", torch.rand(20, 1)), r"'qaf_logits'.* each of 2 plan steps, got 1"),
+        (lambda r: r.exclude("observation"), "observation"),
+        (lambda r: r[None], r"batch size .*\(1, 20\)"),
+        (lambda r: r.set("observation", torch.rand(20, 38)), "observation.*20×38"),
+        (lambda r: r.set("action", torch.full((20, 4), float("nan"))), "action.*finite"),
+        (lambda r: r.set("qaf_logits", torch.rand(20, 1)), "qaf_logits"),
     ],
 )
-def test_wrong_rollouts_are_named(tmp_path, change, message):
+def test_errors_name_the_wrong_column(tmp_path, change, message):
     rollout = make_rollout()
     with RerunLogger(tmp_path / "a.rrd") as logger, pytest.raises(ValueError, match=message):
         logger.log_episode(change(rollout.clone()), task="push", objects=make_objects(rollout), plan=PLAN)
@@ -218,27 +217,27 @@ def test_wrong_rollouts_are_named(tmp_path, change, message):
         ),
     ],
 )
-def test_a_short_condition_says_the_same(clauses, text):
+def test_conditions_are_shortened(clauses, text):
     assert short_condition(Query(tuple(clauses))) == text
-    assert short_condition("whatever you say") == "whatever you say"
+    assert short_condition("free-form text") == "free-form text"
 
 
-def test_names_of_things_in_one_place_stand_apart():
+def test_names_of_objects_at_one_position_do_not_overlap():
     place = np.full((5, 3), 0.1, np.float32)
     offsets = name_offsets({"puck": place, "goal": place, "wall": place + 0.5}, ROBOT_EYE)
     assert [name for name, offset in offsets.items() if offset.any()] == ["goal"]
     assert np.linalg.norm(offsets["goal"]) > 0.03
 
 
-def test_pictures_that_the_policy_saw_stand_beside_the_scene(tmp_path):
+def test_the_policys_pictures_are_shown_next_to_the_scene(tmp_path):
     rollout = make_rollout()
     held = torch.arange(20) // 5  # a picture for five steps each
     rollout["pixels"] = (held * 60).to(torch.uint8)[:, None, None, None].expand(20, 32, 64, 3)
-    found = record(tmp_path / "a.rrd", rollout)
-    assert found.times("/push/seen", "EncodedImage:blob") == [0, 5, 10, 15]
-    blobs = [bytes(blob[0]) for blob in found.values("/push/seen", "EncodedImage:blob")]
+    recording = record(tmp_path / "a.rrd", rollout)
+    assert recording.times("/push/seen", "EncodedImage:blob") == [0, 5, 10, 15]
+    blobs = [bytes(blob[0]) for blob in recording.values("/push/seen", "EncodedImage:blob")]
     pictures = [np.asarray(Image.open(io.BytesIO(blob))) for blob in blobs]
     assert [picture.shape for picture in pictures] == [(32, 64, 3)] * 4
     assert [round(float(picture.mean()), -1) for picture in pictures] == [0, 60, 120, 180]
-    views = [value for (_, field), value in found.blueprint().items() if field == "display_name"]
+    views = [value for (_, field), value in recording.blueprint().items() if field == "display_name"]
     assert ["What it saw"] in views

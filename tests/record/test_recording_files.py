@@ -1,10 +1,9 @@
-"""Recordings are never overwritten, and killed runs, full disks and lost viewers never stop a training."""
+"""Recordings are never overwritten; killed runs, full disks and lost viewers keep what was written."""
 
 from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -13,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
-from recordings import Recording, make_rollout
+from recordings import Recording, listens, make_rollout
 
 import lw_torchrl as lw
 from lw_torchrl.record import RerunLogger
@@ -23,7 +22,7 @@ from lw_torchrl.record.viewer import LOCAL, free_port, readable, rerun_program
 
 
 def run_script(script, *arguments):
-    """Start a script that can import this folder's modules."""
+    """Start a script that can import the modules of this folder."""
     code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n{script}"
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     return subprocess.Popen([sys.executable, "-W", "ignore", "-c", code, *map(str, arguments)], env=environment)
@@ -34,8 +33,8 @@ def losses(path):
 
 
 @contextmanager
-def rest_of(path):
-    """What can be read of a recording that was not closed."""
+def completed(path):
+    """Yield a complete copy of a recording that was not closed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with readable(path) as copy:
@@ -65,7 +64,7 @@ def test_a_new_recording_replaces_a_file_only_when_it_is_complete(tmp_path):
     assert os.listdir(tmp_path) == ["a.rrd"]
 
 
-def test_an_exception_keeps_the_file(tmp_path):
+def test_an_exception_closes_the_recording(tmp_path):
     with suppress(KeyError), RerunLogger(tmp_path / "a.rrd") as logger:
         logger.log_episode(make_rollout(), task="push", objects={})
         logger.log_scalar("loss", 1.0)
@@ -73,7 +72,7 @@ def test_an_exception_keeps_the_file(tmp_path):
     assert {"/push/action", "/metrics/loss"} <= Recording(tmp_path / "a.rrd").entities()
 
 
-def test_ending_the_experiment_ends_the_logger(tmp_path):
+def test_finishing_the_experiment_shuts_the_logger_down(tmp_path):
     # TorchRL's service backends do this instead of calling shutdown().
     logger = RerunLogger(tmp_path / "a.rrd")
     logger.log_scalar("loss", 1.0)
@@ -82,7 +81,7 @@ def test_ending_the_experiment_ends_the_logger(tmp_path):
     assert losses(tmp_path / "a.rrd") == [1.0]
 
 
-def test_a_logger_without_shutdown_ends_with_the_process(tmp_path):
+def test_a_logger_shuts_down_when_the_process_exits(tmp_path):
     script = "from lw_torchrl.record import RerunLogger\nRerunLogger(sys.argv[1]).log_scalar('loss', 1.0)"
     assert run_script(script, tmp_path / "a.rrd").wait(120) == 0
     assert losses(tmp_path / "a.rrd") == [1.0]
@@ -101,7 +100,7 @@ for number in range(10**6):
 """
 
 
-def test_a_killed_run_leaves_a_recording(tmp_path):
+def test_a_killed_run_leaves_a_readable_recording(tmp_path):
     path = tmp_path / "a.rrd"
     process = run_script(KILLED, path)
     while not (path.exists() and path.stat().st_size):
@@ -110,7 +109,7 @@ def test_a_killed_run_leaves_a_recording(tmp_path):
     time.sleep(4)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    with rest_of(path) as copy:
+    with completed(path) as copy:
         assert is_complete(copy)
         assert len(losses(copy)) > 50
         assert {"/push/action", "/push/verdict"} <= Recording(copy).entities()
@@ -133,22 +132,22 @@ with warnings.catch_warnings(record=True) as caught:
             if number % 5000 == 0:
                 logger.state_dict()
             longest = max(longest, time.monotonic() - began)
-[warning] = [str(one.message) for one in caught if "is incomplete" in str(one.message)]
+[warning] = [str(item.message) for item in caught if "is incomplete" in str(item.message)]
 assert longest < 3, longest
 """
 
 
-def test_a_full_disk_costs_the_end_of_the_recording_and_not_the_training(tmp_path):
+def test_a_full_disk_loses_the_end_of_the_recording_but_does_not_stop_the_program(tmp_path):
     path = tmp_path / "a.rrd"
     assert run_script(FULL, path).wait(120) == 0
-    with rest_of(path) as copy:
-        found = losses(copy)
-    assert found == list(range(len(found)))
-    assert len(found) > 1000
+    with completed(path) as copy:
+        written = losses(copy)
+    assert written == list(range(len(written)))
+    assert len(written) > 1000
 
 
 @pytest.mark.slow
-def test_no_viewer(tmp_path):
+def test_logging_does_not_wait_for_an_absent_viewer(tmp_path):
     logger = RerunLogger(tmp_path / "a.rrd", connect=f"{LOCAL}:{free_port()}")
     began = time.monotonic()
     for number in range(300):
@@ -158,12 +157,7 @@ def test_no_viewer(tmp_path):
     assert losses(tmp_path / "a.rrd") == list(range(300))
 
 
-def listens(port):
-    with socket.socket() as client:
-        return not client.connect_ex((LOCAL, port))
-
-
-def test_a_viewer_gets_everything(tmp_path):
+def test_a_connected_viewer_receives_everything(tmp_path):
     port, received = free_port(), tmp_path / "received.rrd"
     command = [rerun_program(), "--save", str(received), "--port", str(port), "--bind", LOCAL]
     viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -178,21 +172,25 @@ def test_a_viewer_gets_everything(tmp_path):
     finally:
         viewer.send_signal(signal.SIGINT)
         viewer.wait(30)
-    with rest_of(received) as copy:
+    with completed(received) as copy:
         assert Recording(copy).entities() == Recording(tmp_path / "a.rrd").entities()
         assert Recording(copy).tabs() == ["push", "Metrics"]
 
 
-def test_wrong_paths_and_addresses(tmp_path):
-    with pytest.raises(ValueError, match=r"path must end in '\.rrd'"):
-        RerunLogger(tmp_path / "a.txt")
-    with pytest.raises(ValueError, match="give path, a file to write, or connect"):
-        RerunLogger()
-    with pytest.raises(RuntimeError, match=r"invalid endpoint .*elsewhere"):
-        RerunLogger(connect="rerun+http://127.0.0.1:9876/elsewhere")
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"path": "a.txt"}, ValueError, "path"),
+        ({}, ValueError, "path .* or connect"),
+        ({"connect": "rerun+http://127.0.0.1:9876/elsewhere"}, RuntimeError, "elsewhere"),
+    ],
+)
+def test_wrong_paths_and_addresses_are_errors(arguments, error, message):
+    with pytest.raises(error, match=message):
+        RerunLogger(**arguments)
 
 
-def test_a_step_takes_its_suites_time(tmp_path):
+def test_seconds_per_step_are_those_of_the_suite(tmp_path):
     from lw_torchrl.suites.metaworld.plain_engine import make_metaworld_env
 
     env = make_metaworld_env("reach")
@@ -204,8 +202,8 @@ def test_a_step_takes_its_suites_time(tmp_path):
     env.close()
     with RerunLogger(tmp_path / "a.rrd") as logger:
         lw.log_rollout(logger, rollout, seed=1, suite="fetch")
-    found = Recording(tmp_path / "a.rrd")
-    seconds = found.times("/fetch\\/reach-0/action", "Scalars:scalars", "time")
+    recording = Recording(tmp_path / "a.rrd")
+    seconds = recording.times("/fetch\\/reach-0/action", "Scalars:scalars", "time")
     assert [int(second) for second in seconds] == [0, 40_000_000, 80_000_000]
-    assert "FAILED in 3 steps (0.12 s)" in found.text("/fetch\\/reach-0/verdict")
-    assert found.blueprint()["time_panel", "fps"] == [25.0]
+    assert "FAILED in 3 steps (0.12 s)" in recording.text("/fetch\\/reach-0/verdict")
+    assert recording.blueprint()["time_panel", "fps"] == [25.0]

@@ -1,23 +1,28 @@
-"""The viewer: opened at a tab and a step, and made to draw."""
+"""The viewer: opened at a tab and a step, in a browser, and drawing a picture."""
 
 from __future__ import annotations
 
+import signal
 import stat
-import warnings
+import subprocess
+import sys
+import time
+import urllib.request
 from contextlib import contextmanager
 from types import SimpleNamespace
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 import torch
-from recordings import Recording
+from recordings import Recording, listens, skip_without_graphics_driver
 from tensordict import TensorDict
 
 from lw_torchrl.record import RerunLogger, open_viewer, viewer
-from lw_torchrl.record.viewer import find_recordings, readable, rerun_process
+from lw_torchrl.record.viewer import find_recordings, rerun_process
 
 
 def write(path, steps=20, episodes=1):
-    """A recording of a training and of episodes."""
+    """Write a recording of a training and of episodes."""
     rollout = TensorDict({"observation": torch.rand(steps, 39), "action": torch.rand(steps, 4)}, [steps])
     rollout["next", "success"] = torch.arange(steps)[:, None] >= steps // 2
     with RerunLogger(path) as logger:
@@ -27,77 +32,77 @@ def write(path, steps=20, episodes=1):
     return logger.path
 
 
-def fake_viewer(tmp_path, monkeypatch, prints, code):
+def fake_viewer(tmp_path, monkeypatch, output, code):
     script = tmp_path / "viewer"
-    script.write_text(f"#!/bin/sh\necho '{prints}'\nexit {code}\n")
+    script.write_text(f"#!/bin/sh\necho '{output}'\nexit {code}\n")
     script.chmod(script.stat().st_mode | stat.S_IEXEC)
     monkeypatch.setenv("RERUN_CLI_PATH", str(script))
 
 
 @pytest.mark.parametrize(
-    ("prints", "message"),
+    ("output", "message"),
     [
         ("thread main panicked at Failed to get render context", "apt-get install libvulkan1 mesa-vulkan-drivers"),
-        ("Error: neither WAYLAND_DISPLAY nor DISPLAY is set.", "there is no screen"),
-        ("something else", "ended with an error:\nsomething else"),
+        ("Error: neither WAYLAND_DISPLAY nor DISPLAY is set.", "--screenshot"),
+        ("something else", "something else"),
     ],
 )
 @pytest.mark.parametrize("screenshot", [None, "a.png"])
-def test_a_failing_viewer_says_what_to_do(tmp_path, monkeypatch, prints, message, screenshot):
+def test_error_of_a_failing_viewer_names_the_remedy(tmp_path, monkeypatch, output, message, screenshot):
     write(tmp_path / "a.rrd")
-    fake_viewer(tmp_path, monkeypatch, prints, 102)
+    fake_viewer(tmp_path, monkeypatch, output, 102)
     with pytest.raises(RuntimeError, match=message):
         open_viewer(tmp_path / "a.rrd", None if screenshot is None else tmp_path / screenshot)
     assert not (tmp_path / "a.png").exists()
 
 
-def test_wrong_arguments_of_the_viewer(tmp_path):
+def test_missing_or_unreadable_recordings_and_unknown_episodes_are_errors(tmp_path):
     write(tmp_path / "a.rrd")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(FileNotFoundError, match="there is no recording"):
-        open_viewer(tmp_path / "c.rrd")
-    with pytest.raises(FileNotFoundError, match="holds no recording"):
-        open_viewer(tmp_path / "empty")
+    for path in ("c.rrd", "empty"):
+        with pytest.raises(FileNotFoundError, match=path):
+            open_viewer(tmp_path / path)
     with pytest.raises(ValueError, match="episode must be one of 'reach', 'Metrics', got 'push'"):
         open_viewer(tmp_path / "a.rrd", episode="push")
     for content in (b"", b"something else"):
         (tmp_path / "b.rrd").write_bytes(content)
-        with pytest.raises(ValueError, match="is not a rerun recording, or nothing was written"), quietly():
+        with pytest.warns(UserWarning, match="was not closed"), pytest.raises(ValueError, match="rerun recording"):
             open_viewer(tmp_path / "b.rrd")
 
 
-def test_a_folder_stands_for_its_recordings(tmp_path):
+def test_web_viewer_is_served_on_this_machine_until_interrupted(tmp_path):
+    path = write(tmp_path / "a.rrd")
+    code = f"from lw_torchrl.record import open_viewer; open_viewer({str(path)!r}, episode='Metrics', web_port=0)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
+        address = urlsplit(process.stdout.readline().strip())
+        server = urlsplit(parse_qs(address.query)["url"][0].removeprefix("rerun+"))
+        while not (listens(address.port) and listens(server.port)):
+            assert process.poll() is None
+            time.sleep(0.1)
+        get = urllib.request.build_opener(urllib.request.ProxyHandler({})).open
+        with get(f"http://{address.netloc}/", timeout=20) as page:
+            assert b"re_viewer" in page.read()
+        assert address.hostname == server.hostname == "127.0.0.1"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+    assert not listens(address.port)
+
+
+def test_a_folder_opens_all_its_recordings(tmp_path):
     files = [write(tmp_path / "a.rrd") for _ in range(2)]
     assert find_recordings(tmp_path) == files == [tmp_path / "a.rrd", tmp_path / "a-2.rrd"]
 
 
-@contextmanager
-def quietly():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that the recording was not closed
-        yield
-
-
-@contextmanager
-def needing_a_driver():
-    try:
-        yield
-    except RuntimeError as error:
-        if "no graphics driver" in str(error):
-            pytest.skip("no graphics driver")
-        raise
-
-
-def test_a_picture_is_taken_where_the_machine_can_draw(tmp_path):
+def test_a_screenshot_has_the_window_size(tmp_path):
     write(tmp_path / "a.rrd")
-    with needing_a_driver():
+    with skip_without_graphics_driver():
         open_viewer(tmp_path / "a.rrd", tmp_path / "a.png", "800x600", step=10)
     assert (tmp_path / "a.png").read_bytes()[16:24] == (800).to_bytes(4, "big") + (600).to_bytes(4, "big")
 
 
 @pytest.fixture
 def seen(monkeypatch):
-    """What open_viewer shows in a window, which is one without a screen: cursors, and the views of the tab in front."""
+    """Run open_viewer's window without a screen; return its cursors, and the views of its front tab."""
     seen = {}
 
     @contextmanager
@@ -118,9 +123,9 @@ def seen(monkeypatch):
     return seen
 
 
-def test_several_runs_open_at_their_own_steps(tmp_path, seen):
+def test_several_recordings_open_at_their_own_steps(tmp_path, seen):
     runs = [write(tmp_path / "a.rrd"), write(tmp_path / "b.rrd", steps=30)]
-    with needing_a_driver():
+    with skip_without_graphics_driver():
         open_viewer(runs)
     assert seen["cursors"] == [11, 16]
     assert "Verdict" in seen["views"]
@@ -131,16 +136,16 @@ def test_several_runs_open_at_their_own_steps(tmp_path, seen):
 )
 def test_a_tab_is_brought_to_the_front(tmp_path, seen, episodes, episode, view):
     write(tmp_path / "a.rrd", episodes=episodes)
-    with needing_a_driver():
+    with skip_without_graphics_driver():
         open_viewer(tmp_path / "a.rrd", episode=episode, step=0)
     assert view in seen["views"]
     assert seen["cursors"] == [0]
 
 
-def test_the_rest_of_a_cut_recording_is_shown(tmp_path, seen):
+def test_a_truncated_recording_is_shown_with_a_warning(tmp_path, seen):
     content = write(tmp_path / "a.rrd", steps=400).read_bytes()
     (tmp_path / "a.rrd").write_bytes(content[: int(0.9 * len(content))])
-    with needing_a_driver(), pytest.warns(UserWarning, match="was not closed"):
+    with skip_without_graphics_driver(), pytest.warns(UserWarning, match="was not closed"):
         open_viewer(tmp_path / "a.rrd")
     assert "Verdict" in seen["views"]
 
@@ -150,15 +155,9 @@ def test_episodes_side_by_side_come_before_their_own_tabs(tmp_path):
     with RerunLogger(tmp_path / "a.rrd") as logger:
         names = [logger.log_episode(rollout, task="reach", objects={}) for _ in range(2)]
         logger.compare(names)
-        with pytest.raises(ValueError, match="names must be of two episodes or more"):
-            logger.compare(["reach"])
-        with pytest.raises(ValueError, match="names must be one of 'reach', 'reach-2', got 'push'"):
-            logger.compare(["reach", "push"])
+        for wrong in (["reach"], ["reach", "push"]):
+            with pytest.raises(ValueError, match="names"):
+                logger.compare(wrong)
     recording = Recording(tmp_path / "a.rrd")
     assert recording.tabs() == ["Side by side", "reach", "reach-2"]
     assert recording.shown_tabs()["Side by side"] == ["reach", "reach-2"]
-
-
-def test_a_complete_recording_is_read_in_place(tmp_path):
-    with readable(write(tmp_path / "a.rrd")) as file:
-        assert file == tmp_path / "a.rrd"

@@ -48,7 +48,7 @@ def env():
     env.close()
 
 
-def test_the_environment_keeps_torchrl_s_rules(env):
+def test_environment_follows_torchrls_rules(env):
     check_env_specs(env)
     assert (env.tasks, env.max_steps, env.action_spec.shape) == (BOTH, 160, (4, 9))
     torch.manual_seed(0)
@@ -59,7 +59,7 @@ def test_the_environment_keeps_torchrl_s_rules(env):
     assert not torch.equal(first, env.reset(episode=3)["observation"])
 
 
-def test_the_first_59_numbers_are_the_kitchen_s_own():
+def test_first_59_numbers_are_the_kitchens():
     theirs = KitchenEnv(tasks_to_complete=["microwave"])
     ours = KitchenEngine([*BOTH, "kitchen/microwave"])
     states = ours.reset([0, 1, 2], [5, 6, 7])
@@ -76,7 +76,7 @@ def test_the_first_59_numbers_are_the_kitchen_s_own():
     ours.close()
 
 
-def test_all_seven_things_succeed_and_what_is_open_is_said_so():
+def test_all_seven_objects_succeed_and_openings_are_right():
     engine = KitchenEngine([f"kitchen/{thing.replace(' ', '-')}" for thing in OBS_ELEMENT_GOALS])
     rows = list(range(len(OBS_ELEMENT_GOALS)))
     engine.reset(rows, rows)
@@ -96,7 +96,7 @@ def test_all_seven_things_succeed_and_what_is_open_is_said_so():
     engine.close()
 
 
-def test_the_check_finds_nothing_wrong_and_names_an_opening_that_is_no_share():
+def test_check_finds_nothing_wrong_but_an_opening_outside_its_range():
     found = check_suite(SUITE)
     assert all(one.right for one in found)
     assert "opening of the microwave" in {one.what for one in found}
@@ -105,7 +105,7 @@ def test_the_check_finds_nothing_wrong_and_names_an_opening_that_is_no_share():
     assert [one.what for one in check_suite(wrong) if not one.right] == ["opening of the microwave"]
 
 
-def test_plans_about_openings_are_read_from_every_format():
+def test_plans_about_openings_survive_every_format():
     plan = PLANS[MICROWAVE.name]
     for name in lw.PLAN_FORMATS:
         found = lw.decode_plan(lw.encode_plan(plan, name), MICROWAVE, format=name)
@@ -124,7 +124,7 @@ def actors(features):
 
 
 @pytest.mark.parametrize("features", ["raw", "differences", "relative", "opening", "both"])
-def test_actors_give_nine_numbers(features, env, tmp_path):
+def test_actors_write_nine_numbers(features, env, tmp_path):
     for actor in actors(features):
         state = env.reset()
         state = state if actor.plans is None else transform_of(actor)(state)
@@ -135,7 +135,7 @@ def test_actors_give_nine_numbers(features, env, tmp_path):
         assert torch.equal(again(state.clone())["action"], actor(state.clone())["action"])
 
 
-def test_an_evaluator_reads_a_thing_s_opening():
+def test_evaluator_reads_an_objects_opening():
     evaluator = lw.StateQueryEvaluator(PLANS, width=8)
     state = torch.zeros(2, 93)
     state[1, DOOR] = 1.0
@@ -144,7 +144,7 @@ def test_an_evaluator_reads_a_thing_s_opening():
     assert not torch.equal(logits[0, 2], logits[1, 2])
 
 
-def test_what_needs_a_displacement_says_so():
+def test_errors_where_a_displacement_is_needed():
     go = ScriptedSkill("go there", "microwave")
     plan = lw.ConditionalPlan.from_pairs(MICROWAVE, [("the microwave is closed", go.text)])
     says = "an action of layout 'kitchen' has no displacement of the hand"
@@ -176,7 +176,7 @@ def replay(demos):
 
 
 @pytest.mark.slow
-def test_a_policy_learns_from_demonstrations_and_acts(demos, replay):
+def test_policy_learns_from_demonstrations_and_acts(demos, replay):
     assert demos.success_rate == {CABINET.name: 1.0}
     torch.manual_seed(0)
     for actor in actors("both"):
@@ -189,7 +189,7 @@ def test_a_policy_learns_from_demonstrations_and_acts(demos, replay):
 
 
 @pytest.mark.slow
-def test_torchrl_s_losses_step(replay):
+def test_torchrls_losses_train(replay):
     actor = lw.PlanConditionedActor(PLANS, **small())
     qvalue = lw.PlanConditionedQValue(PLANS, text_encoder=letters, width=32, depth=1)
     loss = TD3Loss(actor, qvalue, bounds=(-1.0, 1.0))
@@ -220,7 +220,7 @@ def places_of_bodies(chunks, scene):
 
 
 @pytest.mark.slow
-def test_a_recording_shows_the_kitchen_as_it_moved(tmp_path):
+def test_recording_shows_the_kitchens_movements(tmp_path):
     actor = lw.PlanConditionedActor(PLANS, **small())
     (one,) = run_recorded(actor, "kitchen/microwave", suite=SUITE, seed=7, max_steps=10)
     with lw.RerunLogger(tmp_path / "kitchen.rrd") as logger:
@@ -237,7 +237,7 @@ def test_a_recording_shows_the_kitchen_as_it_moved(tmp_path):
     assert abs(z) < 0.02  # on the counter, which is our z = 0
 
 
-def test_chance_acts_in_it(tmp_path):
+def test_random_behaviour_acts(tmp_path):
     made = lw.collect_demonstrations(
         "kitchen", suite=SUITE, policy="random", episodes_per_task=1, max_steps=4, redraw_failures=False,
         root=tmp_path / "random", progress=False,
@@ -248,7 +248,7 @@ def test_chance_acts_in_it(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_line_evaluates_and_records_it(tmp_path, capsys):
+def test_command_line_evaluates_and_records(tmp_path, capsys):
     lw.save_actor(lw.PlanConditionedActor(PLANS), tmp_path / "kitchen.safetensors")
     where = ["--suite", f"{__name__}:SUITE", "--episodes", "1", "--max-steps", "3", "--out", str(tmp_path / "out")]
     main(["evaluate", str(tmp_path / "kitchen.safetensors"), *where])

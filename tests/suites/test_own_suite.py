@@ -1,4 +1,4 @@
-"""A suite of one's own works wherever Meta-World does: environment, data, training, files, evaluation, recordings."""
+"""A custom suite works wherever Meta-World does: environment, data, training, files, evaluation, recordings."""
 
 import math
 from dataclasses import replace
@@ -42,14 +42,14 @@ def small(actions=7):
 
 
 def role_actor(plans, actions=7):
-    """A policy that knows a step by its role, and sees the opening of the gripper."""
+    """A policy on the roles of the steps and the opening of the gripper."""
     plans = lw.canonical_plans(plans)
-    seen = Concat(ObservationFeatures("opening", layout=plans.layout), RoleFeatures(plans))
-    return lw.PlanConditionedActor(plans, features=seen, **small(actions))
+    features = Concat(ObservationFeatures("opening", layout=plans.layout), RoleFeatures(plans))
+    return lw.PlanConditionedActor(plans, features=features, **small(actions))
 
 
 def pressing(task):
-    """A plan that says a motion: of "move the gripper to the block" alone nobody knows what for."""
+    """A plan of motions with a purpose, which "move the gripper to the block" lacks."""
     block = task.object_names[1]
     steps = [("not near", "lower the gripper onto"), ("near", "press")]
     return lw.ConditionalPlan.from_pairs(
@@ -65,7 +65,7 @@ def demos(tmp_path_factory):
     )
 
 
-def test_the_environment_keeps_torchrl_s_rules():
+def test_environment_follows_torchrls_rules():
     env = lw.LanguageWorldEnv("toy", suite=SUITE, num_envs=4)
     assert (env.tasks, env.max_steps, env.layout) == (("toy/touch-blue", "toy/touch-red"), 30, TOY)
     check_env_specs(env)
@@ -76,7 +76,7 @@ def test_the_environment_keeps_torchrl_s_rules():
     env.close()
 
 
-def test_scripted_plans_demonstrate_and_data_say_their_layout(demos):
+def test_scripted_plans_demonstrate_and_datasets_keep_the_layout(demos):
     assert demos.success_rate == {"toy/touch-blue": 1.0, "toy/touch-red": 1.0}
     replay = lw.LanguageWorldExperienceReplay(demos.root, transform=lw.QAFTransform(SUITE.plans))
     sample = replay.sample(8)
@@ -84,10 +84,10 @@ def test_scripted_plans_demonstrate_and_data_say_their_layout(demos):
     assert replay.demonstrations.config.layout == TOY
     assert lw.collect_demonstrations(
         "toy", suite=SUITE, episodes_per_task=3, root=demos.root, progress=False
-    ).episodes == demos.episodes  # read again, not run  # fmt: skip
+    ).episodes == demos.episodes  # read, not collected again  # fmt: skip
 
 
-def test_behaviours_by_name_follow_the_suite_s_plans(tmp_path):
+def test_named_behaviours_follow_the_suites_plans(tmp_path):
     run = {"suite": SUITE, "episodes_per_task": 1, "redraw_failures": False, "progress": False}
     plain, chance = (
         lw.collect_demonstrations("toy", policy=who, root=tmp_path / who, **run) for who in ("scripted", "random")
@@ -95,27 +95,26 @@ def test_behaviours_by_name_follow_the_suite_s_plans(tmp_path):
     assert plain.success_rate == {"toy/touch-blue": 1.0, "toy/touch-red": 1.0}
     assert lw.LanguageWorldExperienceReplay(chance.root, label="executed")[:]["action"].shape == (60, 7)
     bare = replace(SUITE, plans=None)
-    with pytest.raises(ValueError, match="suite 'toy' has no plans, which this behaviour follows; give a policy"):
+    with pytest.raises(ValueError, match="suite 'toy' has no plans"):
         lw.collect_demonstrations("toy", policy="random", root=tmp_path / "bare", **run | {"suite": bare})
 
 
 @pytest.mark.parametrize("features", FEATURES)
-def test_every_feature_has_the_layout_s_width(features, demos):
+def test_features_have_the_layouts_width(features, demos):
     plans = SUITE.plans
     transform = Compose(lw.QAFTransform(plans), lw.transforms.SwapUnmentioned(plans, 0.5))
     replay = lw.LanguageWorldExperienceReplay(demos.root, transform=transform)
-    seen = ObservationFeatures(features, layout=TOY)
-    actor = lw.PlanConditionedActor(plans, features=Concat(seen, FocusFeatures(plans)), **small())
-    lw.BehavioralCloningTrainer(
-        actor, replay, lw.BehavioralCloningConfig(steps=2, batch_size=8), progress=False
-    ).train()  # fmt: skip
-    things = 10  # pairs of hand, three blocks and goal
-    widths = {"raw": 16, "relative": 9 * things, "differences": 9 * things + 2, "both": 16 + 9 * things + 2}
-    assert seen.width == widths[features]
+    observed = ObservationFeatures(features, layout=TOY)
+    actor = lw.PlanConditionedActor(plans, features=Concat(observed, FocusFeatures(plans)), **small())
+    config = lw.BehavioralCloningConfig(steps=2, batch_size=8)
+    lw.BehavioralCloningTrainer(actor, replay, config, progress=False).train()
+    pairs = 10  # of hand, three blocks and goal
+    widths = {"raw": 16, "relative": 9 * pairs, "differences": 9 * pairs + 2, "both": 16 + 9 * pairs + 2}
+    assert observed.width == widths[features]
     assert actor.spec["action"].shape == (7,)
 
 
-def test_a_policy_is_trained_saved_evaluated_and_recorded(demos, tmp_path):
+def test_policy_is_trained_saved_evaluated_and_recorded(demos, tmp_path):
     plans = lw.Plans([pressing(task) for task in TASKS.values()])
     actor = role_actor(plans)
     replay = lw.LanguageWorldExperienceReplay(
@@ -136,20 +135,12 @@ def test_a_policy_is_trained_saved_evaluated_and_recorded(demos, tmp_path):
         episodes = []
         keys = ["observation", "task_id", "qaf", "skill_weights"]
         lw.evaluate(again, **run, also_record=keys, on_episode=episodes.append)
-        names = [
-            lw.log_rollout(
-                logger,
-                one.steps.set("episode", torch.full((len(one.steps),), one.episode)),
-                again.plans,
-                seed=1_000,
-                suite=SUITE,
-            )
-            for one in episodes[:1]
-        ]
-    assert names[0].startswith("toy")
+        steps = episodes[0].steps
+        steps["episode"] = torch.full((len(steps),), episodes[0].episode)
+        assert lw.log_rollout(logger, steps, again.plans, seed=1_000, suite=SUITE).startswith("toy")
 
 
-def test_a_recording_names_the_layout_s_actions_and_needs_no_plan(tmp_path):
+def test_recording_names_the_layouts_actions_and_needs_no_plan(tmp_path):
     env = lw.LanguageWorldEnv("toy", suite=SUITE)
     rollout = env.rollout(3, auto_reset=True)[0]
     with lw.RerunLogger(tmp_path / "toy.rrd") as logger:
@@ -158,9 +149,9 @@ def test_a_recording_names_the_layout_s_actions_and_needs_no_plan(tmp_path):
     assert action_names(TOY) == ["0", "dx", "dy", "dz", "4", "5", "gripper"]
 
 
-def test_failures_are_attributed_by_the_suite_s_own_skills():
-    spoilt = {text: ScriptedSkill(text, skill.target, offset=(0.1, 0.0, 0.0)) for text, skill in SKILLS.items()}
-    actor = lw.ScriptedSkillActor(SUITE.plans, skills=spoilt)
+def test_failures_are_attributed_with_the_suites_skills():
+    shifted = {text: ScriptedSkill(text, skill.target, offset=(0.1, 0.0, 0.0)) for text, skill in SKILLS.items()}
+    actor = lw.ScriptedSkillActor(SUITE.plans, skills=shifted)
     result = lw.evaluate(
         actor, tasks="toy/touch-red", suite=SUITE, episodes_per_task=2, seed=7, attribute=True, progress=False
     )
@@ -179,31 +170,28 @@ def test_evaluators_and_critics_read_the_layout(demos):
     env.close()
 
 
-def test_a_policy_of_meta_world_acts_in_it():
-    """Without training it only shows that sizes, units and signs are turned."""
+def test_metaworld_policy_acts_in_the_suite():
+    """The policy is not trained: only sizes, units and signs are tested."""
     trained = role_actor(lw.load_plans("MT10"), 4).eval()
     moved = TransferredActor(ActorEnsemble([trained, trained]), CANONICAL)
-    given = torch.tensor([[0.5, -1.0, 0.2, 0.7], [0.0, 0.0, 0.0, 0.2]])
-    turned = moved.converted(given)
-    torch.testing.assert_close(turned[0], torch.tensor([0.0, 0.1, -0.2, 0.04, 0.0, 0.0, -1.0]))
-    assert turned[1, 6] == 1.0  # below 0.3 it opens, and -1 closes here
-    faster = TransferredActor(trained, CANONICAL, speed=6.0).converted(given)[0]
+    actions = torch.tensor([[0.5, -1.0, 0.2, 0.7], [0.0, 0.0, 0.0, 0.2]])
+    converted = moved.converted(actions)
+    torch.testing.assert_close(converted[0], torch.tensor([0.0, 0.1, -0.2, 0.04, 0.0, 0.0, -1.0]))
+    assert converted[1, 6] == 1.0  # efforts below 0.3 open the gripper, and here -1 closes
+    faster = TransferredActor(trained, CANONICAL, speed=6.0).converted(actions)[0]
     torch.testing.assert_close(faster, torch.tensor([0.0, 0.6, -1.0, 0.24, 0.0, 0.0, -1.0]))
     result = lw.evaluate(moved, tasks="toy", suite=SUITE, episodes_per_task=1, seed=3, progress=False)
     assert set(result.success_once) == set(TASKS)
 
 
-def test_what_does_not_carry_over_is_named():
-    trained = lw.PlanConditionedActor(lw.load_plans("MT10"))
-    with pytest.raises(ValueError, match="features 'differences' of layout 'metaworld' do not transfer to 'toy'"):
-        TransferredActor(trained, SUITE.plans)
-    with pytest.raises(TypeError, match="needs an actor that follows plans"):
+def test_policies_that_cannot_transfer_raise():
+    with pytest.raises(ValueError, match="'differences' of layout 'metaworld' do not transfer to 'toy'"):
+        TransferredActor(lw.PlanConditionedActor(lw.load_plans("MT10")), SUITE.plans)
+    with pytest.raises(TypeError, match="plans"):
         TransferredActor(lw.DescriptorConditionedActor("MT10"), SUITE.plans)
-    with pytest.raises(ValueError, match=r"speed must be above 0, got 0\.0"):
-        TransferredActor(role_actor(lw.load_plans("MT10"), 4), CANONICAL, speed=0.0)
 
 
-def test_a_transferred_policy_is_saved(tmp_path):
+def test_transferred_policy_is_saved(tmp_path):
     moved = TransferredActor(role_actor(lw.load_plans("MT10"), 4), CANONICAL, speed=1.5).eval()
     lw.save_actor(moved, tmp_path / "moved.safetensors")
     again = lw.load_actor(tmp_path / "moved.safetensors").eval()
@@ -216,9 +204,9 @@ def test_a_transferred_policy_is_saved(tmp_path):
 
 def test_plans_of_two_suites_do_not_mix():
     both = [*lw.load_plans("MT10").values(), *SUITE.plans.values()]
-    with pytest.raises(lw.PlanError, match="tasks must be of one layout, got 'metaworld'"):
+    with pytest.raises(lw.PlanError, match=r"layout.*'metaworld'"):
         lw.Plans(both)
-    with pytest.raises(ValueError, match="tasks must be of one suite, got tasks of fetch, metaworld"):
+    with pytest.raises(ValueError, match=r"tasks .*fetch, metaworld"):
         lw.LanguageWorldEnv(["fetch/reach", "reach"])
 
 
@@ -228,32 +216,35 @@ def test_suites_are_found_by_name(monkeypatch):
     env = lw.LanguageWorldEnv("toy/touch-red")
     assert env.suite is SUITE
     env.close()
-    with pytest.raises(ValueError, match=r"suite must be one of .*got 'toi'; did you mean 'toy'"):
+    with pytest.raises(ValueError, match=r"^suite .*'toi'; did you mean 'toy'"):
         lw.LanguageWorldEnv("toi/touch-red")
     with pytest.raises(ValueError, match="did you mean 'toy/touch-red'"):
         lw.LanguageWorldEnv("toy/touch-rad")
 
 
 @pytest.mark.parametrize(
-    ("change", "error", "says"),
+    ("change", "message"),
     [
-        ({"tasks": {"toy/other": TASKS["toy/touch-red"]}}, TypeError, "must map names to their Task"),
-        ({"tasks": {"reach": lw.TASKS["reach"]}}, ValueError, "task 'reach' must have the layout of suite 'toy'"),
-        ({"name": "tay"}, ValueError, "tasks of suite 'tay' must be named 'tay/...'"),
-        ({"plans": lw.load_plans("MT10")}, ValueError, "plans of suite 'toy' are for tasks that it lacks"),
+        ({"tasks": {"toy/other": TASKS["toy/touch-red"]}}, "tasks .*'toy/touch-red' as 'toy/other'"),
+        ({"tasks": {"reach": lw.TASKS["reach"]}}, "task 'reach' must have the layout of suite 'toy'"),
+        ({"name": "tay"}, "tasks of suite 'tay' must be named 'tay/...'"),
+        ({"plans": lw.load_plans("MT10")}, "plans of suite 'toy' are for tasks that it lacks"),
     ],
 )
-def test_what_is_no_suite_is_named(change, error, says):
+def test_contradictory_suites_raise(change, message):
     options = {"name": "toy", "layout": TOY, "tasks": TASKS, "make_engine": ToyEngine} | change
-    with pytest.raises(error, match=says):
+    with pytest.raises(ValueError, match=message):
         Suite(**options)
 
 
-def test_the_check_says_what_is_off():
-    assert all(one.right for one in check_suite(SUITE))
-    slow = make_toy_suite(partial(ToyEngine, reach=0.02))
-    off = {one.what for one in check_suite(slow) if not one.right}
-    assert off == {"+x moves right", "+y moves away from the robot", "+z moves up"}
+def wrong_findings(suite):
+    """What check_suite finds wrong, and its measurements."""
+    return {(finding.what, finding.measured) for finding in check_suite(suite) if not finding.right}
+
+
+def what_is_wrong(layout, engine, plans=None):
+    tasks = {name: replace(task, layout=layout) for name, task in TASKS.items()}
+    return {what for what, _ in wrong_findings(Suite("toy", layout, tasks, engine, plans=plans))}
 
 
 class Broken(ToyEngine):
@@ -261,12 +252,12 @@ class Broken(ToyEngine):
 
     fault = ""
 
-    def _spoilt(self, seen):
+    def _broken(self, seen):
         if self.fault == "NaN":
             seen[:, 10] = np.nan
         elif self.fault == "floor":
             seen[:, [3, 6, 9, 12, 15]] += 0.42
-        elif self.fault == "things from the hand":
+        elif self.fault == "objects from the hand":
             seen[:, 4:13] -= np.tile(seen[:, 1:4], 3)
             seen[:, 4:13] = -seen[:, 4:13]
         elif self.fault == "single":
@@ -274,14 +265,14 @@ class Broken(ToyEngine):
         return seen
 
     def reset(self, rows, seeds):
-        seen = self._spoilt(super().reset(rows, seeds))
+        seen = self._broken(super().reset(rows, seeds))
         return np.tile(seen, (2, 1))[:2] if self.fault == "all rows" else seen
 
     def step(self, action, active):
         done = super().step(action, np.ones_like(active) if self.fault == "restless" else active)
         if self.fault == "restless":
             self.state[1, 1] += 0.01
-        done = done._replace(observation=self._spoilt(done.observation))
+        done = done._replace(observation=self._broken(done.observation))
         return tuple(done) if self.fault == "tuple" else done
 
 
@@ -289,21 +280,40 @@ class Broken(ToyEngine):
     ("fault", "what"),
     [
         ("NaN", "the numbers"),
-        ("floor", "the lowest of things and pressed hands"),
-        ("things from the hand", "thing 1 as the hand moves"),
+        ("floor", "the lowest object or hand"),
+        ("objects from the hand", "object 1 as the hand moves"),
         ("single", "observations of a reset"),
         ("all rows", "a reset of one row of two"),
         ("restless", "a row that is not active"),
         ("tuple", "a step"),
     ],
 )
-def test_the_check_finds_what_is_easily_wrong(fault, what, monkeypatch):
+def test_check_finds_a_broken_engine(fault, what, monkeypatch):
     monkeypatch.setattr(Broken, "fault", fault)
-    assert what in {one.what for one in check_suite(make_toy_suite(Broken)) if not one.right}
+    assert what in dict(wrong_findings(make_toy_suite(Broken)))
+
+
+@pytest.mark.parametrize(
+    ("options", "findings"),
+    [
+        ({}, set()),
+        ({"inertia": 0.9}, {("the hand moves on for", "5.7 steps")}),
+        ({"closing": 0.05}, {("steps to close", "18")}),
+    ],
+    ids=str,
+)
+def test_check_measures_a_slow_hand_and_gripper(options, findings):
+    assert findings <= wrong_findings(make_toy_suite(partial(ToyEngine, **options)))
+    assert findings or not wrong_findings(SUITE)
+
+
+def test_check_measures_the_reach():
+    axes = {"+x moves right", "+y moves away from the robot", "+z moves up"}
+    assert what_is_wrong(TOY, partial(ToyEngine, reach=0.02)) == axes
 
 
 class NoPast(ToyEngine):
-    """The numbers of the step before are always 0."""
+    """The numbers of the previous step are always 0."""
 
     def reset(self, rows, seeds):
         return np.pad(super().reset(rows, seeds), ((0, 0), (0, 13)))
@@ -313,35 +323,30 @@ class NoPast(ToyEngine):
         return done._replace(observation=np.pad(done.observation, ((0, 0), (0, 13))))
 
 
-def off_in(layout, engine, plans=None):
-    tasks = {name: replace(task, layout=layout) for name, task in TASKS.items()}
-    return {one.what for one in check_suite(Suite("toy", layout, tasks, engine, plans=plans)) if not one.right}
+def test_check_finds_a_past_that_is_zero():
+    assert what_is_wrong(replace(TOY, size=29, past=13, goal=26), NoPast) == {"numbers of the previous step"}
 
 
-def test_the_check_finds_a_past_that_is_zero():
-    assert off_in(replace(TOY, size=29, past=13, goal=26), NoPast) == {"numbers of the step before"}
-
-
-def test_the_check_finds_a_gripper_that_does_not_move():
+def test_check_finds_a_gripper_that_does_not_move():
     still = replace(TOY, gripper=5)
     task = replace(TASKS["toy/touch-red"], layout=still)
     pairs = [("the gripper is open", "go"), ("the gripper is closed", "stay")]
     plans = lw.Plans([lw.ConditionalPlan.from_pairs(task, pairs)])
-    assert off_in(still, ToyEngine) == set()
-    assert off_in(still, ToyEngine, plans) == {"gripper"}
+    assert what_is_wrong(still, ToyEngine) == set()
+    assert what_is_wrong(still, ToyEngine, plans) == {"gripper"}
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
-        ({"opening": 2}, "uses number 2 of an observation for two purposes"),
-        ({"things": (Slot(3),)}, "uses number 3 of an observation for two purposes"),
-        ({"past": 2, "size": 40}, "for two purposes"),
-        ({"gripper": 2}, "gripper of layout 'toy' must not be an index of the displacement, got 2"),
+        ({"opening": 2}, "number 2 .*two"),
+        ({"things": (Slot(3),)}, "number 3 .*two"),
+        ({"past": 2, "size": 40}, "two"),
+        ({"gripper": 2}, "gripper .*displacement"),
     ],
 )
-def test_a_number_is_one_thing(change, says):
-    with pytest.raises(ValueError, match=says):
+def test_number_of_a_layout_has_one_meaning(change, message):
+    with pytest.raises(ValueError, match=message):
         replace(TOY, **change)
 
 
@@ -355,7 +360,7 @@ def value(plans):
 
 
 @pytest.mark.parametrize("make_loss", [td3, value])
-def test_losses_train_offline_with_the_layout_s_statistics(make_loss, demos):
+def test_losses_train_offline_with_the_layouts_statistics(make_loss, demos):
     plans = SUITE.plans
     loss = make_loss(plans)
     loss.make_value_estimator(gamma=0.9)
@@ -364,16 +369,4 @@ def test_losses_train_offline_with_the_layout_s_statistics(make_loss, demos):
     )
     trainer = lw.OfflineTrainer(loss, replay, lw.OfflineConfig(steps=2, batch_size=8), progress=False)
     trainer.train()
-    assert all(math.isfinite(one) for one in trainer.last.values())
-
-
-@pytest.mark.parametrize(
-    ("fault", "found"),
-    [({"inertia": 0.9}, ("the hand goes on for", "5.7 steps")), ({"closing": 0.05}, ("steps to close", "18"))],
-)
-def test_the_check_says_what_is_slow(fault, found):
-    task = "toy/touch-red"
-    off = [
-        one for one in check_suite(make_toy_suite(partial(ToyEngine, **fault))) if one.task == task and not one.right
-    ]
-    assert found in {(one.what, one.measured) for one in off}
+    assert all(map(math.isfinite, trainer.last.values()))

@@ -17,7 +17,7 @@ TABLES = {
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_a_table_is_pickled_and_cannot_be_changed(name):
+def test_tasks_are_pickled_and_read_only(name):
     table = TABLES[name]()
     assert pickle.loads(pickle.dumps(table)) == table
     with pytest.raises(TypeError, match="does not support item assignment"):
@@ -25,7 +25,7 @@ def test_a_table_is_pickled_and_cannot_be_changed(name):
 
 
 @pytest.mark.parametrize("name", ["metaworld", "fetch"])
-def test_a_suite_is_pickled(name):
+def test_suite_is_pickled(name):
     suite = load_suite(name)
     sent = pickle.loads(pickle.dumps(suite))
     assert (sent.tasks, sent.skills, sent.layout) == (suite.tasks, suite.skills, suite.layout)

@@ -33,13 +33,13 @@ def suite(example):
     return example.make_suite("Panda")
 
 
-def test_the_suite_is_what_it_says(suite):
+def test_check_finds_nothing_wrong(suite):
     """Of one task: the others have the same arm, gripper and frame."""
     lift = replace(suite, tasks={"robosuite/lift": suite.tasks["robosuite/lift"]}, plans=None)
     assert [one for one in check_suite(lift) if not one.right] == []
 
 
-def test_a_seed_is_an_episode_whatever_the_row_did(suite):
+def test_seed_determines_an_episode(suite):
     engine = suite.make_engine(["robosuite/lift", "robosuite/lift"])
     first = engine.reset([0, 1], [7, 8])
     action = np.array([[0.3, -0.5, -1.0, 1.0]] * 2, np.float32)
@@ -65,7 +65,7 @@ def test_plans_with_scripted_skills_succeed(task, suite):
     assert lw.evaluate(actor, tasks=f"robosuite/{task}", suite=suite, **run).mean_success == 1.0
 
 
-def test_the_example_runs_a_policy_of_meta_world(example, tmp_path):
+def test_example_runs_a_metaworld_policy(example, tmp_path):
     plans = lw.canonical_plans(lw.load_plans("MT10"))
     features = Concat(ObservationFeatures("opening"), RoleFeatures(plans))
     actor = lw.PlanConditionedActor(plans, features=features, decoder=MLPDecoder(width=8))

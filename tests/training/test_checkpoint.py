@@ -17,7 +17,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 import lw_torchrl as lw
 from lw_torchrl._util.reproducibility import package_versions
 from lw_torchrl._util.tensor_files import read_tensors, write_tensors
-from lw_torchrl.language import embeddings
+from lw_torchrl.language import text
 from lw_torchrl.language.skills import load_skills
 from lw_torchrl.modules import ActorEnsemble, MLPDecoder, ObservationFeatures, SkillEncoder
 from lw_torchrl.modules.describe import describe
@@ -125,9 +125,9 @@ CUSTOM_TEXTS = {
 @pytest.mark.parametrize("make", CUSTOM_TEXTS.values(), ids=CUSTOM_TEXTS)
 def test_policies_with_texts_that_are_not_shipped_load_in_a_new_process(make, path):
     lw.save_actor(make(), path)
-    embeddings._sentence_transformer.cache_clear()  # as in a new process
+    text._sentence_transformer.cache_clear()  # as in a new process
     lw.load_actor(path)
-    assert embeddings._sentence_transformer.cache_info().misses
+    assert text._sentence_transformer.cache_info().misses
 
 
 @pytest.mark.parametrize("other", [lambda actor: actor, lambda actor: actor.with_plans(PLANS)])

@@ -1,4 +1,4 @@
-"""Augmentations of sampled rows: objects that no active step mentions, the gripper's opening, and the target."""
+"""SwapUnmentioned, HideOpening and JitterTarget: augmentations of a replay buffer's rows."""
 
 import pytest
 import torch
@@ -34,7 +34,7 @@ def test_conditions_and_skills_mention_objects():
     ]
 
 
-def test_points_beside_an_object_mention_it_and_fixed_places_mention_nothing():
+def test_named_points_mention_their_object_and_fixed_places_nothing():
     assert table("hammer", ("the gripper is above the hammer handle", "wait")) == [[1, 0, 0]]
     assert table("hammer", ("the hammer head is near the nail", "wait")) == [[1, 1, 0]]
     assert table("bin-picking", ("the gripper is above the other bin", "wait")) == [[0, 0, 0]]
@@ -44,14 +44,14 @@ def test_points_beside_an_object_mention_it_and_fixed_places_mention_nothing():
 
 @pytest.mark.parametrize("skills", ["own", "MT10"])
 def test_a_canonical_step_mentions_what_it_moves_and_its_target(skills):
-    """Also where the words do not: "lift the puck out of the hole" is on its way to the target location."""
+    """Even if its text does not: "lift the puck out of the hole" is on its way to the target location."""
     plans = lw.canonical_plans(lw.load_plans("MT50", skills=skills))
     tables = PlanTables(plans)
-    found = mentioned(plans, tables)
+    result = mentioned(plans, tables)
     for task, plan in plans.items():
         for number, step in enumerate(plan.steps):
             if "target location" in (step.role.moved, step.role.target):
-                assert found[tables.index.row(task), number, 2], (task, step.skill)
+                assert result[tables.index.row(task), number, 2], (task, step.skill)
 
 
 # One condition of push for each row: the puck alone is mentioned, or the goal too.
@@ -67,13 +67,13 @@ KEPT = torch.tensor([[True, False, False], [True, False, True]])
 
 def rows(number=8, seed=0, plans=PUSH, task="push", step=None):
     generator = torch.Generator().manual_seed(seed)
-    found = TensorDict(
+    result = TensorDict(
         observation=torch.randn(number, 39, generator=generator), task_id=torch.full((number,), lw.task_id(task))
     ).auto_batch_size_(1)
-    found["qaf"] = torch.rand(number, plans.num_steps, generator=generator) < 0.5
+    result["qaf"] = torch.rand(number, plans.num_steps, generator=generator) < 0.5
     if step is not None:
-        found["qaf"] = torch.nn.functional.one_hot(torch.as_tensor(step).expand(number), plans.num_steps).bool()
-    return found
+        result["qaf"] = torch.nn.functional.one_hot(torch.as_tensor(step).expand(number), plans.num_steps).bool()
+    return result
 
 
 def seeded(transform, tensordict, seed=0):
@@ -84,7 +84,7 @@ def seeded(transform, tensordict, seed=0):
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(1, 30), st.integers(0, 2**31), st.floats(0.0, 1.0), st.booleans())
-def test_only_the_unmentioned_moves_and_only_to_where_it_is_in_another_row(number, seed, probability, soft):
+def test_only_unmentioned_objects_are_swapped_with_another_row(number, seed, probability, soft):
     was = rows(number, seed)
     if soft:
         was["qaf"] = was["qaf"].float() * 0.9 + 0.05
@@ -101,10 +101,10 @@ def test_only_the_unmentioned_moves_and_only_to_where_it_is_in_another_row(numbe
         assert torch.equal(swapped[kept[:, thing]][:, place], observation[kept[:, thing]][:, place])
         for row in swapped[:, place]:
             assert (observation[:, place] == row).all(-1).any()
-    assert torch.equal(now["qaf"], was["qaf"]), "answers are those of the scene as it was"
+    assert torch.equal(now["qaf"], was["qaf"]), "answers belong to the unchanged scene"
 
 
-def test_the_probability_is_that_of_each_swap():
+def test_swap_probability_holds_for_each_object():
     was = rows(4000, step=0)
     was["observation"] = torch.arange(4000.0)[:, None].expand(-1, 39).clone()
     moved = seeded(lw.transforms.SwapUnmentioned(PUSH, 0.3), was)["observation"] != was["observation"]
@@ -117,7 +117,7 @@ def test_the_probability_is_that_of_each_swap():
     assert torch.equal(shaped.reshape(-1, 39) != was["observation"], moved)
 
 
-def test_the_next_observation_is_swapped_alike_and_keeps_what_either_mentions():
+def test_next_observation_is_swapped_alike():
     was = rows(64, step=0)
     was["next"] = TensorDict(observation=was["observation"] + 100, batch_size=[64])
     now = seeded(lw.transforms.SwapUnmentioned(PUSH, 1.0), was)
@@ -142,7 +142,7 @@ def test_fallback_steps_mention_nothing_in_the_plans_own_turn():
     assert active[:, own].all()
 
 
-def test_the_opening_is_that_of_another_row():
+def test_opening_comes_from_another_row():
     was = rows(2000)
     now = seeded(lw.transforms.HideOpening(0.3), was)["observation"]
     others = [column for column in range(39) if column != OPENING]
@@ -161,7 +161,7 @@ def steps_with(verbs, plans=CANONICAL):
     ]
 
 
-def test_the_target_is_moved_where_something_is_pushed_or_pulled():
+def test_target_offset_only_for_pushed_or_pulled_objects():
     transform = lw.transforms.JitterTarget(CANONICAL, 0.03)
     for task, step in steps_with(("push", "pull")):
         offset = seeded(transform, rows(4000, plans=CANONICAL, task=task, step=step))["target_offset"]
@@ -172,7 +172,7 @@ def test_the_target_is_moved_where_something_is_pushed_or_pulled():
         assert not transform(rows(plans=CANONICAL, task=task, step=step))["target_offset"].any()
 
 
-def test_in_a_buffer_each_sample_is_drawn_anew_and_the_storage_is_left_alone():
+def test_each_sample_is_drawn_anew_and_the_storage_stays_unchanged():
     replay = TensorDictReplayBuffer(
         storage=LazyTensorStorage(64),
         batch_size=64,
@@ -191,7 +191,7 @@ def test_in_a_buffer_each_sample_is_drawn_anew_and_the_storage_is_left_alone():
     assert "target_offset" in first.keys()
 
 
-def test_keys_have_other_names():
+def test_renamed_keys():
     was = rows(64, step=0)
     moved = TensorDict({("a", "seen"): was["observation"], ("a", "task"): was["task_id"], "truth": was["qaf"]}, [64])
     keys = [("a", "seen"), ("a", "task"), "truth"]
@@ -202,7 +202,7 @@ def test_keys_have_other_names():
 
 
 @pytest.mark.parametrize("name", ["SwapUnmentioned", "HideOpening", "JitterTarget", "RandomYaw"])
-def test_no_rows_stay_no_rows(name):
+def test_call_with_no_rows(name):
     was = rows(plans=CANONICAL).set("action", torch.zeros(8, 4))[:0]
     assert MAKERS[name]()(was)["observation"].shape == (0, 39)
 
@@ -217,49 +217,42 @@ MAKERS = {
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_an_environment_refuses_it(name):
+def test_environments_refuse_augmentations(name):
     env = lw.LanguageWorldEnv("reach")
-    with pytest.raises(TypeError, match=f"^{name} is for replay buffers"):
+    with pytest.raises(TypeError, match=name):
         env.append_transform(MAKERS[name]())
-    with pytest.raises(TypeError, match=f"^{name} is for replay buffers"):
+    with pytest.raises(TypeError, match=name):
         TransformedEnv(env, Compose(lw.QAFTransform(CANONICAL), MAKERS[name]())).rollout(1)
     env.close()
 
 
 @pytest.mark.parametrize("name", ["SwapUnmentioned", "JitterTarget"])
-def test_answers_of_longer_plans_are_cut_if_they_are_for_the_same_plan(name):
+def test_wider_qaf_of_the_same_plan_is_accepted(name):
     task = min(CANONICAL, key=lambda task: len(CANONICAL[task].steps))
     transform = getattr(lw.transforms, name)(Plans([CANONICAL[task]]), 0.5)
     was = lw.QAFTransform(CANONICAL)(rows(task=task).exclude("qaf"))
     now, expected = seeded(transform, was), seeded(getattr(lw.transforms, name)(CANONICAL, 0.5), was)
     assert (now == expected).all()
-    with pytest.raises(ValueError, match="qaf must have shape"):
+    with pytest.raises(ValueError, match="qaf"):
         transform(was.exclude("qaf_plan"))
 
 
 @pytest.mark.parametrize("name", ["SwapUnmentioned", "JitterTarget"])
-def test_missing_keys_and_other_plans_are_named(name):
+def test_missing_keys_other_plans_and_unknown_tasks_are_refused(name):
     transform = MAKERS[name]()
-    with pytest.raises(ValueError, match=r"qaf.* are needed"):
+    with pytest.raises(ValueError, match="qaf"):
         transform(rows().exclude("qaf"))
     with pytest.raises(ValueError, match="qaf answers other plans"):
         transform(lw.QAFTransform(MT10)(rows(plans=MT10)))
-    with pytest.raises(ValueError, match="tasks without a plan"):
+    with pytest.raises(ValueError, match="task_id"):
         transform(rows(plans=CANONICAL, task="soccer"))
-
-
-def test_wrong_arguments_are_refused():
-    with pytest.raises(ValueError, match=r"probability must be from 0 to 1, got 1\.5"):
-        lw.transforms.SwapUnmentioned(MT10, 1.5)
-    with pytest.raises(ValueError, match="probability must be finite and at least 0"):
-        lw.transforms.HideOpening(-0.1)
-    with pytest.raises(ValueError, match=r"plans must be those of lw.canonical_plans; step 0 of .* has no role"):
+    with pytest.raises(ValueError, match="canonical_plans"):
         lw.transforms.JitterTarget(MT10, 0.1)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
-def test_it_compiles_to_one_graph(name):
+def test_augmentation_compiles_to_one_graph(name):
     torch._dynamo.reset()
     compiled = torch.compile(MAKERS[name](), fullgraph=True, backend="eager")
     assert compiled(rows(plans=CANONICAL).set("action", torch.zeros(8, 4))).batch_size == (8,)

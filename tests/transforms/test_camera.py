@@ -1,4 +1,4 @@
-"""CameraTransform: pictures of the rows that moved, at the steps that are asked for, whatever is around."""
+"""CameraTransform: pictures of the rows that moved, every N steps."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def moving(tensordict):
     return tensordict.set("action", torch.tensor([[0.8, -0.6, 0.4, 0.5]]) * (-1) ** rows)
 
 
-def test_a_picture_is_of_the_state_that_its_row_is_in():
+def test_picture_shows_the_present_state():
     env = opened(num_envs=3)
     state = env.reset()
     assert state["pixels"].shape == (3, 24, 32, 3)
@@ -44,7 +44,7 @@ def test_a_picture_is_of_the_state_that_its_row_is_in():
     env.close()
 
 
-def test_specs_hold_and_several_cameras_stand_side_by_side():
+def test_specs_and_several_cameras_side_by_side():
     env = opened(cameras=("corner", "topview"))
     check_env_specs(env)
     state = env.reset()
@@ -53,7 +53,7 @@ def test_specs_hold_and_several_cameras_stand_side_by_side():
     env.close()
 
 
-def test_a_picture_is_held_between_two_and_begins_anew_with_its_row():
+def test_picture_is_held_for_every_steps_and_renewed_at_a_reset():
     env = opened(every=3)
     state, shown, drawings = env.reset(), [], []
     for _ in range(7):
@@ -69,20 +69,20 @@ def test_a_picture_is_held_between_two_and_begins_anew_with_its_row():
     env.close()
 
 
-def test_rows_that_a_mask_leaves_out_are_not_drawn(monkeypatch):
+def test_mrendered_rows_are_not_rendered(monkeypatch):
     env = opened(num_envs=4)
-    state, asked = env.reset(), []
+    state, rendered = env.reset(), []
     render = env.base_env.render
-    monkeypatch.setattr(env.base_env, "render", lambda **options: asked.append(options["rows"]) or render(**options))
+    monkeypatch.setattr(env.base_env, "render", lambda **options: rendered.append(options["rows"]) or render(**options))
     before = state["pixels"].clone()
     moved = torch.tensor([False, True, True, False])
     after = env.step(moving(state).set("_step", moved))["next"]["pixels"]
-    assert asked == [[1, 2]]
+    assert rendered == [[1, 2]]
     assert torch.equal(after[~moved], before[~moved])
     env.close()
 
 
-def test_pictures_do_not_depend_on_what_stands_beside():
+def test_pictures_do_not_depend_on_other_rows():
     many, alone = opened(["drawer-open"], num_envs=3), opened(["drawer-open"], batch_size=())
     state, one = many.reset(), alone.reset(episode=1)
     assert one["pixels"].shape == (24, 32, 3)
@@ -91,7 +91,7 @@ def test_pictures_do_not_depend_on_what_stands_beside():
     alone.close()
 
 
-def test_its_state_is_the_environments_and_wants_a_reset():
+def test_state_dict_holds_the_environments_and_requires_a_reset():
     env, other = opened(["reach"]), opened(["reach"])
     env.reset()
     state = env.state_dict()
@@ -100,22 +100,22 @@ def test_its_state_is_the_environments_and_wants_a_reset():
     other.load_state_dict(state)
     with pytest.raises(RuntimeError, match=r"reset"):
         other.step(moving(began))
-    found = other.reset()
-    assert found["episode"] == expected["episode"] == 1
-    assert torch.equal(found["pixels"], expected["pixels"])
+    result = other.reset()
+    assert result["episode"] == expected["episode"] == 1
+    assert torch.equal(result["pixels"], expected["pixels"])
     env.close()
     other.close()
 
 
-def test_it_goes_into_each_worker():
+def test_camera_belongs_into_each_worker():
     env = SerialEnv(2, lambda: opened(["reach"]))
     assert env.reset()["pixels"].shape == (2, 1, 24, 32, 3)
     env.close()
-    with pytest.raises(TypeError, match=r"workers of a SerialEnv: put it into each of them"):
+    with pytest.raises(TypeError, match="worker"):
         TransformedEnv(SerialEnv(2, lambda: lw.LanguageWorldEnv("reach")), lw.transforms.CameraTransform())
 
 
-def test_a_replay_buffer_is_told_of_add_pictures():
+def test_replay_buffer_is_refused_with_a_hint_to_add_pictures():
     buffer = ReplayBuffer(storage=LazyTensorStorage(4), transform=lw.transforms.CameraTransform(), batch_size=2)
     env = lw.LanguageWorldEnv("reach")
     buffer.extend(env.rollout(4).reshape(-1))
@@ -124,10 +124,10 @@ def test_a_replay_buffer_is_told_of_add_pictures():
         buffer.sample()
 
 
-def test_rows_that_are_not_there_are_refused():
+def test_rendering_unknown_rows_is_refused():
     env = lw.LanguageWorldEnv("reach")
     env.reset()
-    with pytest.raises(ValueError, match=r"rows must be below 1, got 3"):
+    with pytest.raises(ValueError, match="rows"):
         env.render(rows=[0, 3])
     assert env.render(rows=[]).shape == (0, 240, 320, 3)
     env.close()

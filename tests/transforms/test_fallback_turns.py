@@ -1,4 +1,4 @@
-"""FallbackTurns: a turn ends when nothing moves, or after its longest; rows do not depend on one another."""
+"""FallbackTurns: a turn ends when nothing moves, or after its maximum length; rows are independent."""
 
 import pytest
 import torch
@@ -12,57 +12,57 @@ import lw_torchrl as lw
 from lw_torchrl.modules.policy import transform_of
 from lw_torchrl.transforms import FallbackTurns
 
-HAND, THING = slice(0, 3), slice(4, 7)
+HAND, OBJECT = slice(0, 3), slice(4, 7)
 
 
 def turns_of(ways, rows=None, **options):
-    """The turn after each step of observations (T, B, 39), of which the first is a reset's."""
+    """Return the turn after each step of observations (T, B, 39); the first is a reset's."""
     transform = FallbackTurns(**options)
     start = TensorDict(observation=ways[0], batch_size=[ways.shape[1]])
-    found = [transform._reset(TensorDict(batch_size=start.batch_size), start)["turn"]]
+    result = [transform._reset(TensorDict(batch_size=start.batch_size), start)["turn"]]
     for number, now in enumerate(ways[1:]):
         before = TensorDict(batch_size=start.batch_size)
         if rows is not None:
             before["_step"] = rows[number]
-        found.append(transform._step(before, TensorDict(observation=now, batch_size=start.batch_size))["turn"])
-    return torch.stack(found)
+        result.append(transform._step(before, TensorDict(observation=now, batch_size=start.batch_size))["turn"])
+    return torch.stack(result)
 
 
 def standing(steps, rows=1):
     return torch.zeros(steps + 1, rows, 39)
 
 
-def test_a_turn_ends_after_so_many_steps_without_motion():
+def test_turn_ends_after_patience_steps_without_motion():
     assert turns_of(standing(7), patience=3, longest=99).flatten().tolist() == [0, 0, 0, 1, 1, 1, 2, 2]
 
 
-@pytest.mark.parametrize("part", [HAND, THING], ids=["hand", "thing"])
-def test_what_moves_the_hand_or_a_thing_goes_on(part):
+@pytest.mark.parametrize("part", [HAND, OBJECT], ids=["hand", "object"])
+def test_motion_of_the_hand_or_an_object_prolongs_a_turn(part):
     ways = standing(12)
     ways[:, 0, part.start] = 0.011 * torch.arange(13)  # 2 cm in two steps
     assert turns_of(ways, patience=3, longest=99).max() == 0
 
 
-def test_trembling_is_no_motion():
+def test_small_motions_do_not_count():
     ways = standing(6)
     ways[1::2, 0, HAND] += 0.01  # 1.7 cm
     assert turns_of(ways, patience=3, longest=99).flatten().tolist() == [0, 0, 0, 1, 1, 1, 2]
 
 
-def test_a_turn_that_moves_in_circles_ends_too():
+def test_turn_ends_after_its_maximum_length():
     ways = standing(8)
     ways[::2, 0, 0] = 0.3
     assert turns_of(ways, patience=3, longest=4).flatten().tolist() == [0, 0, 0, 0, 1, 1, 1, 1, 2]
 
 
-def test_a_goal_that_moves_is_no_motion():
+def test_motion_of_the_goal_does_not_count():
     ways = standing(4)
     ways[..., 36] = torch.arange(5.0).unsqueeze(-1)
     assert turns_of(ways, patience=2, longest=99).max() == 2
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(1, 9))
-def test_a_row_depends_on_its_own_steps_alone(seed, patience, longest):
+def test_rows_are_independent(seed, patience, longest):
     generator = torch.Generator().manual_seed(seed)
     ways = torch.rand(15, 3, 39, generator=generator) * torch.tensor([0.001, 0.02, 0.2]).unsqueeze(-1)
     together = turns_of(ways, patience=patience, longest=longest)
@@ -70,12 +70,12 @@ def test_a_row_depends_on_its_own_steps_alone(seed, patience, longest):
     assert torch.equal(together, torch.cat(alone, 1))
 
 
-def test_a_row_that_makes_no_step_does_not_wait():
+def test_masked_row_does_not_wait():
     rows = torch.tensor([[True, False]] * 6)
     assert turns_of(standing(6, 2), rows, patience=3, longest=99)[-1].tolist() == [2, 0]
 
 
-def test_a_reset_begins_with_turn_0_in_the_rows_that_begin():
+def test_reset_rows_start_with_turn_0():
     transform, state = FallbackTurns(patience=1), TensorDict(observation=torch.zeros(2, 39), batch_size=[2])
     transform._reset(TensorDict(batch_size=[2]), state.clone())
     assert transform._step(TensorDict(batch_size=[2]), state.clone())["turn"].tolist() == [1, 1]
@@ -83,20 +83,20 @@ def test_a_reset_begins_with_turn_0_in_the_rows_that_begin():
     assert transform._reset(begun, state.clone())["turn"].tolist() == [0, 1]
 
 
-def test_an_environment_with_it_has_right_specs():
+def test_specs():
     env = TransformedEnv(lw.LanguageWorldEnv(["reach", "push"], num_envs=4), FallbackTurns(patience=2))
     check_env_specs(env)
     assert env.reset()["turn"].dtype == torch.int64
     env.close()
 
 
-def test_rows_of_a_buffer_keep_what_they_have():
+def test_buffer_rows_keep_their_turn():
     rows = TensorDict(observation=torch.zeros(2, 39), turn=torch.tensor([0, 3]), batch_size=[2])
     assert FallbackTurns()(rows.clone())["turn"].tolist() == [0, 3]
     assert FallbackTurns()(rows.exclude("turn"))["turn"].tolist() == [0, 0]
 
 
-def test_a_policy_with_fallback_steps_acts_on_demonstrations_and_in_environments():
+def test_policy_with_fallback_steps_on_rows_and_in_an_environment():
     plans = lw.canonical_plans(lw.load_plans("MT10"), fallback=True)
     actor = lw.PlanConditionedActor(plans)
     assert "turn" in actor.in_keys

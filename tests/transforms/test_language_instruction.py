@@ -38,14 +38,14 @@ def test_each_row_has_its_description_at_each_step():
     ],
     ids=["one", "without rows", "serial", "around serial"],
 )
-def test_specs_are_right(batched):
+def test_specs(batched):
     env = batched()
     check_env_specs(env)
     env.close()
 
 
 @pytest.mark.slow
-def test_a_parallel_environment_and_a_collector_have_it():
+def test_parallel_environment_and_collector():
     env = ParallelEnv(2, make, mp_start_method="fork")
     assert env.reset()["language_instruction"] == [TEXTS, TEXTS]
     env.close()
@@ -55,12 +55,12 @@ def test_a_parallel_environment_and_a_collector_have_it():
     collector.shutdown()
 
 
-def test_rows_of_a_buffer_have_the_descriptions_of_their_tasks():
+def test_buffer_rows_have_the_descriptions_of_their_tasks():
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(6), batch_size=6, transform=LanguageInstruction("MT10"))
     ids = torch.tensor([lw.task_id("push"), lw.task_id("door-open")]).repeat(3)
     replay.extend(TensorDict(task_id=ids, batch_size=[6]))
-    found = replay.sample()
+    result = replay.sample()
     names = {lw.task_id(task): lw.TASKS[task].description for task in lw.MT10}
-    assert found["language_instruction"] == [names[number] for number in found["task_id"].tolist()]
+    assert result["language_instruction"] == [names[number] for number in result["task_id"].tolist()]
     with pytest.raises(ValueError, match="is not among the tasks of LanguageInstruction: give it tasks="):
         LanguageInstruction("MT10")(TensorDict(task_id=torch.full((2,), lw.task_id("soccer")), batch_size=[2]))

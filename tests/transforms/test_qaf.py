@@ -52,25 +52,25 @@ def env(few_plans) -> Iterator[TransformedEnv]:
 
 @pytest.fixture(scope="module")
 def rollout(env) -> TensorDictBase:
-    """An episode of the experts and the beginning of the next."""
+    """Return an episode of the experts and the beginning of the next."""
     env.set_seed(0)
     return env.rollout(STEPS + 5, lw.ExpertActor(TASKS), break_when_any_done=False)
 
 
 def answers(observation: Tensor, task_id: Tensor) -> Tensor:
-    """Each condition of each row by a program of its own, for one state at a time."""
+    """Answer each condition of each row by a separate program, one state at a time."""
     states, tasks = observation.reshape(-1, 39), task_id.reshape(-1)
-    found = torch.zeros(len(states), WIDTH, dtype=torch.bool)
+    result = torch.zeros(len(states), WIDTH, dtype=torch.bool)
     for task in TASKS:
         rows = torch.nonzero(tasks == lw.task_id(task)).flatten()
         for step, (condition, _) in enumerate(PAIRS[task]):
             program = lw.QueryProgram({task: [condition]})
             for row in rows.tolist():
-                found[row, step] = program(states[row : row + 1], tasks[row : row + 1]).item()
-    return found.reshape(*task_id.shape, WIDTH)
+                result[row, step] = program(states[row : row + 1], tasks[row : row + 1]).item()
+    return result.reshape(*task_id.shape, WIDTH)
 
 
-def test_it_is_the_programs_answer_at_every_step(rollout):
+def test_answers_are_the_programs_at_every_step(rollout):
     expected = answers(rollout["observation"], rollout["task_id"])
     assert torch.equal(rollout["qaf"], expected)
     assert torch.equal(rollout["next", "qaf"], answers(rollout["next", "observation"], rollout["next", "task_id"]))
@@ -85,7 +85,7 @@ def test_it_is_the_programs_answer_at_every_step(rollout):
     assert not torch.equal(rollout["qaf"][:, STEPS], rollout["next", "qaf"][:, STEPS - 1]), "a reset answers afresh"
 
 
-def test_the_specs_know_it(env):
+def test_specs(env):
     spec = env.observation_spec["qaf"]
     assert isinstance(spec, Binary)
     assert spec.shape == (ROWS, WIDTH)
@@ -120,7 +120,7 @@ def test_some_rows_of_a_worker_are_reset(few_plans):
     env.close()
 
 
-def test_other_transforms_go_beside_it(few_plans):
+def test_other_transforms_around_it(few_plans):
     env = TransformedEnv(
         lw.LanguageWorldEnv(["push", "reach"], seed=0, max_steps=4),
         Compose(StepCounter(), lw.QAFTransform(few_plans), InitTracker()),
@@ -139,7 +139,7 @@ def test_other_transforms_go_beside_it(few_plans):
 
 
 def buffer(data: TensorDictBase, plans: lw.Plans) -> TensorDictReplayBuffer:
-    """Whose samples hold every row once, in some order."""
+    """Return a buffer whose samples hold every row once, in some order."""
     replay = TensorDictReplayBuffer(
         storage=LazyTensorStorage(len(data)),
         sampler=SamplerWithoutReplacement(),
@@ -154,7 +154,7 @@ STORED = ("observation", "task_id", "action", ("next", "observation"), ("next", 
 
 
 @pytest.mark.parametrize("next_task_id", [True, False])
-def test_on_a_replay_buffer(rollout, few_plans, next_task_id):
+def test_answers_on_a_replay_buffer(rollout, few_plans, next_task_id):
     data = rollout.select(*STORED).flatten(0, 1)
     if not next_task_id:
         data = data.exclude(("next", "task_id"))
@@ -188,83 +188,45 @@ def test_any_leading_shape(rollout, few_plans):
 # --- bad input -----------------------------------------------------------------------------------------------------
 
 
-def test_a_task_without_a_plan_is_named_at_once(few_plans):
+def test_task_without_a_plan_is_refused_at_once(few_plans):
     env = lw.LanguageWorldEnv(["reach", "sweep", "soccer"])
-    with pytest.raises(lw.PlanError, match=r"plans lack soccer, sweep; they cover button-press-topdown, .*reach"):
+    with pytest.raises(lw.PlanError, match="soccer, sweep"):
         TransformedEnv(env, lw.QAFTransform(few_plans))
-    with pytest.raises(lw.PlanError, match="plans lack soccer, sweep"):
+    with pytest.raises(lw.PlanError, match="soccer, sweep"):
         TransformedEnv(env, Compose(StepCounter(), Compose(lw.QAFTransform(few_plans))))
     transformed = TransformedEnv(env, StepCounter())
-    with pytest.raises(lw.PlanError, match="plans lack soccer, sweep"):
+    with pytest.raises(lw.PlanError, match="soccer, sweep"):
         transformed.append_transform(lw.QAFTransform(few_plans))
     env.close()
 
 
-@pytest.mark.parametrize(
-    ("plans", "error", "message"),
-    [
-        ({}, lw.PlanError, "at least one plan"),
-        (None, TypeError, "plans must be a Plans or a mapping, got None"),
-        ("MT10", TypeError, "plans must be a Plans or a mapping, got .MT10"),
-        (
-            {"reach": "move to the goal"},
-            TypeError,
-            "plans must hold ConditionalPlan.*from_pairs.*QueryProgram takes queries alone",
-        ),
-    ],
-    ids=str,
-)
-def test_wrong_plans_are_named(plans, error, message):
-    with pytest.raises(error, match=message):
-        lw.QAFTransform(plans)
-
-
-def test_a_plan_under_another_name_is_named(few_plans):
-    with pytest.raises(lw.PlanError, match="plans\\['push'\\] is a plan for another task, 'reach'"):
-        lw.QAFTransform({"push": few_plans["reach"]})
-
-
-def wrong_states() -> dict[str, tuple[dict[str, Tensor], str]]:
+def wrong_states() -> dict[str, dict[str, Tensor]]:
+    """States of which one entry, the first word of their name, is wrong."""
     observation, reach = torch.zeros(3, 39), torch.full((3,), lw.task_id("reach"))
-    nan, infinite, unknown = observation.clone(), observation.clone(), reach.clone()
-    nan[1, 4], infinite[2, 0], unknown[1] = float("nan"), float("inf"), lw.task_id("soccer")
-    outside = reach.clone()
-    outside[0] = 50
+    nan, infinite, unknown, outside = observation.clone(), observation.clone(), reach.clone(), reach.clone()
+    nan[1, 4], infinite[2, 0], unknown[1], outside[0] = torch.nan, torch.inf, lw.task_id("soccer"), 50
+    observations = {"narrow": torch.zeros(3, 36), "wide": torch.zeros(3, 40), "integer": observation.long()}
+    observations |= {"nan": nan, "infinite": infinite}
+    ids = {"no plan": unknown, "too large": outside, "negative": reach - 100, "float": reach.float()}
+    ids |= {"extra axis": reach.expand(2, 3).T}
     return {
-        "narrow": ({"observation": torch.zeros(3, 36), "task_id": reach}, r"observation must be .*39\), got .*\(3, 36"),
-        "wide": ({"observation": torch.zeros(3, 40), "task_id": reach}, r"observation must be .*39\), got .*\(3, 40"),
-        "integers": (
-            {"observation": observation.long(), "task_id": reach},
-            "observation must be float.* got torch.int",
-        ),
-        "NaN": ({"observation": nan, "task_id": reach}, "observation must hold finite numbers, got NaN"),
-        "infinite": ({"observation": infinite, "task_id": reach}, "observation must hold finite numbers"),
-        "no plan": ({"observation": observation, "task_id": unknown}, r"task_id names tasks without queries.*: soccer"),
-        "too large": ({"observation": observation, "task_id": outside}, r"task_id names tasks without queries.*: 50"),
-        "negative": ({"observation": observation, "task_id": reach - 100}, r"task_id names tasks without queries.*: -"),
-        "float id": (
-            {"observation": observation, "task_id": reach.float()},
-            "task_id must be int64.* got torch.float32",
-        ),
-        "extra axis": (
-            {"observation": observation, "task_id": reach.expand(2, 3).T},
-            r"task_id must be .*\(3,\).*\(3, 2\)",
-        ),
+        **{f"observation {name}": {"observation": wrong, "task_id": reach} for name, wrong in observations.items()},
+        **{f"task_id {name}": {"observation": observation, "task_id": wrong} for name, wrong in ids.items()},
     }
 
 
 @pytest.mark.parametrize("case", wrong_states())
 @pytest.mark.parametrize("place", ["now", "next"])
-def test_a_wrong_state_is_named(few_plans, case, place):
-    state, message = wrong_states()[case]
+def test_wrong_states_are_refused(few_plans, case, place):
+    state = wrong_states()[case]
     good = {"observation": torch.zeros(3, 39), "task_id": torch.full((3,), lw.task_id("reach"))}
     data = {**state} if place == "now" else {**good, "next": state}
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=case.split()[0]):
         lw.QAFTransform(few_plans)(TensorDict(data, [3]))
 
 
 @pytest.mark.parametrize("key", ["observation", "task_id"])
-def test_a_missing_entry_is_named(few_plans, key):
+def test_missing_key_is_named(few_plans, key):
     data = TensorDict({"observation": torch.zeros(3, 39), "task_id": torch.full((3,), lw.task_id("reach"))}, [3])
     with pytest.raises((KeyError, ValueError), match=key):
         lw.QAFTransform(few_plans)(data.exclude(key))

@@ -1,4 +1,4 @@
-"""RandomYaw: everything is turned alike, and nothing else changes."""
+"""RandomYaw: positions and actions turn by the same angle, and nothing else changes."""
 
 import pytest
 import torch
@@ -25,12 +25,12 @@ def angle(vectors):
 
 
 def wrapped(angles):
-    """The same angles in [-pi, pi)."""
+    """Return the same angles in [-pi, pi)."""
     return torch.remainder(angles + torch.pi, 2 * torch.pi) - torch.pi
 
 
 def between(first, second):
-    """The angle from one to the other."""
+    """Return the angle from the first to the second."""
     return wrapped(angle(second) - angle(first))
 
 
@@ -56,7 +56,7 @@ def test_heights_orientations_and_the_gripper_stay():
     assert not torch.isclose(now["observation"][:, :2], was["observation"][:, :2]).any()
 
 
-def test_the_angles_are_normal_with_the_given_scale():
+def test_angles_are_normal_with_the_given_scale():
     was = rows(20_000, reach=0.5)
     torch.manual_seed(0)
     turned = between(was["action"], lw.RandomYaw(0.3)(was.clone())["action"])
@@ -64,7 +64,7 @@ def test_the_angles_are_normal_with_the_given_scale():
     assert 0.29 < turned.std() < 0.31
 
 
-def test_an_action_that_would_leave_the_box_keeps_its_direction():
+def test_action_that_would_leave_the_box_is_shortened():
     was = rows(1_000, reach=1.0)
     was["action"][:, :2] = 1.0
     now = lw.RandomYaw(0.4)(was.clone())
@@ -77,8 +77,8 @@ def test_an_action_that_would_leave_the_box_keeps_its_direction():
     )
 
 
-def test_an_action_that_was_outside_the_box_keeps_its_length():
-    """The scripts' unclipped actions are labels up to 25: shortened, they would be others."""
+def test_action_outside_the_box_keeps_its_length():
+    """Unclipped actions of the scripts, up to 25, are labels that must not be shortened."""
     was = rows(1_000, reach=20.0)
     now = lw.RandomYaw(0.4)(was.clone())
     outside = was["action"][:, :2].abs().amax(-1) > 1
@@ -89,7 +89,7 @@ def test_an_action_that_was_outside_the_box_keeps_its_length():
     assert now["action"][~outside][:, :2].abs().max() <= 1
 
 
-def test_actions_inside_the_box_are_turned_bit_for_bit_as_ever():
+def test_turned_actions_inside_the_box_to_the_bit():
     was = rows(1_000, reach=1.0)
     torch.manual_seed(0)
     now = lw.RandomYaw(0.4)(was.clone())["action"]
@@ -101,25 +101,25 @@ def test_actions_inside_the_box_are_turned_bit_for_bit_as_ever():
     assert torch.equal(now[:, :2], turned)
 
 
-def test_the_next_observation_turns_with_its_row():
+def test_next_observation_turns_with_its_row():
     was = rows()
     was["next", "observation"] = was["observation"].clone()
     now = lw.RandomYaw(0.5)(was)
     assert torch.equal(now["next", "observation"], now["observation"])
 
 
-def test_scale_0_changes_nothing_and_the_seed_fixes_the_rest():
+def test_scale_0_changes_nothing_and_the_seed_fixes_the_angles():
     was = rows()
     assert (lw.RandomYaw(0.0)(was.clone()).exclude("observation_yaw") == was).all()
-    found = []
+    result = []
     for seed in (1, 1, 2):
         torch.manual_seed(seed)
-        found.append(lw.RandomYaw(0.3)(was.clone())["observation"])
-    assert torch.equal(found[0], found[1])
-    assert not torch.equal(found[0], found[2])
+        result.append(lw.RandomYaw(0.3)(was.clone())["observation"])
+    assert torch.equal(result[0], result[1])
+    assert not torch.equal(result[0], result[2])
 
 
-def test_the_angle_is_written_and_turns_back():
+def test_written_angle_turns_back():
     was = rows()
     was["next", "observation"] = was["observation"].clone()
     now = lw.RandomYaw(0.5)(was.clone())
@@ -131,7 +131,7 @@ def test_the_angle_is_written_and_turns_back():
     assert torch.equal(turn_vectors(vectors, angle_of)[:, 2], vectors[:, 2])
 
 
-def test_rows_that_are_turned_twice_have_the_sum_of_both_angles():
+def test_two_turns_write_the_sum_of_their_angles():
     was = rows()
     was["next", "observation"] = was["observation"].clone()
     now = lw.RandomYaw(0.5)(lw.RandomYaw(0.5)(was.clone()))
@@ -157,7 +157,7 @@ PLANS = lw.Plans(
     ("truth", "any_angle"),
     [((1, 0, 0), True), ((0, 1, 0), False), ((1, 1, 0), False), ((1, 0, 1), True), ((0, 0, 0), False)],
 )
-def test_rows_whose_steps_say_no_direction_are_turned_by_any_angle(truth, any_angle):
+def test_rows_without_a_direction_are_turned_by_any_angle(truth, any_angle):
     was = rows(2_000, reach=0.5)
     was["qaf"] = torch.tensor(truth, dtype=torch.bool).expand(2_000, 3)
     was["task_id"] = torch.full((2_000,), lw.task_id("push"))
@@ -171,25 +171,25 @@ def test_rows_whose_steps_say_no_direction_are_turned_by_any_angle(truth, any_an
         assert turned.std() == pytest.approx(0.1, rel=0.1)
 
 
-def test_with_plans_it_needs_their_answers():
-    with pytest.raises(ValueError, match="qaf and task_id are needed"):
+def test_plans_require_their_answers():
+    with pytest.raises(ValueError, match="qaf"):
         lw.RandomYaw(0.1, plans=PLANS)(rows())
     was = rows()
     was["task_id"] = torch.full((64,), lw.task_id("push"))
     was["qaf"] = torch.zeros(64, 2, dtype=torch.bool)
-    with pytest.raises(ValueError, match=r"qaf must have shape \(64, 3\)"):
+    with pytest.raises(ValueError, match="qaf"):
         lw.RandomYaw(0.1, plans=PLANS)(was)
     pairs = [(f"gripper is {state}", "wait") for state in ("open", "closed", "not open")]
     other = lw.QAFTransform(lw.Plans([lw.ConditionalPlan.from_pairs("push", pairs)]))(was)
     with pytest.raises(ValueError, match="qaf answers other plans"):
         lw.RandomYaw(0.1, plans=PLANS)(other)
     was["task_id"] = torch.full((64,), lw.task_id("reach"))
-    with pytest.raises(ValueError, match="tasks without a plan"):
+    with pytest.raises(ValueError, match="task_id"):
         lw.RandomYaw(0.1, plans=PLANS)(was)
 
 
 @pytest.mark.parametrize("name", ["observation", "action"])
-def test_what_is_missing_is_named(name):
+def test_missing_key_is_named(name):
     with pytest.raises(ValueError, match=f"observation and action are needed, got (?!{name})"):
         lw.RandomYaw(0.1)(rows().exclude(name))
 
@@ -200,7 +200,7 @@ def demos(tmp_path_factory):
     return lw.collect_demonstrations("reach", episodes_per_task=1, root=root, **options).root
 
 
-def test_executed_and_expert_action_and_what_came_turn_alike(demos):
+def test_all_actions_and_the_next_observation_turn_alike(demos):
     replay = lw.LanguageWorldExperienceReplay(demos, label="executed")
     was = replay[:].clone()
     now = lw.RandomYaw(0.7)(was.clone())
@@ -212,7 +212,7 @@ def test_executed_and_expert_action_and_what_came_turn_alike(demos):
     torch.testing.assert_close(after, turned, atol=1e-3, rtol=0)
 
 
-def test_on_a_buffer_conditions_are_those_of_the_scene_as_it_was_and_the_storage_is_left_alone(demos):
+def test_buffer_answers_on_the_unchanged_scene_and_keeps_its_storage(demos):
     plans = lw.load_plans("MT10")
     plain = lw.LanguageWorldExperienceReplay(demos, transform=lw.QAFTransform(plans))
     turned = lw.LanguageWorldExperienceReplay(demos, transform=Compose(lw.QAFTransform(plans), lw.RandomYaw(1.0)))

@@ -1,9 +1,9 @@
-"""attribute_failures: why episodes failed, by re-running them with one part of the policy replaced."""
+"""attribute_failures: find why episodes failed, by re-running them with one part of the policy replaced."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -14,12 +14,9 @@ from torchrl.envs import EnvBase
 from lw_torchrl._util.checks import Count, Scale, missing_keys, typed
 from lw_torchrl._util.devices import device_of
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.diagnose.counterfactuals import Counterfactuals, own_evaluators
-from lw_torchrl.evaluation.diagnose.decision import MARGIN, decide
-from lw_torchrl.evaluation.diagnose.failure import Failure
-from lw_torchrl.evaluation.diagnose.findings import Difference, Finding
-from lw_torchrl.evaluation.diagnose.rerun import EpisodeId, Rerun, null_control
-from lw_torchrl.evaluation.diagnose.scripts import Scripts
+from lw_torchrl.evaluation.diagnose.counterfactuals import Counterfactuals, Rerun, null_control
+from lw_torchrl.evaluation.diagnose.failure import REPLACEMENTS, Cause, Difference, Failure, Finding
+from lw_torchrl.evaluation.diagnose.replacements import EpisodeId, Scripts, own_evaluators
 from lw_torchrl.evaluation.diagnose.states import EpisodeStates, Explanation, explain, stall_step, states_of
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.skills import ScriptedSkill, load_skills
@@ -27,6 +24,11 @@ from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.parts import evaluating
 from lw_torchrl.modules.policy import plans_of
 from lw_torchrl.suites.suite import Suite, find_suite
+
+MARGIN = 0.3  # a clear lead, as a share of the task's failed episodes
+_FACTS = ("perception", "query")  # tried only if an observation or answer was wrong, which is a fact
+_WIDER = {"skill": ("gripper", "actuation", "policy"), "gripper": ("policy",), "actuation": ("policy",)}
+"""Replacements that contain another one, so that they fix every episode that it fixes."""
 
 
 @typed
@@ -52,18 +54,24 @@ def attribute_failures(
     policy, or the time limit.
 
     **A rule reads the states.** The cause is *query* if the policy acted on wrong answers; else *plan* if, late in the
-    episode, the plan requests something else than the reference plan; else *skill*. This is no proof: a plan that
+    episode, the plan requests another action than the reference plan; else *skill*. This is no proof: a plan that
     differs from the reference may succeed. Without a reference the rule recognises only wrong answers, a plan of which
     no condition holds, and a skill that stays far from its target. Without ``actor``, only the rule is used.
 
-    **A counterfactual decides**, with ``actor``. First the null control: the same episode is re-run, with the same
+    **Counterfactuals decide**, with ``actor``. First comes the null control: the same episode is re-run with the same
     noise and nothing replaced. If it succeeds, the failure is *not reproducible*, and the finding says what differs.
-    Otherwise it is re-run with one part replaced by a sound one: the observations, if the policy was shown wrong ones
-    (*perception*); the answers, where they were wrong (*query*); the *plan*, by the reference; the policy's action, by
-    that of scripted skills or, where a step has none, the expert's, in one step of the plan (*skill*), for the
-    *gripper* or the hand's motion (*actuation*) only, or in all steps (*policy*); or twice the time (*out of time*). If
-    nothing helps, pairs are tried, which give ``cause`` and ``also``. If several replacements help, the one that fixes
-    most of the task's failed episodes counts, and of those about as good the smallest; but a skill does not count if
+    Otherwise the episode is re-run with one part replaced by a sound one:
+
+    - *perception*: the observations, if the policy was shown wrong ones;
+    - *query*: the answers, where they were wrong;
+    - *plan*: the plan, by the reference;
+    - *skill*: the policy's action in one step of the plan, by that of a scripted skill, or of the expert where the step
+      has no scripted skill; *gripper* and *actuation*: only the gripper's or the hand's part of the action, in all
+      steps; *policy*: the whole action, in all steps;
+    - *out of time*: twice the time.
+
+    If nothing helps, pairs are tried, which give ``cause`` and ``also``. If several replacements help, the one that
+    fixes most of the task's failed episodes counts, and of those about as good the smallest. A skill does not count if
     other steps have the same fault. For a policy without plans, no step is reported.
 
     Args:
@@ -107,8 +115,6 @@ def attribute_failures(
     answered = as_plans(plans)
     if actor is not None and (own := plans_of(actor)) is not None and (other := answered.differences(own)):
         raise ValueError(f"plans differ from the actor's own for {', '.join(other)}; pass the actor's plans")
-    if not isinstance(rollouts, Iterable):
-        raise TypeError(f"rollouts must be a list of finished episodes, got {type(rollouts).__name__}")
     failed = _failed(rollouts, answered)
     if not failed:
         return []
@@ -116,19 +122,24 @@ def attribute_failures(
     own_suite = find_suite(names, suite)
     table = (own_suite.skills or load_skills()) if skills is None else skills
     given = {} if reference is None else as_plans(reference, "reference")
-    others = {task: plan for task, plan in given.items() if task in names}
+    trusted = {task: plan for task, plan in given.items() if task in names}
     seen = [states_of(task, k, steps, answered, _answers(steps, actor)) for task, k, steps in failed]
-    scripts, theirs = Scripts(answered, table), Scripts(Plans(others), table) if others else None
-    explained = [(one, explain(one, scripts, theirs)) for one in seen]
+    scripts, trusted_scripts = Scripts(answered, table), Scripts(Plans(trusted), table) if trusted else None
+    explained = [(states, explain(states, scripts, trusted_scripts)) for states in seen]
     if actor is None:
-        return [_by_rule(*both, seed) for both in explained]
+        return [
+            Failure(states.task, seed, states.episode, cause, None, *blames[cause], evidence=evidence)
+            for states, (cause, blames, evidence) in explained
+        ]
     tasks = {name: own_suite.tasks.get(name, answered[name].definition) for name in names}
     env_options = {"seed": seed, "suite": own_suite, "engine": engine, "num_threads": num_threads}
     env_options["max_steps"] = own_suite.max_steps if max_steps is None else max_steps
     rerun = Rerun(tasks, env_options, noise_scale, num_envs, device, progress)
-    null = null_control(rerun, {one.which: one.steps for one in seen}, actor, answered, evaluator)
-    tried = Counterfactuals(actor, evaluator, None if theirs is None else theirs.plans, scripts, rerun, null)
-    tried.run(seen, [one.which for one, explanation in explained if explanation.evidence.get("plan_departs") == 0.0])
+    null = null_control(rerun, {states.which: states.steps for states in seen}, actor, answered, evaluator)
+    tried = Counterfactuals(
+        actor, evaluator, None if trusted_scripts is None else trusted_scripts.plans, scripts, rerun, null
+    )
+    tried.run(seen, [states.which for states, explanation in explained if _plans_agree(explanation)])
     shares = tried.shares()
     return [_by_counterfactuals(*both, tried, shares.get(both[0].task, {}), seed) for both in explained]
 
@@ -139,22 +150,23 @@ def _failed(rollouts: Iterable[Any], plans: Plans) -> list[tuple[str, int, Tenso
     failed: list[tuple[str, int, TensorDictBase]] = []
     seen: set[EpisodeId] = set()
     for place, rollout in enumerate(rollouts):
+        name = f"rollouts[{place}]"
         steps, number = (rollout.steps, rollout.episode) if isinstance(rollout, FinishedEpisode) else (rollout, None)
         if not isinstance(steps, TensorDictBase) or steps.batch_dims != 1 or not len(steps):
-            what = type(steps).__name__
-            raise ValueError(f"rollouts[{place}] must be a finished episode, or a TensorDict of batch (T,), got {what}")
+            got = type(steps).__name__
+            raise ValueError(f"{name} must be a finished episode, or a TensorDict of batch (T,), got {got}")
         needed = ["observation", "task_id", ("next", "success"), *(["episode"] if number is None else [])]
-        if missing := [key for key in needed if steps.get(key, None) is None]:
-            raise missing_keys(steps.keys(True, True), *(str(key) for key in missing))
+        if missing := [str(key) for key in needed if steps.get(key, None) is None]:
+            raise missing_keys(steps.keys(True, True), *missing)
         tasks = steps.get("task_id").unique().tolist()
         if len(tasks) != 1 or tasks[0] not in by_id:
-            raise ValueError(f"rollouts[{place}] must be of one task that plans has, {', '.join(plans)}; got {tasks}")
+            raise ValueError(f"{name} must be of one task that plans has, {', '.join(plans)}; got {tasks}")
         episodes = steps.get("episode").unique().tolist() if number is None else [number]
         if len(episodes) != 1:
-            raise ValueError(f"rollouts[{place}] must be one episode, got {len(episodes)}: split them")
+            raise ValueError(f"{name} must be one episode, got {len(episodes)}: split them")
         which = by_id[tasks[0]], episodes[0]
         if which in seen:
-            raise ValueError(f"rollouts[{place}] is episode {which[1]} of {which[0]!r} again")
+            raise ValueError(f"{name} is episode {which[1]} of {which[0]!r} again")
         seen.add(which)
         if not steps.get(("next", "success")).any():
             failed.append((*which, steps))
@@ -166,48 +178,48 @@ def _answers(steps: TensorDictBase, actor: Any) -> Tensor | None:
     evaluators = own_evaluators(actor)
     if not evaluators or "qaf_logits" in steps.keys():
         return None
-    read = dict.fromkeys(key for one in evaluators for key in one.in_keys)
-    if missing := ", ".join(str(key) for key in read if steps.get(key, None) is None):
+    keys = dict.fromkeys(key for evaluator in evaluators for key in evaluator.in_keys)
+    if missing := ", ".join(str(key) for key in keys if steps.get(key, None) is None):
         needed = f"rollouts must hold {missing}, which the policy's evaluator reads, or its answers, qaf_logits"
         raise ValueError(f"{needed}; evaluate(..., attribute=True) records them")
     with torch.no_grad(), evaluating(actor):
         device = device_of(actor)
-        logits = [one.logits(*(steps.get(key).to(device) for key in one.in_keys)) for one in evaluators]
+        logits = [each.logits(*(steps.get(key).to(device) for key in each.in_keys)) for each in evaluators]
     return torch.stack(logits).mean(0).cpu() > 0
 
 
 def keys_to_attribute(actor: Any, env: EnvBase) -> list[NestedKey]:
     """Return the keys of each step that attribution reads, as far as environment and actor write them."""
-    there = set(env.full_observation_spec.keys(True, True))
-    keys = [key for key in getattr(actor, "in_keys", ()) if key in there]
+    written = set(env.full_observation_spec.keys(True, True))
+    keys = [key for key in getattr(actor, "in_keys", ()) if key in written]
     return ["observation", "task_id", "qaf", *keys, "skill_weights", "qaf_logits"]
 
 
-def _by_rule(one: EpisodeStates, explanation: Explanation, seed: int) -> Failure:
-    """Return the failure as the states alone show it."""
-    cause, blames, evidence = explanation
-    return Failure(one.task, seed, one.episode, cause, None, *blames[cause], evidence=evidence)
+def _plans_agree(explanation: Explanation) -> bool:
+    """Return whether plan and reference request the same actions in all states of an episode."""
+    return explanation.evidence.get("plan_departs") == 0.0
 
 
 def _by_counterfactuals(
-    one: EpisodeStates, explanation: Explanation, tried: Counterfactuals, shares: Mapping[str, float], seed: int
+    seen: EpisodeStates, explanation: Explanation, tried: Counterfactuals, shares: Mapping[str, float], seed: int
 ) -> Failure:
     """Return the failure as the counterfactuals show it, with findings from the states."""
-    which, null = one.which, tried.null
-    share, number = null.share(one.task), float(sum(task == one.task for task, _ in null.episodes))
+    which, null = seen.which, tried.null
+    share, number = null.share(seen.task), float(sum(task == seen.task for task, _ in null.episodes))
     record: dict[str, Any] = {"evidence": {**explanation.evidence, "failed": number}}
     record["shares"] = {"nothing": share, **shares}
     if null.succeeds(which) or (which in null.differs and share >= MARGIN):
-        first = null.differs.get(which, Difference("nothing", len(one.steps) - 1))
+        first = null.differs.get(which, Difference("nothing", len(seen.steps) - 1))
         record["succeeds_at"] = null.episodes[which].first_success
-        return Failure(one.task, seed, one.episode, "not reproducible", None, None, first.at, first, **record)
+        return Failure(seen.task, seed, seen.episode, "not reproducible", None, None, first.at, first, **record)
     tried_here = {name: results[which] is not None for name, results in tried.results.items() if which in results}
     record["counterfactuals"] = tried_here
-    same = explanation.evidence.get("plan_departs") == 0.0
-    counting = [name for name in tried.mending(one) if not (same and name == "plan")]
+    # Where both plans request the same, the reference cannot have helped by what it says.
+    same = _plans_agree(explanation)
+    counting = [name for name in tried.mending(seen) if not (same and name == "plan")]
     decision = decide(counting, shares, share)
-    cause, also, mended = decision.cause, decision.also, tried.mended(decision, which)
-    only = tried.step_of_motion(one) if cause == "actuation" else None
+    cause, also, mended = decision.cause, decision.also, tried.mended(decision.by, which)
+    only = tried.step_of_motion(seen) if cause == "actuation" else None
     cause = cause if only is None else "skill"
     if mended is not None:
         record |= {"replaced": decision.by, "rival": decision.rival, "succeeds_at": len(mended.steps), "mended": mended}
@@ -216,16 +228,78 @@ def _by_counterfactuals(
     elif explanation.cause == "query" and "query" not in tried_here and not (same and tried_here.get("plan")):
         cause = "query"
     step: int | None
-    shown: Finding | None
-    step, at, shown = explanation.blames.get(cause, explanation.blames["undecided"])
+    finding: Finding | None
+    step, at, finding = explanation.blames.get(cause, explanation.blames["undecided"])
     if cause == "skill" and also is None:
-        step, plan = tried.step[which] if only is None else only, tried.plans[one.task]
-        at, shown = stall_step(one, step, plan.definition.layout), one.active_time(plan, step)
+        step, plan = tried.step[which] if only is None else only, tried.plans[seen.task]
+        at, finding = stall_step(seen, step, plan.definition.layout), seen.active_time(plan, step)
     elif cause == "perception":
-        shown = null.misled[which]
+        finding = null.misled[which]
     elif cause == "undecided" and explanation.cause != "undecided":
-        record["suspect"], shown = explanation.cause, explanation.blames[explanation.cause].finding
+        record["suspect"], finding = explanation.cause, explanation.blames[explanation.cause].finding
     if plans_of(tried.actor) is None and cause != "query":
         step = None
-    shown = None if step is None and cause != "perception" else shown
-    return Failure(one.task, seed, one.episode, cause, also, step, at, shown, **record)
+    finding = None if step is None and cause != "perception" else finding
+    return Failure(seen.task, seed, seen.episode, cause, also, step, at, finding, **record)
+
+
+class Decision(NamedTuple):
+    """The cause, a second cause, the replacement that counts, and the next best replacement."""
+
+    cause: Cause
+    also: Cause | None = None
+    by: str | None = None
+    rival: str | None = None
+
+
+def decide(mended: Collection[str], shares: Mapping[str, float], null: float = 0.0) -> Decision:
+    """Return the cause of a failed episode, from the replacements with which it succeeds (``mended``).
+
+    ``shares`` is the share of the task's failed episodes that each replacement fixes, among those it was tried on, and
+    ``null`` that of a plain re-run.
+
+    Wrong observations and answers come first, if correcting them helps. Of the other replacements, the one that fixes
+    most of the task's failed episodes counts. Among those about as good, the first counts: the plan, unless scripts
+    that follow it succeed; a skill in one step; the gripper or the motion. It is the policy, without naming a part, if
+    two replacements that do not contain each other are about as good, or if none leads clearly over a plain re-run.
+    Time comes last, then pairs.
+    """
+    single = {name: causes[0] for name, causes in REPLACEMENTS.items() if len(causes) == 1}
+    fixes = {name: shares.get(name, 1.0) for name in single if name in mended}
+    time = fixes.pop("time", None)
+    if not fixes:
+        if time is not None:
+            return Decision("out of time", by="time")
+        pair = choose_pair(mended, shares)
+        return Decision("undecided") if pair is None else Decision(*pair)
+    if "policy" in fixes and any(name in fixes for name in ("skill", "gripper", "actuation")):
+        fixes.pop("plan", None)  # scripts that follow the plan succeed
+    best = next(iter(fixes))
+    if facts := [name for name in fixes if name in _FACTS]:
+        best = max(facts, key=fixes.__getitem__)
+    else:
+        for name, share in fixes.items():
+            if share >= fixes[best] + MARGIN:
+                best = name
+    rivals = {name: share for name, share in fixes.items() if name != best and name not in _WIDER.get(best, ())}
+    rival = max(rivals, key=rivals.__getitem__, default=None)
+    close = rival is not None and best not in _FACTS and best != "plan" and rivals[rival] > fixes[best] - MARGIN
+    if fixes[best] < null + MARGIN or (close and best != "policy"):
+        return Decision("policy", by=best, rival=rival)
+    return Decision(single[best], by=best, rival=rival)
+
+
+def choose_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tuple[Cause, Cause, str] | None:
+    """Return the pair of causes that counts, with its replacement.
+
+    Wrong answers come first, then the cause whose replacement alone fixes more.
+    """
+    alone = {**shares, "skill": max(shares.get("skill", 0.0), shares.get("policy", 0.0))}
+    pairs = [name for name in mended if len(REPLACEMENTS[name]) > 1]
+    if not pairs:
+        return None
+    by = max(pairs, key=lambda name: sum(alone.get(cause, 0.0) for cause in REPLACEMENTS[name]))
+    cause, also = REPLACEMENTS[by]
+    if cause != "query" and alone.get(also, 0.0) > alone.get(cause, 0.0):
+        cause, also = also, cause
+    return cause, also, by

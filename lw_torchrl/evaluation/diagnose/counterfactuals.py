@@ -1,22 +1,29 @@
-"""Counterfactuals: failed episodes re-run with one part of the policy, or of its input, replaced by a sound one."""
+"""Re-run failed episodes exactly as they were run, with nothing, one part or two parts of the policy replaced."""
+
+from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterable, Sequence
-from copy import deepcopy
-from typing import Any
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
-from torch import nn
-from torchrl.envs import Transform
+from tensordict.utils import NestedKey
+from torchrl.envs import RenameTransform, Transform
 
-from lw_torchrl._util.keys import write
 from lw_torchrl.envs.episodes import FinishedEpisode
-from lw_torchrl.evaluation.diagnose.decision import Decision
-from lw_torchrl.evaluation.diagnose.failure import MendedEpisode
-from lw_torchrl.evaluation.diagnose.findings import REPLACEMENTS
-from lw_torchrl.evaluation.diagnose.rerun import EpisodeId, NullControl, Perception, Rerun
-from lw_torchrl.evaluation.diagnose.scripts import ScriptedControl, Scripts
+from lw_torchrl.evaluation.diagnose.failure import REPLACEMENTS, Difference, MendedEpisode, Misled
+from lw_torchrl.evaluation.diagnose.replacements import (
+    TRUE_OBSERVATION,
+    EpisodeId,
+    Perception,
+    ScriptedControl,
+    Scripts,
+    with_true_answers,
+)
 from lw_torchrl.evaluation.diagnose.sentences import replacement_text
 from lw_torchrl.evaluation.diagnose.states import (
     EpisodeStates,
@@ -25,45 +32,113 @@ from lw_torchrl.evaluation.diagnose.states import (
     compare_with_scripts,
     states_of,
 )
+from lw_torchrl.evaluation.rollout import rollout
 from lw_torchrl.language.canonical import canonical_like
 from lw_torchrl.language.plans import Plans
+from lw_torchrl.language.tasks import Task, task_id
 from lw_torchrl.modules.policy import plans_of, with_plans
-from lw_torchrl.modules.query_evaluator import QueryEvaluator
-from lw_torchrl.transforms.qaf import plan_program
 
+_KEYS: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next", "success"), ("next", "reward")]
 _TRIED_STEPS = 3  # the number of steps in which a skill is replaced, one at a time
 
 
-class TrueAnswers(QueryEvaluator):
-    """An evaluator whose answers are exact: true or false, with logits of 5 and -5."""
+@dataclass(frozen=True)
+class Rerun:
+    """The settings with which episodes were run, to run them again."""
 
-    def __init__(self, plans: Plans) -> None:
-        super().__init__(plans)
-        self.program = plan_program(plans)
+    tasks: Mapping[str, Task]
+    env_options: Mapping[str, Any]
+    noise_scale: float
+    num_envs: int | None
+    device: str | torch.device | None
+    progress: bool
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        truth = self.program(tensordict.get("observation"), tensordict.get("task_id"))
-        return write(tensordict, self, [truth, 10.0 * truth.to(torch.float32) - 5.0])
+    def __call__(
+        self,
+        label: str,
+        which: Sequence[EpisodeId],
+        actor: Any,
+        plans: Plans,
+        evaluator: Any = None,
+        longer: int = 1,
+        wrap: Callable[[Any], Any] | None = None,
+    ) -> dict[EpisodeId, FinishedEpisode]:
+        """Return the episodes, each up to its first success, with ``longer`` times the time limit."""
+        listed = {task: [k for _, k in group] for task, group in groupby(sorted(which), itemgetter(0))}
+        episodes: dict[EpisodeId, FinishedEpisode] = {}
+        rollout(
+            f"again with {label}",
+            actor,
+            {task: self.tasks[task] for task in listed},
+            listed,
+            lambda episode: episodes.__setitem__(episode[:2], episode),
+            plans=plans,
+            evaluator=evaluator,
+            num_envs=None if self.num_envs is None else max(len(listed), self.num_envs),
+            env_options={**self.env_options, "max_steps": self.env_options["max_steps"] * longer},
+            keys=_KEYS,
+            optional=["qaf", "skill_weights"],
+            noise_scale=self.noise_scale,
+            after_success=0,
+            first=RenameTransform(["observation"], [TRUE_OBSERVATION], create_copy=True),
+            wrap=wrap,
+            device=self.device,
+            progress=self.progress,
+        )
+        return episodes
 
 
-def own_evaluators(actor: Any) -> list[QueryEvaluator]:
-    """Return the evaluators inside a policy, without those inside another evaluator."""
-    if isinstance(actor, QueryEvaluator):
-        return [actor]
-    children = actor.children() if isinstance(actor, nn.Module) else ()
-    return list(dict.fromkeys(evaluator for child in children for evaluator in own_evaluators(child)))
+class NullControl(NamedTuple):
+    """Failed episodes after a plain re-run."""
+
+    episodes: Mapping[EpisodeId, FinishedEpisode]
+    misled: Mapping[EpisodeId, Misled]  # episodes in which the policy was shown a wrong state
+    differs: Mapping[EpisodeId, Difference]  # the first difference of episodes that went another way
+
+    def succeeds(self, which: EpisodeId) -> bool:
+        return self.episodes[which].first_success is not None
+
+    def share(self, task: str) -> float:
+        """Return the share of a task's failed episodes that succeed in the re-run."""
+        succeeded = [one.first_success is not None for (of, _), one in self.episodes.items() if of == task]
+        return sum(succeeded) / len(succeeded)
 
 
-def with_true_answers(actor: Any) -> Any:
-    """Return the policy with exact answers instead of its own evaluators; the policy itself if it has none."""
-    if not own_evaluators(actor):
-        return actor
-    other = deepcopy(actor)
-    for module in list(other.modules()):
-        for name, child in list(module.named_children()):
-            if isinstance(child, QueryEvaluator):
-                module._modules[name] = TrueAnswers(child.plans)
-    return other
+def null_control(
+    rerun: Rerun, failed: Mapping[EpisodeId, TensorDictBase], actor: Any, plans: Plans, evaluator: Any
+) -> NullControl:
+    """Re-run the failed episodes; raise :class:`ValueError` if one does not begin as it did."""
+    with Perception(actor) as seen:
+        episodes = rerun("nothing replaced", list(failed), actor, plans, evaluator)
+    differs = {}
+    for which, steps in failed.items():
+        again = episodes[which].steps
+        if not torch.equal(again.get("observation")[0], steps.get("observation")[0]):
+            raise ValueError(
+                f"rollouts: episode {which[1]} of {which[0]!r} does not begin as that episode of "
+                f"seed={rerun.env_options['seed']} does; pass its own seed and engine, and all its states"
+            )
+        if (first := difference(steps, again)) is not None:
+            differs[which] = first
+    numbers = {(task_id(task), k): (task, k) for task, k in failed}
+    return NullControl(episodes, {numbers[one]: misled for one, misled in seen.misled.items()}, differs)
+
+
+def difference(steps: TensorDictBase, again: TensorDictBase) -> Difference | None:
+    """Return the first difference between two runs of an episode, or None."""
+    both = min(len(steps), len(again))
+    states = (steps.get("observation")[:both] != again.get("observation")[:both]).any(-1)
+    if not states.any():
+        return None if len(steps) == len(again) else Difference("length", both - 1, len(steps), len(again))
+    first = int(states.int().argmax())
+    executed = steps.get(("next", "executed_action"), steps.get("action", None))
+    if executed is None:
+        return Difference("states", first)
+    error = (executed[:first] - again.get("action")[:first]).abs().amax(-1)
+    if not (error > 0).any():
+        return Difference("environment", first)
+    at = int((error > 0).int().argmax())
+    return Difference("actions", at, size=float(error[at]))
 
 
 class Counterfactuals:
@@ -74,10 +149,10 @@ class Counterfactuals:
     ) -> None:
         self.actor, self.evaluator, self.scripts, self.rerun, self.null = actor, evaluator, scripts, rerun, null
         self.plans = plans = scripts.plans
-        # Replacement to the episodes it was tried on: the re-run episode if it succeeds, else None.
+        # By replacement, for each episode that it was tried on: the re-run episode if it succeeds, else None.
         self.results: dict[str, dict[EpisodeId, FinishedEpisode | None]] = {}
         self.step: dict[EpisodeId, int] = {}  # the step in which a scripted skill fixes an episode
-        self.comparisons: dict[EpisodeId, ScriptComparison] = {}  # policy and scripts where the episode failed
+        self.comparisons: dict[EpisodeId, ScriptComparison] = {}  # policy and scripts in the failed episode's states
         # The same, joined with the states of re-runs in which a script controlled a step.
         self.with_script: dict[EpisodeId, dict[int, ScriptComparison]] = {}
         self.reference: Plans | None = None
@@ -99,11 +174,14 @@ class Counterfactuals:
         """Run the replacements; ``same`` are the episodes in which plan and reference request the same actions."""
         seen = [one for one in seen if not self.null.succeeds(one.which)]
         every = [one.which for one in seen]
+        # Each replacement is tried only where it can decide something that those before it did not.
         misled = [which for which in every if which in self.null.misled]
+        is_sensor = isinstance(self.evaluator, Transform) and "observation" in self.evaluator.out_keys
+        evaluator = None if is_sensor else self.evaluator
         with Perception(self.actor, correct=True):
-            self._run("perception", misled, self.actor, self.plans, None if self._is_sensor() else self.evaluator)
+            self._run("perception", misled, self.actor, self.plans, evaluator)
         true = with_true_answers(self.actor)
-        can_answer = (self.evaluator is not None and not self._is_sensor()) or true is not self.actor
+        can_answer = evaluator is not None or true is not self.actor
         wrong = [one.which for one in seen if can_answer and bool((one.given != one.truth).any())]
         self._run("query", wrong, true, self.plans)
         left = self._unmended(every, "perception", "query")
@@ -122,10 +200,6 @@ class Counterfactuals:
         left = self._unmended(with_reference, "query + skill", "query + plan")
         wrap = self._scripted(self.reference)
         self._run("plan + skill", left, self.other, self.reference, self.other_evaluator, wrap=wrap)
-
-    def _is_sensor(self) -> bool:
-        """Return whether the evaluator is a transform that changes the observation."""
-        return isinstance(self.evaluator, Transform) and "observation" in self.evaluator.out_keys
 
     def _mends(self, name: str, which: EpisodeId) -> bool:
         return self.results.get(name, {}).get(which) is not None
@@ -151,7 +225,7 @@ class Counterfactuals:
         return lambda actor: ScriptedControl(actor, plans, scripts, **where)
 
     def _run_scripts(self, seen: Sequence[EpisodeStates]) -> None:
-        """Give scripts control of one step, the likeliest steps in turn; of gripper or motion; of everything."""
+        """Give scripts control of one step, trying the likeliest steps in turn; of gripper or motion; of everything."""
         ranked = {}
         for one in seen:
             comparison = compare_with_scripts(self.actor, one, self.scripts)
@@ -240,13 +314,13 @@ class Counterfactuals:
                     return step
         return None
 
-    def mended(self, decision: Decision, which: EpisodeId) -> MendedEpisode | None:
-        """Return the re-run of an episode that the decision rests on, with the plan that is carried out in it."""
-        episode = None if decision.by is None else self.results[decision.by].get(which)
-        if episode is None or decision.by is None:
+    def mended(self, by: str | None, which: EpisodeId) -> MendedEpisode | None:
+        """Return the successful re-run of an episode with a replacement, and the plan that is carried out in it."""
+        episode = None if by is None else self.results[by].get(which)
+        if episode is None or by is None:
             return None
-        plans = self.reference if "plan" in REPLACEMENTS[decision.by] and self.reference is not None else self.plans
-        return MendedEpisode(decision.by, plans[which[0]], episode.steps)
+        plans = self.reference if "plan" in REPLACEMENTS[by] and self.reference is not None else self.plans
+        return MendedEpisode(by, plans[which[0]], episode.steps)
 
     def shares(self) -> dict[str, dict[str, float]]:
         """Return, by task, the share of its failed episodes that each replacement fixes, of those it was tried on."""

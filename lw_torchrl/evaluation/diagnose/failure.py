@@ -1,21 +1,134 @@
-"""Failure: why one episode failed, as typed data, and its form in JSON."""
+"""Failure: why one episode failed, as typed data. Its parts are a cause, a finding, and the results of re-runs."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from reprlib import repr as short
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
-from lw_torchrl._util.checks import ArgumentError, Count, Natural, typed_fields
-from lw_torchrl.evaluation.diagnose.findings import CAUSES, FINDINGS, REPLACEMENTS, Cause, Finding
-from lw_torchrl.evaluation.diagnose.sentences import explain_failure
+from beartype.vale import Is
+from tensordict import TensorDictBase
 
-if TYPE_CHECKING:
-    from tensordict import TensorDictBase
+from lw_torchrl._util.checks import Count, Natural, Scale, shown, typed_fields
+from lw_torchrl.language.plans import ConditionalPlan
 
-    from lw_torchrl.language.plans import ConditionalPlan
+Blamed = Literal["not reproducible", "perception", "query", "plan", "skill", "gripper", "actuation", "policy"]
+Cause = Literal[Blamed, "out of time", "undecided"]
+
+CAUSES: dict[str, str] = {
+    "not reproducible": "a plain re-run succeeds",
+    "perception": "the policy was shown a wrong state",
+    "query": "a condition was answered wrongly",
+    "plan": "the plan is wrong",
+    "skill": "the policy executed a skill badly",
+    "gripper": "the gripper opened or closed wrongly",
+    "actuation": "the hand moved wrongly in several steps",
+    "policy": "the policy, unclear which part of it",
+    "out of time": "it succeeds with more time",
+    "undecided": "no replacement helps",
+}
+"""Each cause and its meaning."""
+
+REPLACEMENTS: dict[str, tuple[Cause, ...]] = {
+    "perception": ("perception",),
+    "query": ("query",),
+    "plan": ("plan",),
+    "skill": ("skill",),
+    "gripper": ("gripper",),
+    "actuation": ("actuation",),
+    "policy": ("policy",),
+    "time": ("out of time",),
+    "query + skill": ("query", "skill"),
+    "query + plan": ("query", "plan"),
+    "plan + skill": ("plan", "skill"),
+}
+"""The name of each replacement, and the causes to blame if an episode succeeds with it."""
+
+Finite = Annotated[float, Is[lambda x: abs(x) < 1e300]]
+_Replacement = Annotated[str, Is[lambda name: name in REPLACEMENTS]]
+# beartype checks one entry of a mapping, and these check all of them.
+_Numbers = Annotated[
+    Mapping[str, Finite], Is[lambda table: all(type(x) in (int, float) and abs(x) < 1e300 for x in table.values())]
+]
+_Tried = Annotated[
+    Mapping[str, bool], Is[lambda table: {*table} <= {*REPLACEMENTS} and all(type(x) is bool for x in table.values())]
+]
+
+
+@typed_fields
+@dataclass(frozen=True)
+class WrongAnswers:
+    """The condition of a step was answered wrongly in ``states`` of ``of`` states, first at ``first``."""
+
+    step: Natural
+    condition: str
+    states: Natural
+    of: Count
+    first: Natural
+
+
+@typed_fields
+@dataclass(frozen=True)
+class NoCondition:
+    """No condition of the plan held in ``states`` of the last ``of`` states."""
+
+    states: Natural
+    of: Count
+
+
+@typed_fields
+@dataclass(frozen=True)
+class PlanDeparts:
+    """The plan requested another action than the reference in ``states`` of ``of`` states, the last if ``late``."""
+
+    step: Natural  # of the plan, in most of these states
+    skill: str
+    reference: str  # the skill that the reference requests there
+    states: Natural
+    of: Count
+    late: bool
+    uncovered: bool  # no condition of the plan held in most of them
+
+
+@typed_fields
+@dataclass(frozen=True)
+class ActiveStep:
+    """A step was active in ``states`` of the last ``of`` states, and at the end ``distance`` metres from its target."""
+
+    step: Natural
+    skill: str
+    states: Natural
+    of: Count
+    distance: Scale | None = None
+
+
+@typed_fields
+@dataclass(frozen=True)
+class Misled:
+    """The observation that the policy was shown differed from the true one, most in entry ``number``, by ``error``."""
+
+    error: Scale
+    number: Natural
+
+
+@typed_fields
+@dataclass(frozen=True)
+class Difference:
+    """The first difference between two runs of an episode, with ``at``, the state to look at.
+
+    ``part`` is "length", of ``given`` and ``again`` steps; "actions", which differ there by ``size``; "environment", if
+    the same action leads to another state; "states", in a rollout without actions; or "nothing" that was recorded.
+    """
+
+    part: Literal["length", "actions", "environment", "states", "nothing"]
+    at: Natural
+    given: Natural | None = None
+    again: Natural | None = None
+    size: Scale | None = None
+
+
+Finding = WrongAnswers | NoCondition | PlanDeparts | ActiveStep | Misled | Difference
+_FINDINGS = {kind.__name__: kind for kind in get_args(Finding)}
 
 
 class MendedEpisode(NamedTuple):
@@ -41,8 +154,8 @@ class Failure:
         also: a second cause, if the episode succeeds only with both replaced.
         step: the step of the plan to which the failure belongs, from 0; None if it belongs to no step.
         at: the step of the episode to look at first, from 0.
-        finding: what the episode's states show of the cause, or of ``suspect``.
-        replaced: the replacement that decided, one of :data:`REPLACEMENTS`; None without one.
+        finding: what the episode's states show about the cause, or about ``suspect``.
+        replaced: the replacement that decided, one of :data:`REPLACEMENTS`; None if none did.
         rival: the next best replacement.
         succeeds_at: the step at which the episode succeeds with ``replaced``, or in a plain re-run.
         scripted_step: a step in which a scripted skill also suffices, although other steps have the same fault.
@@ -63,122 +176,54 @@ class Failure:
     step: Natural | None
     at: Natural
     finding: Finding | None = None
-    replaced: str | None = None
-    rival: str | None = None
+    replaced: _Replacement | None = None
+    rival: _Replacement | None = None
     succeeds_at: Count | None = None
     scripted_step: Natural | None = None
     suspect: Cause | None = None
-    evidence: Mapping[str, float] = field(default_factory=dict)
-    counterfactuals: Mapping[str, bool] = field(default_factory=dict)
-    shares: Mapping[str, float] = field(default_factory=dict)
+    evidence: _Numbers = field(default_factory=dict)
+    counterfactuals: _Tried = field(default_factory=dict)
+    shares: _Numbers = field(default_factory=dict)
     mended: MendedEpisode | None = field(default=None, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.also is not None and (self.also == self.cause or "undecided" in (self.also, self.cause)):
+            raise ValueError(f"also must be None or another decided cause than {self.cause!r}, got {self.also!r}")
 
     @property
     def why(self) -> str:
         """The failure in a few English sentences."""
+        from lw_torchrl.evaluation.diagnose.sentences import explain_failure  # which imports this module
+
         return explain_failure(self)
 
     def to_json(self) -> dict[str, Any]:
-        """All fields except :attr:`mended`, as JSON."""
-        return {one.name: _to_json(getattr(self, one.name)) for one in fields(self) if one.compare}
+        """Return all fields except :attr:`mended`, as JSON."""
+        content = {each.name: getattr(self, each.name) for each in fields(self) if each.compare}
+        if self.finding is not None:
+            content["finding"] = {"kind": type(self.finding).__name__, **vars(self.finding)}
+        return content
+
+    @classmethod
+    def from_json(cls, content: Any) -> Failure:
+        """Return a failure from the result of :meth:`to_json`; raise :class:`ValueError` for other JSON."""
+        stated = content.get("finding") if isinstance(content, dict) else None
+        if isinstance(stated, dict):
+            kind = _FINDINGS.get(str(stated.get("kind")))
+            if kind is None:
+                raise ValueError(f"finding must be one of {', '.join(_FINDINGS)}, got {shown(stated)}")
+            try:
+                finding = record_from_json(kind, {name: stated[name] for name in stated if name != "kind"})
+            except ValueError as error:
+                raise ValueError(f"finding: {error}") from None
+            content = {**content, "finding": finding}
+        failure: Failure = record_from_json(cls, content)
+        return failure
 
 
-def _to_json(value: Any) -> Any:
-    if isinstance(value, get_args(Finding)):
-        return {"kind": type(value).__name__, **vars(value)}
-    return dict(value) if isinstance(value, Mapping) else value
-
-
-def is_number(value: Any) -> bool:
-    """Return whether JSON's value is a number that can be summed."""
-    return type(value) in (int, float) and abs(value) < 1e300
-
-
-def read_records(
-    argument: str,
-    stated: Any,
-    record: Any,
-    faults: Callable[[Any], Iterable[str]],
-    parse: Callable[[str, dict[str, Any]], dict[str, Any]] = lambda where, entry: entry,
-) -> tuple[Any, ...]:
-    """Read a list of JSON objects as dataclasses of exactly their compared fields, each converted by ``parse``.
-
-    ``faults`` yields what is wrong with a record, which raises :class:`ValueError`.
-    """
-    if not isinstance(stated, list):
-        raise ValueError(f"{argument} must be a list, got {short(stated)}")
-    names, records = {field.name for field in fields(record) if field.compare}, []
-    for number, entry in enumerate(stated):
-        where = f"{argument}[{number}]"
-        if not isinstance(entry, dict) or set(entry) != names:
-            raise ValueError(f"{where} must be an object of {', '.join(sorted(names))}, got {short(entry)}")
-        try:
-            records.append(record(**parse(where, entry)))
-        except ArgumentError as error:
-            raise ArgumentError(f"{where}: {error}") from None
-        for fault in faults(records[-1]):
-            raise ValueError(f"{where}: {fault}, got {short(entry)}")
-    return tuple(records)
-
-
-def _read_finding(where: str, stated: Any) -> Any:
-    """Return the finding of a file; raise :class:`ValueError` if it is not one."""
-    if stated is None:
-        return None
-    kind = FINDINGS.get(str(stated.get("kind"))) if isinstance(stated, dict) else None
-    if kind is None or set(stated) != {"kind", *(one.name for one in fields(kind))}:
-        kinds = ", ".join(FINDINGS)
-        raise ValueError(f"{where} must be null, or a kind of {kinds} with its fields, got {short(stated)}")
-    try:
-        return kind(**{name: value for name, value in stated.items() if name != "kind"})
-    except ArgumentError as error:
-        raise ArgumentError(f"{where}: {error}") from None
-
-
-def read_failures(stated: Any, config: Mapping[str, Any], failed: Sequence[tuple[str, int]]) -> tuple[Failure, ...]:
-    """Return the failures of a file: one for each failed episode, (task, episode); otherwise :class:`ValueError`."""
-
-    def faults(one: Failure) -> Iterator[str]:
-        if one.seed != config["seed"]:
-            yield "seed must be config's"
-        if one.also is not None and (one.also == one.cause or "undecided" in (one.also, one.cause)):
-            yield "also must be null or another cause than the first"
-        if one.at >= config["max_steps"]:
-            yield "at must be a step of the episode"
-        for name in ("evidence", "shares"):
-            numbers = getattr(one, name)
-            if not isinstance(numbers, dict) or not all(map(is_number, numbers.values())):
-                yield f"{name} must be names and numbers"
-        tried = one.counterfactuals.items() if isinstance(one.counterfactuals, dict) else [("", 0)]
-        if not all(name in REPLACEMENTS and type(value) is bool for name, value in tried):
-            yield f"counterfactuals must be some of {', '.join(REPLACEMENTS)}, to true or false"
-        if not {one.replaced, one.rival} <= {None, *REPLACEMENTS}:
-            yield f"replaced and rival must be null or one of {', '.join(REPLACEMENTS)}"
-
-    def parse(where: str, entry: dict[str, Any]) -> dict[str, Any]:
-        return entry | {"finding": _read_finding(f"{where}.finding", entry["finding"])}
-
-    found = read_records("failures", stated, Failure, faults, parse)
-    if sorted(failed) != sorted((failure.task, failure.episode) for failure in found):
-        raise ValueError("failures must be one for each episode without success")
-    return found
-
-
-def count_causes(tasks: Sequence[str], failures: Sequence[Failure]) -> dict[str, Counter[str]]:
-    """Return the number of failures of each cause, by task."""
-    return {task: Counter(failure.cause for failure in failures if failure.task == task) for task in tasks}
-
-
-def failure_table(tasks: Sequence[str], episodes_per_task: int, failures: Sequence[Failure]) -> str:
-    """Return the numbers of failures as text: a row for each task, a column for each cause that occurs."""
-    causes = [cause for cause in CAUSES if any(failure.cause == cause for failure in failures)]
-    width = max(len("task"), *map(len, tasks))
-    lines = [f"{'task':{width}}  {'failed':>10}  " + "  ".join(f"{cause:>5}" for cause in causes)]
-    counts = count_causes(tasks, failures)
-    if len(tasks) > 1:
-        counts["all"] = Counter(failure.cause for failure in failures)
-    for task, row in counts.items():
-        trials = episodes_per_task * (len(tasks) if task == "all" and len(tasks) > 1 else 1)
-        cells = "  ".join(f"{row[cause]:>{max(5, len(cause))}}" for cause in causes)
-        lines.append(f"{task:{width}}  {f'{sum(row.values())} of {trials}':>10}  {cells}")
-    return "\n".join(lines)
+def record_from_json(kind: type[Any], content: Any) -> Any:
+    """Return a dataclass from a JSON object of exactly its compared fields; the dataclass checks their values."""
+    names = {each.name for each in fields(kind) if each.compare}
+    if not isinstance(content, dict) or set(content) != names:
+        raise ValueError(f"a {kind.__name__} must be an object of {', '.join(sorted(names))}, got {shown(content)}")
+    return kind(**content)

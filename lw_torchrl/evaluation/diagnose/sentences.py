@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from lw_torchrl.evaluation.diagnose.findings import (
+from lw_torchrl.evaluation.diagnose.failure import (
     REPLACEMENTS,
     ActiveStep,
     Difference,
+    Failure,
     Finding,
     Misled,
     NoCondition,
     PlanDeparts,
     WrongAnswers,
 )
-
-if TYPE_CHECKING:
-    from lw_torchrl.evaluation.diagnose.failure import Failure
 
 _TEXTS = {
     "perception": ("the true observations", "the observations"),
@@ -28,18 +24,18 @@ _TEXTS = {
     "policy": ("scripted skills in every step", "all actions"),
     "out of time": ("twice the time", "the time limit"),
 }
-"""The sound part that a replacement for each cause puts in, and the part that it takes out."""
+"""For each cause, the part that its replacement puts in, and the part that it takes out."""
 _IN_PAIRS = _TEXTS | {"skill": ("scripted skills", "all actions")}
 
 
 def replacement_text(name: str) -> str:
-    """Return what a replacement puts in: "the true answers and scripted skills"."""
-    return " and ".join(put_in for put_in, _ in _texts(name))
+    """Return the parts that a replacement puts in, for example "the true answers and scripted skills"."""
+    return " and ".join(new for new, _ in _texts(name))
 
 
 def replaced_text(name: str) -> str:
-    """Return what a replacement takes out: "the answers and all actions"."""
-    return " and ".join(taken_out for _, taken_out in _texts(name))
+    """Return the parts that a replacement takes out, for example "the answers and all actions"."""
+    return " and ".join(old for _, old in _texts(name))
 
 
 def _texts(name: str) -> list[tuple[str, str]]:
@@ -52,17 +48,17 @@ def explain_failure(failure: Failure) -> str:
     parts = [] if failure.finding is None else [finding_text(failure.finding)]
     if failure.cause == "not reproducible":
         fails = "it fails in another way, and other episodes of the task succeed"
-        ended = fails if failure.succeeds_at is None else "it succeeds"
-        parts = [f"in a plain re-run {ended}", *parts]
-    elif not failure.shares:  # only the rule: nothing was run again
-        parts = ["The states alone do not tell", *parts] if failure.cause == "undecided" else parts
+        ending = fails if failure.succeeds_at is None else "it succeeds"
+        parts = [f"in a plain re-run {ending}", *parts]
+    elif not failure.shares:  # by the rule alone: no episode was re-run
+        parts = ["The states alone do not show the cause", *parts] if failure.cause == "undecided" else parts
     else:
         parts += _counterfactual_texts(failure)
     return " ".join(f"{part[0].upper()}{part[1:]}." for part in parts)
 
 
 def _counterfactual_texts(failure: Failure) -> list[str]:
-    """Return what re-running the episode showed."""
+    """Return the results of re-running the episode."""
     if failure.also is not None and failure.replaced is not None:
         first, second = _IN_PAIRS[failure.cause][0], _IN_PAIRS[failure.also][0]
         return [f"neither {first} nor {second} is enough; with both, the episode succeeds"]
@@ -75,7 +71,7 @@ def _counterfactual_texts(failure: Failure) -> list[str]:
             parts.append(f"{suffices}, but the motion is as wrong in other steps")
         return parts
     if failure.counterfactuals.get("plan"):
-        parts = ["with the reference plan it succeeds, although both plans request the same in every state"]
+        parts = ["with the reference plan it succeeds, although both plans request the same actions in every state"]
     elif failure.cause == "query":
         parts = ["these answers could not be replaced"]
     elif failure.counterfactuals:
@@ -99,7 +95,7 @@ def _success_text(failure: Failure) -> str:
 
 
 def finding_text(finding: Finding) -> str:
-    """Return half a sentence with the finding's numbers."""
+    """Return a finding as a clause with its numbers."""
     match finding:
         case WrongAnswers(step, condition, states, of, first):
             often = f"{states} of {of} states, first at {first}"
@@ -107,7 +103,7 @@ def finding_text(finding: Finding) -> str:
         case NoCondition(states, of):
             return f"no condition of the plan held in {states} of the last {of} states"
         case PlanDeparts(step, skill, reference, states, of, late, uncovered):
-            departs = f"the plan requests something else than the reference, in step {step + 1}, '{skill}'"
+            departs = f"the plan requests another action than the reference, in step {step + 1}, '{skill}'"
             departs = "no condition of the plan holds" if uncovered else departs
             often = f"in {states} of {'the last ' if late else ''}{of} states"
             return f"{often} {departs}, where the reference requests '{reference}'"
@@ -123,7 +119,7 @@ def finding_text(finding: Finding) -> str:
                 "length": f"the length: the rollout has {given} steps, the re-run {again}",
                 "actions": f"the executed actions, {differ}",
                 "environment": f"the environment: the same action in state {at - 1} leads to another state",
-                "states": f"the states, from {at} on; the rollout holds no actions, which would tell more",
-                "nothing": "in nothing that was recorded",
+                "states": f"the states, from {at} on; the rollout holds no actions, which would show more",
+                "nothing": "in data that were not recorded",
             }
             return f"the first difference is {texts[part]}"

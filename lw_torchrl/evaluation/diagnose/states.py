@@ -1,4 +1,4 @@
-"""Read the states of a failed episode: wrong answers, departures of the plan from a reference, the step it ended in."""
+"""The states of a failed episode: wrong answers, departures of the plan from a reference, and the step it ended in."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from torch.nn.functional import one_hot, pad
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lw_torchrl._util.devices import device_of
-from lw_torchrl.evaluation.diagnose.findings import ActiveStep, Cause, Finding, NoCondition, PlanDeparts, WrongAnswers
-from lw_torchrl.evaluation.diagnose.scripts import Scripts, attended
+from lw_torchrl.evaluation.diagnose.failure import ActiveStep, Cause, Finding, NoCondition, PlanDeparts, WrongAnswers
+from lw_torchrl.evaluation.diagnose.replacements import Scripts, attended
 from lw_torchrl.evaluation.plan_use import where_stuck
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import ConditionalPlan, Plans
@@ -22,16 +22,21 @@ from lw_torchrl.modules.parts import evaluating
 from lw_torchrl.modules.policy import draws, plans_of
 from lw_torchrl.transforms.qaf import plan_program
 
-_OFTEN, _BRIEF = 0.4, 5  # the smallest share of a step's states that is often; fewer states decide nothing
+_OFTEN, _BRIEF = 0.4, 5  # "often" is a larger share of a step's states; fewer states decide nothing
 _SAME = 0.02  # actions that differ by less count as equal to the script's
 _HALF = 0.5  # the share of the error that a fault may leave unexplained, and that counts in other steps
+_LATE = 100  # the last states of a failed episode, in which it made no progress
+_AHEAD, _STILL = 10, 0.01  # the hand stands still if it moves less than a centimetre in 10 states
+_AWAY = 25  # longest interruption of a stay in a step, in states: two alternating steps are one stay
+_WRONG = 0.01  # the smallest share of states with wrong answers that counts
+OTHER = 0.3  # actions that differ by more, on some axis, have different purposes
 
 
 class ScriptComparison(NamedTuple):
-    """A policy's actions in T states, and those of the scripted skills of the active steps."""
+    """A policy's actions in T states, and the actions of the scripted skills of the active steps."""
 
     done: Tensor  # (T, A) float32
-    wanted: Tensor  # (T, A) float32, infinite where the active step has no script
+    wanted: Tensor  # (T, A) float32, infinite where the active step has no scripted skill
     active: Tensor  # (T,) int64, the active step, -1 for none
 
     def followed_by(self, other: ScriptComparison | None) -> ScriptComparison:
@@ -44,33 +49,30 @@ class ScriptComparison(NamedTuple):
         """Select some of the action's numbers, (A,) bool."""
         return ScriptComparison(self.done[:, numbers], self.wanted[:, numbers], self.active)
 
-    @property
-    def gaps(self) -> Tensor:
-        """The largest difference on any axis, (T,) float32; 0 where no step is active."""
-        return (self.done - self.wanted).abs().amax(-1).masked_fill(self.active < 0, 0.0)
+    def differ_by(self, size: float) -> Tensor:
+        """Return (T,) bool: whether the actions differ by more than ``size`` on any axis; False without active step."""
+        return (self.done - self.wanted).abs().amax(-1).masked_fill(self.active < 0, 0.0) > size
 
     def unlike(self) -> Tensor:
-        """Return (T,) bool: where actions are not those of scripts."""
-        return self.gaps > _SAME
+        """Return (T,) bool: whether the policy's action is not the script's."""
+        return self.differ_by(_SAME)
 
     def far(self, steps: Iterable[int]) -> float:
         """Return the largest share, over these steps, of a step's states whose actions are far from the scripts'."""
-        stays = [self.active == step for step in steps]
-        shares = [float((self.gaps[stay] > OTHER).float().mean()) for stay in stays if stay.sum() >= _BRIEF]
-        return max(shares, default=0.0)
+        far, stays = self.differ_by(OTHER), [self.active == step for step in steps]
+        return max((float(far[stay].float().mean()) for stay in stays if stay.sum() >= _BRIEF), default=0.0)
 
     def often_far(self, steps: Iterable[int]) -> bool:
-        """Return whether :meth:`far` is large; :meth:`seldom_far` whether it is small."""
         return self.far(steps) > _OFTEN
 
     def seldom_far(self, steps: Iterable[int]) -> bool:
         return self.far(steps) < _OFTEN / 2
 
     def in_other_steps(self, step: int) -> bool | None:
-        """Return whether the fault of a step is in the other steps too; None if that cannot be decided.
+        """Return whether the other steps have the fault of a step; None if that cannot be decided.
 
-        The fault is read off the axis with the largest error, as a factor of the script's action or as a shift. It is
-        in the other steps if it explains at least half of their error. It is undecided if neither describes the step's
+        The fault is estimated on the axis with the largest error, as a factor of the script's action or as a shift. The
+        other steps have it if it explains at least half of their error. It is undecided if neither describes the step's
         error, if the fault would not show in the other steps, or if these are half as far off in another way.
         """
         known = self.wanted.isfinite().all(-1) & (self.active >= 0)
@@ -94,7 +96,10 @@ def _off(values: Tensor, where: Tensor) -> float:
 
 
 def compare_with_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> ScriptComparison | None:
-    """Compare them in an episode; return None if the policy draws its actions, or reads keys that were not recorded."""
+    """Compare a policy with scripts in an episode's states; return None if its actions there cannot be computed.
+
+    That is so if the policy draws its actions, or reads keys that were not recorded.
+    """
     keys = [key for key in getattr(actor, "in_keys", ()) if key != "qaf"]
     plans = plans_of(actor)
     is_known = isinstance(actor, TensorDictModuleBase) and not draws(actor)
@@ -111,15 +116,8 @@ def compare_with_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> S
     return ScriptComparison(action, wanted.masked_fill(unscripted.unsqueeze(-1), torch.inf), seen.active)
 
 
-_LATE = 100  # the last states, in which a failed episode got nowhere
-_AHEAD, _STILL = 10, 0.01  # the hand stands still if it moves less than a centimetre in 10 states
-_AWAY = 25  # longest interruption of a stay in a step, in states: two alternating steps are one stay
-_WRONG = 0.01  # the smallest share of states with wrong answers that counts
-OTHER = 0.3  # actions that differ by more, on some axis, have different purposes
-
-
 class EpisodeStates(NamedTuple):
-    """A failed episode: its T states under a plan of S steps."""
+    """The T states of a failed episode under a plan of S steps."""
 
     task: str
     episode: int
@@ -141,7 +139,7 @@ class EpisodeStates(NamedTuple):
 
 
 class Blame(NamedTuple):
-    """The step of the plan and the state at which a cause shows, and what shows there."""
+    """The step of the plan and the state at which a cause shows, and the finding there."""
 
     step: int
     at: int
@@ -149,7 +147,7 @@ class Blame(NamedTuple):
 
 
 class Explanation(NamedTuple):
-    """What the states alone show."""
+    """The cause that the states alone show."""
 
     cause: Cause  # "undecided" if they do not decide
     blames: Mapping[str, Blame]  # by possible cause
@@ -180,7 +178,7 @@ def states_of(task: str, episode: int, steps: TensorDictBase, plans: Plans, give
 def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
     """Return the steps that may be to blame for a failure, the likeliest first, by the states ``among`` (T,) bool.
 
-    These are the furthest and the most frequent step late in the episode, then those of all states, then the others.
+    The furthest and the most frequent step late in the episode come first, then those of all states, then the others.
     """
     counted = seen.active >= 0 if among is None else (seen.active >= 0) & among
     if not counted.any():
@@ -195,7 +193,7 @@ def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
 
 
 def last_stay_start(states: Tensor) -> int:
-    """Return where the last stay in ``states`` (T,) bool begins; an interruption of up to 25 states does not end it."""
+    """Return the start of the last stay in ``states`` (T,) bool; an interruption of up to 25 states does not end it."""
     places = states.nonzero().flatten()
     if not len(places):
         return len(states) - 1
@@ -204,7 +202,7 @@ def last_stay_start(states: Tensor) -> int:
 
 
 def stall_step(seen: EpisodeStates, step: int, layout: Layout = METAWORLD) -> int:
-    """Return the first state of the last stay in a step from which the hand stands still, else the stay's beginning."""
+    """Return the state of the last stay in a step from which the hand stands still, else the start of the stay."""
     inside = seen.active == step
     begin = last_stay_start(inside)
     hand = seen.steps.get("observation")[begin:, layout.positions[0]]
@@ -245,15 +243,15 @@ def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) ->
         departs, ours, theirs = _departs(seen, plan, scripts, other, reference)
         evidence["plan_departs"] = float(departs.float().mean())
         evidence["plan_departs_late"] = float(departs[-late:].float().mean())
-        recent, where, step, asked = int(departs[-late:].sum()), departs.clone(), stuck, other.steps[0].skill
+        recent, where, step, requested = int(departs[-late:].sum()), departs.clone(), stuck, other.steps[0].skill
         where[:-late] &= not recent
         if where.any():
             step = int(torch.bincount(ours[where]).argmax())
-            asked = other.steps[int(torch.bincount(theirs[where & (ours == step)]).argmax())].skill
+            requested = other.steps[int(torch.bincount(theirs[where & (ours == step)]).argmax())].skill
         uncovers = bool(where.any()) and bool(none[where].float().mean() > 0.5)
         states, of = (recent, late) if recent else (int(departs.sum()), length)
         at = last_stay_start(departs & (ours == step)) if departs.any() else stalled
-        finding = PlanDeparts(step, plan.steps[step].skill, asked, states, of, bool(recent), uncovers)
+        finding = PlanDeparts(step, plan.steps[step].skill, requested, states, of, bool(recent), uncovers)
         blames["plan"] = Blame(step, at, finding)
 
     evidence["in_step_late"] = float((seen.active == stuck)[-late:].float().mean())
@@ -280,7 +278,7 @@ def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) ->
 def _departs(
     seen: EpisodeStates, plan: ConditionalPlan, scripts: Scripts, other: ConditionalPlan, other_scripts: Scripts
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return (T,) bool, where the plan's true step requests another action than the reference's, and both steps."""
+    """Return whether the plan's true step requests another action than the reference's, (T,) bool, and both steps."""
     observation, task_id = seen.steps.get("observation"), seen.steps.get("task_id")
     answers = plan_program(Plans([other]))(observation, task_id)
     ours, theirs = chosen(seen.truth, len(plan.steps)), chosen(answers, len(other.steps))

@@ -1,4 +1,4 @@
-"""Plans in prose, "- When C, the robot should S.", written, and read as models really write them."""
+"""Plans in prose, "- When C, the robot should S.": a writer, and a tolerant reader."""
 
 import re
 from collections.abc import Sequence
@@ -7,21 +7,20 @@ from dataclasses import replace
 from lw_torchrl._util.checks import shown
 from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, item
 from lw_torchrl.language.objects import GRIPPER
-from lw_torchrl.language.plan_text import one_line
-from lw_torchrl.language.plans import ConditionalPlan
+from lw_torchrl.language.plans import ConditionalPlan, one_line
 from lw_torchrl.language.tasks import TASKS, Task
 
 
 def md(style: Style) -> PlanFormat:
-    """The format of a style in prose; in the goal style "- When C, move the robot's gripper until G."
+    """Return the prose format of a style; the goal style writes "- When C, move the robot's gripper until G."
 
     Source: paper section 'Conditional Plan Generation', which tried plans in prose beside those in code.
     """
 
     def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
         about = "A robot that has one arm with a gripper does each task by the rules below it.\n"
-        said = "".join(f"{line}\n" for line in hints)
-        return "\n".join([about, *(_write(plan, style) for plan in examples), said + _opening(task)])
+        hint = "".join(f"{line}\n" for line in hints)
+        return "\n".join([about, *(_write(plan, style) for plan in examples), hint + _opening(task)])
 
     return PlanFormat("md", lambda plan: _write(plan, style), ProseReading, prompt, style)
 
@@ -63,23 +62,26 @@ _NO_SKILL = frozenset(("the", "a", "an", "it", "this", "that", "you", "we", "the
 
 
 def _is_read(line: str) -> bool:
-    """Whether a line would be read as a part of a plan, and no comment."""
-    found = END.search(line) or _heading(line) or _BULLET.match(line) or item(line) or _clause(1, line, bullet=False)
-    return bool(found) or _listing(line) is not None
+    """Return whether a line would be read as a part of a plan, not as a comment."""
+    match = END.search(line) or _heading(line) or _BULLET.match(line) or item(line) or _clause(1, line, bullet=False)
+    return bool(match) or _listing(line) is not None
 
 
 class ProseReading(Reading):
-    """What a text says in prose, for :attr:`PlanFormat.read`: a clause is a bullet that begins with "When", "If" and
-    the like, or, without such bullets, a sentence like "When C, the robot should S"; others are its reason."""
+    """The clauses of a text in prose.
+
+    A clause is a bullet that begins with "When", "If" or the like. In a section without such bullets it is a sentence
+    "When C, the robot should S". Other sentences are the reason of the next clause.
+    """
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        self.bulleted: dict[int, bool] = {}  # of a section, by its place: whether its clauses are bullets
+        self.bulleted: dict[int, bool] = {}  # section number to whether its clauses are bullets
         self.reason: list[str] = []
         self.listing = False
         for number, line in enumerate(text.splitlines(), 1):
-            said, *cut = END.split(line, maxsplit=1)
-            self.read(number, said.strip())
+            before, *cut = END.split(line, maxsplit=1)
+            self.read(number, before.strip())
             if cut:
                 self.note(number, "the answer ends here")
                 break
@@ -93,8 +95,8 @@ class ProseReading(Reading):
             self.reason.clear()
         elif (steps := _listing(raw)) is not None:
             self.listing, self.section.listed = True, steps
-        elif found := _clause(number, line, bullet is not None):
-            self.add(found, bullet is not None, line)
+        elif clause := _clause(number, line, bullet is not None):
+            self.add(clause, bullet is not None, line)
         elif self.listing and (numbered := item(line)):
             self.section.listed += f"  {numbered[0]}. {numbered[1]}"
             return
@@ -104,20 +106,20 @@ class ProseReading(Reading):
             self.reason.append(line)
         self.listing = self.listing and steps is not None
 
-    def add(self, found: Clause, bullet: bool, line: str) -> None:
+    def add(self, clause: Clause, bullet: bool, line: str) -> None:
         place = len(self.sections)
         if bullet and not self.bulleted.get(place, True):
-            self.section.clauses.clear()  # sentences that only say why
+            self.section.clauses.clear()  # where there are bullets, sentences only explain
         if bullet or not self.bulleted.get(place, False):
             self.bulleted[place] = bullet
-            self.section.clauses.append(replace(found, reason=" ".join(self.reason)))
+            self.section.clauses.append(replace(clause, reason=" ".join(self.reason)))
             self.reason.clear()
         else:
             self.reason.append(line)
 
 
 def _heading(line: str) -> str:
-    """The task that a line begins, "" if it is no heading."""
+    """Return the task that a heading names; "" if the line is not a heading."""
     if (named := _NAMED.match(line)) and (named[1] or named[2].lower() in TASKS):
         return named[2].replace("_", "-").lower()
     if (alone := _ALONE.fullmatch(line)) and ("-" in alone[1] or alone[1].replace("_", "-") in TASKS):
@@ -126,23 +128,23 @@ def _heading(line: str) -> str:
 
 
 def _listing(line: str) -> str | None:
-    found = re.match(r"[#*\s]*steps\s*:[*\s]*(.*)", line, re.IGNORECASE)
-    return found[1] if found else None
+    match = re.match(r"[#*\s]*steps\s*:[*\s]*(.*)", line, re.IGNORECASE)
+    return match[1] if match else None
 
 
 def _clause(number: int, line: str, bullet: bool) -> Clause | None:
     start = _BULLET.match(line)
-    found = _WHEN.match(line, start.end() if start else 0)
-    if not found:
+    match = _WHEN.match(line, start.end() if start else 0)
+    if not match:
         return None
-    rest = found[2]
+    rest = match[2]
     should, until = _SHOULD.search(rest), _UNTIL.search(rest)
     if until and not (should and should.start() < until.start()):
         goal = re.sub(r"^it is\b", f"the {GRIPPER} is", _ended(rest[until.end() :]))
         if not goal:
-            return None  # cut off
+            return None  # the text was cut off
         return Clause(number, rest[: until.start()], "", goal)
-    if (should and found[1].lower() in ("when", "if", "whenever", "once")) or (should and bullet):
+    if (should and match[1].lower() in ("when", "if", "whenever", "once")) or (should and bullet):
         return Clause(number, rest[: should.start()], _ended(rest[should.end() :]))
     comma = _COMMA.search(rest)
     if not bullet or not comma:
@@ -154,13 +156,13 @@ def _clause(number: int, line: str, bullet: bool) -> Clause | None:
 
 
 def _ended(text: str) -> str:
-    """A sentence's end without its full stop, and without the quotes and tags that a line may end in."""
-    said = text.rstrip()
+    """Return the end of a sentence without its full stop, quotes and closing tags."""
+    sentence = text.rstrip()
     while True:
-        shorter = said.rstrip("\"'`,\\* ")
+        shorter = sentence.rstrip("\"'`,\\* ")
         before, tag, name = shorter.rpartition("</")
         if tag and name.endswith(">") and name[:-1].isalnum():
             shorter = before
-        if shorter == said:
-            return said.removesuffix(".")
-        said = shorter
+        if shorter == sentence:
+            return sentence.removesuffix(".")
+        sentence = shorter

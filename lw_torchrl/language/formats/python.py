@@ -1,4 +1,4 @@
-"""Plans that look like Python, written, and read as models really write them; never executed."""
+"""Plans that look like Python: a writer, and a tolerant reader, which executes nothing."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -7,23 +7,24 @@ from dataclasses import dataclass
 from lw_torchrl._util.checks import shown
 from lw_torchrl.language.formats.base import END, Clause, PlanFormat, Reading, Style, item
 from lw_torchrl.language.objects import GRIPPER
-from lw_torchrl.language.plan_text import function_head, one_line, quote
-from lw_torchrl.language.plans import ConditionalPlan, PlanStep
+from lw_torchrl.language.plans import ConditionalPlan, PlanStep, function_head, one_line, quote
 from lw_torchrl.language.queries import Query
 from lw_torchrl.language.tasks import TASKS, Task
 
 
 def py(style: Style) -> PlanFormat:
-    """The format of a style as a bare function, ``if check("…"):`` and ``robot.verb("…")`` for each step.
+    """Return the format of a style as a function, with ``if check("…"):`` and ``robot.verb("…")`` for each step.
 
-    In the goal style a skill is ``robot.move_gripper("above the puck", close_gripper=True)``, the place to reach, or
-    ``robot.move_gripper(until="the puck is near the target location")`` for any other state.
+    The goal style writes a skill as the place that the gripper is to reach,
+    ``robot.move_gripper("above the puck", close_gripper=True)``, or as another state to reach,
+    ``robot.move_gripper(until="the puck is near the target location")``.
+
     Source: paper section 'Conditional Plan Generation' and its figure of a plan.
     """
 
     def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
-        said = "".join(f"# {line}\n" for line in hints)
-        return "\n".join([*(_write(plan, style) for plan in examples), said + function_head(task)])
+        hint = "".join(f"# {line}\n" for line in hints)
+        return "\n".join([*(_write(plan, style) for plan in examples), hint + function_head(task)])
 
     return PlanFormat("py", lambda plan: _write(plan, style), PythonReading, prompt, style)
 
@@ -35,7 +36,7 @@ def _write(plan: ConditionalPlan, style: Style) -> str:
     for number, (step, goal) in enumerate(zip(plan.steps, plan.goals, strict=True)):
         if style.explains and (reason := one_line(step.reason).lstrip("# ")):
             if number == 0 and re.match(r"\[?\d", reason):
-                lines.append("#")  # it would go on with the list
+                lines.append("#")  # a reason like "2. and so on" would continue the list
             lines.append(f"# {reason}")
         lines += [f"if check({quote(str(step.condition))}):", f"    robot.{_call(step, goal if style.goals else None)}"]
     return function_head(plan.definition) + "".join(f"    {line}\n" for line in lines)
@@ -57,7 +58,7 @@ _HELD = {"": "", _OPENED: ", open_gripper=True", _CLOSED: ", close_gripper=True"
 
 
 def py_md(style: Style) -> PlanFormat:
-    """The format of a style as a chat message with functions in fenced blocks."""
+    """Return the format of a style as a chat message with functions in fenced code blocks."""
 
     def fenced(code: str) -> str:
         return f"```python\n{code}```\n"
@@ -81,7 +82,7 @@ def py_md(style: Style) -> PlanFormat:
 
 _STRING = r'(?:[fFrRbBuU]{0,2}(?:"(?:[^"\\]|\\.)*+"|\'(?:[^\'\\]|\\.)*+\'))'
 _STRINGS = rf"{_STRING}(?:[\s+]*{_STRING})*"
-_LITERAL = re.compile(r'"(?:[^"\\]|\\.?)*+("|\Z)|\'(?:[^\'\\]|\\.?)*+(\'|\Z)')  # also one that is cut off
+_LITERAL = re.compile(r'"(?:[^"\\]|\\.?)*+("|\Z)|\'(?:[^\'\\]|\\.?)*+(\'|\Z)')  # or the start of a cut-off string
 _BRANCH = re.compile(r"(if|elif|while)\b\s*|(else)\s*:")
 _ARGUMENT = re.compile(rf"(?:(\w+)\s*=\s*)?(?:({_STRINGS})|([^\s,()\"'][^,()\"']*))\s*(?:,\s*)?")
 _PRINTED = re.compile(r"\s*print\(\s*(\"|')(.*)\1\s*\)\s*;?")
@@ -89,28 +90,28 @@ _DEF = re.compile(r"(?:async\s+)?def\b\s*(\w*)")
 _CHECK = re.compile(rf"(and\b|or\b)?\s*(not\b)?\s*\(?\s*(?:self\.|robot\.)?check\s*\(\s*({_STRINGS})\s*\)?\s*")
 _CALL = re.compile(r"(?:self\.)?robot\.(\w+)\s*\(\s*")
 _HEADING = re.compile(r"#+\s*([A-Za-z][\w-]*)\s*:")
-_MOST_JOINED = 6  # lines of one statement
+_MOST_JOINED = 6  # lines that a statement may span
 
 
 @dataclass
 class _Block:
-    """An ``if``: its indentation, its line, what it asks (None if it cannot be read), and its block's indentation."""
+    """An ``if`` statement."""
 
     indent: int
     line: int
-    condition: str | None
-    body: int | None = None
+    condition: str | None  # None if it cannot be read
+    body: int | None = None  # indentation of its block
 
 
 class PythonReading(Reading):
-    """What a text says in Python, for :attr:`PlanFormat.read`, line by line; an ``if`` in a block asks for both."""
+    """The clauses of a text in Python, read line by line. A nested ``if`` requires both conditions."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
         self.blocks: list[_Block] = []
         self.reason: list[str] = []
         self.listing = False
-        self.ignored: tuple[int, int, str] | None = None  # lines that are no part of a plan: from, to, the first
+        self.ignored: tuple[int, int, str] | None = None  # lines outside a plan: first and last number, first line
         for number, line in _statements(text):
             if not self.read(number, line):
                 break
@@ -121,15 +122,15 @@ class PythonReading(Reading):
         super().note(line, text)
 
     def flush(self) -> None:
-        """Note the lines that were passed over."""
+        """Add a note on the lines that were skipped."""
         if self.ignored is not None:
             first, last, line = self.ignored
             self.ignored = None
-            which = "is" if first == last else f"and what follows up to line {last} is"
-            super().note(first, f"{which} no part of a plan: {shown(line.strip())}")
+            which = "is" if first == last else f"to line {last} are"
+            super().note(first, f"{which} not part of a plan: {shown(line.strip())}")
 
     def read(self, number: int, line: str) -> bool:
-        """Take a line in; False if the answer ends with it."""
+        """Read a line; return False if the answer ends with it."""
         code = line.strip()
         if END.match(code):
             self.note(number, "the answer ends here")
@@ -167,15 +168,15 @@ class PythonReading(Reading):
     def code(self, number: int, line: str, code: str) -> None:
         indent = len(line) - len(line.lstrip())
         call, branch = _CALL.match(code), _BRANCH.match(code)
-        while self.blocks:  # end the blocks that the line is not in
+        while self.blocks:  # close the blocks that do not contain the line
             last = self.blocks[-1]
             if last.body is None and call and indent == last.indent:
-                break  # a call right below its condition belongs to it, however it is indented
+                break  # a call right below a condition belongs to it, even if it is not indented
             if indent > last.indent and (last.body is None or indent >= last.body):
                 break
             self.blocks.pop()
-        if found := _DEF.match(code):
-            self.open(_task_name(found[1]), number)
+        if definition := _DEF.match(code):
+            self.open(_task_name(definition[1]), number)
         elif branch:
             self.flush()
             self.branch(number, indent, code, branch)
@@ -189,39 +190,39 @@ class PythonReading(Reading):
             self.ignored = (first[0], number, first[2])
 
     def branch(self, number: int, indent: int, code: str, branch: re.Match[str]) -> None:
-        condition, rest = (None, code[branch.end() :]) if branch[2] else self.asked(number, code, branch.end())
+        condition, rest = (None, code[branch.end() :]) if branch[2] else self.condition(number, code, branch.end())
         if branch[2]:
-            self.note(number, "an 'else' says no condition; what follows from it is left out")
+            self.note(number, "an 'else' has no condition; its skills are left out")
         if branch[1] == "elif":
-            self.note(number, "'elif' is taken for 'if': that what is above it does not hold is left out")
+            self.note(number, "'elif' is read as 'if'; the negation of the conditions above it is left out")
         if self.blocks and self.blocks[-1].body is None:
             self.blocks[-1].body = indent
         self.blocks.append(_Block(indent, number, condition))
         if call := _CALL.match(rest):
             self.call(number, indent + 1, rest, call)
 
-    def asked(self, number: int, code: str, at: int) -> tuple[str | None, str]:
-        """What an ``if`` asks, None if it cannot be read, and what stands behind its colon."""
-        asked: list[str] = []
+    def condition(self, number: int, code: str, at: int) -> tuple[str | None, str]:
+        """Return the condition of an ``if``, None if it cannot be read, and the code after its colon."""
+        conditions: list[str] = []
         fault = ""
         while match := _CHECK.match(code, at):
             text = _unquoted(match[3])
             if match[1] == "or":
-                fault = "an 'or' of conditions cannot be said in a plan"
+                fault = "a plan cannot express an 'or' of conditions"
             if match[2] and re.search(r"\band\b", text):
-                fault = "the opposite of several conditions cannot be said in a plan"
-            asked.append(f"not {text}" if match[2] else text)
+                fault = "a plan cannot express the negation of several conditions"
+            conditions.append(f"not {text}" if match[2] else text)
             at = match.end()
         rest = code[at:].lstrip(" )")
-        if not asked:
+        if not conditions:
             bare = _bare(code)
             cut = '"' in bare or not bare.rstrip().endswith(":")
-            fault = f"is cut off: {shown(code)}" if cut else f'asks nothing by check("..."): {shown(code)}'
+            fault = f"is cut off: {shown(code)}" if cut else f'has no check("..."): {shown(code)}'
         elif not rest.startswith((":", "#")):
-            fault = fault or (f'is more than check("..."): {shown(code)}' if rest else "")
+            fault = fault or (f'has more than check("..."): {shown(code)}' if rest else "")
         if fault:
             self.note(number, fault)
-        return (None if fault else " and ".join(asked)), rest.lstrip(": ")
+        return (None if fault else " and ".join(conditions)), rest.lstrip(": ")
 
     def call(self, number: int, indent: int, code: str, call: re.Match[str]) -> None:
         words, named, at = list[str](), dict[str, str](), call.end()
@@ -244,7 +245,7 @@ class PythonReading(Reading):
         block.body = indent if block.body is None else block.body
         conditions = [above.condition for above in self.blocks if above.condition is not None]
         if len(conditions) < len(self.blocks):
-            return  # the `if` is noted
+            return  # the note on the `if` says why
         skill, goal = f"{call[1]} {' '.join(words)}", named.get("goal", "")
         if call[1] == "move_gripper":
             skill, goal = _state_to_reach(" ".join(words), named)
@@ -253,7 +254,7 @@ class PythonReading(Reading):
 
 
 def _state_to_reach(place: str, named: dict[str, str]) -> tuple[str, str]:
-    """The skill and the goal of ``robot.move_gripper``; one of them is ""."""
+    """Return the skill and the goal of ``robot.move_gripper``; one of them is ""."""
     parts = [f"the {GRIPPER} is {place}"] if place else []
     parts += [text for name in ("until", "goal") if (text := named.get(name, ""))]
     for name, state in (("close_gripper", "closed"), ("open_gripper", "open")):
@@ -268,12 +269,12 @@ def _unquoted(strings: str) -> str:
 
 
 def _task_name(name: str) -> str:
-    """The task that a function is for: "door-lock", of "door_lock" and "DoorLock"."""
+    """Return a function's task: "door-lock" for "door_lock" and "DoorLock"."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name).replace("_", "-").strip("-").lower() or "?"
 
 
 def _statements(text: str) -> Iterator[tuple[int, str]]:
-    """The numbered lines of a text; those of one call are joined, and what is printed is taken as it is."""
+    """Yield the numbered lines of a text, with the lines of a call joined and the text of ``print`` unquoted."""
     lines = text.expandtabs(4).splitlines()
     at = 0
     while at < len(lines):
@@ -285,7 +286,7 @@ def _statements(text: str) -> Iterator[tuple[int, str]]:
         while joins and at < len(lines) and at - start < _MOST_JOINED:
             bare, code = _bare(line), lines[at].strip()
             if '"' in bare or bare.count("(") <= bare.count(")"):
-                break  # no parenthesis, or a string, is open
+                break  # no parenthesis is open, or a string is
             if not code or code.startswith(("#", "```", "def ", "robot.")) or _BRANCH.match(code):
                 break  # a statement of its own
             line, at = f"{line} {code}", at + 1
@@ -293,5 +294,5 @@ def _statements(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _bare(code: str) -> str:
-    """A line without its strings and its comment; of a string that is cut off a quote is left."""
-    return _LITERAL.sub(lambda found: "" if found[1] or found[2] else '"', code).partition("#")[0]
+    """Return a line without its strings and its comment; a cut-off string leaves a quote."""
+    return _LITERAL.sub(lambda literal: "" if literal[1] or literal[2] else '"', code).partition("#")[0]

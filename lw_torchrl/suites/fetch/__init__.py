@@ -1,6 +1,4 @@
-"""gymnasium-robotics' Fetch tasks: an arm with a parallel gripper reaches, pushes, slides and picks up;
-what its numbers mean, its words, and what simulates it.
-"""
+"""gymnasium-robotics' Fetch tasks as a suite: an arm with a parallel gripper reaches, pushes, slides and picks up."""
 
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
@@ -22,7 +20,7 @@ __all__ = ["FETCH", "TASKS", "FetchEngine", "load_plans", "load_skills", "make_s
 _DATA = files("lw_torchrl.suites.fetch") / "data"
 
 HELD = 0.55
-"""The opening below which the fingers hold the puck, with edges of 5 cm; their pads reach it at 0.48."""
+"""The opening below which the fingers hold the puck, whose edges are 5 cm; the pads touch it at 0.48."""
 FETCH = Layout(
     "fetch",
     25,
@@ -35,26 +33,26 @@ FETCH = Layout(
     binary_gripper=True,
     thresholds={"open": HELD, "closed": HELD},
 )
-"""The 25 numbers of an observation: hand, opening, puck and its quaternion, the same 11 a step before, goal."""
+"""The 25 numbers of an observation: hand, opening, puck and its quaternion, these 11 at the previous step, goal."""
 
 TASKS: Tasks = ReadOnlyDict(
     {name: Task.from_json(name, row, FETCH) for name, row in sorted(read_toml(_DATA / "tasks.toml", TaskError).items())}
 )
-"""The four names, sorted, to their :class:`~lw_torchrl.language.tasks.Task`."""
+"""The four tasks by name, sorted."""
 
 
 def load_skills() -> Skills:
-    """The scripted skills by their text: Fetch's, and Meta-World's under other texts."""
+    """Return Fetch's scripted skills by their text; some are Meta-World's under other texts."""
     return skills.load_skills(str(_DATA / "skills.toml"), tasks=TASKS)
 
 
 def load_plans() -> Plans:
-    """A plan for each task, every step with a scripted skill of :func:`load_skills`."""
+    """Return a plan for each task; every step has a scripted skill of :func:`load_skills`."""
     return plan_files.load_plans(str(_DATA / "plans"), tasks=TASKS)
 
 
 def make_suite() -> Suite:
-    """The four tasks, with their scripted skills and plans. Episodes have 50 steps, as gymnasium-robotics has it."""
+    """Return Fetch as a suite; its episodes have 50 steps, as in gymnasium-robotics."""
     step_time = 0.04  # 20 simulation steps of 2 ms
     return Suite("fetch", FETCH, TASKS, _make_engine, load_skills(), load_plans(), max_steps=50, step_time=step_time)
 
@@ -64,7 +62,7 @@ def _make_engine(row_tasks: list[str], **options: Any) -> Any:
 
 
 def __getattr__(name: str) -> Any:
-    if name == "FetchEngine":  # words alone load neither MuJoCo nor TorchRL
+    if name == "FetchEngine":  # imported when it is used, because tasks and plans need no MuJoCo
         from lw_torchrl.suites.fetch.engine import FetchEngine
 
         return FetchEngine

@@ -1,6 +1,7 @@
-"""The Fetch engine: gymnasium-robotics bit for bit, its physics in threads, its numbers in our axes.
+"""The Fetch engine: gymnasium-robotics bit for bit, with physics in threads and numbers in our axes.
 
-Fetch's x points away from the robot, its y to the left, its z up from the floor; lengths are metres in both.
+Fetch's x points away from the robot, its y to the left, its z up from the floor; ours point right, away, and up from
+the table. Both are in metres.
 """
 
 from collections.abc import Sequence
@@ -24,20 +25,20 @@ from lw_torchrl.suites.metaworld.simulated_rows import ThreadedEngine
 from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY
 
 HAND_HEIGHT = 0.03
-"""Metres of the hand above Fetch's grip site, which is between the finger pads. Meta-World's hand is as high above what
-it holds, so "near" and the other relations mean the same."""
+"""Height of our hand above Fetch's grip site, which is between the finger pads, metres. Meta-World's hand is as high
+above an object that it holds, so relations such as "near" mean the same."""
 OPEN = 0.1
-"""Metres between the fingers, of an open gripper."""
+"""Distance between the fingers of an open gripper, metres."""
 
 
 def our_positions(positions: Array, origin: Array) -> Array:
     """Convert positions (..., 3) float64 from Fetch's axes to ours, relative to ``origin`` (..., 3) in Fetch's axes."""
-    way = positions - origin
-    return np.stack((-way[..., 1], way[..., 0], way[..., 2]), -1)
+    offset = positions - origin
+    return np.stack((-offset[..., 1], offset[..., 0], offset[..., 2]), -1)
 
 
 def our_quaternions(quaternions: Array) -> Array:
-    """Convert the axis of quaternions (..., 4) float64, w first, to our axes: (1, 0, 0, 0) stays."""
+    """Convert the rotation axis of quaternions (..., 4) float64, w first, to our axes; (1, 0, 0, 0) stays."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     return np.stack((w, -y, x, z), -1)
 
@@ -49,24 +50,24 @@ def turned_quaternions(quaternions: Array) -> Array:
 
 
 def fetch_actions(action: NDArray[Any]) -> NDArray[Any]:
-    """Return gymnasium-robotics' actions, (..., 4) of the same dtype, where +1 opens, for ours, where +1 closes."""
+    """Convert our actions (..., 4), where +1 closes, to gymnasium-robotics', of the same dtype, where +1 opens."""
     return np.stack((action[..., 1], -action[..., 0], action[..., 2], -action[..., 3]), -1)
 
 
 CAMERAS = ("external_camera_0", "head_camera_rgb", "gripper_camera_rgb", "lidar")
 """The cameras of Fetch's scenes."""
 
-_NOW = FETCH.past or 0  # how many numbers tell of this step
-_READ = 12  # grip site (3), finger joints (2), thing's site (3) and quaternion (4), in Fetch's axes
+_NOW = FETCH.past or 0  # the number of numbers of the present step
+_READ = 12  # grip site (3), finger joints (2), object's site (3) and quaternion (4), in Fetch's axes
 _FINGERS = ("robot0:r_gripper_finger_joint", "robot0:l_gripper_finger_joint")
-_TURN = np.array([1.0, 0.0, 1.0, 0.0])  # what each action adds to the hand's quaternion: fingers down
-_METRES = 0.05  # per unit of a displacement
+_TURN = np.array([1.0, 0.0, 1.0, 0.0])  # gymnasium-robotics adds this to the hand's quaternion: fingers down
+_METRES = 0.05  # of a displacement of 1
 _SUCCESS = 0.05  # metres
 
 
 class _Scene(NamedTuple):
-    """A task's class in gymnasium-robotics, and our origin: metres, in Fetch's axes. An object on the table is at our
-    z = 0.018, two millimetres below what counts as touching; hands start near x = 0, y = 0.6."""
+    """A task's class in gymnasium-robotics, and our origin in Fetch's axes, metres. An object on the table is then at
+    z = 0.018, 2 mm below the threshold of touching; hands start near x = 0, y = 0.6."""
 
     module: str
     env: str
@@ -83,9 +84,9 @@ _SCENES = {
 
 @cache
 def _builder(task: str) -> Any:
-    """Build gymnasium-robotics' environment of a task; its model never changes, so all rows of all engines share it."""
+    """Build gymnasium-robotics' environment of a task. All rows of all engines share its model, which never changes."""
     scene = _SCENES[task]
-    with naming_absent_renderer(), redirect_stderr(StringIO()):  # importing it prints news of other environments
+    with naming_absent_renderer(), redirect_stderr(StringIO()):  # its import prints news about other environments
         try:
             module = import_module(f"gymnasium_robotics.envs.fetch.{scene.module}")
         except ImportError as error:
@@ -94,7 +95,7 @@ def _builder(task: str) -> Any:
 
 
 class _Row:
-    """A state of its own on a shared model. Resets are gymnasium-robotics' own code, on a light copy of the builder."""
+    """A MuJoCo state on a shared model. Resets run gymnasium-robotics' code on a light copy of its environment."""
 
     def __init__(self, task: str) -> None:
         built = _builder(task)
@@ -103,20 +104,20 @@ class _Row:
         self._env = object.__new__(type(built))
         self._env.__dict__.update(built.__dict__, data=data, mujoco_renderer=None)
         self.path = str(built.fullpath)
-        self.has_thing, self._blocked = bool(built.has_object), bool(built.block_gripper)
+        self.has_object, self._blocked = bool(built.has_object), bool(built.block_gripper)
         self.goal: Array = np.zeros(3)
 
         hand = self._model.body("robot0:gripper_link").id
-        self.bodies = BodyPoses(data.xpos, data.xquat)  # as they are now
+        self.bodies = BodyPoses(data.xpos, data.xquat)  # views of the present state
         self._hand = data.xpos[hand], data.xquat[hand]
         self._mocap = data.mocap_pos[0], data.mocap_quat[0]
         self._fingers = [int(self._model.joint(name).qposadr[0]) for name in _FINGERS]
-        # The order of the drives, which are driven from where their fingers are; two tasks of the four have none.
+        # In the order of the actuators, whose controls count from the fingers' positions; two of the tasks have none.
         self._driven = self._model.jnt_qposadr[self._model.actuator_trnid[:, 0]]
         self._target = self._model.site("target0").id
         self._sites = [data.site_xpos[self._model.site("robot0:grip").id]]
         self._quaternion: Array | None = None
-        if self.has_thing:
+        if self.has_object:
             self._sites.append(data.site_xpos[self._model.site("object0").id])
             self._quaternion = data.xquat[self._model.body("object0").id]
         self._warnings = data.warning.number
@@ -128,7 +129,7 @@ class _Row:
         self._read(read)
 
     def simulate(self, displacement: Array, effort: np.float64, read: Array, warnings: NDArray[np.int32]) -> None:
-        """Simulate 20 steps of physics and fill ``read`` (12,) and ``warnings`` (3,); ``displacement`` is in metres."""
+        """Simulate 20 steps of physics; fill ``read`` (12,) and ``warnings`` (3,). ``displacement`` is in metres."""
         data = self.data
         np.add(self._hand[0], displacement, out=self._mocap[0])
         np.add(self._hand[1], _TURN, out=self._mocap[1])
@@ -148,28 +149,28 @@ class _Row:
             read[5:8], read[8:] = self._sites[1], self._quaternion
 
     def seen(self) -> tuple[RowModel, Any]:
-        """Its model and data, the mark of the target at the goal; no physics reads that site."""
+        """Return the model and the data, with the target's mark, which does not affect physics, at the goal."""
         self.data.site_xpos[self._target] = self.goal
         return RowModel(self.path, self._model), self.data
 
 
 class FetchEngine(ThreadedEngine):
-    """Simulates rows of FetchReach-v4, FetchPush-v4, FetchSlide-v4 and FetchPickAndPlace-v4.
+    """An engine for FetchReach-v4, FetchPush-v4, FetchSlide-v4 and FetchPickAndPlace-v4.
 
-    Its states, goals and successes are gymnasium-robotics', bit for bit, whatever the number of threads and whatever a
-    row did before: those of ``gymnasium.make(id)`` after ``reset(seed=seed)`` and the same actions. The action that
-    equals (right, away, up, effort) there is (away, -right, up, -effort), of the same dtype: float32 stays float32. A
-    displacement of 1 asks for 5 cm, of which the hand makes 3.2 in a step. The gripper's effort counts from where the
-    fingers are: 0 leaves them there, without the force that holds a puck. Reach, push and slide keep them closed.
+    States, goals and successes equal those of ``gymnasium.make(id)`` after ``reset(seed=seed)`` and the same actions,
+    bit for bit, for any number of threads. Our action (right, away, up, effort) is gymnasium-robotics' (away, -right,
+    up, -effort), in the same dtype. A displacement of 1 requests 5 cm, of which the hand moves 3.2 cm in a step. The
+    gripper's effort counts from the present position of the fingers, so 0 holds no puck. Reach, push and slide keep the
+    fingers closed.
 
     Observations have 25 numbers (:data:`~lw_torchrl.suites.fetch.FETCH`), in metres and in Meta-World's axes. Reach has
-    no object: its numbers are zeros, and its goal is the hand's, 3 cm above the grip site's goal. Rows fault as in
+    zeros for its missing object, and its goal is the hand's, 3 cm above the grip site's. Rows fault as in
     :class:`~lw_torchrl.suites.metaworld.vectorized_engine.VectorizedEngine`.
 
     Args:
         tasks: the task of each row.
-        reward: "sparse" for the success as 0 and 1; "dense" for minus the distance to the goal, metres.
-        num_threads: number of threads that simulate; None for one a core.
+        reward: "sparse" for the success as 0 or 1; "dense" for minus the distance to the goal, metres.
+        num_threads: number of threads that simulate; None for one per core.
 
     Source: Plappert et al., 'Multi-Goal Reinforcement Learning'; gymnasium-robotics 1.4.2.
     """
@@ -180,10 +181,10 @@ class FetchEngine(ThreadedEngine):
         self._dense = check_choice("reward", reward, ("sparse", "dense")) == "dense"
         tasks = [check_choice("task", task, _SCENES) for task in tasks]
         n = len(tasks)
-        super().__init__([""] * n, FETCH, num_threads)  # rows share what they read alone: any of them may be together
+        super().__init__([""] * n, FETCH, num_threads)  # shared models are only read, so rows need no grouping by model
         self._rows = [_Row(task) for task in tasks]
         self._origin = np.array([_SCENES[task].origin for task in tasks]).reshape(n, 3)
-        self._has_thing = np.array([row.has_thing for row in self._rows], dtype=bool)
+        self._has_object = np.array([row.has_object for row in self._rows], dtype=bool)
         self._read = np.zeros((n, _READ))
 
     def _reset_row(self, row: int, seed: int) -> None:
@@ -193,14 +194,14 @@ class FetchEngine(ThreadedEngine):
     def _observe_first(self, rows: Index) -> None:
         now = self._now(rows)
         goal = our_positions(self._goal[rows], self._origin[rows])
-        goal[:, 2] += np.where(self._has_thing[rows], 0.0, HAND_HEIGHT)
+        goal[:, 2] += np.where(self._has_object[rows], 0.0, HAND_HEIGHT)
         self._observation[rows] = np.concatenate((now, now, goal), axis=1)
 
     def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
         warnings = np.full((len(action), 3), WARNED_ALREADY, dtype=np.int32)
-        theirs = fetch_actions(np.clip(action, -1, 1))
-        displacement = (theirs[:, :3] * _METRES).astype(np.float64)  # multiplied in the action's own precision
-        effort = theirs[:, 3].astype(np.float64)
+        action = fetch_actions(np.clip(action, -1, 1))
+        displacement = (action[:, :3] * _METRES).astype(np.float64)  # multiplied in the action's own precision
+        effort = action[:, 3].astype(np.float64)
 
         def simulate(row: int) -> None:
             self._rows[row].simulate(displacement[row], effort[row], self._read[row], warnings[row])
@@ -211,7 +212,7 @@ class FetchEngine(ThreadedEngine):
         stable = np.isfinite(now).all(axis=1) & (warnings[rows] == WARNED_ALREADY).all(axis=1)
         self._faulted[rows[~stable]] = True
         rows, now = rows[stable], now[stable]
-        achieved = np.where(self._has_thing[rows, None], self._read[rows, 5:8], self._read[rows, :3])
+        achieved = np.where(self._has_object[rows, None], self._read[rows, 5:8], self._read[rows, :3])
         distance = np.linalg.norm(achieved - self._goal[rows], axis=-1)
         success[rows] = distance < _SUCCESS
         reward[rows] = -distance if self._dense else success[rows]
@@ -225,16 +226,16 @@ class FetchEngine(ThreadedEngine):
         now[:, :3] = our_positions(read[:, :3], origin)
         now[:, 2] += HAND_HEIGHT
         now[:, 3] = np.clip((read[:, 3] + read[:, 4]) / OPEN, 0.0, 1.0)
-        thing = self._has_thing[rows]
-        now[thing, 4:7] = our_positions(read[thing, 5:8], origin[thing])
-        now[thing, 7:] = our_quaternions(read[thing, 8:])
+        objects = self._has_object[rows]
+        now[objects, 4:7] = our_positions(read[objects, 5:8], origin[objects])
+        now[objects, 7:] = our_quaternions(read[objects, 8:])
         return now
 
     def poses(self, row: int) -> BodyPoses:
-        """Where all bodies of a row are now, in our axes."""
+        """Return the present poses of all bodies of a row, in our axes."""
         position, quaternion = super().poses(row)
         return BodyPoses(our_positions(position, self._origin[row]), turned_quaternions(quaternion))
 
     def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        """As :meth:`SeenRows.render`, by one of Fetch's own cameras."""
+        """Return images as :meth:`SeenRows.render` does, by one of Fetch's own cameras."""
         return super().render(rows, camera=check_choice("camera", camera, CAMERAS), height=height, width=width)

@@ -1,4 +1,4 @@
-"""Meta-World's dense reward of many rows at once, bit for bit."""
+"""Meta-World's dense reward for many rows at once, bit for bit."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,7 +16,7 @@ FULL_REWARD = 10.0
 
 
 class EpisodeStarts:
-    """What rewards need of the beginning of an episode, one entry a row."""
+    """The numbers of an episode's first state that rewards need, with one entry per row."""
 
     def __init__(self, rewards: Sequence[TaskReward]) -> None:
         for reward in rewards:
@@ -43,7 +43,7 @@ class EpisodeStarts:
 
 
 class DenseReward:
-    """Rewards a fixed set of rows, of which ``starts`` are those of all rows."""
+    """Computes the rewards of a fixed set of rows; ``starts`` are those of all rows of the engine."""
 
     def __init__(self, starts: EpisodeStarts, rows: Index) -> None:
         self._starts, self._rows = starts, rows
@@ -54,10 +54,10 @@ class DenseReward:
         self._lifts = [(LIFTS[name], np.flatnonzero(task.lift == name)) for name in np.unique(task.lift) if name]
         self._formulas = [(FORMULAS[name], np.flatnonzero(task.formula == name)) for name in np.unique(task.formula)]
 
-    @np.errstate(all="ignore")  # rows whose simulation broke, and branches that are not taken, may hold anything
+    @np.errstate(all="ignore")  # unstable rows, and branches that are not used, may hold any number
     def __call__(self, sensors: Array, observation: Array, goal: Array, action: NDArray[Any]) -> Array:
-        """(rows,) as Meta-World's ``compute_reward``, of sensors (rows, REWARD_WIDTH), observations (rows, 39), goals
-        (rows, 3) and actions (rows, 4) in their own precision."""
+        """Return rewards (rows,) as Meta-World's ``compute_reward``, from sensors (rows, REWARD_WIDTH), observations
+        (rows, 39), goals (rows, 3) and actions (rows, 4) in their own precision."""
         task, less, points = self._task, self._starts.less[self._rows], self._starts.points[self._rows]
         features = terms.gather_features(task, sensors, observation[:, CURRENT], goal, points)
         proximity = self._proximity(features, less)

@@ -17,19 +17,19 @@ from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 from lw_torchrl.suites.metaworld.plain_engine import import_metaworld
 
-_quiet = Lock()  # Python's filters of warnings are the process's: two threads would leave ours behind
+_quiet = Lock()  # warning filters belong to the process: two threads at once would not restore them
 
 
 class ExpertActor(TensorDictModuleBase):
-    """Meta-World's scripted policy of each row's task.
+    """Meta-World's scripted policies, one for each row's task.
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``action`` (B, 4) float32, clipped to [-1,
     1], and ``unclipped_action`` (B, 4) float32, the script's action, usually far larger. Rows that a ``_step`` mask
-    (B,) leaves out get zeros. A task_id outside ``tasks`` raises a ValueError.
+    (B,) excludes get zeros. Raises ValueError for a task_id that is not one of ``tasks``.
 
     Args:
-        tasks: the tasks that it knows, as for :func:`resolve_tasks`.
-        in_keys, out_keys: other names for these keys, in the order above; nested keys are allowed.
+        tasks: the tasks of its rows, as for :func:`resolve_tasks`.
+        in_keys, out_keys: other names for these keys, in this order; nested keys are allowed.
 
     Example:
         >>> import lw_torchrl as lw
@@ -40,7 +40,7 @@ class ExpertActor(TensorDictModuleBase):
     Source: ``metaworld.policies``.
     """
 
-    row_by_row = True  # no network: its rows need no blocks of one size
+    row_by_row = True  # a row's action depends only on that row, also bit for bit
 
     def __init__(
         self,
@@ -58,21 +58,19 @@ class ExpertActor(TensorDictModuleBase):
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        observation, given = read(tensordict, self.in_keys)
-        if observation.shape[-1:] != (METAWORLD.size,):
-            raise ValueError(f"observation must have 39 numbers, got shape {tuple(observation.shape)}")
-        if given.shape != observation.shape[:-1]:
-            shape = tuple(observation.shape[:-1])
-            raise ValueError(f"task_id must be of shape {shape}, one per observation, got {tuple(given.shape)}")
+        observation, ids = read(tensordict, self.in_keys)
+        if observation.shape[-1:] != (METAWORLD.size,) or ids.shape != observation.shape[:-1]:
+            shapes = f"{tuple(observation.shape)} and {tuple(ids.shape)}"
+            raise ValueError(f"observation must have shape (B, 39) and task_id (B,), got {shapes}")
         states = observation.reshape(-1, METAWORLD.size).cpu().numpy().astype(np.float64)
-        task_ids = given.reshape(-1).tolist()
+        task_ids = ids.reshape(-1).tolist()
         action = np.zeros((len(task_ids), METAWORLD.action_size), dtype=np.float32)
         with _quiet, warnings.catch_warnings():
-            # The scripts warn nearly every step that they ask for more than [-1, 1].
+            # The scripts warn at nearly every step that their actions exceed [-1, 1].
             warnings.filterwarnings("ignore", message="Constant\\(s\\) may be too high")
             for row in np.flatnonzero(row_mask(tensordict, "_step", len(task_ids))):
                 if (task := task_ids[row]) not in self._policies:
-                    raise ValueError(f"task_id {task} is none of this expert's tasks: {', '.join(self.tasks)}")
+                    raise ValueError(f"task_id {task} is not one of this expert's tasks: {', '.join(self.tasks)}")
                 action[row] = self._policies[task].get_action(states[row])
-        asked = torch.from_numpy(action).to(observation.device).reshape(*observation.shape[:-1], METAWORLD.action_size)
-        return write(tensordict, self, [asked.clamp(-1.0, 1.0), asked])
+        unclipped = torch.from_numpy(action).to(observation.device).reshape(*ids.shape, METAWORLD.action_size)
+        return write(tensordict, self, [unclipped.clamp(-1.0, 1.0), unclipped])

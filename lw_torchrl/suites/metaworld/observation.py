@@ -1,4 +1,4 @@
-"""What is read from the states after each step, and the observations and successes made of it."""
+"""Sensors, the numbers read from each state after a step, and the observations and successes made of them."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -13,8 +13,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-# The columns of the sensors. The first 18 are laid out like the observation, whose number 3, the opening of the
-# gripper, is computed. Columns that a task does not have hold arbitrary numbers.
+# Columns of the sensors. The first 18 have the order of the observation, whose number 3, the gripper's opening, is
+# computed. Columns that a task lacks hold arbitrary numbers.
 HAND = slice(0, 3)
 GRIPPER = 3
 OBJECT = slice(4, 7)
@@ -31,7 +31,7 @@ POINT = slice(39, 42)
 JOINT = slice(42, 43)
 WIDTH = 43
 
-# Of the dense reward only.
+# Only for the dense reward.
 LEFT_PAD = slice(43, 46)
 RIGHT_PAD = slice(46, 49)
 PLACE = slice(49, 52)
@@ -42,9 +42,8 @@ MATRIX_OF = "matrix of "
 
 
 class StateView:
-    """The arrays of a MuJoCo state, which are in one block of memory, as one, so that a single ``take`` reads from any:
-    joining ten small arrays, out of the processor's cache, costs four times as much. The state must outlive this view.
-    """
+    """One array over all arrays of a MuJoCo state, which share a block of memory. A single ``take`` then reads from all
+    of them; joining ten small arrays would take four times as long. The state must outlive this view."""
 
     def __init__(self, model: Any, data: Any) -> None:
         self._model = model
@@ -59,11 +58,12 @@ class StateView:
         self.numbers = as_strided(first, shape=(size // first.itemsize,), strides=(first.itemsize,))
 
     def find(self, what: str) -> Index:
-        """Where in ``numbers`` are the position of "body NAME", "geom NAME" or "site NAME"; the nine numbers of "matrix
-        of geom NAME", or of a body or site; the four of "quaternion of body NAME"; or the one of "joint NAME"."""
+        """Return the indices in ``numbers`` of the position of "body NAME", "geom NAME" or "site NAME"; of the nine
+        numbers of "matrix of geom NAME", also of a body or site; of the four of "quaternion of body NAME"; or of the
+        one of "joint NAME"."""
         kind, _, name = what.rpartition(" ")
         if kind not in self._arrays:
-            raise ValueError(f"a state has {', '.join(self._arrays)}, got {what!r}")
+            raise ValueError(f"a state has arrays of {', '.join(self._arrays)}, got {what!r}")
         named = getattr(self._model, kind.split()[-1])(name)
         row = named.qposadr[0] if kind == "joint" else named.id
         own = self._arrays[kind][row : row + 1]
@@ -75,7 +75,7 @@ def _address(array: Array) -> int:
 
 
 def sensor_index(window: StateView, sources: TaskSources, reward: TaskReward | None) -> Index:
-    """(WIDTH,) which numbers of the window make a task's row of sensors; (REWARD_WIDTH,) with a dense reward."""
+    """Return the indices of a task's sensors in the window, (WIDTH,), or (REWARD_WIDTH,) with a dense reward."""
     success = sources.success
     parts = [(HAND, "body hand"), (OBJECT, sources.object)]
     parts += [(RIGHT_CLAW, "body rightclaw"), (LEFT_CLAW, "body leftclaw")]
@@ -113,7 +113,7 @@ DIAL_RADIUS = 0.05  # metres
 
 
 class Observer:
-    """Makes the observations of a fixed set of rows, by Meta-World's operations in its order, bit for bit."""
+    """Computes the observations of a fixed set of rows with Meta-World's operations in its order, bit for bit."""
 
     def __init__(self, sources: Sequence[TaskSources]) -> None:
         self._matrices = np.flatnonzero([row.quaternion.startswith(MATRIX_OF) for row in sources])
@@ -130,7 +130,7 @@ class Observer:
             self._is_constant[k, SECOND_QUATERNION] = row.second is None or row.second_quaternion == "zeros"
 
     def current(self, sensors: Array) -> Array:
-        """(rows, 18) the part of the observation that describes the present state."""
+        """Return the part of the observation that describes the present state, (rows, 18)."""
         current = sensors[:, CURRENT].copy()
         np.copyto(current, self._constant, where=self._is_constant)
         span = row_norm(sensors[:, RIGHT_CLAW] - sensors[:, LEFT_CLAW])
@@ -148,19 +148,19 @@ class Observer:
 
 
 def row_norm(vectors: Array) -> Array:
-    """The length of each row, with the bits of ``np.linalg.norm`` of that row alone, which takes the dot product from
-    BLAS as ``vecdot`` does; a sum of squares over an axis rounds differently in one case out of nine."""
+    """Return the length of each row, with the bits of ``np.linalg.norm`` of a single row. Both use BLAS's dot product;
+    a sum of squares over an axis rounds differently in one case out of nine."""
     return np.sqrt(np.vecdot(vectors, vectors))
 
 
 def quaternion_of_matrix(matrix: Array) -> Array:
-    """(n, 4) quaternions, x y z w, of (n, 9) rotation matrices, with the bits of SciPy's
-    ``Rotation.from_matrix(...).as_quat()`` at a fraction of its cost."""
+    """Return quaternions (n, 4), x y z w, of rotation matrices (n, 9), with the bits of SciPy's
+    ``Rotation.from_matrix(...).as_quat()`` in a fraction of its time."""
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix.T
     trace = m00 + m11 + m22
     quaternion = np.stack((m21 - m12, m02 - m20, m10 - m01, 1.0 + trace))
-    # Most objects stand about upright and have a large w. Where another component is the largest, SciPy takes
-    # that one from the diagonal and the others from it, which loses fewer digits.
+    # Most objects are nearly upright and have a large w. If another component is the largest, SciPy computes it first,
+    # from the diagonal, and the others from it, which loses fewer digits.
     tilted = (trace <= m00) | (trace <= m11) | (trace <= m22)
     if tilted.any():
         for k in np.flatnonzero(tilted):
@@ -170,7 +170,7 @@ def quaternion_of_matrix(matrix: Array) -> Array:
 
 
 def _quaternion_of_tilted(m: list[list[float]], trace: float) -> list[float]:
-    """x, y, z, w, not yet of length 1, where w is not the largest. Few rows at a time: plain numbers are fast."""
+    """Return x, y, z, w, not yet of length 1, where w is not the largest. For few rows, plain numbers are fast."""
     i = max(range(3), key=lambda axis: m[axis][axis])
     j, k = (i + 1) % 3, (i + 2) % 3
     quaternion = [0.0, 0.0, 0.0, m[k][j] - m[j][k]]
@@ -181,8 +181,8 @@ def _quaternion_of_tilted(m: list[list[float]], trace: float) -> list[float]:
 
 
 class Scene(NamedTuple):
-    """The inputs of a rule, one entry a row: whether the point is as close to the goal as the table asks, the sensors,
-    the first 18 numbers of the observations, the goals (rows, 3), and the points (rows, 3) that are to reach them."""
+    """The inputs of a rule, with one entry per row: whether the point is near the goal, the sensors, the first 18
+    numbers of the observations, the goals (rows, 3), and the points (rows, 3) that must reach them."""
 
     near: Mask
     sensors: Array
@@ -197,8 +197,8 @@ STICK_UPWARD = 0.06
 
 
 class SuccessFunction:
-    """The success of a fixed set of rows; ``programs`` gives a row's present :class:`TaskProgram`, for the one rule
-    that looks at contacts."""
+    """Computes the success of a fixed set of rows. ``programs`` returns a row's present :class:`TaskProgram`, for the
+    one rule that reads contacts."""
 
     def __init__(self, sources: Sequence[TaskSources], programs: Callable[[int], Any]) -> None:
         success = [row.success for row in sources]
@@ -220,7 +220,8 @@ class SuccessFunction:
         ]
 
     def __call__(self, sensors: Array, current: Array, goal: Array) -> Mask:
-        """(rows,) whether each row succeeds, by sensors (rows, WIDTH), observations (rows, 18) and goals (rows, 3)."""
+        """Return whether each row succeeds, (rows,), from sensors (rows, WIDTH), observations (rows, 18), goals (rows,
+        3)."""
         point = current[:, OBJECT].copy()
         if self._seconds.size:
             point[self._seconds] = current[self._seconds, SECOND]
@@ -240,7 +241,7 @@ class SuccessFunction:
         return success
 
     def _point_below_goal(self, rows: Index, scene: Scene) -> Mask:
-        """The ring is over the peg and has sunk below its top."""
+        """The ring is around the peg, below its top."""
         return scene.near[rows] & (scene.goal[rows, 2] - scene.point[rows, 2] > 0.0)
 
     def _object_above_goal(self, rows: Index, scene: Scene) -> Mask:
@@ -274,7 +275,7 @@ class SuccessFunction:
             if not (current[GRIPPER] > 0.0 and lifted):
                 held[k] = False
                 continue
-            # Both pads must push against the stick, by the contact forces that Meta-World looks at.
+            # Both pads must push against the stick, by the contact forces that Meta-World reads.
             model, data, pairs = program.model, program.data, program.data.contact.geom
             touched = (pairs == model.geom("objGeom").id).any(axis=1)
             for pad in ("leftpad_geom", "rightpad_geom"):

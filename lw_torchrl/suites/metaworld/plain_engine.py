@@ -14,11 +14,11 @@ from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import EngineStep, RowModel
 
 UNSTABLE = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
-"""MuJoCo's three warnings of an unstable simulation: bad positions, velocities or accelerations."""
+"""MuJoCo's three warnings about an unstable simulation: bad positions, velocities or accelerations."""
 
 
 def import_metaworld() -> Any:
-    """Import Meta-World; the error names a missing rendering library."""
+    """Import Meta-World; an error names a missing rendering library."""
     with naming_absent_renderer():
         import metaworld
         import metaworld.policies
@@ -26,8 +26,8 @@ def import_metaworld() -> Any:
 
 
 def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
-    """Meta-World's own environment of ``task``, goal observable, a new initial state and goal at every reset. Seed it
-    with ``env.seed(seed)``; Meta-World ignores ``reset(seed=...)``."""
+    """Return Meta-World's own environment of a task, with an observable goal and a new initial state at every reset.
+    Seed it with ``env.seed(seed)``: Meta-World ignores ``reset(seed=...)``."""
     import_metaworld()
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
 
@@ -40,13 +40,13 @@ def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
 
 
 class MetaWorldEngine(SeenRows):
-    """Meta-World's ``env.step`` in a loop, in one thread: slow, and the oracle for every other engine."""
+    """An engine that runs Meta-World's own environments in a loop, in one thread: slow; the others' oracle."""
 
     def __init__(
         self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: int | None = None
     ) -> None:
         self._dense = reward == "dense"
-        # The environment above counts the steps; Meta-World's own limit must not come first.
+        # LanguageWorldEnv counts the steps; Meta-World's own limit must not come first.
         self._envs = [make_metaworld_env(task, max_steps=2**31 - 1) for task in tasks]
         self._last = np.zeros((len(self._envs), METAWORLD.size))
 
@@ -64,7 +64,7 @@ class MetaWorldEngine(SeenRows):
         for row in np.flatnonzero(active):
             env = self._envs[row]
             observation, dense, _, _, info = env.step(action[row])
-            # MuJoCo silently restarts an unstable simulation, and only counts a warning; a reset clears it.
+            # MuJoCo restarts an unstable simulation silently and only counts a warning, which a reset clears.
             warned = env.data.warning.number[UNSTABLE].any()
             if warned or env._did_see_sim_exception or not np.isfinite(observation).all():
                 fault[row] = True

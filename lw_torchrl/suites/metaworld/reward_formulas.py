@@ -1,4 +1,4 @@
-"""The formula of each kind of reward, and the lifts: how well a held object is on its way to the goal."""
+"""The formula of each kind of reward, and the lifts, which measure a held object's progress to the goal."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, row_norm
 from lw_torchrl.suites.metaworld.reward_terms import Numbers, hamacher_product, limited, square, tolerance
 
 Cast = Callable[[Any], Any]
-"""Brings numbers to the precision that a formula is computed in: single, where a number of a float32 action takes part,
-for NumPy gives way to it where a plain Python number meets it."""
+"""Converts numbers to the precision of a formula: single if a number of a float32 action takes part, because NumPy
+keeps single precision when Python's numbers are added."""
 
 Formula = Callable[["StepState", Index, Cast], Numbers]  # (state, rows, cast) -> (len(rows),) their rewards
 
 
 @dataclass
 class StepState:
-    """All rows after one step, one entry a row."""
+    """The state of all rows after a step, with one entry per row."""
 
     task: terms.Parameters
     features: Array  # (rows, FEATURES)
@@ -28,19 +28,19 @@ class StepState:
     near: Array  # the values of these terms
     placed: Array
     via: Array
-    above: Array  # how well the hand keeps above the floor of the funnel
-    lift: Array  # how well a held object is on its way to the goal
-    wide: Mask  # where ``lift`` is a NumPy number, not a Python one, so that single precision gives way to it
+    above: Array  # how well the hand stays above the floor of the funnel
+    lift: Array  # the progress of a held object to the goal
+    wide: Mask  # where ``lift`` is a NumPy number in Meta-World, so that single precision becomes double
     grasp: Array  # how well the object is gripped
     narrow: Mask  # where a number of the action takes part, so that the reward has the action's precision
-    closed: Numbers  # how far the gripper is told to close, from 0 to 1
+    closed: Numbers  # the gripper's closing command, from 0 to 1
     effort: Numbers  # the gripper's action, from 0, open, to 1, closed
     held: Mask  # whether the object counts as held
 
 
 def _by_name(*functions: Any) -> dict[str, Any]:
     """Functions by their names in data/rewards.toml."""
-    return {one.__name__.replace("_", " "): one for one in functions}
+    return {function.__name__.replace("_", " "): function for function in functions}
 
 
 TO_HANDLE = np.array([-0.05, 0.0, 0.0])
@@ -53,7 +53,7 @@ def reach(s: StepState, rows: Index, cast: Cast) -> Array:
 
 
 def press(s: StepState, rows: Index, cast: Cast) -> Array:
-    """Be near with the gripper open (``shut``: closed); where held, press as well. ``weights`` of the two."""
+    """Come near with the gripper open (``shut``: closed), then press, with two ``weights``."""
     opening = s.features[rows, at.GRIPPER]
     opening = np.where(s.task.shut[rows], 1 - opening, opening)
     first, second = s.task.weights[rows].T
@@ -75,20 +75,20 @@ def weighted_sum(s: StepState, rows: Index, cast: Cast) -> Array:
 
 
 def both(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Near as well as placed, times ``factor``; ``gripper``: and the gripper is told to close."""
+    """Near and placed, times ``factor``; with ``gripper``, also the closing command."""
     near = cast(s.near[rows])
     near = np.where(s.task.gripper[rows], hamacher_product(near, cast(s.closed[rows])), near)
     return cast(s.task.factor[rows]) * hamacher_product(near, cast(s.placed[rows]))
 
 
 def slide(s: StepState, rows: Index, cast: Cast) -> Array:
-    """Come near; low down and near, slide."""
+    """Come near, then slide while low and near."""
     low = s.features[rows, terms.TCP.start + 2] <= 0.03
     return np.where(low & s.held[rows], 2 + 7 * s.placed[rows], 1.5 * s.near[rows])
 
 
 def door(s: StepState, rows: Index, cast: Cast) -> Array:
-    """Come to the handle from above, told to close the gripper, and turn the door."""
+    """Come to the handle from above, close the gripper, and turn the door."""
     features = s.features[rows]
     handle, angle = features[:, at.OBJECT], -features[:, at.JOINT.start]
     near = tolerance(row_norm(features[:, at.HAND] - (handle + TO_HANDLE) - BESIDE_HANDLE), 0.0, 0.06, 0.5)
@@ -100,7 +100,7 @@ def door(s: StepState, rows: Index, cast: Cast) -> Array:
 
 
 def lid(s: StepState, rows: Index, cast: Cast) -> Array:
-    """Come to the lid from above, told to close the gripper, lift it and bring it over the box, all of it upright."""
+    """Come to the lid from above, close the gripper, lift the lid and bring it over the box, upright all the time."""
     ready = hamacher_product(s.above[rows], s.near[rows])
     lifted = 0.2 * (s.features[rows, at.OBJECT.stop - 1] + 0.02 > 0.04) + 0.8 * s.placed[rows]
     reward = 2.0 * hamacher_product(s.effort[rows], ready) + 8.0 * lifted
@@ -109,7 +109,7 @@ def lid(s: StepState, rows: Index, cast: Cast) -> Array:
 
 
 def turned_like(quaternion: Array, ideal: Array, margin: float) -> Array:
-    """1 where a quaternion is the ideal one, 0 from ``margin`` on."""
+    """Return 1 for the ideal quaternion, and 0 from a distance of ``margin`` on."""
     return np.maximum(1.0 - row_norm(quaternion - ideal) / margin, 0.0)
 
 
@@ -118,7 +118,7 @@ LYING = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def carry(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Grip and place; where held, 1 more, and ``bonus`` times the lift."""
+    """Grip and place; if held, add 1 and ``bonus`` times the lift."""
     reward = hamacher_product(cast(s.grasp[rows]), cast(s.placed[rows]))
     more = 1.0 + s.task.bonus[rows] * s.lift[rows]
     carried = np.where(s.wide[rows], reward + more, reward + cast(more))
@@ -126,7 +126,7 @@ def carry(s: StepState, rows: Index, cast: Cast) -> Any:
 
 
 def _by_way(s: StepState, rows: Index, cast: Cast, gripped: Any) -> Any:
-    """Where held, first to a point at the wall; what is beyond the wall, to the goal."""
+    """Bring a held object first to a point at the wall, and beyond the wall to the goal."""
     coming = gripped + 1.0 + cast(4.0 * s.via[rows])
     going = gripped + 1.0 + 4.0 + cast(3.0 * s.placed[rows])
     carried = np.where(s.features[rows, at.OBJECT.start + 1] > 0.75, going, coming)
@@ -159,7 +159,7 @@ def sweep(s: StepState, rows: Index, cast: Cast) -> Any:
 
 
 def soccer(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Less where the ball comes to the goal line beside the goal."""
+    """Grip and place, less for a ball that crosses the goal line beside the goal."""
     ball, goal = s.features[rows, at.OBJECT], s.features[rows, terms.GOAL]
     placed, line = s.placed[rows], goal[:, 1] - 0.1
     missed = (ball[:, 1] > line) & (np.abs(ball[:, 0] - goal[:, 0]) > 0.1)
@@ -169,13 +169,13 @@ def soccer(s: StepState, rows: Index, cast: Cast) -> Any:
 
 
 def _with_tool(s: StepState, rows: Index, cast: Cast, placed: Array, upright: Array) -> Any:
-    """Grip and place, all of it turned as the tool should be."""
+    """Grip and place a tool, times how well it is oriented."""
     turned = turned_like(s.features[rows, at.QUATERNION], upright, 0.4)
     return (2.0 * cast(s.grasp[rows]) + cast(6.0 * placed)) * cast(turned)
 
 
 def peg(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Bring the ring over the peg: far away high up, then down."""
+    """Bring the ring over the peg from high above, then down."""
     ring = s.features[rows, at.PLACE]
     error = s.features[rows, terms.GOAL] - ring
     radius = row_norm(error[:, :2])
@@ -205,14 +205,14 @@ def hammer(s: StepState, rows: Index, cast: Cast) -> Any:
 
 
 def stick_push(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Grip the stick; held, bring it and with it the container to the goal."""
+    """Grip the stick and push the container with it to the goal."""
     carried = 2.0 + 5.0 * s.via[rows] + 3.0 * s.placed[rows]
     carried = np.where(s.proximity.distance[rows, terms.PLACED] <= 0.12, 10.0, carried)
     return np.where(s.held[rows], carried, cast(s.grasp[rows]))
 
 
 def stick_pull(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Grip the stick, bring it to the handle; once through it, pull the container to the goal."""
+    """Grip the stick, put it through the handle, and pull the container to the goal."""
     features = s.features[rows]
     stick, handle = features[:, at.OBJECT], features[:, at.SECOND]
     end, goal = features[:, at.PLACE], features[:, terms.GOAL]
@@ -238,32 +238,32 @@ FORMULAS: dict[str, Formula] = {
 
 
 def over_funnel(s: StepState, rows: Index) -> None:
-    """The hand is to come from above, and to stay so."""
+    """The hand must come from above and stay above."""
     s.lift[rows] = hamacher_product(s.above[rows], s.placed[rows])
 
 
 def into_box(s: StepState, rows: Index) -> None:
-    """The peg's head counts as less placed within two corners of the box, where it would collide."""
+    """The peg's head is worth less within two corners of the box, where it would collide."""
     features = s.features[rows]
     head = features[:, at.PLACE]
     zero_1, one_1, zero_2, one_2 = features[:, at.CORNERS].reshape(-1, 4, 3).transpose(1, 0, 2)
     (first, in_first), (second, in_second) = _within_prism(head, zero_1, one_1), _within_prism(head, zero_2, one_2)
     s.placed[rows] = s.lift[rows] = hamacher_product(s.placed[rows], hamacher_product(second, first))
-    s.narrow[rows] &= ~(in_first | in_second)  # a NumPy number then, to which single precision gives way
+    s.narrow[rows] &= ~(in_first | in_second)  # in Meta-World then a NumPy number, which makes the reward double
 
 
 def _within_prism(point: Array, zero: Array, one: Array) -> tuple[Array, Any]:
-    """Within a box, the product of how far the point is along each axis; 1 outside. And whether it is within."""
+    """Return the product of a point's relative positions along the axes of a box, or 1 outside; and if it is inside."""
     inside = ((np.minimum(zero, one) <= point) & (point <= np.maximum(zero, one))).all(axis=1)
     x, y, z = ((point - zero) / (one - zero)).T
     return np.where(inside, x * y * z, 1.0), inside
 
 
 def onto_shelf(s: StepState, rows: Index) -> None:
-    """In front of the shelf and below its board the object counts as less placed, under the board as not at all."""
+    """The object is worth less in front of the shelf and below its board, and nothing under the board."""
     features = s.features[rows]
-    thing, goal, placed = features[:, at.OBJECT], features[:, terms.GOAL], s.placed[rows]
-    x, y, z = thing.T
+    goal, placed = features[:, terms.GOAL], s.placed[rows]
+    x, y, z = features[:, at.OBJECT].T
     low = (z > 0.0) & (z < 0.24) & (goal[:, 0] - 0.15 < x) & (x < goal[:, 0] + 0.15)
     edge = goal[:, 1] - 3 * 0.05
     before, under = low & (edge < y) & (y < goal[:, 1]), low & (y > goal[:, 1])

@@ -1,4 +1,4 @@
-"""What rewards are made of: the numbers of data/rewards.toml as arrays, features and terms, of all rows at once."""
+"""The parts of dense rewards: the numbers of data/rewards.toml as arrays, features, and terms, for all rows at once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lw_torchrl.suites.metaworld import tables
 from lw_torchrl.suites.metaworld.observation import Array, Mask, row_norm
 from lw_torchrl.suites.metaworld.tables import FIRST_DISTANCE, POINTS, Cage, Funnel, Held, TaskReward, Term
 
-# The columns of the features: first the sensors, then these. The first four are constant within an episode.
+# Columns of the features: the sensors, then these, of which the first four are constant in an episode.
 START, TCP_START, MARK, CONSTANT, GOAL, TCP, GRIP = (
     slice(at.REWARD_WIDTH + 3 * number, at.REWARD_WIDTH + 3 * number + 3) for number in range(7)
 )
@@ -35,9 +35,9 @@ _NO_FUNNEL = Funnel(over="hand", about=("object",), rim=0.0, slope=0.0, height=0
 
 
 class Parameters(SimpleNamespace):
-    """Arrays over the rows: the numbers of :class:`TaskReward`, and of its parts ``cage``, ``funnel`` and ``held``. The
-    last axes of ``points`` and ``offset`` are [distance or margin][first point, second point][term][x, y, z], of the
-    other arrays of terms the term."""
+    """Arrays over the rows with the numbers of :class:`TaskReward` and of its parts ``cage``, ``funnel`` and ``held``.
+    After the row, ``points`` and ``offset`` have the axes [distance or margin][first or second point][term][x, y, z];
+    the other arrays of terms have [term]."""
 
     def of(self, rows: Any) -> Parameters:
         own = vars(self).items()
@@ -94,7 +94,8 @@ def _points(reward: TaskReward) -> list[list[list[list[int]]]]:
 
 
 def _less(term: Term) -> float:
-    """What is taken from the distance of the margin's points; a margin that is a number has one point twice."""
+    """Return the number subtracted from the distance of the margin's points. A margin that is a number has the same
+    point twice, so that this number is the margin."""
     if isinstance(term.margin, tuple):
         return term.less
     if term.margin == FIRST_DISTANCE:
@@ -103,7 +104,7 @@ def _less(term: Term) -> float:
 
 
 def gather_features(task: Parameters, sensors: Array, current: Array, goal: Array, episode: Array) -> Array:
-    """(rows, FEATURES): sensors and observation, then the points that only rewards use."""
+    """Return features (rows, FEATURES): sensors and observation, then the points that only rewards use."""
     features = np.empty((len(sensors), FEATURES))
     features[:, : at.REWARD_WIDTH] = sensors
     features[:, at.CURRENT] = current
@@ -118,7 +119,7 @@ def gather_features(task: Parameters, sensors: Array, current: Array, goal: Arra
 
 
 Numbers = NDArray[np.floating]
-"""Single or double precision: Meta-World computes with the gripper's action in the action's own."""
+"""Single or double precision: Meta-World uses the action's precision where the gripper's action takes part."""
 
 AT_MARGIN = 0.1  # the value at a distance of one margin
 LONG_TAIL = np.sqrt(1 / AT_MARGIN - 1)
@@ -126,49 +127,49 @@ GAUSSIAN = np.sqrt(-2 * np.log(AT_MARGIN))
 
 
 def square(x: Array) -> Array:
-    """The square as C's ``pow`` gives it, and so Python and NumPy for a single number; an array's ``x**2`` is
-    ``x * x``, which differs in the last bit in one case out of a thousand."""
+    """Return the square by C's ``pow``, as Python and NumPy do for a single number. For an array, ``x**2`` is ``x *
+    x``, whose last bit differs in one case out of a thousand."""
     return np.float_power(x, 2.0)
 
 
 def long_tail(margins: Array) -> Array:
-    """From 1 at 0 to 0.1 at 1; beyond, it falls slowly."""
+    """Return a curve from 1 at 0 to 0.1 at 1, which then falls slowly."""
     return 1 / (square(margins * LONG_TAIL) + 1)
 
 
 def gaussian(margins: Array) -> Array:
-    """From 1 at 0 to 0.1 at 1; beyond, it falls fast to 0."""
+    """Return a curve from 1 at 0 to 0.1 at 1, which then falls quickly to 0."""
     return np.exp(-0.5 * square(margins * GAUSSIAN))
 
 
 def tolerance(x: Array, lower: Array | float, upper: Array | float, margin: Array | float) -> Array:
-    """1 from ``lower`` to ``upper``, beyond a long tail; a margin of 0 is a sharp edge."""
+    """Return 1 from ``lower`` to ``upper``, and a long tail outside; a margin of 0 makes a sharp edge."""
     margins = np.where(x < lower, lower - x, x - upper) / margin
     return np.where((lower <= x) & (x <= upper), 1.0, long_tail(margins))
 
 
 def hamacher_product(a: Numbers, b: Numbers) -> Numbers:
-    """Both of two numbers from 0 to 1, as a number from 0 to 1."""
+    """Return the fuzzy "and" of two numbers from 0 to 1."""
     product = a * b
     either = a + b - product
     return np.where(either > 0, product / either, product)
 
 
 def limited(x: Numbers, low: float, high: float) -> Numbers:
-    """``np.clip`` at a third of its cost for few numbers."""
+    """Clip as ``np.clip``, in a third of its time for few numbers."""
     return np.minimum(np.maximum(x, low), high)
 
 
 class Proximity(NamedTuple):
-    """How close two points are, for every term of every row, each (rows, 4)."""
+    """How close two points are, for every term of every row; all arrays are (rows, 4)."""
 
     distance: Array
-    margin: Array  # how much further the value falls to 0.1
-    value: Array  # 1 where the points are close, less where they are not
+    margin: Array  # the further distance at which the value is 0.1
+    value: Array  # 1 if the points are close, less if they are not
 
 
 class ProximityTerms:
-    """How close pairs of points are, for a fixed set of rows."""
+    """Measures how close pairs of points are, for a fixed set of rows."""
 
     def __init__(self, task: Parameters) -> None:
         row = np.arange(len(task.within)).reshape(-1, 1, 1, 1, 1) * FEATURES
@@ -181,8 +182,8 @@ class ProximityTerms:
         self._gaussian = np.nonzero(task.gaussian)
 
     def __call__(self, features: Array, less: Array) -> Proximity:
-        """Measure features (rows, FEATURES). ``less`` (rows, 4) is taken from the distance of a margin's points; NaN is
-        replaced by the present distance, and makes it the margin."""
+        """Measure features (rows, FEATURES). ``less`` (rows, 4) is subtracted from the distance of a margin's points;
+        NaN in it is replaced by the present distance, which becomes the margin."""
         numbers = features.reshape(-1)
         difference = numbers.take(self._first)
         difference += self._offset
@@ -200,14 +201,14 @@ class ProximityTerms:
         return Proximity(distance, margin, value)
 
 
-CAGED = 0.97  # from here on it counts that the gripper closes
+CAGED = 0.97  # above this value, closing the gripper counts
 CAGED_FOR_PINCH = 0.95
 PADS = np.array([at.LEFT_PAD.start + 1, at.RIGHT_PAD.start + 1])
 SIDES = np.array([1.0, -1.0])
 
 
 class CagingTerm:
-    """How well the gripper encloses and grips the object, for a fixed set of rows."""
+    """Measures how well the gripper encloses and grips the object, for a fixed set of rows."""
 
     def __init__(self, task: Parameters) -> None:
         self._rows = np.flatnonzero(task.cage.used)
@@ -224,9 +225,9 @@ class CagingTerm:
         self._pinch = (cage.radius + cage.pinch)[self._pinching][:, None]
 
     def __call__(self, features: Array, near: Proximity, closed: Numbers, narrow: Mask) -> tuple[Array, Mask]:
-        """Values (rows,) from 0 to 1 of features (rows, FEATURES), and where they have the action's precision, because
-        ``closed`` takes part. ``closed`` (rows,) is how far the gripper is told to close, in that precision; ``narrow``
-        (rows,) where it is a number of the action itself, not a bound of its range."""
+        """Return values (rows,) from 0 to 1 for features (rows, FEATURES), and in which rows they have the action's
+        precision because ``closed`` takes part. ``closed`` (rows,) is the gripper's closing command in that precision;
+        ``narrow`` (rows,) is true if it is a number of the action, not a bound of its range."""
         rows = self._rows
         numbers = features.reshape(-1)
         pads, where = numbers.take(self._pads), numbers.take(self._object)
@@ -261,11 +262,11 @@ class CagingTerm:
         return np.where(high | medium, (both + other) / 2, both)
 
 
-FUNNEL_DEPTH = 0.01  # metres below the floor that still count as above
+FUNNEL_DEPTH = 0.01  # metres below the floor that still count as above it
 
 
 class FunnelTerm:
-    """Whether the hand keeps above a funnel's floor on its way, for a fixed set of rows."""
+    """Measures whether the hand stays above a funnel's floor, for a fixed set of rows."""
 
     def __init__(self, task: Parameters) -> None:
         self._rows = np.flatnonzero(task.funnel.used)
@@ -279,7 +280,7 @@ class FunnelTerm:
         self._margin = funnel.margin
 
     def __call__(self, features: Array) -> Array:
-        """(rows,) 1 above the floor, less below it."""
+        """Return 1 above the floor and less below it, (rows,)."""
         above = np.ones(len(features))
         if self._rows.size:
             numbers = features.reshape(-1)

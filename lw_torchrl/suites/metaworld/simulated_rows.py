@@ -1,4 +1,4 @@
-"""Simulated rows, each a MuJoCo state on a shared model, and engines whose threads work through groups of rows."""
+"""Rows, each a MuJoCo state on a shared model, and a base class of engines whose threads simulate groups of rows."""
 
 import os
 from abc import abstractmethod
@@ -27,8 +27,8 @@ _VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 
 class SimulatedRow:
-    """A state, the positions that its last reset gave to bodies and sites, and a copy of Meta-World's program for each
-    episode. No other thread may use the ``shared`` model while this row simulates or resets."""
+    """A MuJoCo state with the places of bodies and sites that its last reset chose, and a copy of Meta-World's program.
+    No other thread may use the ``shared`` model while this row simulates or resets."""
 
     def __init__(self, sources: TaskSources, shared: SharedModel, builder: Any, reward: TaskReward | None) -> None:
         self.sources = sources
@@ -37,10 +37,10 @@ class SimulatedRow:
         self.builder = builder
         self._model = shared.model
         self._data = mujoco.MjData(shared.model)
-        self.bodies = BodyPoses(self._data.xpos, self._data.xquat)  # as they are now
+        self.bodies = BodyPoses(self._data.xpos, self._data.xquat)  # views of the present state
         self._places = shared.compiled[0].copy(), shared.compiled[1].copy()
         self._substeps: int = builder.frame_skip
-        self.mocap: Array = self._data.mocap_pos[0]  # that the hand is drawn to
+        self.mocap: Array = self._data.mocap_pos[0]  # a weld pulls the hand to this point
         self._control: Array = self._data.ctrl
         window = StateView(self._model, self._data)
         self._numbers = window.numbers
@@ -49,7 +49,7 @@ class SimulatedRow:
         self._warnings: NDArray[np.int32] = self._data.warning.number[UNSTABLE]
 
     def reset(self, seed: int) -> Array:
-        """Start an episode, a function of the seed alone; returns the first observation."""
+        """Start an episode, which depends only on the seed; return the first observation."""
         self.shared.restore()
         self._looked = False
         self.program = self.builder.on(self._data)
@@ -59,8 +59,7 @@ class SimulatedRow:
         return observation
 
     def simulate(self, mocap: Array, control: Array, sensors: Array, warnings: NDArray[np.int32]) -> None:
-        """Simulate five steps of physics, then ``mj_forward``, which leaves the accelerations from which the next
-        solver starts; fill ``sensors`` and ``warnings`` (3,) while the state is still in the processor's cache."""
+        """Simulate five steps of physics; fill ``sensors`` and ``warnings`` (3,) while the state is in the cache."""
         self._take_model()
         self.mocap[...] = mocap
         self._control[...] = control
@@ -69,22 +68,22 @@ class SimulatedRow:
             mujoco.mj_step(self._model, self._data, self._substeps - 1)
         else:
             mujoco.mj_step(self._model, self._data, self._substeps)
-        mujoco.mj_forward(self._model, self._data)
+        mujoco.mj_forward(self._model, self._data)  # the next solver starts from its accelerations
         self._looked = True
         self._numbers.take(self._sensor_index, out=sensors, mode="clip")
         warnings[...] = self._warnings
 
     def seen(self) -> tuple[RowModel, Any]:
-        """Its model, with this row's places in it, and its data."""
+        """Return the model, with this row's places in it, and the data."""
         self._take_model()
         return RowModel(self.shared.path, self._model), self._data
 
     def _substep_after_look(self) -> None:
-        """One ``mj_step`` where since the last ``mj_forward`` only the controls and the mocap body have moved.
+        """Do one ``mj_step`` after an ``mj_forward`` since which only the controls and the mocap body changed.
 
-        That body touches nothing, and only the weld to the hand depends on it. So contacts, inertia, velocities and
-        what they cause are still those of the look, which saves a tenth of the step with the same bits. Newton's solver
-        needs no projection of constraints. The substep after this one finds numbers that are not finite or too large.
+        The mocap body touches nothing, and only its weld to the hand depends on it. So contacts, inertia and velocities
+        are still those of the ``mj_forward``, and skipping them saves a tenth of the step with the same bits. Newton's
+        solver needs no projection of constraints. The next substep detects numbers that are not finite or too large.
         """
         model, data = self._model, self._data
         mujoco.mj_kinematics(model, data)
@@ -100,14 +99,14 @@ class SimulatedRow:
 
 @dataclass
 class RowGroup:
-    """Rows that share a model, and so take turns; ``seconds`` is the time of each row's last work."""
+    """Rows that share a model and therefore take turns; ``seconds`` is the time that a row took last."""
 
     rows: tuple[int, ...]
     seconds: float = 1.0
 
 
 def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
-    """Put the rows with one key together, apart only if they would keep a thread busy for over half of its share."""
+    """Group rows by their key, and split a group that would keep a thread busy for more than half of its share."""
     by_key: dict[str, list[int]] = defaultdict(list)
     for row, key in enumerate(keys):
         by_key[key].append(row)
@@ -117,15 +116,15 @@ def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
 
 
 class WorkerPool:
-    """Threads that take one group after another, those that took long last time first, until none is left. One thread
-    at a time works on a group, so its rows may share a model; which thread changes no result."""
+    """Threads that work through groups of rows, slow groups first. One thread at a time works on a group, so its rows
+    may share a model; results do not depend on which thread it is."""
 
     def __init__(self, num_threads: int) -> None:
         self._helpers = num_threads - 1
         self._threads = ThreadPoolExecutor(self._helpers, "lw_torchrl") if self._helpers else None
 
     def work(self, groups: Iterable[tuple[RowGroup, Sequence[int]]], do: Callable[[int], None]) -> None:
-        """Call ``do(item)`` for every item of every ``(group, items)``, the items of a group in turn."""
+        """Call ``do(item)`` for every item of every ``(group, items)``; items of one group in order."""
         if self._threads is None:
             for _, items in groups:
                 for item in items:
@@ -164,9 +163,9 @@ def available_cores() -> int:
 
 
 class ThreadedEngine(SeenRows):
-    """An engine whose physics runs in threads, by default one a core; rows of one of the ``keys`` share a model."""
+    """A base class of engines with physics in threads, by default one per core; rows with one key share a model."""
 
-    _rows: list[Any]  # each with ``seen`` and ``bodies``
+    _rows: list[Any]  # each has ``seen`` and ``bodies``
 
     def __init__(self, keys: Sequence[str], layout: Layout, num_threads: int | None) -> None:
         threads = check_value("num_threads", available_cores() if num_threads is None else num_threads, Count)
@@ -182,15 +181,15 @@ class ThreadedEngine(SeenRows):
 
     @abstractmethod
     def _observe_first(self, rows: Index) -> None:
-        """Write the observations of rows that were reset."""
+        """Write the first observations of rows that were reset."""
 
     @abstractmethod
     def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
-        """Step rows, by the actions of all, and write their observations, rewards and successes, or that they fault."""
+        """Step ``rows``, given the actions of all, and write their observations, rewards, successes and faults."""
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
         index, seed_of = seeds_of_rows(rows, seeds)
-        # A reset that fails half-way leaves rows that must not be stepped.
+        # If a reset fails half-way, its rows must not be stepped.
         self._started[index] = False
         self._pool.work(self._by_group(index), lambda row: self._reset_row(row, seed_of[row]))
         self._observe_first(index)
@@ -208,15 +207,15 @@ class ThreadedEngine(SeenRows):
         return EngineStep(self._observation.copy(), reward, success, active & self._faulted)
 
     def _by_group(self, rows: Index) -> list[tuple[RowGroup, list[int]]]:
-        wanted = set(rows.tolist())
-        found = [(group, [row for row in group.rows if row in wanted]) for group in self._groups]
-        return [(group, members) for group, members in found if members]
+        chosen = set(rows.tolist())
+        groups = [(group, [row for row in group.rows if row in chosen]) for group in self._groups]
+        return [(group, members) for group, members in groups if members]
 
     def _seen(self, row: int) -> tuple[RowModel, Any]:
         return self._rows[row].seen()
 
     def poses(self, row: int) -> BodyPoses:
-        """As :meth:`SeenRows.poses`, whoever holds the model that the row shares."""
+        """Return the present poses of all bodies of a row; no model is needed, so another row may use it."""
         position, quaternion = self._rows[row].bodies
         return BodyPoses(position.copy(), quaternion.copy())
 

@@ -1,4 +1,4 @@
-"""The tables of all tasks: data/simulation.toml (observation, success) and data/rewards.toml."""
+"""Tables of all tasks: data/simulation.toml (observations, successes) and data/rewards.toml (dense rewards)."""
 
 import tomllib
 from collections.abc import Mapping
@@ -13,12 +13,12 @@ Vector = tuple[float, float, float]
 Pair = tuple[float, float]
 
 NO_OFFSET: Vector = (-0.0, -0.0, -0.0)
-"""Adding -0.0 leaves every number as it is, 0.0 and -0.0 included; adding 0.0 does not."""
+"""Adding -0.0 changes no number; adding 0.0 would turn -0.0 into 0.0."""
 
 
 @dataclass(frozen=True)
 class SuccessSources:
-    """What makes a task a success; see the head of data/simulation.toml for each field."""
+    """The condition of a task's success; data/simulation.toml explains the fields."""
 
     within: float = inf
     under: float = inf
@@ -35,7 +35,7 @@ class SuccessSources:
 
 @dataclass(frozen=True)
 class TaskSources:
-    """Where one task's observation comes from; see the head of data/simulation.toml for each field."""
+    """The sources of a task's observation; data/simulation.toml explains the fields."""
 
     object: str
     quaternion: str
@@ -55,7 +55,7 @@ FIRST_DISTANCE = "first distance"
 
 @dataclass(frozen=True)
 class Term:
-    """How close two points are; see the head of data/rewards.toml for each field."""
+    """How close two points are; data/rewards.toml explains the fields."""
 
     between: tuple[str, str] = ("object", "object")
     offset: Vector = NO_OFFSET
@@ -69,7 +69,7 @@ class Term:
 
 @dataclass(frozen=True)
 class Cage:
-    """How the gripper is to enclose the object."""
+    """How the gripper must enclose the object."""
 
     radius: float
     pad: float
@@ -85,7 +85,7 @@ class Cage:
 
 @dataclass(frozen=True)
 class Funnel:
-    """Above what a point is to stay on its way."""
+    """A floor above which a point must stay on its way."""
 
     over: str
     about: tuple[str, ...]
@@ -98,7 +98,7 @@ class Funnel:
 
 @dataclass(frozen=True)
 class Held:
-    """When the object counts as held; without limits, always."""
+    """When the object counts as held; by default always."""
 
     near: float = inf
     within: float = inf
@@ -139,7 +139,7 @@ class TaskReward:
 
     @property
     def terms(self) -> tuple[Term, Term, Term, Term]:
-        """near, placed and via, and how close the gripper is across the object."""
+        """The terms near, placed and via, and the gripper's distance across the object."""
         across = Term()
         if (cage := self.cage) is not None:
             margin = cage.start, "tcp at start"
@@ -148,7 +148,7 @@ class TaskReward:
 
 
 def _read(file: str, task: Any, parts: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the tables of a TOML file by task, with their ``parts`` as classes of their own."""
+    """Return the tables of a TOML file by task, with the classes of their ``parts``."""
 
     def plain(table: Mapping[str, Any]) -> dict[str, Any]:
         return {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
@@ -156,8 +156,8 @@ def _read(file: str, task: Any, parts: Mapping[str, Any]) -> Mapping[str, Any]:
     text = (files("lw_torchrl.suites.metaworld") / "data" / file).read_text(encoding="utf-8")
     tasks = {}
     for name, entry in tomllib.loads(text).items():
-        made = {key: parts[key](**plain(entry.pop(key))) for key in parts.keys() & entry.keys()}
-        tasks[name] = task(**plain(entry), **made)
+        own_parts = {key: parts[key](**plain(entry.pop(key))) for key in parts.keys() & entry.keys()}
+        tasks[name] = task(**plain(entry), **own_parts)
     return MappingProxyType(tasks)
 
 

@@ -1,4 +1,4 @@
-"""Meta-World's own reset, on compiled models that rows share."""
+"""Meta-World's own resets, on compiled models that rows share."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class SharedModel:
-    """A compiled model that many rows use in turn. A reset of a Meta-World task moves bodies and sites of the model
-    itself, so each row keeps its own ``places`` of both, and loads them unless it is still the ``holder``."""
+    """A compiled model that many rows use in turn. Meta-World's resets move bodies and sites of the model itself, so
+    each row keeps its own places of both and loads them unless it is still the ``holder``."""
 
     def __init__(self, path: str, model: Any, compiled: Places | None = None) -> None:
         self.path, self.model = path, model
@@ -39,28 +39,28 @@ class SharedModel:
         self.load(None, self.compiled)
 
 
-# reentrant: an engine that Python collects gives its models back, perhaps inside borrow_model
+# Reentrant, because Python may collect an engine, which returns its models, inside borrow_model.
 _lock = threading.RLock()
 _compiled: dict[str, SharedModel] = {}
 _idle: dict[str, SharedModel] = {}
 
 
 def borrow_model(path: str) -> SharedModel:
-    """A model of the XML file that nobody else uses, compiled only once in a process."""
+    """Return a model of an XML file that no other engine uses; a process compiles each file once."""
     with _lock:
         if (idle := _idle.pop(path, None)) is not None:
             return idle
         if (known := _compiled.get(path)) is None:
             _compiled[path] = SharedModel(path, mujoco.MjModel.from_xml_path(path))
             return _compiled[path]
-        # It may be in use: take what never changes from it, not its present state.
+        # The known model may be in use: its arrays are copied, and then reset to the compiled places.
         twin = SharedModel(path, copy.copy(known.model), known.compiled)
         twin.restore()
         return twin
 
 
 def return_models(models: Iterable[SharedModel]) -> None:
-    """Give borrowed models back. One of each XML file is kept for the next borrower."""
+    """Return borrowed models; one of each XML file is kept for the next engine."""
     with _lock:
         for model in models:
             model.restore()
@@ -68,14 +68,13 @@ def return_models(models: Iterable[SharedModel]) -> None:
 
 
 WARNED_ALREADY = 1000
-"""MuJoCo prints a warning, and writes MUJOCO_LOG.TXT, only when its count of that kind is zero. We start the
-counts here instead: nothing is written, and a count that is another number tells of a warning."""
+"""MuJoCo prints a warning and writes MUJOCO_LOG.TXT only if its count of that kind is zero. We start the counts at this
+number: nothing is written, and any other count means that a warning occurred."""
 
 
 class TaskProgram:
-    """A Meta-World environment without a simulator of its own, mixed into one of Meta-World's classes. It is built once
-    for each model; every episode of every row runs on a light copy (:meth:`on`) that shares everything but the state.
-    """
+    """A mixin that takes the simulator away from one of Meta-World's environments. It is built once for each model;
+    every episode of every row runs on a light copy (:meth:`on`), which shares everything but the state."""
 
     model: Any
     data: Any
@@ -90,7 +89,7 @@ class TaskProgram:
     def __init__(self, model: Any) -> None:
         self.model = model
         super().__init__()
-        # The goal is part of the observation; each reset draws a new initial state and goal from the seed.
+        # The goal is observable, and each reset draws a new initial state and goal from the seed.
         self._partially_observable = False
         self.__dict__.pop("sawyer_observation_space", None)
         self._set_task_called = True
@@ -103,19 +102,21 @@ class TaskProgram:
         return self.model, mujoco.MjData(self.model)
 
     def on(self, data: Any) -> TaskProgram:
-        """A copy of this program, as it was when built, that works on ``data``."""
+        """Return a copy of this program that works on ``data``."""
         program = object.__new__(type(self))
         program.__dict__.update(self.__dict__)
         program.data = data
-        # Two attributes are views of the state: in Meta-World they follow the fingers.
+        # In Meta-World these two are views of the state, which follow the fingers.
         program.init_left_pad = program.get_body_com("leftpad")  # type: ignore[attr-defined]
         program.init_right_pad = program.get_body_com("rightpad")  # type: ignore[attr-defined]
         return program
 
     def start_episode(self, seed: int) -> NDArray[np.float64]:
-        """Reset as Meta-World's ``env.seed(seed); env.reset()`` does; return the first observation. Meta-World places
-        everything twice and moves the hand both times. Of the first round only the random draws and the positions of
-        bodies and sites survive, which do not depend on the hand, so here the first round does not move it."""
+        """Reset as Meta-World's ``env.seed(seed); env.reset()`` does; return the first observation.
+
+        Meta-World does everything twice. Only random draws and places of bodies and sites survive the first round, and
+        they do not depend on the hand, so here the first round does not move it.
+        """
         self.np_random, _ = seeding.np_random(seed)
         for self._moves_hand in (False, True):
             mujoco.mj_resetData(self.model, self.data)
@@ -149,5 +150,5 @@ def program_class(task: str) -> Any:
 
 
 def model_path(task: str) -> str:
-    """The XML file of a task; 36 files serve the 50 tasks."""
+    """Return the XML file of a task; 36 files serve the 50 tasks."""
     return object.__new__(_task_class(task)).model_name

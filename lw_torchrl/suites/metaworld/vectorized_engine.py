@@ -1,4 +1,4 @@
-"""The fast engine: Meta-World bit for bit, at nearly the speed of its physics."""
+"""The vectorized engine: Meta-World bit for bit, at nearly the speed of its physics."""
 
 import weakref
 from collections.abc import Sequence
@@ -17,18 +17,25 @@ from lw_torchrl.suites.metaworld.dense_reward import DenseReward, EpisodeStarts
 from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, Observer, SuccessFunction
 from lw_torchrl.suites.metaworld.tables import reward_table, simulation_table
 
-FINGERS = np.array([1.0, -1.0])  # the two fingers are driven against each other by one number of the action
+FINGERS = np.array([1.0, -1.0])  # one number of the action moves both fingers, in opposite directions
 
 
 class VectorizedEngine(simulated_rows.ThreadedEngine):
-    """Simulates all rows together: physics in threads, by default one a core, everything else in NumPy over all rows.
+    """An engine that simulates all rows together: physics in threads, everything else in NumPy over all rows.
 
-    Its numbers are those of :class:`~lw_torchrl.suites.metaworld.plain_engine.MetaWorldEngine`, bit for bit, whatever
-    the number of threads. The rows of one XML file share a compiled model. Raises ImportError for
-    versions of Meta-World or MuJoCo that this engine was not compared with.
+    Its numbers equal those of :class:`~lw_torchrl.suites.metaworld.plain_engine.MetaWorldEngine`, bit for bit, for any
+    number of threads. Rows of one XML file share a compiled model.
 
-    A row faults when its action is not finite, or when its simulation becomes unstable. It then repeats its last stable
-    observation and is not simulated until it is reset; other rows are not affected.
+    A row faults if its action is not finite or its simulation becomes unstable. It then repeats its last stable
+    observation and is not simulated until its reset; other rows are not affected.
+
+    Args:
+        tasks: the task of each row.
+        reward: "sparse" for the success as 0 or 1, or "dense" for Meta-World's own.
+        num_threads: number of threads that simulate; None for one per core.
+
+    Raises:
+        ImportError: this engine was not compared with the installed version of Meta-World or MuJoCo.
 
     Example:
         >>> engine = VectorizedEngine(["reach", "push"], num_threads=1)
@@ -54,12 +61,13 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
         rewards = [reward_table()[task] if dense else None for task in tasks]
         rows: dict[int, simulated_rows.SimulatedRow] = {}
         models: list[task_programs.SharedModel] = []
-        # A borrowed model goes back even if the engine is never closed.
+        # Models are returned even if the engine is never closed.
         self._return_models = weakref.finalize(self, task_programs.return_models, models)
         for group in self._groups:
             models.append(task_programs.borrow_model(task_programs.model_path(tasks[group.rows[0]])))
-            here = {tasks[row] for row in group.rows}
-            programs = {task: task_programs.program_class(task)(models[-1].model) for task in here}
+            programs = {
+                task: task_programs.program_class(task)(models[-1].model) for task in {tasks[row] for row in group.rows}
+            }
             for row in group.rows:
                 sources, program = simulation_table()[tasks[row]], programs[tasks[row]]
                 rows[row] = simulated_rows.SimulatedRow(sources, models[-1], program, rewards[row])
@@ -89,13 +97,13 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
         self._current[rows] = self._observation[rows, at.CURRENT]
 
     def close(self) -> None:
-        """End the threads and give the models back, for the next engine of this process."""
+        """End the threads and return the models, for the next engine of this process."""
         super().close()
         self._running = None
         self._return_models()
 
     def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
-        if self._running is None or not np.array_equal(self._running.rows, rows):  # which run seldom changes
+        if self._running is None or not np.array_equal(self._running.rows, rows):  # they seldom change
             self._running = _RunningRows(self, rows)
         running, action = self._running, action[rows]
         shift = np.minimum(np.maximum(action[:, :3], -1), 1) * self._action_scale
@@ -129,7 +137,7 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
 
 
 class _RunningRows:
-    """What is constant for one set of running rows."""
+    """The constants of a set of running rows, prepared once."""
 
     def __init__(self, engine: VectorizedEngine, rows: Index) -> None:
         self.rows = rows

@@ -33,7 +33,7 @@ def arguments(out, *more, methods=("pcbc", "dc"), seeds=(0, 1)):
     return ("few-shot", "--seeds", *seeds, "--methods", *methods, "--episodes", 1, "--out", out, *more)
 
 
-def test_runs_and_their_summary(capsys, tmp_path, tiny):
+def test_command_runs_and_summarizes(capsys, tmp_path, tiny):
     names = run(capsys, *arguments(tmp_path, "--list")).split()
     assert names == [
         *(f"demonstrations/reachx1-astray-seed{seed}" for seed in (0, 1)),
@@ -60,7 +60,7 @@ def test_runs_and_their_summary(capsys, tmp_path, tiny):
 
 
 @pytest.mark.slow
-def test_the_best_of_several_evaluations_is_reported(capsys, tmp_path, tiny):
+def test_best_of_several_evaluations_is_reported(capsys, tmp_path, tiny):
     out = run(capsys, *arguments(tmp_path, "--preset", "paper", "--passes", 50, methods=["dc"]))
     assert "| dc, best of the last 3 evaluations " in out
     folder = tmp_path / "few-shot" / "paper"
@@ -70,7 +70,7 @@ def test_the_best_of_several_evaluations_is_reported(capsys, tmp_path, tiny):
     assert means["dc, best of the last 3 evaluations"] == pytest.approx(expected)
 
 
-def test_other_plans_have_a_folder_of_their_own(capsys, tmp_path, tiny):
+def test_other_plans_have_their_own_folder(capsys, tmp_path, tiny):
     folder = tmp_path / "compare/best/llama3.1/chain_py"  # as benchmarks.plan_comparison writes it
     lw.save_plans({"push": lw.load_plans("MT10")["push"]}, folder)
     given = arguments(tmp_path, "--plans", "MT50", folder, "--list", methods=["pcbc"], seeds=[0])
@@ -79,7 +79,7 @@ def test_other_plans_have_a_folder_of_their_own(capsys, tmp_path, tiny):
         main([str(one) for one in arguments(tmp_path, "--plans", folder, "--list")])
 
 
-def test_wrong_choices_are_named(tmp_path):
+def test_wrong_choices_raise(tmp_path):
     for given, message in {
         ("one-shot", "--preset", "one-network"): "--preset one-network is only for few-shot, got one-shot",
         ("few-shot", "--passes", "3"): "--passes requires --preset paper",
@@ -101,7 +101,7 @@ def test_every_row_of_every_offline_table_is_listed(capsys, tmp_path):
     assert names[-3:] == [f"five/C/bc-plan/seed{seed}" for seed in range(3)]
 
 
-def test_a_command_runs_in_a_process():
+def test_command_runs_in_a_process():
     assert "few-shot/strong/dc/seed0" in run_command(["few-shot", "--list"])
     with pytest.raises(RuntimeError, match=r"benchmarks.paper few-shot --run nonsense failed:\n(.*\n)*.*--run must be"):
         run_command(["few-shot", "--run", "nonsense"])
@@ -109,7 +109,7 @@ def test_a_command_runs_in_a_process():
 
 @pytest.mark.parametrize("launcher", ["local", pytest.param("ray", marks=pytest.mark.slow)])
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::FutureWarning", "ignore::DeprecationWarning")
-def test_all_commands_run_and_an_error_is_raised_at_the_end(launcher):
+def test_all_commands_run_before_an_error_is_raised(launcher):
     if launcher == "ray":
         pytest.importorskip("ray")
     outputs = {}

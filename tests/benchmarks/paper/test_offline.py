@@ -34,7 +34,7 @@ def out(tmp_path_factory):
     return out
 
 
-def test_runs_and_datasets_have_names_of_their_own():
+def test_runs_and_datasets_have_different_names():
     tables = [table for name, table in OFFLINE_TABLES.items() if name != "quick"]
     runs = {run for table in tables for run in offline_runs(table, (0, 1), OfflineRecipe(), 20)}
     advantages = {run.advantages for run in runs} - {None}
@@ -48,7 +48,7 @@ def test_runs_and_datasets_have_names_of_their_own():
     assert max(seeds) < EVALUATION_SEED
 
 
-def test_tables_compare_the_methods_that_they_name():
+def test_tables_compare_their_methods():
     for table in OFFLINE_TABLES.values():
         for rows in table.rows.values():
             assert rows[0] == ("advantage", "pcbc", "pcbc")
@@ -57,7 +57,7 @@ def test_tables_compare_the_methods_that_they_name():
     assert {method.loss for method in OFFLINE_METHODS.values()} == {*DISTRIBUTIONS}
 
 
-def test_data_are_of_the_behaviours_of_the_mixture(out):
+def test_data_have_the_mixtures_behaviours(out):
     for dataset in tiny().datasets:
         config = read_metadata(out / dataset.folder).config
         assert (config.behaviour, config.tasks) == (dataset.portion.behaviour, TASK_SETS["two"])
@@ -88,7 +88,7 @@ def test_advantages_are_standardised_by_task_and_depend_on_the_critic(out):
         assert abs(rows.std(correction=0).item() - 1) < 1e-3
 
 
-def test_stopped_anywhere_a_run_ends_with_the_same_policy(out, tmp_path, monkeypatch):
+def test_run_stopped_anywhere_ends_with_the_same_policy(out, tmp_path, monkeypatch):
     run = tiny()
     expected = execute_run(run, PLANS, out, progress=False)
     shutil.copytree(out / "data", tmp_path / "data")
@@ -111,7 +111,7 @@ def test_stopped_anywhere_a_run_ends_with_the_same_policy(out, tmp_path, monkeyp
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
 
-def test_results_and_advantages_of_another_recipe_are_refused(out):
+def test_results_and_advantages_of_another_recipe_raise(out):
     execute_run(tiny(), PLANS, out, progress=False)
     other = tiny(recipe=replace(TINY, beta=1.5))
     with pytest.raises(ValueError, match=r"results.json' is of another configuration, it differs in recipe.beta"):
@@ -120,7 +120,7 @@ def test_results_and_advantages_of_another_recipe_are_refused(out):
         other.advantages.make(PLANS, out, progress=False)
 
 
-def test_the_table_shows_means_and_differences(out):
+def test_table_shows_means_and_differences(out):
     runs = [tiny(), tiny("filtered-bc"), tiny("bc", "dc")]
     results = {run: execute_run(run, PLANS, out, progress=False) for run in runs}
     head = write_table("quick", runs, results, out)

@@ -34,7 +34,7 @@ def make(name, alpha):
 
 
 @pytest.mark.parametrize("name", DISTRIBUTIONS)
-def test_the_actor_imitates_by_l1_and_values_change_only_the_actor(name):
+def test_actor_imitates_by_l1_and_values_change_only_the_actor(name):
     loss, n = make(name, alpha=0.0), len(TASKS)
     rows = TensorDict(observation=torch.rand(n, 39), task_id=TASKS, action=torch.rand(n, 4) * 2 - 1)
     batch = lw.QAFTransform(PLANS)(rows.auto_batch_size_(1))
@@ -52,7 +52,7 @@ def test_the_actor_imitates_by_l1_and_values_change_only_the_actor(name):
     assert reached == {"actor_network_params"}
 
 
-def test_the_scale_of_a_task_does_not_count():
+def test_scale_of_a_task_does_not_matter():
     q = torch.randn(len(TASKS), 1)
     scale = (1.0 + TASKS.float()).unsqueeze(-1)
     torch.testing.assert_close(in_deviations_of_task(q * scale, TASKS), in_deviations_of_task(q, TASKS))

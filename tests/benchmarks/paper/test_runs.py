@@ -54,7 +54,7 @@ def copied(undisturbed, tmp_path):
 
 
 @by_name
-def test_a_finished_run_is_not_repeated(undisturbed, run, monkeypatch):
+def test_finished_run_is_not_repeated(undisturbed, run, monkeypatch):
     episodes, config = result_of(undisturbed / run.folder)
     assert [episode["task"] for episode in episodes] == [run.setting.targets or "reach"] * 2
     assert (config["seed"], config["noise_scale"], config["run"]["method"]) == (10_003, 0.1, run.method)
@@ -63,7 +63,7 @@ def test_a_finished_run_is_not_repeated(undisturbed, run, monkeypatch):
     assert not list((undisturbed / run.folder).glob("checkpoint*"))
 
 
-def test_folders_are_named_by_what_runs_depend_on(undisturbed):
+def test_folders_are_named_after_the_options_of_a_run(undisturbed):
     assert a_run().folder.as_posix() == "tiny/strong/pcbc/seed3"
     assert a_run(SCRIPTED, setting=TINY_ONE_SHOT).folder.as_posix() == "scripted/seed3"
     assert replace(a_run(), plans_name="palm").folder.as_posix() == "tiny/strong-palm/pcbc/seed3"
@@ -71,7 +71,7 @@ def test_folders_are_named_by_what_runs_depend_on(undisturbed):
     assert folders == {"reachx2-astray-seed3", "pushx1-target-seed3"}
 
 
-def test_a_result_of_another_configuration_is_refused(copied):
+def test_result_of_another_configuration_raises(copied):
     longer = replace(PRESET, training=replace(PRESET.training, steps=61))
     with pytest.raises(ValueError, match=r"of another configuration, it differs in training.steps \(60, now 61\)"):
         execute(a_run("dc", preset=longer), copied)
@@ -98,7 +98,7 @@ def test_a_result_of_another_configuration_is_refused(copied):
         pytest.param(TINY_ONE_SHOT, ENSEMBLE, 106, 126, marks=pytest.mark.slow),
     ],
 )
-def test_a_stopped_run_resumes_to_the_same_result(undisturbed, tmp_path, monkeypatch, setting, preset, stop, steps):
+def test_stopped_run_resumes_to_the_same_result(undisturbed, tmp_path, monkeypatch, setting, preset, stop, steps):
     run = a_run(setting=setting, preset=preset)
     count = stop_training(monkeypatch, setting, stop)
     with pytest.raises(KeyboardInterrupt):
@@ -141,7 +141,7 @@ def test_actors_of_descriptions_act_in_demonstrated_tasks(tmp_path):
     assert (policy.demonstrated.tasks, len(policy.tasks)) == (("reach",), 50)
 
 
-def test_a_preset_can_put_an_evaluator_into_the_policy(tmp_path):
+def test_preset_can_add_an_evaluator_to_the_policy(tmp_path):
     member = Member({"width": 32, "depth": 1}, {"evaluator": {"width": 16, "depth": 1}})
     training = replace(PRESET.training, steps=2, qaf_anchor=1.0)
     run = a_run(preset=replace(PRESET, name="evaluator", members=(member,), training=training))
@@ -165,7 +165,7 @@ def test_every_recipe_loads_and_makes_its_policies(name):
         assert ImitationRun(SETTINGS[setting], "pcbc", 0, preset).describe(PLANS)["training"]
 
 
-def test_settings_are_those_of_the_paper():
+def test_settings_are_the_papers():
     assert (SETTINGS["zero-shot"].base, SETTINGS["zero-shot"].episodes) == ("MT10", 100)
     assert (SETTINGS["few-shot"].base, SETTINGS["few-shot"].episodes) == ("MT50", 10)
     assert (SETTINGS["one-shot"].base, SETTINGS["one-shot"].targets) == ("MT10", "MT50")

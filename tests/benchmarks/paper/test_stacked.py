@@ -45,7 +45,7 @@ def stack(demos, number=2, config=CONFIG, kind="focused plan", checkpoint=None):
 
 
 @pytest.mark.parametrize("kind", first_fast(["plan", "focused plan", "description", "one-hot"]))
-def test_every_loss_is_that_of_separate_training(demos, kind):
+def test_losses_are_those_of_separate_trainings(demos, kind):
     together = stack(demos, 3, kind=kind)
     losses = torch.stack([together.step() for _ in range(CONFIG.steps)])
     assert losses[-10:].mean() < losses[:10].mean() / 2
@@ -56,7 +56,7 @@ def test_every_loss_is_that_of_separate_training(demos, kind):
         assert (losses[:, number] - own).abs().max() < 1e-5
 
 
-def test_it_resumes_from_its_checkpoint_and_writes_the_weights_back(demos, tmp_path):
+def test_training_resumes_and_writes_the_weights_back(demos, tmp_path):
     config = lw.BehavioralCloningConfig(steps=20, batch_size=30, checkpoint_every=10)
     whole, path = stack(demos, config=config), tmp_path / "checkpoint.safetensors"
     losses = torch.stack([whole.step() for _ in range(20)])
@@ -79,7 +79,7 @@ def test_it_resumes_from_its_checkpoint_and_writes_the_weights_back(demos, tmp_p
         stack(demos, config=lw.BehavioralCloningConfig(steps=21, batch_size=30, checkpoint_every=10), checkpoint=path)
 
 
-def test_actors_that_differ_in_more_than_weights_are_refused(demos):
+def test_actors_that_differ_in_more_than_weights_raise(demos):
     """With the same shapes, they would be trained as the first one is."""
     actors = [lw.PlanConditionedActor(PLANS, decoder=MLPDecoder(squash=squash)) for squash in (True, False)]
     with pytest.raises(ValueError, match=r"actors must have the same parts and plans, 0 and 1 differ in .*squash"):
@@ -88,7 +88,7 @@ def test_actors_that_differ_in_more_than_weights_are_refused(demos):
         StackedBehavioralCloning([actors[0], actors[0]], [replay(demos), replay(demos)], CONFIG)
 
 
-def test_the_actor_with_a_loss_that_is_not_finite_is_named(demos):
+def test_error_names_the_actor_with_a_nonfinite_loss(demos):
     broken = make("plan", 0)
     torch.nn.init.constant_(broken.decoder.network[0].weight, float("nan"))
     trainer = StackedBehavioralCloning(

@@ -26,14 +26,14 @@ def assert_same(task: str, seed: int, actions: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("task", IDS)
-def test_an_episode_is_gymnasiums(task):
+def test_episode_has_gymnasiums_bits(task):
     assert_same(task, 3, random_actions(3, 15))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2, 1_000, 2**31])
 @pytest.mark.parametrize("task", IDS)
-def test_episodes_of_random_and_scripted_actions_are_gymnasiums(task, seed):
+def test_random_and_scripted_episodes_have_gymnasiums_bits(task, seed):
     assert_same(task, seed, random_actions(seed, STEPS))
     assert_same(task, seed, scripted(task, range(seed, seed + 1), STEPS)[0][:, 0])
     assert_same(task, seed, random_actions(seed, 10).astype(np.float64) * 1.5)  # cut off in double precision
@@ -53,7 +53,7 @@ def all_rows(tasks: list[str], threads: int) -> list[np.ndarray]:
     return found
 
 
-def test_neither_threads_nor_the_order_of_rows_matter():
+def test_results_depend_neither_on_threads_nor_on_the_order_of_rows():
     tasks = sorted(IDS)
     expected = all_rows(tasks, 1)
     for order, threads in (([0, 1, 2, 3], 3), ([2, 0, 3, 1], 2)):
@@ -61,7 +61,7 @@ def test_neither_threads_nor_the_order_of_rows_matter():
         assert all(np.array_equal(a, b[order]) for a, b in zip(found, expected, strict=True))
 
 
-def test_rows_that_rest_repeat_their_observation():
+def test_inactive_rows_repeat_their_observation():
     engine = FetchEngine(["fetch/push", "fetch/reach"], num_threads=1)
     first = engine.reset([0, 1], [5, 6])
     result = engine.step(np.ones((2, 4), np.float32), np.array([True, False]))
@@ -72,7 +72,7 @@ def test_rows_that_rest_repeat_their_observation():
     engine.close()
 
 
-def test_things_rest_on_the_table_and_reach_has_none():
+def test_objects_rest_on_the_table_and_reach_has_none():
     engine = FetchEngine(sorted(IDS), num_threads=1)
     numbers = engine.reset(range(4), range(4))
     things, reach = numbers[[0, 1, 3]], numbers[2]
@@ -84,7 +84,7 @@ def test_things_rest_on_the_table_and_reach_has_none():
     engine.close()
 
 
-def test_our_axes():
+def test_actions_move_the_hand_along_our_axes():
     engine = FetchEngine(["fetch/pick-and-place"] * 3, num_threads=1)
     first = engine.reset(range(3), [0] * 3)
     for _ in range(5):
@@ -94,7 +94,7 @@ def test_our_axes():
     engine.close()
 
 
-def test_an_effort_of_one_closes():
+def test_effort_of_one_closes_the_gripper():
     engine = FetchEngine(["fetch/pick-and-place"], num_threads=1)
     engine.reset([0], [0])
     for effort, opening in ((-1.0, 1.0), (0.0, 1.0), (1.0, 0.0)):
@@ -104,7 +104,7 @@ def test_an_effort_of_one_closes():
     engine.close()
 
 
-def test_a_row_faults_alone():
+def test_fault_stays_in_its_row():
     engine = FetchEngine(["fetch/push"] * 3, num_threads=2)
     alone = FetchEngine(["fetch/push"], num_threads=1)
     first, active = engine.reset(range(3), range(3)), np.ones(3, bool)
@@ -123,7 +123,7 @@ def test_a_row_faults_alone():
     alone.close()
 
 
-def test_a_recording_shows_the_goal_and_changes_nothing():
+def test_recording_shows_the_goal_and_changes_nothing():
     engine, other = (FetchEngine(["fetch/push"], num_threads=1) for _ in range(2))
     engine.reset([0], [0]), other.reset([0], [0])
     for action in random_actions(0, 5):
@@ -137,7 +137,7 @@ def test_a_recording_shows_the_goal_and_changes_nothing():
     engine.close(), other.close()
 
 
-def test_the_absent_package_is_named(monkeypatch):
+def test_error_names_the_missing_extra(monkeypatch):
     builder = fetch_engine._builder
     monkeypatch.setattr(fetch_engine, "_builder", builder.__wrapped__)
     monkeypatch.setitem(sys.modules, "gymnasium_robotics.envs.fetch.push", None)

@@ -13,7 +13,7 @@ from lw_torchrl.language.skills import skills_for
 from lw_torchrl.suites.fetch import TASKS, load_plans, load_skills
 
 
-def test_every_step_has_a_scripted_skill_and_is_read():
+def test_every_step_has_a_scripted_skill_and_is_understood():
     plans, skills = load_plans(), load_skills()
     assert list(plans) == list(TASKS) == sorted(IDS)
     for plan in plans.values():
@@ -41,12 +41,12 @@ def test_plans_survive_every_format(format):
 
 
 @pytest.mark.parametrize("name", ["fetch/", "/push", "a/b/c", "Fetch/push", "fetch_it/push", "fetch//push"])
-def test_what_no_task_may_be_called(name):
+def test_wrong_task_names_raise(name):
     with pytest.raises(ValueError, match="lower-case words joined by hyphens"):
         lw.Task(name, "Do it.", TASKS["fetch/push"].objects)
 
 
-def test_a_plan_succeeds():
+def test_plan_succeeds():
     _, success, _ = scripted("fetch/pick-and-place", range(4), 30)
     assert success.any(0).all()
 

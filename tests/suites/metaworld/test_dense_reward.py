@@ -71,19 +71,19 @@ def play_both(tasks: list[str], steps: int, precisions: list[tuple[type, ...]], 
     return dict(zip(tasks, worst.tolist(), strict=True))
 
 
-def test_every_tasks_reward_has_metaworlds_bits():
+def test_rewards_of_all_tasks_have_metaworlds_bits():
     differences = play_both(TASKS, 30, [(np.float32, np.float64)], seed=0)
     assert set(differences.values()) == {0.0}, differences
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tasks", [TASKS[k : k + 10] for k in range(0, 50, 10)], ids=lambda tasks: tasks[0])
-def test_whole_episodes_have_metaworlds_bits(tasks):
+def test_rewards_of_whole_episodes_have_metaworlds_bits(tasks):
     differences = play_both(tasks, 500, [(np.float32,), (np.float64,), (np.float32,)], seed=1)
     assert set(differences.values()) == {0.0}, differences
 
 
-def invent_states(engine: VectorizedEngine, rng: np.random.Generator) -> np.ndarray:
+def construct_states(engine: VectorizedEngine, rng: np.random.Generator) -> np.ndarray:
     """Put the hand, the objects and the joints of every row where a formula may look twice: at, near and far from
     the object, the start, the goal and whatever else there is. Returns the actions."""
     for number, row in enumerate(engine._rows):
@@ -139,7 +139,7 @@ def invent_states(engine: VectorizedEngine, rng: np.random.Generator) -> np.ndar
     return action
 
 
-def test_every_formula_has_metaworlds_bits_in_invented_states():
+def test_formulas_have_metaworlds_bits_in_constructed_states():
     """Positions are written into the states without any physics, so that even seldom branches are taken often."""
     n, rng = len(TASKS), np.random.default_rng(0)
     engine = VectorizedEngine(TASKS, reward="dense", num_threads=1)
@@ -149,7 +149,7 @@ def test_every_formula_has_metaworlds_bits_in_invented_states():
     compared, full, wrong = np.zeros(n, int), np.zeros(n, int), defaultdict(list)
     seen_rewards = [set() for _ in TASKS]
     for trial in range(200):
-        action = invent_states(engine, rng).astype([np.float32, np.float64][trial % 2])
+        action = construct_states(engine, rng).astype([np.float32, np.float64][trial % 2])
         sensors = np.stack([row._numbers.take(row._sensor_index) for row in engine._rows])
         current = observer.current(sensors)
         observation = np.concatenate((current, current, engine._goal), axis=1)
@@ -173,7 +173,7 @@ def test_every_formula_has_metaworlds_bits_in_invented_states():
     assert {reward_table()[task].formula for task in never} <= unlimited, never
 
 
-def test_a_row_is_rewarded_alike_in_any_company():
+def test_reward_does_not_depend_on_other_rows():
     tasks = ["push", "dial-turn", "bin-picking", "push", "peg-insert-side"]
     together = VectorizedEngine(tasks, reward="dense", num_threads=1)
     alone = [VectorizedEngine([task], reward="dense", num_threads=1) for task in tasks]
@@ -189,7 +189,7 @@ def test_a_row_is_rewarded_alike_in_any_company():
         assert got.tolist() == expected
 
 
-def test_a_reset_forgets_the_first_distance_of_the_episode_before():
+def test_reset_forgets_the_previous_episodes_first_distance():
     """bin-picking measures by the distance after the first step."""
     engine = VectorizedEngine(["bin-picking"], reward="dense", num_threads=1)
     everyone, action = np.ones(1, bool), np.ones((1, 4), np.float32)
@@ -214,7 +214,7 @@ def test_tolerance_and_its_curves_have_metaworlds_bits():
         assert curve(x + 1e-9).tolist() == expected
 
 
-def test_the_hamacher_product_has_metaworlds_bits():
+def test_hamacher_product_has_metaworlds_bits():
     a, b = np.random.default_rng(0).random((2, 5000))
     a[:100], b[50:150] = 0.0, 0.0
     expected = [reward_utils.hamacher_product(float(p), float(q)) for p, q in zip(a, b, strict=True)]
@@ -222,27 +222,27 @@ def test_the_hamacher_product_has_metaworlds_bits():
         assert terms.hamacher_product(a, b).tolist() == expected
 
 
-def test_a_square_is_cs_pow():
+def test_square_is_that_of_pow():
     x = np.random.default_rng(0).normal(size=100000)
     squares = terms.square(x)
     assert squares.tolist() == [float(value) ** 2 for value in x]
     assert (squares != x * x).any(), "then x * x would do"
 
 
-def test_the_table_has_a_reward_for_every_task_and_uses_every_formula():
+def test_table_has_a_reward_for_every_task_and_uses_every_formula():
     table = reward_table()
     assert list(table) == TASKS
     assert {reward.formula for reward in table.values()} == set(FORMULAS)
     assert {reward.lift for reward in table.values()} - {None} == set(LIFTS)
 
 
-def test_an_attribute_that_metaworld_no_longer_notes_is_an_error():
+def test_missing_attribute_of_metaworld_raises():
     starts = EpisodeStarts([reward_table()["window-open"]])
     with pytest.raises(AttributeError, match="window_handle_pos_init"):
         starts.begin(0, SimpleNamespace(obj_init_pos=np.zeros(3), init_tcp=np.zeros(3)))
 
 
-def test_the_sparse_reward_reads_no_more_than_before():
+def test_sparse_reward_reads_fewer_sensors():
     sparse, dense = (VectorizedEngine(["stick-pull"], reward=kind, num_threads=1) for kind in ("sparse", "dense"))
     assert len(sparse._rows[0]._sensor_index) == MATRIX.stop + 10
     assert len(dense._rows[0]._sensor_index) == CORNERS.stop

@@ -17,7 +17,7 @@ def whole_substep(row: SimulatedRow) -> None:
     mujoco.mj_step(row._model, row._data)
 
 
-def test_a_substep_after_a_look_has_the_bits_of_a_whole_one(monkeypatch):
+def test_shortened_substep_has_the_bits_of_a_whole_one(monkeypatch):
     """All tasks, the state itself compared after every step, with a reset on the way."""
     n, rng = len(TASKS), np.random.default_rng(0)
     engine, plain = (VectorizedEngine(TASKS, num_threads=1) for _ in range(2))
@@ -38,7 +38,7 @@ def test_a_substep_after_a_look_has_the_bits_of_a_whole_one(monkeypatch):
     assert sum(row._data.ncon for row in engine._rows) > n
 
 
-def test_the_first_step_of_an_episode_is_whole(monkeypatch):
+def test_first_step_of_an_episode_is_not_shortened(monkeypatch):
     """A reset may leave places as they were before its last change."""
     calls = []
     engine = VectorizedEngine(["push"], num_threads=1)
@@ -51,7 +51,7 @@ def test_the_first_step_of_an_episode_is_whole(monkeypatch):
     assert len(calls) == 1
 
 
-def test_the_mocap_body_touches_and_carries_nothing():
+def test_assumptions_of_the_shortened_substep_hold():
     """What the shortened substep rests on."""
     for row in VectorizedEngine(TASKS, num_threads=1)._rows:
         model = row._model

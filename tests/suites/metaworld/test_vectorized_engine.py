@@ -67,7 +67,7 @@ def play(engine, tasks: list[str], steps: int, *, seed: int = 0) -> list[np.ndar
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tasks", [TASKS[k : k + 10] for k in range(0, 50, 10)], ids=lambda tasks: tasks[0])
-def test_every_task_equals_metaworld_in_every_bit(tasks):
+def test_all_tasks_have_metaworlds_bits(tasks):
     """2 episodes of 500 steps, expert actions with noise, single precision and then double."""
     n = len(tasks)
     rng = np.random.default_rng(TASKS.index(tasks[0]))
@@ -99,7 +99,7 @@ def test_every_task_equals_metaworld_in_every_bit(tasks):
 
 
 @pytest.mark.parametrize("tasks", [SHARING * 2, VARIED], ids=["shared models", "varied tasks"])
-def test_any_mask_and_any_history(tasks):
+def test_masks_and_resets_in_any_order_have_metaworlds_bits(tasks):
     """Rows that share models, stepped and reset in any mixture by one or two threads, do as if each were alone."""
     n = len(tasks)
     rng = np.random.default_rng(1)
@@ -125,7 +125,7 @@ def test_any_mask_and_any_history(tasks):
             assert not got.success[~active].any()
 
 
-def test_an_episode_depends_on_seed_and_actions_alone():
+def test_episode_depends_only_on_seed_and_actions():
     """Neither what a row did before nor the rows beside it show in an episode."""
     tasks = ["faucet-open", "faucet-close", "window-open"]
     fresh = VectorizedEngine(tasks, num_threads=1)
@@ -143,7 +143,7 @@ def test_an_episode_depends_on_seed_and_actions_alone():
     assert all(same_bits(a, b).all() for a, b in zip(expected, got, strict=True))
 
 
-def test_a_reset_finds_the_model_as_compiled():
+def test_reset_restores_the_compiled_model():
     """plate-slide moves a body that plate-slide-back, on the same model, leaves where it is."""
     tasks = ["plate-slide", "plate-slide-back"]
     engine = VectorizedEngine(tasks, num_threads=1)
@@ -178,7 +178,7 @@ def test_sparse_reward_is_the_success():
     assert result.success.all()
 
 
-def test_results_belong_to_the_caller():
+def test_results_are_new_arrays():
     engine = VectorizedEngine(["reach", "push"], num_threads=1)
     first = engine.reset([0, 1], [0, 1])
     kept = first.copy()
@@ -209,7 +209,7 @@ def break_by_force(engine: VectorizedEngine, action: np.ndarray) -> None:
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("damage", [break_by_action, break_by_position, break_by_speed, break_by_force])
-def test_a_fault_stays_in_its_row(damage, threads, tmp_path, monkeypatch, capfd):
+def test_fault_stays_in_its_row(damage, threads, tmp_path, monkeypatch, capfd):
     """Rows 0 to 2 share a model; row 1 breaks at step 5."""
     monkeypatch.chdir(tmp_path)
     tasks = ["push", "push", "push", "drawer-open"]
@@ -245,7 +245,7 @@ def test_a_fault_stays_in_its_row(damage, threads, tmp_path, monkeypatch, capfd)
     assert capfd.readouterr() == ("", "")
 
 
-def test_an_action_that_is_not_finite_is_a_fault_of_its_row_alone():
+def test_nonfinite_action_is_a_fault_of_its_row():
     engine = VectorizedEngine(["reach"] * 3, num_threads=1)
     engine.reset([0, 1, 2], [0, 1, 2])
     action = np.zeros((3, 4), np.float32)
@@ -255,7 +255,7 @@ def test_an_action_that_is_not_finite_is_a_fault_of_its_row_alone():
 
 
 @pytest.mark.parametrize("threads", [2, 3, 8])
-def test_the_number_of_threads_changes_nothing(threads):
+def test_results_do_not_depend_on_the_number_of_threads(threads):
     tasks = ["push", "soccer", *["pick-place"] * 5, "sweep"]
     alone, together = (VectorizedEngine(tasks, num_threads=k) for k in (1, threads))
     for a, b in zip(play(alone, tasks, 30), play(together, tasks, 30), strict=True):
@@ -277,7 +277,7 @@ def test_two_engines_do_not_disturb_each_other():
         assert same_bits(expected[k + 1], got).all()
 
 
-def test_rows_are_light_and_models_are_kept():
+def test_rows_need_little_memory_and_models_are_reused():
     def memory() -> int:
         return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
@@ -297,7 +297,7 @@ def test_rows_are_light_and_models_are_kept():
     assert {id(row.shared) for row in again._rows} == models
 
 
-def test_an_engine_that_is_forgotten_gives_its_models_back():
+def test_collected_engine_returns_its_models():
     engine = VectorizedEngine(["plate-slide"], num_threads=1)
     engine.reset([0], [5])
     shared = engine._rows[0].shared
@@ -310,7 +310,7 @@ def test_an_engine_that_is_forgotten_gives_its_models_back():
     return_models([borrowed])
 
 
-def test_a_reset_moves_nothing_in_a_model_but_bodies_and_sites():
+def test_reset_changes_only_places_of_bodies_and_sites():
     """What a reset edits is kept for each row, so it must edit nothing that we do not keep."""
 
     def arrays(model) -> dict[str, bytes]:
@@ -348,7 +348,7 @@ def test_versions_that_were_compared_give_the_vectorized_engine_without_a_warnin
     assert not [warning for warning in recwarn if "slower" in str(warning.message)]
 
 
-def test_the_table_names_metaworlds_tasks():
+def test_table_has_metaworlds_tasks():
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
     assert {f"{task}-v3" for task in TASKS} == set(ALL_V3_ENVIRONMENTS)
@@ -363,12 +363,12 @@ def test_quaternions_have_scipys_bits():
     assert same_bits(one_by_one, quaternion_of_matrix(matrices.reshape(-1, 9))).all()
 
 
-def test_norms_have_the_bits_of_one_norm():
+def test_norms_have_numpys_bits():
     vectors = np.random.default_rng(0).normal(size=(20000, 3)) * 0.1
     assert same_bits(np.array([np.linalg.norm(v) for v in vectors]), row_norm(vectors)).all()
 
 
-def test_rows_of_one_model_stay_together_unless_a_thread_would_starve():
+def test_rows_of_a_model_form_a_group_unless_a_thread_would_idle():
     keys = ["a", "b", "a", "c", "a", "b"]
     assert {group.rows for group in split_into_groups(keys, 1)} == {(0, 2, 4), (1, 5), (3,)}
     assert {group.rows for group in split_into_groups(["a"] * 8, 2)} == {(0, 1), (2, 3), (4, 5), (6, 7)}
@@ -376,7 +376,7 @@ def test_rows_of_one_model_stay_together_unless_a_thread_would_starve():
 
 
 @pytest.mark.parametrize("threads", [1, 4])
-def test_a_worker_pool_does_each_item_once_and_a_group_in_turn(threads):
+def test_worker_pool_does_each_item_once_and_a_group_in_order(threads):
     pool = WorkerPool(threads)
     jobs = [(RowGroup(range(k, k + 5)), range(k, k + 5)) for k in range(0, 100, 5)]
     busy = [threading.Lock() for _ in jobs]
@@ -394,14 +394,14 @@ def test_a_worker_pool_does_each_item_once_and_a_group_in_turn(threads):
     pool.close()
 
 
-def test_a_worker_pool_works_side_by_side():
+def test_worker_pool_works_in_parallel():
     pool, meeting = WorkerPool(3), threading.Barrier(3, timeout=10)
     pool.work([(RowGroup([k]), [k]) for k in range(3)], lambda item: meeting.wait())
     pool.close()
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_an_error_in_a_thread_reaches_the_caller(threads):
+def test_error_in_a_thread_reaches_the_caller(threads):
     pool = WorkerPool(threads)
 
     def do(item: int) -> None:

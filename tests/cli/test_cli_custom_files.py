@@ -1,4 +1,4 @@
-"""Your own tasks, plans, skills and text encoders, by the same options in every command."""
+"""Custom tasks, plans, skills and text encoders, with the same options in every command."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ TINY = ("--steps", 5, "--width", 8, "--depth", 1)
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory):
-    """A folder with your own files."""
+    """Return a folder with custom files."""
     folder = tmp_path_factory.mktemp("own")
     (folder / "tasks.toml").write_text(TASKS)
     (folder / "reach.plan").write_text(PLAN)
@@ -53,11 +53,11 @@ def own(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def there(own, monkeypatch):
+def work_in_the_folder(own, monkeypatch):
     monkeypatch.chdir(own)
 
 
-def test_scripted_skills_carry_out_your_plan(capsys, tmp_path):
+def test_scripted_skills_carry_out_a_custom_plan(capsys, tmp_path):
     files = ("--plans", "reach.plan", "--skill-file", "skills.toml", "--task-file", "tasks.toml")
     printed = run(capsys, "evaluate", "scripted", *files, "--episodes", 3, "--noise", 0, "--out", tmp_path / "out")
     assert "reach: success 1.00" in printed
@@ -68,7 +68,7 @@ def test_scripted_skills_carry_out_your_plan(capsys, tmp_path):
     )
 
 
-def test_a_policy_is_trained_and_evaluated_with_them(capsys, tmp_path):
+def test_a_policy_is_trained_with_custom_files(capsys, tmp_path):
     policy = tmp_path / "policy.safetensors"
     files = ("--plans", "reach.plan", "--task-file", "tasks.toml", "--text-encoder", "my_texts:encode")
     run(capsys, "train", "demos", "--out", policy, "--tasks", "reach", *files, *TINY, "--batch-size", 8)
@@ -83,8 +83,8 @@ def test_a_policy_is_trained_and_evaluated_with_them(capsys, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_policy_on_your_own_words_works_in_other_processes(forks, own, tmp_path):
-    """Trained, evaluated, recorded and fine-tuned, each time where no text has been encoded yet."""
+def test_a_policy_with_custom_texts_works_in_other_processes(forks, own, tmp_path):
+    """Train, evaluate, record and fine-tune, each in a process that has not encoded any text."""
     plan = PLAN.replace("the ball", "the reach target")
     (tmp_path / "mine.plan").write_text(plan)  # the plan itself says which task it is for
     policy, tuned = tmp_path / "policy.safetensors", tmp_path / "tuned.safetensors"
@@ -100,15 +100,14 @@ def test_a_policy_on_your_own_words_works_in_other_processes(forks, own, tmp_pat
         assert ended.status == 0, (command, ended.err)
 
 
-def test_a_task_that_the_simulator_lacks_is_named(capsys, tmp_path):
+def test_a_task_without_a_simulator_is_an_error(capsys, tmp_path):
     (tmp_path / "tasks.toml").write_text('[stack-cup]\ndescription = "Stack."\nobjects.cup = "obs[4:7]"\n')
     (tmp_path / "plans.json").write_text(json.dumps({"stack-cup": [["the gripper is open", "go to the cup"]]}))
     plans = lw.load_plans(tmp_path / "plans.json", tasks=lw.load_tasks(tmp_path / "tasks.toml"))
     both = lw.Plans({**plans, "reach": lw.load_plans("MT10")["reach"]})
-    for name, some in (("alone", plans), ("both", both)):
-        lw.save_actor(lw.PlanConditionedActor(some), tmp_path / f"{name}.safetensors")
-    error = fails(capsys, "evaluate", tmp_path / "alone.safetensors", "--tasks", "stack-cup")
-    assert "A task of your own is a Task with an engine=, see docs/training.md" in error
-    assert "no simulator has the policy's tasks, stack-cup" in fails(capsys, "evaluate", tmp_path / "alone.safetensors")
+    for name, of_name in (("single", plans), ("both", both)):
+        lw.save_actor(lw.PlanConditionedActor(of_name), tmp_path / f"{name}.safetensors")
+    assert "stack-cup" in fails(capsys, "evaluate", tmp_path / "single.safetensors", "--tasks", "stack-cup")
+    assert "no simulator" in fails(capsys, "evaluate", tmp_path / "single.safetensors")
     printed = run(capsys, "evaluate", tmp_path / "both.safetensors", "--episodes", 1, "--max-steps", 5)
     assert printed.startswith("evaluating 1 task of the policy's 2; choose others by --tasks\n")
