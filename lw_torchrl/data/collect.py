@@ -31,7 +31,6 @@ from lw_torchrl.data.collection_policy import Behaviour, SegmentActor, behaviour
 from lw_torchrl.data.dataset import COLUMNS, TRAJECTORY, CollectConfig, DatasetError, Demonstrations
 from lw_torchrl.envs.episodes import policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.parts import evaluating
 from lw_torchrl.modules.policy import plans_of, tasks_of, transform_of
@@ -135,8 +134,7 @@ def suite_expert(suite: Suite, tasks: Sequence[str]) -> Any:
         return suite.make_expert(tasks)
     if suite.plans is None or suite.skills is None:
         raise ValueError(f"policy='expert': suite {suite.name!r} has no plans with scripted skills; give a policy")
-    suite.plans.require(tasks)
-    return ScriptedSkillActor(Plans([suite.plans[task] for task in tasks]), skills=suite.skills)
+    return ScriptedSkillActor(segment_plans(tasks, suite), skills=suite.skills)
 
 
 def run_missing_episodes(

@@ -115,7 +115,7 @@ def add_pictures(
             for start in range(0, len(episodes), _TOGETHER):
                 group = episodes[start : start + _TOGETHER]
                 for episode, images in zip(group, _render(demonstrations, rows, group, pictures), strict=True):
-                    _write(pictures.file(root, episode), images)
+                    _write(pictures.file(demonstrations.root, episode), images)
                     bar.update(len(images))
 
 

@@ -166,13 +166,9 @@ def _pixel_format(pictures: Pictures) -> str:
 def _video_feature(pictures: Pictures, fps: int) -> dict[str, Any]:
     """Return a video's entry in LeRobot's info.json."""
     height, width, _ = pictures.shape
-    info: dict[str, Any] = {
-        "video.height": height,
-        "video.width": width,
-        "video.channels": 3,
-        "video.is_depth_map": False,
-    }
-    info |= {"video.codec": "h264", "video.pix_fmt": _pixel_format(pictures), "video.fps": fps, "has_audio": False}
+    info: dict[str, Any] = {"video.height": height, "video.width": width, "video.channels": 3, "video.fps": fps}
+    info |= {"video.codec": "h264", "video.pix_fmt": _pixel_format(pictures)}
+    info |= {"video.is_depth_map": False, "has_audio": False}
     return {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": info}
 
 
