@@ -69,11 +69,6 @@ class Behaviour:
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
 
-    @classmethod
-    def from_json(cls, described: Mapping[str, Any]) -> Behaviour:
-        """Return the behaviour that :meth:`to_json` described."""
-        return cls(**described)
-
 
 EXPERT: Behaviour = Behaviour("expert", "expert")
 NOISY = "noisy"  # the label of an expert's episodes that are executed with noise

@@ -92,9 +92,10 @@ class CollectConfig:
     def from_json(cls, config: Mapping[str, Any]) -> CollectConfig:
         """Return the configuration that :meth:`to_json` described."""
         options = {**config, "tasks": tuple(config["tasks"]), "noise_scale": tuple(config["noise_scale"])}
-        for key, parse in (("policy", Behaviour.from_json), ("layout", Layout.from_json)):
-            if key in options:
-                options[key] = parse(options[key])
+        if "policy" in options:
+            options["policy"] = Behaviour(**options["policy"])
+        if "layout" in options:
+            options["layout"] = Layout.from_json(options["layout"])
         return cls(**options)
 
     @property
@@ -314,31 +315,30 @@ def load_rows(demonstrations: Demonstrations) -> TensorDict:
 _VERIFIED: dict[Path, tuple[list[Any], set[EpisodeInfo]]] = {}
 
 
-def whole_episodes(demonstrations: Demonstrations, *, progress: bool) -> list[EpisodeInfo]:
-    """Return the episodes whose rows match their checksums."""
-    rows, whole = load_rows(demonstrations), []
-    with Progress("checking", len(demonstrations.episodes), "episode", show=progress) as bar:
-        for info in demonstrations.episodes:
-            if _is_whole(info, rows):
-                whole.append(info)
+def damaged_episodes(
+    demonstrations: Demonstrations, episodes: Sequence[EpisodeInfo], *, progress: bool = False
+) -> list[EpisodeInfo]:
+    """Return the episodes whose rows differ from their checksums."""
+    rows, damaged_ones = load_rows(demonstrations), []
+    with Progress("checking", len(episodes), "episode", show=progress) as bar:
+        for info in episodes:
+            steps = rows[info.start : info.start + info.length]
+            if describe_episode(info.task, info.episode, info.start, steps) != info:
+                damaged_ones.append(info)
             bar.update()
-    return whole
-
-
-def _is_whole(info: EpisodeInfo, rows: TensorDictBase) -> bool:
-    return describe_episode(info.task, info.episode, info.start, rows[info.start : info.start + info.length]) == info
+    return damaged_ones
 
 
 def verify(demonstrations: Demonstrations, episodes: Sequence[EpisodeInfo]) -> None:
     """Raise DatasetError unless episodes match their checksums; each is compared once while the files do not change."""
-    rows, root = load_rows(demonstrations), demonstrations.root.resolve()
+    load_rows(demonstrations)  # raises if a file is missing
+    root = demonstrations.root.resolve()
     states = [path.stat() for path in (root / METADATA, *(_path(root / DATA, key) for key in COLUMNS))]
     files = [(state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns) for state in states]
     files_before, known = _VERIFIED.get(root, (files, set()))
     if files != files_before:
         known = set()
-    for info in episodes:
-        if info not in known and not _is_whole(info, rows):
-            episode = f"episode {info.episode} of {info.task!r}"
-            raise damaged(f"the rows in {str(root)!r} are damaged: {episode} differs from its checksum")
+    if broken := damaged_episodes(demonstrations, [info for info in episodes if info not in known]):
+        episode = f"episode {broken[0].episode} of {broken[0].task!r}"
+        raise damaged(f"the rows in {str(root)!r} are damaged: {episode} differs from its checksum")
     _VERIFIED[root] = (files, known | set(episodes))

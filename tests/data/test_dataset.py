@@ -123,8 +123,8 @@ def test_only_the_selected_episodes_are_checked(damaged_root):
 
 
 def test_checksums_are_compared_once_while_the_files_do_not_change(damaged_root, monkeypatch):
-    checked, real = [], module._is_whole
-    monkeypatch.setattr(module, "_is_whole", lambda info, rows: checked.append(info.episode) or real(info, rows))
+    checked, describe = [], module.describe_episode
+    monkeypatch.setattr(module, "describe_episode", lambda *args: checked.append(args[1]) or describe(*args))
     for _ in range(3):
         LanguageWorldExperienceReplay(damaged_root, label="executed").verify()
     assert len(checked) == len(ALL)
