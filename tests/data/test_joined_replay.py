@@ -117,10 +117,10 @@ def test_one_demonstration_mixes_with_the_base_tasks(base, target):
         assert torch.equal(batch["is_target"], batch["task_id"] == lw.task_id("reach"))
         assert batch["qaf"].shape[0] == 40
         batches.append(batch[batch["is_target"]])
-    seen = torch.cat(batches)
-    assert seen["episode"].unique().tolist() == [1]
-    assert seen["collector", "traj_ids"].unique().tolist() == [6 + 1]
-    assert torch.equal(seen["observation"].unique(dim=0), demonstration["observation"].unique(dim=0))
+    rows = torch.cat(batches)
+    assert rows["episode"].unique().tolist() == [1]
+    assert rows["collector", "traj_ids"].unique().tolist() == [6 + 1]
+    assert torch.equal(rows["observation"].unique(dim=0), demonstration["observation"].unique(dim=0))
 
 
 def test_a_checkpoint_resumes_only_with_the_same_episodes(base, target, tmp_path):

@@ -133,12 +133,12 @@ def test_every_task_starts_and_moves_as_in_metaworld(mt50, metaworld_env):
             observation, reward, *_ = own.step(action)
             expected.append(observation.astype(np.float32))
             rewards.append(np.float32(reward))
-        got = np.stack([state["observation"][number].numpy() for state in states])
-        if not np.array_equal(got, np.stack(expected)):
+        observations = np.stack([state["observation"][number].numpy() for state in states])
+        if not np.array_equal(observations, np.stack(expected)):
             wrong.append((task, "trajectory"))
         if [state["reward"][number].item() for state in states[1:]] != rewards:
             wrong.append((task, "reward"))
-        moved += not np.array_equal(got[0], got[-1])
+        moved += not np.array_equal(observations[0], observations[-1])
         own.seed(episode_seed(task, 3, 0))
         if not np.array_equal(first[number].numpy(), own.reset()[0].astype(np.float32)):
             wrong.append((task, "episode 0"))
