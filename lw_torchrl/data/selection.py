@@ -30,6 +30,8 @@ class EpisodeFilter:
         behaviours: keep episodes with these labels, "spoilt-30" for example.
         best: the fraction of each task's remaining episodes to keep, at least one: those of the highest return, the
             shorter at a tie.
+        else_best: for a task without an episode that meets the conditions, the fraction of all its episodes to keep,
+            chosen as for ``best``; None for an error.
 
     Example:
         >>> EpisodeFilter(success=True, behaviours=("expert", "noisy")).best is None
@@ -40,6 +42,7 @@ class EpisodeFilter:
     least_return: float | None = None
     best: Probability | None = None
     behaviours: tuple[str, ...] | None = None
+    else_best: Probability | None = None
 
     def __post_init__(self) -> None:
         if self.behaviours == ():
@@ -59,9 +62,12 @@ class EpisodeFilter:
         chosen: set[tuple[int, EpisodeInfo]] = set()
         empty = []
         for task in sorted({episode.task for _, episode, *_ in listed}):
-            left = [row for row in listed if row[1].task == task and self._keeps(parts[row[0]], *row[1:3])]
-            if self.best is not None:  # the highest returns, and the shorter at a tie
-                left = sorted(left, key=lambda row: (-row[2], row[3]))[: max(1, round(self.best * len(left)))]
+            of_task = [row for row in listed if row[1].task == task]
+            left, share = [row for row in of_task if self._keeps(parts[row[0]], *row[1:3])], self.best
+            if not left and self.else_best is not None:
+                left, share = of_task, self.else_best
+            if share is not None:  # the highest returns, and the shorter at a tie
+                left = sorted(left, key=lambda row: (-row[2], row[3]))[: max(1, round(share * len(left)))]
             chosen |= {row[:2] for row in left}
             if not left:
                 empty.append(task)

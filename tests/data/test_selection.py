@@ -50,15 +50,17 @@ filters = st.builds(
     least_return=st.sampled_from([None, -5, 0.0, 0.5]),
     best=st.sampled_from([None, 0.01, 0.25, 0.5, 1.0]),
     behaviours=st.sampled_from([None, ("expert",), ("expert", "random"), ("wrong",)]),
+    else_best=st.sampled_from([None, 0.3, 1.0]),
 )
 
 
-def oracle(parts, returns, success, least_return, best, behaviours):
+def oracle(parts, returns, success, least_return, best, behaviours, else_best):
     """Return the kept (part, number) pairs, computed in another way."""
-    kept = []
+    kept, everything = [], []
     for place, part in enumerate(parts):
         for number, episode in enumerate(part.episodes):
             total, rows = returns[place][number].tolist()
+            everything.append((episode.task, -total, rows, place, number))
             if success is not None and episode.success != success:
                 continue
             if least_return is not None and total < least_return:
@@ -68,10 +70,12 @@ def oracle(parts, returns, success, least_return, best, behaviours):
             kept.append((episode.task, -total, rows, place, number))
     chosen = set()
     for task in TASKS:
-        of_task = sorted(row for row in kept if row[0] == task)
+        of_task, share = sorted(row for row in kept if row[0] == task), best
         if not of_task:
-            return None
-        size = len(of_task) if best is None else max(1, round(best * len(of_task)))
+            if else_best is None:
+                return None
+            of_task, share = sorted(row for row in everything if row[0] == task), else_best
+        size = len(of_task) if share is None else max(1, round(share * len(of_task)))
         chosen |= {row[3:] for row in of_task[:size]}
     return chosen
 
