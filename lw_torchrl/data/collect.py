@@ -145,6 +145,7 @@ def run_missing_episodes(
     missing = sum(map(len, wanted.values()))
     if not missing:
         return kept
+    # The dense reward is recorded; the sparse one follows from success.
     base = LanguageWorldEnv(
         config.tasks,
         suite=suite,
@@ -226,6 +227,7 @@ def _assemble(
             yield rows
 
     building = files.folder / "rows"
+    # The folder of the rows gets its name when it is complete, and the metadata, written last, finish the dataset.
     for old in (building, root / dataset.DATA):
         shutil.rmtree(old, ignore_errors=True)
     dataset.write_rows(building, episodes(), config.layout)

@@ -262,7 +262,7 @@ def write_rows(folder: Path, episodes: Iterable[TensorDictBase], layout: Layout)
                 file.write(steps.get(key).contiguous().numpy().data)
     for name, entries in _meta(rows, layout).items():
         (folder / name / "meta.json").write_text(json.dumps(entries, separators=(",", ":")), encoding="utf-8")
-    for path in sorted(folder.rglob("*"), reverse=True):
+    for path in sorted(folder.rglob("*"), reverse=True):  # files before their folders
         flush(path)
     flush(folder)
 

@@ -36,6 +36,7 @@ def _read_part(
     else:
         taken, other = ("expert_action", "unclipped_action")[:: 1 if label == "expert" else -1]
         rows = rows.exclude("next", "action", other).rename_key_(taken, "action")
+    # One NaN would spoil the weights of a policy, and the loss shows it only a step later.
     if not finite(rows.get("action")):
         raise DatasetError(f"root: {str(whole.root)!r} holds an action that is NaN or infinite, for label={label!r}")
     if chosen.episodes == whole.episodes and after is None:

@@ -158,7 +158,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         self.n_steps, self.gamma, self.columns = n_steps, gamma, dict[str, str]()
         self._plain = keys is not None
         rows = [[[e.task, e.episode, e.start, e.length, e.checksum] for e in part.episodes] for part in parts]
-        shown = json.dumps([rows, after_success, terminate_on_success])
+        shown = json.dumps([rows, after_success, terminate_on_success])  # identifies the rows in saved states
         storage = DatasetStorage(loaded, sha256(shown.encode()).hexdigest())
         kwargs |= {"sampler": sampler, "batch_size": batch_size, "transform": transform}
         super().__init__(storage=storage, writer=ImmutableDatasetWriter(), **kwargs)
@@ -173,6 +173,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
     def set_sampler(self, sampler: Sampler) -> Sampler:
         """Use another sampler, which draws from the buffer's generator; in a worker, call ``set_rng`` after it."""
         before = super().set_sampler(sampler)
+        # In a DataLoader's workers the generators are equal copies, so all workers would draw the same rows.
         if get_worker_info() is None:
             self.set_rng(self._rng)
         return before

@@ -134,7 +134,7 @@ class GroupSampler(Sampler):
         if not same.any(1).all():
             return False
         label, moved = same.int().argmax(1), torch.zeros(length, dtype=torch.bool)
-        moved[rows] = True
+        moved[rows] = True  # they leave the pass that they were in
         passes, cursors = [], []
         orders = self._order.split(self._size.tolist())
         for group, (order, cursor) in enumerate(zip(orders, self._cursor.tolist(), strict=True)):

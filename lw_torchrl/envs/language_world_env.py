@@ -193,6 +193,7 @@ class LanguageWorldEnv(EnvBase):
         raise TypeError("a LanguageWorldEnv can be neither pickled nor copied: pass a function that makes it")
 
     def _check_process(self) -> None:
+        # The simulator's threads and its OpenGL context do not survive a fork: a child would hang.
         if os.getpid() != self._process:
             raise RuntimeError(
                 "this process was forked after the environment was made: make the environment in this process (give "

@@ -72,7 +72,7 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
         steps = arrow.slice(in_file[0][0], in_file[-1][1] - in_file[0][0])
         pq.write_table(steps, path, compression="zstd", use_dictionary=False)
         bar.update(len(steps))
-    place = np.unique(place, return_inverse=True)[1]
+    place = np.unique(place, return_inverse=True)[1]  # a long episode may skip a number
     episodes: dict[str, Any] = {
         "episode_index": np.arange(len(lengths)),
         "tasks": [[table.descriptions[task]] for task in table.tasks],
