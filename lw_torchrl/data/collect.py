@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
 from numbers import Real
 from pathlib import Path
@@ -215,27 +215,17 @@ def _assemble(
     root: Path, config: CollectConfig, versions: dict[str, str], files: EpisodeFiles, kept: dict[str, list[int]]
 ) -> None:
     """Join the episodes' files to a dataset."""
-    listed = [(task, episode) for task in config.tasks for episode in kept[task]]
-    infos: list[dataset.EpisodeInfo] = []
-
-    def episodes() -> Iterator[TensorDictBase]:
-        for number, (task, episode) in enumerate(listed):
-            rows = files.get(task, episode)
-            rows.set(TRAJECTORY, torch.full(rows.batch_size, number))
-            start = infos[-1].start + infos[-1].length if infos else 0
-            infos.append(dataset.describe_episode(task, episode, start, rows))
-            yield rows
-
+    episodes = ((task, episode, files.get(task, episode)) for task in config.tasks for episode in kept[task])
     building = files.folder / "rows"
     # The folder of the rows gets its name when it is complete, and the metadata, written last, finish the dataset.
     for old in (building, root / dataset.DATA):
         shutil.rmtree(old, ignore_errors=True)
-    dataset.write_rows(building, episodes(), config.layout)
+    infos = dataset.write_rows(building, episodes, config.layout)
     os.replace(building, root / dataset.DATA)
     flush(root)
     attempts = {task: max(kept[task]) + 1 for task in config.tasks}
     task_ids = {task: task_id(task) for task in config.tasks}
-    dataset.write_metadata(Demonstrations(root, config, versions, task_ids, tuple(infos), attempts))
+    dataset.write_metadata(Demonstrations(root, config, versions, task_ids, infos, attempts))
 
 
 def _finished(root: Path, config: CollectConfig) -> Demonstrations | None:

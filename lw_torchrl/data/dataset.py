@@ -34,6 +34,7 @@ from lw_torchrl._util.checks import Count, Scale, typed_fields
 from lw_torchrl._util.files import AnyPath, flush, read_json, write_json
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.collection_policy import EXPERT, NOISY, Behaviour, check_own_label
+from lw_torchrl.envs.episodes import first_success
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.tasks import resolve_tasks
 
@@ -249,22 +250,28 @@ def _meta(rows: int, layout: Layout = METAWORLD) -> dict[str, dict[str, Any]]:
     return {folder: entries | about for folder, entries in folders.items()}
 
 
-def write_rows(folder: Path, episodes: Iterable[TensorDictBase], layout: Layout) -> None:
-    """Write episodes one after another, and flush them to the disk; an :class:`OSError` leaves some of them there."""
-    rows = 0
+def write_rows(
+    folder: Path, episodes: Iterable[tuple[str, int, TensorDictBase]], layout: Layout
+) -> tuple[EpisodeInfo, ...]:
+    """Write episodes (task, index, rows) one after another, flush them to the disk, and return their descriptions."""
+    infos: list[EpisodeInfo] = []
+    start = 0
     for name in _meta(0):
         (folder / name).mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         files = {key: stack.enter_context(_path(folder, key).open("wb")) for key in COLUMNS}
-        for steps in episodes:
-            rows += len(steps)
+        for number, (task, episode, rows) in enumerate(episodes):
+            rows.set(TRAJECTORY, torch.full(rows.batch_size, number))
+            infos.append(describe_episode(task, episode, start, rows))
+            start += len(rows)
             for key, file in files.items():
-                file.write(steps.get(key).contiguous().numpy().data)
-    for name, entries in _meta(rows, layout).items():
+                file.write(rows.get(key).contiguous().numpy().data)
+    for name, entries in _meta(start, layout).items():
         (folder / name / "meta.json").write_text(json.dumps(entries, separators=(",", ":")), encoding="utf-8")
     for path in sorted(folder.rglob("*"), reverse=True):  # files before their folders
         flush(path)
     flush(folder)
+    return tuple(infos)
 
 
 def describe_episode(task: str, episode: int, start: int, rows: TensorDictBase) -> EpisodeInfo:
@@ -272,8 +279,7 @@ def describe_episode(task: str, episode: int, start: int, rows: TensorDictBase) 
     checksum = 0
     for key in COLUMNS:
         checksum = crc32(rows.get(key).contiguous().numpy().data, checksum)
-    successes = rows.get(("next", "success")).flatten().nonzero().flatten()
-    first = int(successes[0]) + 1 if len(successes) else None
+    first = first_success(rows.get(("next", "success")))
     return EpisodeInfo(task, episode, start, len(rows), first is not None, first, checksum)
 
 
