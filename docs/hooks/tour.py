@@ -21,11 +21,9 @@ def run(folder: Path) -> nbformat.NotebookNode:
 
 
 def kept(notebook: nbformat.NotebookNode) -> str:
-    """Without times, and without the recording, whose page ends with the kernel."""
+    """Return the notebook as text, without times."""
     for cell in notebook.cells:
         cell.metadata = {}
-        for output in cell.get("outputs", ()):
-            output.get("data", {}).pop("text/html", None)
     return nbformat.writes(notebook) + "\n"
 
 

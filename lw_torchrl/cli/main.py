@@ -109,19 +109,19 @@ def _check_ranges(command: Any) -> None:
         value = getattr(command, name)
         if is_dataclass(value):
             _check_ranges(value)
-        validators = [*_validators(hint)]
+        parts = [*_parts(hint)]
         for allowed, text in _RANGES:
-            if get_args(allowed)[1] in validators:
+            if get_args(allowed)[1] in parts:
                 for number in value if isinstance(value, tuple) else [] if value is None else [value]:
                     if not is_bearable(number, allowed):
                         raise ValueError(f"--{name.replace('_', '-')} must be {text}, got {number}")
 
 
-def _validators(hint: Any) -> Iterator[Any]:
-    """Yield the metadata of all annotated types in a type hint."""
-    yield from getattr(hint, "__metadata__", ())
-    for inner in get_args(hint)[:1] if hasattr(hint, "__metadata__") else get_args(hint):
-        yield from _validators(inner)
+def _parts(hint: Any) -> Iterator[Any]:
+    """Yield the types and validators in a type hint, nested ones too."""
+    yield hint
+    for part in get_args(hint):
+        yield from _parts(part)
 
 
 def _overview(commands: dict[str, tuple[str, str, str]]) -> str:

@@ -78,12 +78,13 @@ def open_viewer(
         raise ValueError("web_port excludes screenshot and step")
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        files = [stack.enter_context(readable(recording)) for recording in recordings]
+        files: list[Path] = []
         layouts: list[Path] = []
         openings: dict[str, Opening] = {}
         unknown: list[ValueError] = []
-        for file in files:
-            reader = RrdReader(file)
+        for recording in recordings:
+            files.append(stack.enter_context(readable(recording)))
+            reader = RrdReader(files[-1])
             known, tabs, front, at = reader.recordings()[0], Tabs.read(reader), episode, step
             if tabs is not None and episode is not None:
                 try:
@@ -92,10 +93,14 @@ def open_viewer(
                     unknown.append(error)
                     front = at = None
             openings[known.recording_id] = Opening.of(tabs, front, at)
-            # A recording that was never closed has no layout; a web viewer's front tab is set by its layout.
-            if tabs is not None and (not reader.blueprints() or (web_port is not None and front is not None)):
+            own_front = None if web_port is None else front  # a web viewer's front tab is set by a layout
+            if own_front is not None:  # a copy without its own layout, which would replace ours
+                files[-1] = folder / f"{known.recording_id}.rrd"
+                ids = {"application_id": known.application_id, "recording_id": known.recording_id}
+                reader.stream().write_rrd(files[-1], **ids)
+            if tabs is not None and (own_front is not None or not reader.blueprints()):  # if it was never closed
                 layouts.append(folder / f"{known.recording_id}.rbl")
-                tabs.blueprint(front if web_port is not None else None).save(known.application_id, str(layouts[-1]))
+                tabs.blueprint(own_front).save(known.application_id, str(layouts[-1]))
         if len(unknown) == len(files):
             raise unknown[-1]
         port = str(free_port())
@@ -111,7 +116,7 @@ def open_viewer(
         if screenshot is None:
             with suppress(KeyboardInterrupt):
                 if process.wait():
-                    raise failure(output)
+                    raise viewer_error(output)
             return
         process, output = stack.enter_context(rerun_process(*arguments, "--window-size", window_size, "--headless"))
         picture = stack.enter_context(replacing(screenshot))
@@ -123,7 +128,7 @@ def open_viewer(
             time.sleep(0.5)  # the viewer takes a moment to print its error
             if process.poll() is None:
                 raise RuntimeError(f"rerun's viewer did not answer: {error}") from error
-            raise failure(output) from error
+            raise viewer_error(output) from error
 
 
 def find_recordings(path: AnyPath) -> list[Path]:
@@ -265,7 +270,7 @@ def rerun_process(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[byt
                 process.wait()
 
 
-def failure(output: IO[bytes]) -> RuntimeError:
+def viewer_error(output: IO[bytes]) -> RuntimeError:
     """Return an error with the reason why rerun's program ended, from its output."""
     output.seek(0)
     text = re.sub(r"\x1b\[[0-9;]*m", "", output.read().decode("utf-8", "replace"))  # without colours

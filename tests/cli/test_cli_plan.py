@@ -110,9 +110,9 @@ def test_generate_writes_answers_and_counts_valid_plans(capsys, tmp_path):
         lambda body: completion("I will not", "length") if asked_for(body) == "reach" else shipped(body)
     )
     with serving(server) as address:
-        asked = generate(address, tmp_path, "push", "reach", "--format", "chain_py", "basic_md")
-        first, second = run(capsys, *asked), run(capsys, *asked)
-        shown = document(capsys, "plan generate", *asked[2:])
+        command = generate(address, tmp_path, "push", "reach", "--format", "chain_py", "basic_md")
+        first, second = run(capsys, *command), run(capsys, *command)
+        shown = document(capsys, "plan generate", *command[2:])
         constrained = run(capsys, *generate(address, tmp_path, "push", "--format", "basic_py", "--constrain"))
     assert shown["notes"] == [{"note": "it was cut off at max_tokens", "answers": 4}]
     rows = table(first)
@@ -145,8 +145,8 @@ def test_errors_of_generate_are_one_line(capsys, tmp_path):
 @pytest.mark.usefixtures("_no_key")
 def test_repair_asks_again_and_shows_the_success_of_each_round(capsys, tmp_path):
     def learns(body):
-        told = any(message["role"] == "assistant" for message in body["messages"])
-        return shipped(body) if told else completion("I would rather", "length")
+        is_repair = any(message["role"] == "assistant" for message in body["messages"])
+        return shipped(body) if is_repair else completion("I would rather", "length")
 
     with serving(FakeServer(learns)) as address:
         where = ("--out", tmp_path / "plans", "--cache", tmp_path / "kept", "--episodes", 1)

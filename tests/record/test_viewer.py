@@ -62,7 +62,7 @@ def test_missing_or_unreadable_recordings_and_unknown_episodes_are_errors(tmp_pa
     for path in ("c.rrd", "empty"):
         with pytest.raises(FileNotFoundError, match=path):
             open_viewer(tmp_path / path)
-    with pytest.raises(ValueError, match="episode must be one of 'reach', 'Metrics', got 'push'"):
+    with pytest.raises(ValueError, match=r"episode .*'reach', 'Metrics'"):
         open_viewer(tmp_path / "a.rrd", episode="push")
     for content in (b"", b"something else"):
         (tmp_path / "b.rrd").write_bytes(content)
