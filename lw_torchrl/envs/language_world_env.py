@@ -124,12 +124,11 @@ class LanguageWorldEnv(EnvBase):
         named = self.suite.named_tasks(tasks)
         self.tasks, self.layout = tuple(named), one_layout(named.values())
         n = len(self.tasks)
-        num_envs = n if num_envs is None else int(num_envs)
+        num_envs = n if num_envs is None else num_envs
         if num_envs < n:
             raise ValueError(f"num_envs must be at least {n}, the number of tasks, got {num_envs}")
-        self.max_steps = self.suite.max_steps if max_steps is None else int(max_steps)
-        self.frame_skip = int(frame_skip)
-        self.strict, self.terminate_on_success = strict, terminate_on_success
+        self.max_steps = self.suite.max_steps if max_steps is None else max_steps
+        self.frame_skip, self.strict, self.terminate_on_success = frame_skip, strict, terminate_on_success
         if batch_size is not None and num_envs != 1:
             raise ValueError(f"batch_size=() is only for a single environment, num_envs is {num_envs}")
         self.row_tasks = tuple(self.tasks[i % n] for i in range(num_envs))
@@ -137,7 +136,7 @@ class LanguageWorldEnv(EnvBase):
         if not 0 <= self.worker[0] < self.worker[1]:
             raise ValueError(f"worker must be (w, W) with 0 <= w < W, got {worker}")
         self._process = os.getpid()
-        self._counter = EpisodeCounter([named[t] for t in self.row_tasks], int(seed), self.worker)
+        self._counter = EpisodeCounter([named[t] for t in self.row_tasks], seed, self.worker)
         super().__init__(device=check_device("device", device), batch_size=(num_envs,) if batch_size is None else ())
         self._rows = RowStates(self.row_tasks, self.layout)
         index = ... if batch_size is None else 0
@@ -196,6 +195,7 @@ class LanguageWorldEnv(EnvBase):
         raise TypeError("a LanguageWorldEnv can be neither pickled nor copied: pass a function that makes it")
 
     def _check_process(self) -> None:
+        # The simulator's threads and its OpenGL context do not survive a fork: a child would hang.
         if os.getpid() != self._process:
             raise RuntimeError(
                 "this process was forked after the environment was made: make the environment in this process (give "
