@@ -178,7 +178,7 @@ def test_custom_task_is_saved_with_its_policy(plans, tmp_path):
     assert loaded.plans.fingerprint == plans.fingerprint
     assert loaded.plans["touch-the-block"].definition.object_names == ("robot's gripper", "block")
     lw.save_actor(
-        lw.DescriptorConditionedActor([plan.definition for plan in plans.values()], text_encoder=letters),
+        lw.modules.DescriptorConditionedActor([plan.definition for plan in plans.values()], text_encoder=letters),
         tmp_path / "dc.safetensors",
     )
     assert lw.load_actor(tmp_path / "dc.safetensors", text_encoder=letters).tasks == ("touch-the-block",)

@@ -100,7 +100,7 @@ def score_evaluator(evaluator: ClauseEvaluator, data: LabelledQueries) -> Evalua
         ...     _ = lw.collect_demonstrations("push", episodes_per_task=2, root=root + "/demos", max_steps=40)
         ...     replay = lw.LanguageWorldExperienceReplay(root + "/demos", label="executed")
         ...     data = lw.training.LabelledQueries(replay, lw.training.QueryEvaluatorConfig())
-        >>> untrained = lw.StateQueryEvaluator(lw.load_plans("MT10"))
+        >>> untrained = lw.modules.StateQueryEvaluator(lw.load_plans("MT10"))
         >>> list(score_evaluator(untrained, data).parts)
         ['states', 'queries']
     """

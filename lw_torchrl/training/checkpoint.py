@@ -89,7 +89,7 @@ def save_evaluator(evaluator: QueryEvaluator, path: AnyPath, **about: Any) -> No
     Example:
         >>> import lw_torchrl as lw, os, tempfile
         >>> path = os.path.join(tempfile.mkdtemp(), "evaluator.safetensors")
-        >>> lw.training.save_evaluator(lw.StateQueryEvaluator(lw.load_plans("MT10"), width=8), path)
+        >>> lw.training.save_evaluator(lw.modules.StateQueryEvaluator(lw.load_plans("MT10"), width=8), path)
         >>> lw.training.load_evaluator(path, lw.load_plans("MT50")).config["width"]
         8
     """

@@ -178,7 +178,7 @@ class QueryEvaluatorTrainer(Training):
         >>> replay = lw.LanguageWorldExperienceReplay(root, label="executed")
         >>> config = lw.training.QueryEvaluatorConfig(steps=200, batch_size=64, held_out_pairs=0.0)
         >>> data = lw.training.LabelledQueries(replay, config)
-        >>> lw.training.QueryEvaluatorTrainer(lw.StateQueryEvaluator(plans), data, config).train() < 0.65
+        >>> lw.training.QueryEvaluatorTrainer(lw.modules.StateQueryEvaluator(plans), data, config).train() < 0.65
         True
 
         From pictures:

@@ -76,7 +76,7 @@ def trained(kind="plan", seed=0, squash=True, **options):
     options["decoder"] = lw.modules.MLPDecoder(width=8, depth=1, squash=squash)
     if kind == "plan":
         return lw.PlanConditionedActor(PLANS, **options)
-    return lw.DescriptorConditionedActor(("push", "reach"), **options)
+    return lw.modules.DescriptorConditionedActor(("push", "reach"), **options)
 
 
 def same_rows(left, right):

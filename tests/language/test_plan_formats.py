@@ -51,7 +51,7 @@ def test_a_custom_format(monkeypatch):
     text = lw.encode_plan(SHIPPED[0], "shouted")
     assert text.startswith("## ")
     assert lw.decode_plan(text, SHIPPED[0].task, "shouted").plan == SHIPPED[0]
-    assert lw.plan_prompt("push", "shouted") == lw.plan_prompt("push", "chain_py")
+    assert lw.planners.plan_prompt("push", "shouted") == lw.planners.plan_prompt("push", "chain_py")
 
 
 @pytest.mark.parametrize("format", NINE)

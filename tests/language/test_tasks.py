@@ -174,7 +174,7 @@ def test_a_suite_s_name_may_have_a_hyphen():
     assert parse_plan(str(plan), tasks={task.name: task}).task == "my-desk/hover-low"
 
 
-@pytest.mark.parametrize("function", [lw.load_plans, lw.load_skills, lw.decode_plan, lw.plan_prompt])
+@pytest.mark.parametrize("function", [lw.load_plans, lw.load_skills, lw.decode_plan, lw.planners.plan_prompt])
 def test_help_begins_with_a_short_signature(function):
     assert "lw.TASKS, the 50 tasks from assembly to window-open" in render_doc(function)
     assert len(str(signature(function))) < 500

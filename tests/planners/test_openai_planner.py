@@ -39,7 +39,7 @@ def test_the_request(ask):
     }  # fmt: skip
     assert second["seed"] == 6
     system, user = first["messages"]
-    assert user == {"role": "user", "content": lw.plan_prompt("push", "chain_py")}
+    assert user == {"role": "user", "content": lw.planners.plan_prompt("push", "chain_py")}
     assert "`push` alone" in system["content"]
     plain = FakeServer()
     ask(plain, "push")
@@ -234,7 +234,7 @@ def test_answers_without_a_plan(ask, tmp_path, body, note):
     assert note is None or any(note in other for other in answer.notes)
     (again,) = ask(FakeServer(), "push")
     assert (again.cached, again.text, again.notes) == (True, answer.text, answer.notes)
-    (read,) = lw.FilePlanner(tmp_path / "out").plans("push")
+    (read,) = lw.planners.FilePlanner(tmp_path / "out").plans("push")
     assert read.text == answer.text
 
 
@@ -268,7 +268,7 @@ def test_servers_that_refuse_max_tokens_and_system_messages(ask):
     server = FakeServer(respond)
     assert all(answer.decoded.plan for answer in ask(server, concurrency=1))
     assert len(server.requests) == 12
-    assert server.requests[-1]["messages"][0]["content"].endswith(lw.plan_prompt(lw.MT10[-1], "chain_py"))
+    assert server.requests[-1]["messages"][0]["content"].endswith(lw.planners.plan_prompt(lw.MT10[-1], "chain_py"))
 
 
 def test_a_custom_task(ask, tmp_path):

@@ -16,8 +16,8 @@ PLANS = {skills: lw.load_plans("MT50", skills=skills) for skills in ("own", "MT1
 def test_a_prompt_is_short_and_lacks_the_task_s_own_plan(format):
     for number, task in enumerate(lw.MT50):
         vocabulary = number % 2 == 0
-        prompt = lw.plan_prompt(task, format, vocabulary=vocabulary)
-        assert math.ceil(len(lw.plan_prompt(task, format, vocabulary=True)) / 3) <= MOST_TOKENS
+        prompt = lw.planners.plan_prompt(task, format, vocabulary=vocabulary)
+        assert math.ceil(len(lw.planners.plan_prompt(task, format, vocabulary=True)) / 3) <= MOST_TOKENS
         assert lw.decode_plan(prompt, task, format).plan is None
         assert all(lw.encode_plan(plans[task], format) not in prompt for plans in PLANS.values())
         name = task if format.endswith("_md") and not format.endswith("py_md") else task.replace("-", "_")
@@ -29,7 +29,7 @@ def test_a_prompt_is_short_and_lacks_the_task_s_own_plan(format):
 def test_a_prompt_contains_the_plans_of_its_examples(format):
     for task in ("pick-place", "stick-pull", "handle-press-side"):
         for example in prompt_examples(task):
-            assert lw.decode_plan(lw.plan_prompt(task, format), example.task, format).plan == example
+            assert lw.decode_plan(lw.planners.plan_prompt(task, format), example.task, format).plan == example
 
 
 @pytest.mark.parametrize("format", lw.PLAN_FORMATS)
@@ -40,7 +40,9 @@ def test_a_continuation_of_a_prompt_is_an_answer(format):
     start = whole.index("    if") if "py" in format else whole.index("- When")
     assert lw.decode_plan(whole[start:], "drawer-open", format).plan.steps[0].condition == plan.steps[0].condition
     if not format.endswith("py_md"):
-        assert lw.decode_plan(lw.plan_prompt("drawer-open", format) + whole[start:], "drawer-open", format).plan
+        assert lw.decode_plan(
+            lw.planners.plan_prompt("drawer-open", format) + whole[start:], "drawer-open", format
+        ).plan
 
 
 def test_the_examples_are_pick_place_and_the_nearest_two():
@@ -61,9 +63,9 @@ def test_the_examples_are_pick_place_and_the_nearest_two():
 
 def test_the_task_comes_last_in_the_format():
     head = "# drawer-open: Take hold of the drawer handle and pull the drawer open.\ndef drawer_open(robot):\n"
-    assert lw.plan_prompt("drawer-open", "chain_py").endswith("\n\n" + head)
-    assert lw.plan_prompt("drawer-open", "chain_py_md").endswith(f"```python\n{head}```\n")
-    last = lw.plan_prompt("drawer-open", "chain_md").splitlines()[-2]
+    assert lw.planners.plan_prompt("drawer-open", "chain_py").endswith("\n\n" + head)
+    assert lw.planners.plan_prompt("drawer-open", "chain_py_md").endswith(f"```python\n{head}```\n")
+    last = lw.planners.plan_prompt("drawer-open", "chain_md").splitlines()[-2]
     assert last == "The task `drawer-open`: Take hold of the drawer handle and pull the drawer open."
 
 
@@ -71,9 +73,9 @@ def test_custom_plans_and_tasks(tmp_path):
     (tmp_path / "tasks.toml").write_text('[stack]\ndescription = "Stack it."\nobjects.brick = "obs[4:7]"\n')
     tasks = lw.load_tasks(tmp_path / "tasks.toml")
     mine = lw.Plans([PLANS["own"]["hammer"]])
-    prompt = lw.plan_prompt("stack", "basic_py", plans=mine, tasks=tasks, vocabulary=True)
+    prompt = lw.planners.plan_prompt("stack", "basic_py", plans=mine, tasks=tasks, vocabulary=True)
     assert "def hammer(robot):" in prompt
     assert "# The things in stack are: the robot's gripper, the brick." in prompt
     assert prompt.endswith("# stack: Stack it.\ndef stack(robot):\n")
     with pytest.raises(ValueError, match=r"plans .*'hammer'"):
-        lw.plan_prompt("hammer", "basic_py", plans=mine)
+        lw.planners.plan_prompt("hammer", "basic_py", plans=mine)

@@ -99,7 +99,7 @@ def test_a_plan_is_repaired(planner, tmp_path):
     assert (answer["role"], answer["content"], facts["role"]) == ("assistant", first[0].raw, "user")
     assert "succeeded in 0% of episodes" in facts["content"]
     assert "stuck in step 1" in facts["content"]
-    assert lw.FilePlanner(tmp_path / "plans", "m-round1").recorded == (("chain_py", "push", 0),)
+    assert lw.planners.FilePlanner(tmp_path / "plans", "m-round1").recorded == (("chain_py", "push", 0),)
 
 
 def test_rounds_limit_the_requests(planner):

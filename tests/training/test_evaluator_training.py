@@ -34,7 +34,7 @@ def replay(tmp_path_factory):
 
 def make(seed=0, **options):
     torch.manual_seed(seed)
-    return lw.StateQueryEvaluator(PLANS, **{"width": 16, "depth": 1, **options})
+    return lw.modules.StateQueryEvaluator(PLANS, **{"width": 16, "depth": 1, **options})
 
 
 def make_trainer(replay, path=None, *, config=SMALL, **options):
