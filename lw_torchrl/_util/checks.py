@@ -99,7 +99,9 @@ def _checked(function: Any, read_hints: Callable[[], dict[str, Any]]) -> Any:
 def check_value(argument: str, value: Any, hint: Any) -> Any:
     """Return ``value``, a NumPy number as Python's, if it matches a type hint; else raise :class:`ArgumentError`."""
     if not checker(hint)(value):
-        choices = [choice for part in _parts(hint) if get_origin(part) is Literal for choice in get_args(part)]
+        choices = [
+            choice for part in (hint, *get_args(hint)) if get_origin(part) is Literal for choice in get_args(part)
+        ]
         close = did_you_mean(value, map(str, choices)) if isinstance(value, str) else ""
         raise ArgumentError(f"{argument} must be {_words(hint)}, got {shown(value)}{close}")
     return _plain(value)
@@ -134,24 +136,18 @@ def checker(hint: Any) -> Callable[[Any], bool]:
     return check
 
 
-def _parts(hint: Any) -> tuple[Any, ...]:
-    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-
-
 def _words(hint: Any) -> str:
     """Describe a type hint in English."""
-    if len(parts := _parts(hint)) > 1:
+    kind, parts = get_origin(hint), get_args(hint)
+    if kind in (Union, UnionType):
         return " or ".join(map(_words, parts))
-    for known in (hint, get_origin(hint)):
-        if known in _WORDS:
-            return _WORDS[known]
-    if get_origin(hint) is Literal:
-        return " or ".join(map(repr, get_args(hint)))
-    if isinstance(hint, type) and get_origin(hint) is None:
-        return f"a {hint.__name__}"
-    if (kind := get_origin(hint)) in (None, Annotated):
-        return str(hint)
-    items = [re.sub("^an? ", "", _words(part)) for part in get_args(hint) if part is not ...]
+    if kind is Literal:
+        return " or ".join(map(repr, parts))
+    if words := _WORDS.get(hint) or _WORDS.get(kind):
+        return words
+    if kind in (None, Annotated):
+        return f"a {hint.__name__}" if isinstance(hint, type) else str(hint)
+    items = [re.sub("^an? ", "", _words(part)) for part in parts if part is not ...]
     return f"{kind.__name__}[{', '.join(items)}]"
 
 
