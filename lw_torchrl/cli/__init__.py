@@ -1,1 +1,1 @@
-"""The command line, ``lw-torchrl``: one file for each group of commands."""
+"""The ``lw-torchrl`` command line, with one module for each group of commands."""

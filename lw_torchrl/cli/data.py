@@ -1,4 +1,4 @@
-"""``lw-torchrl collect``, ``data`` and ``info``: make, summarise and convert datasets, and describe files."""
+"""The commands ``collect``, ``data`` and ``info``: collect, summarize and convert datasets, and describe files."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ class _Episode(NamedTuple):
 
 @dataclass(kw_only=True)
 class Collect:
-    """Collect demonstrations of each task. If it is stopped, the same command resumes it.
+    """Collect demonstrations of each task. To resume an interrupted collection, run the same command again.
 
     Example: lw-torchrl collect MT10 --out demos/mt10 --noise 0 0.1 0.2 --redraw-failures
     """
 
     tasks: options.TaskNames
-    out: Path  # folder of the dataset
-    episodes: Count = 10  # episodes kept for each task
+    out: Path  # folder to which the dataset is written
+    episodes: Count = 10  # number of episodes to keep for each task
     seed: Natural = 0  # random seed (use a different one for evaluation)
-    noise: tuple[Scale, ...] = (0.0,)  # standard deviations of the execution noise, used in turn, one per episode
-    noise_hold: Count = 10  # steps for which each noise value is held; longer leads the robot further off its path
-    redraw_failures: Flag = False  # keep only successful episodes
+    noise: tuple[Scale, ...] = (0.0,)  # standard deviations of the execution noise; episodes use the values in turn
+    noise_hold: Count = 10  # number of time steps that each noise sample is held; larger values perturb the path more
+    redraw_failures: Flag = False  # replace failed episodes with new ones, so that all kept episodes succeed
     policy: options.Who = "expert"
     behaviour: Maybe[str] = None  # label of the episodes (default: the policy's name)
     task_file: options.TaskFile = None
@@ -84,14 +84,14 @@ def _show_dataset(output: Output, dataset: Demonstrations) -> Output:
 
 @dataclass(kw_only=True)
 class Show:
-    """Summarise datasets: collection policy, success rate, return. Several are read as a mixture.
+    """Summarize datasets: collection policy, success rate, return. Several datasets are also summarized together.
 
     Example: lw-torchrl data show demos/mt10 demos/spoilt --check
     """
 
     folders: Positional[Annotated[tuple[Path, ...], options.REQUIRED, arg(metavar="FOLDERS")]]
-    """datasets of `lw-torchrl collect`"""
-    check: Flag = False  # also compare all rows with their checksums
+    """datasets written by `lw-torchrl collect`"""
+    check: Flag = False  # also verify the checksums of all episodes
     json: options.Json = False
 
     def run(self) -> Output:
@@ -130,7 +130,7 @@ def _describe(part: Demonstrations) -> str:
         "dataset": f"{part.root}: {_size(part) / 1e6:.3g} MB",
         "behaviour": f"{config.behaviour} ({config.policy.kind}), in {config.layout.name}",
         "tasks": ", ".join(config.tasks) if len(config.tasks) <= 10 else counted(len(config.tasks), "task"),
-        "episodes": episodes + (f"; {counted(redrawn, 'failure')} drawn again" if config.redraw_failures else ""),
+        "episodes": episodes + (f"; {counted(redrawn, 'failure')} replaced" if config.redraw_failures else ""),
         "noise": noise,
         "made with": ", ".join(f"{name} {version}" for name, version in part.versions.items()),
     }
@@ -180,23 +180,23 @@ def _check(output: Output, parts: list[Demonstrations]) -> None:
     for part in parts:
         if number := len(damaged_episodes(part, part.episodes, progress=True)):
             damaged.append({"folder": part.root, "episodes": number})
-            fault = f"{number} of {counted(len(part.episodes), 'episode')} differ from their checksums"
-            output.fault = f"{str(part.root)!r} is damaged: {fault}; delete the folder and collect it again"
-    output.show("damaged", damaged, None if damaged else "\nchecked: all rows match their checksums")
+            fault = f"checksum mismatch in {number} of {counted(len(part.episodes), 'episode')}"
+            output.fault = f"{str(part.root)!r} is corrupted: {fault}; delete the folder and collect the dataset again"
+    output.show("damaged", damaged, None if damaged else "\nall checksums match")
 
 
 @dataclass(kw_only=True)
 class Export:
-    """Convert a dataset to another library's format. `lw-torchrl data import` restores it, bit for bit.
+    """Convert a dataset to another library's format. `lw-torchrl data import` restores a bit-identical dataset.
 
     Example: lw-torchrl data export demos/mt10 --to lerobot --out lerobot/mt10
     """
 
-    folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]  # dataset of `lw-torchrl collect`
-    to: str  # format: lerobot (version 3) or minari
-    out: Path  # folder to write, new or empty
+    folder: Positional[Annotated[Path, arg(metavar="FOLDER")]]  # dataset written by `lw-torchrl collect`
+    to: str  # target format: lerobot (version 3) or minari
+    out: Path  # output folder, new or empty
     plans: Annotated[tuple[str, ...], options.OPTIONAL] = ()
-    """plans whose conditions are stored with each row (default: the suite's)"""
+    """plans whose conditions are stored with each row (default: the suite's plans)"""
     suite: options.SuiteName = None
     json: options.Json = False
 
@@ -212,15 +212,17 @@ class Export:
 
 @dataclass(kw_only=True)
 class Import:
-    """Convert another library's dataset of a suite's tasks to ours. It prints which columns the source lacks.
+    """Convert another library's dataset to this library's format, and print which columns the source lacks.
+
+    The dataset must hold tasks of an installed suite.
 
     Example: lw-torchrl data import lerobot/mt10 --out demos/mt10
     """
 
     source: Positional[Annotated[Path, arg(metavar="SOURCE")]]  # LeRobot or Minari folder, or robomimic HDF5 file
-    out: Path  # folder of the dataset, new or empty
-    format: Maybe[str] = None  # format of the source (default: recognised by its files)
-    task: Maybe[str] = None  # task of all episodes, if the source does not name it
+    out: Path  # output folder, new or empty
+    format: Maybe[str] = None  # format of the source (default: detected from the files)
+    task: Maybe[str] = None  # task of all episodes, if the source does not name one
     suite: options.SuiteName = None
     behaviour: str = "imported"  # label of the episodes
     episodes: Maybe[Count] = None  # import only the first N episodes of each task
@@ -262,7 +264,7 @@ class Info:
 
 
 def _show_recording(output: Output, path: Path) -> Output:
-    """List the episodes of a recording with their numbers of steps."""
+    """List the episodes of a recording and the number of time steps of each."""
     from rerun.chunk import RrdReader
 
     steps: dict[str, int] = {}

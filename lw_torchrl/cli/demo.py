@@ -1,4 +1,4 @@
-"""``lw-torchrl demo``: collect demonstrations, train a plan-conditioned policy, evaluate it, and record a rollout."""
+"""The command ``lw-torchrl demo``: collect demonstrations, and train, evaluate and record a policy."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RECORDED = ("drawer-open", "window-open")
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """Settings of the demo, written to config.json in its folder."""
+    """The settings of the demo, which are written to config.json in the output folder."""
 
     tasks: tuple[str, ...] = MT10
     demonstrations_per_task: int = 20
@@ -43,13 +43,13 @@ QUICK = DemoConfig(tasks=RECORDED, demonstrations_per_task=4, training_steps=800
 class Demo:
     """Train a plan-conditioned policy on MT10, evaluate it and record an episode, in a few minutes on two cores.
 
-    If it is stopped, the same command resumes it.
+    To resume an interrupted demo, run the same command again.
 
     Example: lw-torchrl demo --quick
     """
 
-    out: Maybe[Path] = None  # folder for all files (default: runs/demo, or runs/demo-quick with --quick)
-    quick: Flag = False  # two tasks and little training, in under a minute; its success rate means nothing
+    out: Maybe[Path] = None  # output folder (default: runs/demo, or runs/demo-quick with --quick)
+    quick: Flag = False  # two tasks and little training, in under a minute (the success rate is not meaningful)
 
     def run(self) -> None:
         options.use_one_thread()
@@ -66,7 +66,7 @@ def run_demo(out: Path, config: DemoConfig) -> lw.EvaluationResult:
         if not path.is_file():
             write_json(path, described)
         elif read_json(path, "out: the configuration") != described:
-            raise ValueError(f"out: {str(out)!r} holds a demo with another configuration; choose another folder")
+            raise ValueError(f"out: {str(out)!r} holds a demo with a different configuration; choose another folder")
         return _run(out, config)
 
 
@@ -76,7 +76,7 @@ def _run(out: Path, config: DemoConfig) -> lw.EvaluationResult:
     from lw_torchrl.record.rollouts import run_recorded, write_recording
 
     plans = lw.load_plans("MT10")
-    print(f"1/4  collecting {config.demonstrations_per_task} demonstrations per task, tasks: {len(config.tasks)}")
+    print(f"1/4  collecting {config.demonstrations_per_task} demonstrations for each of {len(config.tasks)} tasks")
     lw.collect_demonstrations(
         config.tasks,
         episodes_per_task=config.demonstrations_per_task,
@@ -95,7 +95,7 @@ def _run(out: Path, config: DemoConfig) -> lw.EvaluationResult:
     )
     cloning = lw.BehavioralCloningConfig(config.training_steps, config.batch_size, seed=config.training_seed)
     lw.BehavioralCloningTrainer(actor, replay, cloning, checkpoint=out / "checkpoint.safetensors").train()
-    print(f"3/4  evaluating {config.episodes_per_task} episodes per task on seeds that no demonstration used")
+    print(f"3/4  evaluating {config.episodes_per_task} episodes per task on seeds unused in the demonstrations")
     results = out / "results.json"
     noise: dict[str, Any] = {"seed": config.evaluation_seed, "noise_scale": config.evaluation_noise}
     if results.is_file():
@@ -109,7 +109,7 @@ def _run(out: Path, config: DemoConfig) -> lw.EvaluationResult:
     chosen = [episode for episode in episodes if episode.task in RECORDED] or episodes[:1]
     write_recording(out / "rollout.rrd", chosen, plans, seed=config.evaluation_seed, policy="demo")
     print(f"\n{result.table()}\n")
-    print("most attended skills, in order, up to the first success (steps):")
+    print("sequence of highest-weighted skills up to the first success (time steps of each):")
     for episode in episodes:
         skills = _active_skills(episode, plans[episode.task])
         shown = skills if len(skills) <= 8 else [*skills[:4], f"... {len(skills) - 7} changes ...", *skills[-3:]]
@@ -120,7 +120,7 @@ def _run(out: Path, config: DemoConfig) -> lw.EvaluationResult:
 
 
 def _active_skills(episode: FinishedEpisode, plan: ConditionalPlan) -> list[str]:
-    """Return the skills with the largest weight, in order up to the success, with their numbers of steps."""
+    """Return the sequence of highest-weighted skills up to the first success, with the number of time steps of each."""
     end = episode.first_success
     largest = episode.steps.get("skill_weights")[:end].argmax(-1).tolist()
     holds = episode.steps.get("qaf")[:end].any(-1).tolist()

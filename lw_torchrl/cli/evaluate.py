@@ -1,4 +1,4 @@
-"""``lw-torchrl evaluate``: success rates of trained policies, experts and scripted plans."""
+"""The command ``lw-torchrl evaluate``: measure success rates of trained policies, experts and scripted plans."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from lw_torchrl.cli.options import Flag, Maybe, Output
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import Task
 
-_PLANS = f"plans that replace the policy's own: {options.PLANS}"
-_REFERENCE = "with --attribute, trusted plans for the re-run, as for --plans"
-_TASKS = "MT10, MT50, a suite, or names of tasks (default: those of --plans or of the demonstrations)"
+_PLANS = f"plans that replace the policy's plans: {options.PLANS}"
+_REFERENCE = "with --attribute, trusted plans with which failed episodes are re-run; same format as --plans"
+_TASKS = "MT10, MT50, a suite, or names of tasks (default: the tasks of --plans or of the demonstrations)"
 
 
 @dataclass(kw_only=True)
 class Rollout:
-    """Plans, evaluator, noise and seed, as for `evaluate` and `record`."""
+    """The options shared by `evaluate` and `record`: plans, evaluator, noise and seed."""
 
     plans: Annotated[options.PlanSources, options.OPTIONAL, arg(help=_PLANS)] = ()
     suite: options.SuiteName = None
@@ -36,14 +36,14 @@ class Rollout:
     evaluator: options.Evaluator = None
     seed: Natural = 1000  # random seed of initial states, goals and noise (use a different one than for demonstrations)
     noise: Scale = 0.1  # standard deviation of the noise on the executed action
-    max_steps: Maybe[Count] = None  # steps of an episode (default: the suite's, 500 in Meta-World)
-    stop_at_success: Flag = False  # end episodes at their first success; the success rate stays the same
-    attribute: Flag = False  # re-run failed episodes to report why they failed: a query, the plan, a skill or time
+    max_steps: Maybe[Count] = None  # maximum time steps per episode (default: the suite's limit, 500 in Meta-World)
+    stop_at_success: Flag = False  # end episodes at the first success; the success rate stays the same
+    attribute: Flag = False  # re-run failed episodes to find the cause: a query, the plan, a skill or the time limit
     reference: Annotated[tuple[str, ...], options.OPTIONAL, arg(metavar="SOURCES", help=_REFERENCE)] = ()
     device: options.Device = "cpu"
 
     def choose(self, names: tuple[str, ...]) -> list[str]:
-        """Read --suite and --task-file, and return the tasks that ``names`` stand for."""
+        """Load --suite and --task-file, and return the names of the selected tasks."""
         options.use_one_thread()
         self.chosen_suite = options.read_suite(self.suite, names)
         self.known: Mapping[str, Task] = options.read_tasks(self.task_file, names, self.suite)
@@ -59,19 +59,19 @@ class Rollout:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """The arguments that the library's functions for episodes share."""
+        """The keyword arguments shared by all library functions that run episodes."""
         arguments = {"seed": self.seed, "noise_scale": self.noise, "suite": self.chosen_suite, "device": self.device}
         return arguments | ({} if self.max_steps is None else {"max_steps": self.max_steps})
 
     def policy(self, name: str, tasks: list[str]) -> tuple[Any, Plans | None, Any]:
-        """Return a policy, the plans to show, and the evaluator in front of the policy."""
+        """Return a policy, the plans to show, and the evaluator that runs before the policy (or None)."""
         policy, plans = self._policy(name, tasks)
         if self.evaluator is None:
             return policy, plans, None
         if (own := lw.modules.plans_of(policy)) is None:
             raise ValueError(f"--evaluator requires a policy with plans; {name} has none")
         evaluator = options.read_evaluator(self.evaluator, own, self.text_encoder)
-        evaluator.answers = "hard"  # the policy was trained on exact answers
+        evaluator.answers = "hard"  # the policy was trained on exact (binary) answers
         return policy, plans, evaluator
 
     def _policy(self, name: str, tasks: list[str]) -> tuple[Any, Plans | None]:
@@ -86,12 +86,12 @@ class Rollout:
         if options.is_object(name):
             policy = options.read_object(name)
         elif self.seed in demonstration_seeds(name):
-            raise ValueError(f"--seed {self.seed} is the seed of the demonstrations; evaluate on a different one")
+            raise ValueError(f"--seed {self.seed} is the seed of the demonstrations; use a different seed")
         else:
             policy = lw.load_actor(name, text_encoder=options.read_encoder(self.text_encoder))
-            if suite is not None and lw.modules.layout_of(policy) != suite.layout:  # a policy of another robot
+            if suite is not None and lw.modules.layout_of(policy) != suite.layout:  # a policy for another robot
                 if (plans := plans or suite.plans) is None:
-                    raise ValueError(f"suite {suite.name!r} has no plans; give some by --plans")
+                    raise ValueError(f"suite {suite.name!r} has no plans; pass some with --plans")
                 plans = canonical_like(plans, lw.modules.plans_of(policy))
                 policy, plans = TransferredActor(policy, plans, speed=self.speed), None
         if plans is not None:
@@ -111,7 +111,7 @@ class Rollout:
         if name == "expert":
             return suite_expert(suite, tasks), plans
         if plans is None:
-            raise ValueError(f"suite {suite.name!r} has no plans for {name} to follow; give some by --plans")
+            raise ValueError(f"suite {suite.name!r} has no plans for policy {name!r}; pass some with --plans")
         skills = options.read_skills(self.skill_file, self.known) if self.skill_file else suite.skills
         if name == "scripted":
             return lw.ScriptedSkillActor(plans, skills=skills), plans
@@ -123,7 +123,7 @@ class Rollout:
 class Evaluate:
     """Evaluate a policy, and write the success rates, a figure and a recording.
 
-    With --suite, a policy that was trained on another robot runs in that suite, with its plans.
+    With --suite, a policy that was trained on another robot is transferred to that suite and follows the suite's plans.
 
     Example: lw-torchrl evaluate runs/mt10.safetensors --out runs/mt10
 
@@ -132,7 +132,7 @@ class Evaluate:
 
     policy: Positional[options.Who]
     tasks: Annotated[tuple[str, ...], options.OPTIONAL, arg(metavar="TASKS", help=_TASKS)] = ()
-    episodes: Count = 20  # episodes of each task
+    episodes: Count = 20  # number of episodes of each task
     out: Maybe[Path] = None  # folder for results.json, success.png, rollout.rrd, failures.png and plan_use.json
     json: options.Json = False
     rollout: OmitArgPrefixes[Rollout] = field(default_factory=Rollout)
@@ -174,7 +174,9 @@ class Evaluate:
         for name, file in (("checkpoint", policy_file(self.policy)), ("evaluator", Path(rollout.evaluator or ""))):
             origin[name] = file if file.is_file() else None
         result.save(out / "results.json", **origin)
-        lw.evaluation.plot_success(result, out / "success.png", title=f"{self.policy}, {self.episodes} episodes a task")
+        lw.evaluation.plot_success(
+            result, out / "success.png", title=f"{self.policy}, {self.episodes} episodes per task"
+        )
         if use is not None:
             write_json(out / "plan_use.json", {task: counts.to_json() for task, counts in use.tasks().items()})
         if rollout.attribute:
@@ -185,7 +187,7 @@ class Evaluate:
 
 
 def _show_plan_use(output: Output, result: lw.EvaluationResult, use: lw.evaluation.PlanUse, plans: Plans) -> None:
-    """Print the result and, for each plan step, how often it was true, chosen, or the last one of a failed episode."""
+    """Print the result, and how often each plan step was true, was chosen, or was the last step of a failed episode."""
     steps = {}
     for task, used in use.tasks().items():
         columns = zip(plans[task].steps, used.true, used.chosen, used.stuck, strict=True)
@@ -198,7 +200,7 @@ def _show_plan_use(output: Output, result: lw.EvaluationResult, use: lw.evaluati
 
 
 def _default_tasks(policy: Any, demonstrated: set[str], suite: lw.suites.Suite | None) -> list[str]:
-    """Return the policy's demonstrated tasks, or all its tasks if none is recorded, that a suite simulates."""
+    """Return the policy's demonstrated tasks (or all tasks if none is recorded) that a suite can simulate."""
     from lw_torchrl.suites.suite import known_suite
 
     if (known := lw.modules.tasks_of(policy)) is None:
@@ -206,8 +208,8 @@ def _default_tasks(policy: Any, demonstrated: set[str], suite: lw.suites.Suite |
     chosen = [task for task in known if task in demonstrated] or list(known)
     tasks = [task for task in chosen if (known_suite(task) if suite is None else task in suite.tasks)]
     if not tasks:
-        hint = "name others by --tasks, or the suite that has them: --import my_module or --suite my_module:suite"
-        raise ValueError(f"no simulator has the policy's tasks, {', '.join(chosen)}; {hint}")
+        hint = "pass other tasks with --tasks, or their suite with --import my_module or --suite my_module:suite"
+        raise ValueError(f"no simulator has the policy's tasks ({', '.join(chosen)}); {hint}")
     if len(tasks) < len(known):
-        print(f"evaluating {counted(len(tasks), 'task')} of the policy's {len(known)}; choose others by --tasks")
+        print(f"evaluating {counted(len(tasks), 'task')} of the policy's {len(known)}; use --tasks to choose others")
     return tasks

@@ -1,4 +1,4 @@
-"""``lw-torchrl tasks``, ``query`` and ``check``: describe tasks, answer queries, and validate your own files."""
+"""The commands ``tasks``, ``query`` and ``check``: describe tasks, answer queries, and validate custom files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lw_torchrl.language.plan_files import PLAN_LIMIT, check_plan
 from lw_torchrl.language.skills import ScriptedSkill, skills_for
 from lw_torchrl.language.tasks import MT10, Task
 
-_SOURCE = "a .plan file, a folder of them, a .toml file of skills or tasks, or a suite, as its name or my_module:suite"
+_SOURCE = "a .plan file, a folder of .plan files, a .toml file of skills or tasks, or a suite (name or my_module:suite)"
 
 
 @dataclass(kw_only=True)
@@ -31,7 +31,7 @@ class Tasks:
     """
 
     names: Positional[Annotated[tuple[str, ...], options.OPTIONAL, arg(metavar="[NAMES]")]] = ()
-    """MT10, MT50, a suite, or names of tasks (all 50 if none is given)"""
+    """MT10, MT50, a suite, or names of tasks (default: all 50 Meta-World tasks)"""
     plans: options.PlanSources = ("MT50",)
     skill_file: options.SkillFile = None
     task_file: options.TaskFile = None
@@ -66,7 +66,7 @@ class Tasks:
         output.table("skills", [_skill_row(skill.for_task(task)) for skill in skills], columns)
         marks = {query: "   (extension)" if extension else "" for query, extension in queries.items()}
         lines = [f"  {query}{mark}" for query, mark in marks.items() if " is not " not in query]
-        print("\nqueries (each may be negated, and joined to others by 'and'):", *lines, sep="\n")
+        print("\nqueries (each can be negated, and several can be joined by 'and'):", *lines, sep="\n")
         print("\nextension: not part of the paper's Language-World")
         return output
 
@@ -87,15 +87,15 @@ def _numbers(values: Iterable[float]) -> str:
 
 @dataclass(kw_only=True)
 class Ask:
-    """Answer a query in a state of a task: the state after N steps of the scripted expert.
+    """Check whether a query holds in a state of a task: the state after the scripted expert has taken N time steps.
 
     Example: lw-torchrl query pick-place "Is the gripper open and not above the puck?" --step 40
     """
 
     task: options.TaskName
     text: Positional[Annotated[Maybe[str], arg(metavar="[TEXT]")]] = None
-    """the query (if none is given, all supported queries that hold are listed)"""
-    step: Natural = 0  # number of steps that the expert does first
+    """the query (default: list all supported queries that hold)"""
+    step: Natural = 0  # number of time steps that the expert takes first
     seed: Natural = 0  # random seed of the initial state
     episode: Natural = 0  # index of the episode
     task_file: options.TaskFile = None
@@ -138,9 +138,10 @@ class Ask:
 
 @dataclass(kw_only=True)
 class Check:
-    """Validate a file of plans, skills or tasks: report every fault with its line and the nearest allowed text.
+    """Validate a file of plans, skills or tasks: report every error with the line and the closest allowed text.
 
-    A suite is simulated for some steps, and its axes, units, gripper and resting objects are compared with its layout.
+    A suite is simulated for a few time steps; the measured axes, units, gripper and object heights are compared with
+    the suite's layout.
 
     Example: lw-torchrl check my-plans/push.plan
 
@@ -148,7 +149,7 @@ class Check:
     """
 
     source: Positional[Annotated[str, arg(metavar="FILE", help=_SOURCE)]]
-    task: Maybe[str] = None  # task that a plan must be for
+    task: Maybe[str] = None  # task for which the plans must be written
     skill_file: options.SkillFile = None
     task_file: options.TaskFile = None
     json: options.Json = False
@@ -180,21 +181,21 @@ class Check:
 
 
 def _skill_notes(plan: lw.ConditionalPlan, skills: Mapping[str, ScriptedSkill]) -> list[str]:
-    """Name the steps that no scripted skill carries out."""
+    """Return a note for each plan step that no scripted skill can execute."""
     notes = []
     for step in plan.steps:
         if step.skill not in skills or not skills[step.skill].suits(plan.definition):
             try:
                 skill, score = nearest_skill(step.skill, plan.definition, skills_for(plan.definition, skills))
-                hint = f"the nearest is {skill.text!r} ({score:.2f})"
+                hint = f"the closest is {skill.text!r} ({score:.2f})"
             except ValueError:
-                hint = "add yours by --skill-file"
-            notes.append(f"no scripted skill {step.skill!r} for {plan.task}; {hint}. Learned policies need none")
+                hint = "add your own with --skill-file"
+            notes.append(f"no scripted skill {step.skill!r} for {plan.task}; {hint}. Learned policies do not need one")
     return notes
 
 
 def _check_toml(output: Output, file: Path, known: Mapping[str, Task]) -> Output:
-    """Validate a file of tasks, recognised by its keys, or of skills."""
+    """Validate a .toml file of tasks or skills; the keys show which."""
     notes: list[str] = []
     try:
         rows = read_toml(file, ValueError)
@@ -210,7 +211,8 @@ def _check_toml(output: Output, file: Path, known: Mapping[str, Task]) -> Output
             for text in rows:
                 if not any(skills[text].suits(task) for task in known.values()):
                     needed = f"{skills[text].target!r} and {skills[text].moved!r}"
-                    notes.append(f"skill {text!r} suits no task: it needs {needed} (add your tasks by --task-file)")
+                    hint = "add your tasks with --task-file"
+                    notes.append(f"skill {text!r} suits no task: no task has both {needed}; {hint}")
     except ValueError as error:
         output.fault = str(error)
         return output.show("files", [{"file": file, "steps": 0, "faults": [str(error)], "notes": []}])
@@ -220,7 +222,7 @@ def _check_toml(output: Output, file: Path, known: Mapping[str, Task]) -> Output
 
 
 def _check_suite(output: Output, name: str) -> Output:
-    """Measure each task of a suite and compare with its layout."""
+    """Measure each task of a suite in simulation and compare the results with the suite's layout."""
     suite = options.read_suite(name)
     assert suite is not None
     rows = lw.suites.check_suite(suite)
@@ -231,5 +233,5 @@ def _check_suite(output: Output, name: str) -> Output:
         for row in rows
     ]
     if wrong := sum(not row.right for row in rows):
-        output.fault = f"{counted(wrong, 'number')} of suite {suite.name!r} differ from its layout"
+        output.fault = f"{counted(wrong, 'measurement')} of suite {suite.name!r} differ from the suite's layout"
     return output.show("suite", [vars(row) for row in rows], "\n".join(lines))

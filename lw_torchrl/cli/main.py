@@ -1,6 +1,6 @@
-"""The command line, ``lw-torchrl``: parses ``--import``, finds the command and reports errors.
+"""The entry point of the ``lw-torchrl`` command line: parse ``--import``, find the command and report errors.
 
-A command is a dataclass: its docstring and the comments beside its fields are the help text, and ``run`` does the work.
+A command is a dataclass: the docstring and the comments next to the fields are the help text; ``run`` does the work.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from beartype.door import is_bearable
 from lw_torchrl import __version__
 from lw_torchrl._util.checks import Count, Natural, Positive, Probability, Scale, nearest
 
-# Name to group, class and summary. Classes are named, not imported, so that `lw-torchrl --help` loads no torch.
+# Map each command to its group, class and summary. Classes are imported later, so `lw-torchrl --help` loads no torch.
 COMMANDS = {
-    "collect": ("Data", "data:Collect", "Collect demonstrations of scripted experts, skills or a policy"),
-    "data show": ("Data", "data:Show", "Summarise datasets: collection policy, success rate, return"),
+    "collect": ("Data", "data:Collect", "Collect demonstrations from an expert, scripted skills or a policy"),
+    "data show": ("Data", "data:Show", "Summarize datasets: collection policy, success rate, return"),
     "data export": ("Data", "data:Export", "Convert a dataset to another library's format"),
-    "data import": ("Data", "data:Import", "Convert another library's dataset to ours"),
+    "data import": ("Data", "data:Import", "Convert another library's dataset to this library's format"),
     "train": ("Training", "train:Train", "Train a policy on demonstrations"),
-    "train-evaluator": ("Training", "train:TrainEvaluator", "Train a network that answers conditions"),
+    "train-evaluator": ("Training", "train:TrainEvaluator", "Train a network that predicts whether conditions hold"),
     "evaluate": ("Evaluation", "evaluate:Evaluate", "Evaluate a policy, the experts or scripted skills"),
-    "record": ("Evaluation", "record:Record", "Record episodes as a rerun file"),
-    "view": ("Evaluation", "record:View", "Open recordings in the rerun viewer"),
+    "record": ("Evaluation", "record:Record", "Record episodes to a Rerun file (.rrd)"),
+    "view": ("Evaluation", "record:View", "Open recordings in the Rerun viewer"),
     "tasks": ("Language", "language:Tasks", "List tasks, or show one: objects, queries, plan, skills"),
-    "query": ("Language", "language:Ask", "Answer a query in a state of a task"),
+    "query": ("Language", "language:Ask", "Check whether a query holds in a state of a task"),
     "plan prompt": ("Language", "plan:Prompt", "Print the prompt that asks a language model for a plan"),
     "plan generate": ("Language", "plan:Generate", "Ask a language model for plans"),
     "plan read": ("Language", "plan:Read", "Show how a free-form plan is parsed, with a confidence score"),
@@ -40,10 +40,10 @@ COMMANDS = {
     "info": ("Other", "data:Info", "Describe a policy file, a dataset or a recording"),
 }
 _MORE = """`lw-torchrl COMMAND --help` explains a command. Every command accepts --import MODULE, which first
-imports your Python module, for example one that registers a suite or a policy class
+imports your Python module, for example to register a suite or a policy class
 (docs/extending.md). Commands that print a table accept --json. --version prints the version.
 
-Exit status: 0: done; 1: a bug, with a traceback; 2: an error that you can fix
+Exit status: 0: success; 1: a bug, with a traceback; 2: an error that you can fix
 (LW_TORCHRL_TRACEBACK=1 adds the traceback); 130: stopped by Ctrl-C; 141: broken pipe."""
 _USER_ERRORS = (ValueError, OSError, ImportError, RuntimeError)
 _RANGES: tuple[tuple[Any, str], ...] = (
@@ -53,15 +53,15 @@ _RANGES: tuple[tuple[Any, str], ...] = (
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Run the command line; ends with :class:`SystemExit` unless the exit status is 0."""
+    """Run the command line; raise :class:`SystemExit` unless the exit status is 0."""
     try:
         _run(list(sys.argv[1:] if args is None else args))
         sys.stdout.flush()
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else the interpreter complains as it exits
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python prints an error at exit
         sys.exit(141)
     except KeyboardInterrupt:
-        _exit("stopped; most commands resume if you run them again", 130)
+        _exit("interrupted; most commands resume if you run them again", 130)
     except Exception as error:
         if os.environ.get("LW_TORCHRL_TRACEBACK") or not isinstance(error, _USER_ERRORS):
             raise
@@ -96,7 +96,7 @@ def _run(args: list[str]) -> None:
     markers = (tyro.conf.FlagCreatePairsOff, tyro.conf.DisallowNone)
     command = tyro.cli(kind, prog=f"lw-torchrl {name}", args=args[1 + (" " in name) :], config=markers)
     _check_ranges(command)
-    # With --json the document is all that goes to the standard output.
+    # With --json, only the JSON document is written to stdout.
     with redirect_stdout(sys.stderr) if getattr(command, "json", False) else nullcontext():
         output = command.run()
     if output is not None:
@@ -104,7 +104,7 @@ def _run(args: list[str]) -> None:
 
 
 def _check_ranges(command: Any) -> None:
-    """Raise :class:`ValueError`, with the option's name, for the first number that is out of its annotation's range."""
+    """Raise a :class:`ValueError` that names the first option whose value is outside the range of its annotation."""
     for name, hint in get_type_hints(type(command), include_extras=True).items():
         value = getattr(command, name)
         if is_dataclass(value):
@@ -118,7 +118,7 @@ def _check_ranges(command: Any) -> None:
 
 
 def _parts(hint: Any) -> Iterator[Any]:
-    """Yield the types and validators in a type hint, nested ones too."""
+    """Yield all types and validators in a type hint, including nested ones."""
     yield hint
     for part in get_args(hint):
         yield from _parts(part)
@@ -139,7 +139,7 @@ def _import_modules(args: list[str]) -> list[str]:
     for word in words:
         if word == "--import" or word.startswith("--import="):
             if "" not in sys.path:
-                sys.path.insert(0, "")  # the working folder comes first
+                sys.path.insert(0, "")  # search the working folder first
             name = next(words, "") if word == "--import" else word.removeprefix("--import=")
             if not name:
                 raise ValueError("--import requires the name of a Python module")

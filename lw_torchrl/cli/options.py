@@ -1,4 +1,4 @@
-"""Options that several commands share, and readers of their values: tasks, plans, skills, suites and policies."""
+"""Options shared by several commands, and functions that load the tasks, plans, skills and policies they name."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 Row = Mapping[str, Any]
 Columns = Mapping[str, str | Callable[[Row], Any]]
-"""Heading to the key of a row, or to a function of the row."""
+"""A mapping from column headings to a row's key, or to a function that maps a row to the cell's value."""
 
 
 class Output:
-    """Print results as text, or gather them for a JSON document.
+    """The output of a command: printed as text, or gathered in one JSON document.
 
     Attributes:
-        fault: an error found in the user's files; :meth:`finish` raises it after everything is printed.
+        fault: an error found in the user's files; :meth:`finish` raises it after all other output.
 
     Example:
         >>> columns = {"task": "task", "episodes": "run"}
@@ -53,7 +53,7 @@ class Output:
         self._document: dict[str, Any] = {}
 
     def show(self, key: str, value: Any, text: str | None = None) -> Output:
-        """Print ``text`` if it is given, or keep ``value`` for the document; return the output itself."""
+        """Print ``text``, if there is any, or add ``value`` to the JSON document; return this object."""
         if self.as_json:
             self._document[key] = value
         elif text is not None:
@@ -61,14 +61,14 @@ class Output:
         return self
 
     def table(self, key: str, rows: Sequence[Row], columns: Columns, title: str = "") -> Output:
-        """Print rows as a table, or keep them for the document."""
+        """Print rows as a table, or add the rows to the JSON document."""
         if self.as_json:
             return self.show(key, [dict(row) for row in rows])
         _print_table(title, [*columns], [[_cell(row, of) for of in columns.values()] for row in rows])
         return self
 
     def result(self, result: lw.EvaluationResult, **more: Mapping[str, Any]) -> Output:
-        """Print an evaluation's table, or keep its numbers, ``more`` numbers of each task, and its config."""
+        """Print an evaluation's table, or add the results, the config and ``more`` columns by task to the document."""
         rates = ("success_once", "success_at_end", "first_success", "mean_return")
         columns = {name: getattr(result, name) for name in rates} | more
         rows = [{"task": task, **{name: of[task] for name, of in columns.items()}} for task in result.config["tasks"]]
@@ -76,14 +76,14 @@ class Output:
         return self.show("config", result.config)
 
     def notes(self, notes: Iterable[str]) -> None:
-        """Print the notes about a language model's answers, the most frequent first."""
+        """Print the notes about a language model's answers, most frequent first."""
         counts = Counter(notes).most_common()
         self.show("notes", [{"note": note, "answers": times} for note, times in counts])
         for note, times in counts:
             print(f"{counted(times, 'answer')}: {note}")
 
     def finish(self) -> None:
-        """Print the document, and raise :class:`ValueError` if there is a fault."""
+        """Print the JSON document, if requested, and raise a :class:`ValueError` if there is a fault."""
         if self.as_json:
             print(json.dumps(_plain(self._document), indent=2, allow_nan=False))
         if self.fault:
@@ -91,7 +91,7 @@ class Output:
 
 
 def _plain(value: Any) -> Any:
-    """Replace numbers that are not finite by None, and other objects by their text, for JSON."""
+    """Convert a value for JSON: non-finite numbers become None, and objects of other types become strings."""
     if isinstance(value, Mapping):
         return {str(key): _plain(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
@@ -107,7 +107,7 @@ def _cell(row: Row, column: str | Callable[[Row], Any]) -> str:
 
 
 def _print_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table as wide as the terminal, whose first column is never wrapped, or plain columns into a pipe."""
+    """Print a table that fits the terminal without wrapping the first column, or plain columns if stdout is a pipe."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
@@ -126,20 +126,20 @@ def _print_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[st
 
 PLANS = "MT10 or MT50 (the shipped plans), .plan files, .json files of (condition, skill) pairs, or folders"
 WHO = (
-    "expert (Meta-World's scripts, or the suite's own), scripted (plans by scripted skills), spoilt-60 or spoilt-30 "
-    "(the same, right 60 or 30 % of the time), wrong (any skill of the plan), random, a policy file, a shipped policy "
-    "(few-shot-mt50), or your own policy in Python, as my_module:policy"
+    "expert (Meta-World's scripts, or the suite's expert), scripted (plans executed by scripted skills), spoilt-60 or "
+    "spoilt-30 (scripted, but correct only 60 or 30 % of the time), wrong (random skills of the plan), random, a "
+    "policy file, a shipped policy (few-shot-mt50), or a Python object my_module:policy"
 )
 _DEVICE = "device of the networks: cpu, cuda, cuda:1, mps, or auto for a GPU if there is one (the simulation uses CPUs)"
-_SUITE = "suite of the tasks, for example fetch, or your own, as my_module:suite"
-_ENCODER = "your own text encoder, as my_module:function: from a list of N texts to an N x D tensor"
+_SUITE = "suite of the tasks, for example fetch, or a Python object my_module:suite"
+_ENCODER = "custom text encoder: a Python function my_module:function that maps N texts to an N x D tensor"
 _TASKS = "MT10, MT50, a suite, or names of tasks"
 _EVALUATOR = (
-    "answer conditions by a network instead of exactly: a file of `lw-torchrl train-evaluator`, the name of an "
-    "evaluator class, or an evaluator in Python, as my_module:evaluator"
+    "evaluate conditions with a network instead of exactly: a file written by `lw-torchrl train-evaluator`, the name "
+    "of an evaluator class, or a Python object my_module:evaluator"
 )
 
-# Instead of tyro's "(default: )", "(default: None)" and "(default: False)".
+# These replace tyro's "(default: )", "(default: None)" and "(default: False)".
 OPTIONAL, REQUIRED = arg(help_behavior_hint=""), arg(help_behavior_hint="(required)")
 T = TypeVar("T")
 Maybe = Annotated[T | None, OPTIONAL]
@@ -152,7 +152,7 @@ TaskFile = Annotated[Maybe[Path], arg(metavar="FILE", help="a .toml file of your
 SkillFile = Annotated[Maybe[Path], arg(metavar="FILE", help="a .toml file of your skills, added to the shipped ones")]
 Encoder = Annotated[Maybe[str], arg(metavar="MODULE:FUNCTION", help=_ENCODER)]
 SuiteName = Annotated[Maybe[str], arg(metavar="SUITE", help=_SUITE)]
-PlanSources = Annotated[tuple[str, ...], arg(metavar="SOURCES", help=f"{PLANS}; for each task the last plan is used")]
+PlanSources = Annotated[tuple[str, ...], arg(metavar="SOURCES", help=f"{PLANS}; the last plan for each task is used")]
 Evaluator = Annotated[Maybe[str], arg(metavar="FILE", help=_EVALUATOR)]
 Device = Annotated[str, arg(metavar="DEVICE", help=_DEVICE)]
 
@@ -160,23 +160,23 @@ _PLAN_TASK = re.compile(r"^def[ \t]+([a-z]\w*)[ \t]*\(", re.MULTILINE)
 
 
 def import_object(option: str, name: str) -> Any:
-    """Import the object of "package.module:name"; the working folder is searched first."""
+    """Import the object called "package.module:name", searching the working folder first."""
     module, _, attribute = name.partition(":")
     if "" not in sys.path:
         sys.path.insert(0, "")
     try:
         return getattr(import_module(module), attribute)
     except (ModuleNotFoundError, AttributeError, ValueError) as error:
-        raise ValueError(f"{option} must be like my_module:name, got {name!r} ({error})") from error
+        raise ValueError(f"{option} must have the form my_module:name, got {name!r} ({error})") from error
 
 
 def is_object(policy: str) -> bool:
-    """Return whether a policy is given as my_module:policy."""
+    """Return whether the name of a policy has the form my_module:policy."""
     return ":" in policy and not Path(policy).exists()
 
 
 def read_object(name: str) -> Any:
-    """Import the policy of "my_module:policy"."""
+    """Import the policy called "my_module:policy"."""
     policy = import_object("the policy", name)
     if not callable(policy) or isinstance(policy, type):
         raise ValueError(f"the policy {name} must map a TensorDict to a TensorDict, got {policy!r:.80}")
@@ -184,17 +184,17 @@ def read_object(name: str) -> Any:
 
 
 def policy_name(policy: str) -> str:
-    """Return a short name of a policy for labels and file names."""
+    """Return a short policy name for labels and file names."""
     return policy.partition(":")[2] if is_object(policy) else Path(policy).stem
 
 
 def read_encoder(name: str | None) -> TextEncoder | None:
-    """Import the function of --text-encoder."""
+    """Import the function named by --text-encoder; return None without one."""
     return None if name is None else import_object("--text-encoder", name)
 
 
 def read_evaluator(name: str, plans: Plans, text_encoder: str | None = None) -> lw.QueryEvaluator:
-    """Return an evaluator for ``plans``: from a file or "my_module:evaluator", or a new one of a registered class."""
+    """Return an evaluator for ``plans``: from a file, from "my_module:evaluator", or new, of a registered class."""
     encoder = read_encoder(text_encoder)
     if Path(name).exists() or not (":" in name or name == "StateQueryEvaluator"):
         return lw.training.load_evaluator(name, plans, text_encoder=encoder)
@@ -202,12 +202,12 @@ def read_evaluator(name: str, plans: Plans, text_encoder: str | None = None) -> 
     if isinstance(evaluator, lw.QueryEvaluator):
         return evaluator.with_plans(plans)
     if not (isinstance(evaluator, type) and issubclass(evaluator, lw.QueryEvaluator)):
-        raise ValueError(f"--evaluator {name} must be a lw.QueryEvaluator or a class of them, got {evaluator!r:.80}")
+        raise ValueError(f"--evaluator {name} must be a lw.QueryEvaluator or a subclass, got {evaluator!r:.80}")
     return evaluator(plans)
 
 
 def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite | None:
-    """Load the suite of --suite, or else that of ``tasks``, "fetch" or "fetch/push"; None for Meta-World's tasks."""
+    """Load the suite ``name``, or else the suite that ``tasks`` name ("fetch" or "fetch/push"); None for Meta-World."""
     from lw_torchrl.suites.suite import Suite, find_suite, load_suite, suite_name
 
     if name is None:
@@ -219,14 +219,14 @@ def read_suite(name: str | None, tasks: Sequence[str] = ()) -> lw.suites.Suite |
 
 
 def read_tasks(task_file: Path | None, names: Sequence[str] = (), suite: str | None = None) -> Mapping[str, Task]:
-    """Return the tasks of the suite that ``names`` belong to; for Meta-World, those of --task-file too."""
+    """Return all tasks of the suite that contains ``names``; for Meta-World, also those in --task-file."""
     if (named_suite := read_suite(suite, names)) is not None:
         return named_suite.tasks
     return TASKS if task_file is None else load_tasks(task_file)
 
 
 def tasks_of_plans(path: Path, task: str | None, task_file: Path | None) -> Mapping[str, Task]:
-    """Return the tasks that a .plan file, or a folder of them, may name: those of one suite."""
+    """Return the tasks that a .plan file or a folder of .plan files may refer to; all belong to one suite."""
     names = [] if task is None else [task]
     for file in sorted(path.glob("*.plan")) if path.is_dir() else [path]:
         if file.suffix == ".plan" and file.is_file() and (match := _PLAN_TASK.search(read_text(file, PlanError))):
@@ -235,7 +235,7 @@ def tasks_of_plans(path: Path, task: str | None, task_file: Path | None) -> Mapp
 
 
 def select_tasks(names: Sequence[str], tasks: Mapping[str, Task], suite: lw.suites.Suite | None = None) -> list[str]:
-    """Return the tasks that ``names`` stand for: MT10, MT50, a suite's name, or names of tasks."""
+    """Return the names of the tasks in ``names``, in which MT10, MT50 and a suite's name stand for several tasks."""
     if (suite := suite or read_suite(None, names)) is None:
         return list(resolve_tasks(names[0] if len(names) == 1 else names, tasks=tasks))
     return list(suite.tasks if list(names) == [suite.name] else suite.named_tasks(names))
@@ -249,7 +249,7 @@ def _suite_of(tasks: Mapping[str, Task]) -> lw.suites.Suite | None:
 
 
 def read_skills(skill_file: Path | None, tasks: Mapping[str, Task]) -> Mapping[str, ScriptedSkill]:
-    """Load the scripted skills of the suite that ``tasks`` belong to, with those of --skill-file."""
+    """Load the scripted skills of the suite that contains ``tasks``, and those in --skill-file."""
     shipped = load_skills()
     skills = shipped if skill_file is None else load_skills(skill_file, tasks=tasks)
     if (suite := _suite_of(tasks)) is None:
@@ -258,12 +258,12 @@ def read_skills(skill_file: Path | None, tasks: Mapping[str, Task]) -> Mapping[s
 
 
 def read_plans(sources: Sequence[str], tasks: Mapping[str, Task]) -> Plans:
-    """Load the plans of --plans. If ``tasks`` belong to another suite, MT10 and MT50 stand for its plans."""
+    """Load the plans named by --plans. If ``tasks`` are from another suite, MT10 and MT50 mean that suite's plans."""
     return Plans(find_plans(sources, tasks))
 
 
 def find_plans(sources: Sequence[str], tasks: Mapping[str, Task]) -> dict[str, ConditionalPlan]:
-    """Load plans as :func:`read_plans`, possibly none."""
+    """Load plans as :func:`read_plans` does; the result may be empty."""
     if not sources:
         raise ValueError("--plans requires at least one source: MT10, MT50, a file or a folder")
     suite = _suite_of(tasks)
@@ -278,13 +278,13 @@ def find_plans(sources: Sequence[str], tasks: Mapping[str, Task]) -> dict[str, C
             try:
                 plans[task] = ConditionalPlan(task, plan.steps, tasks[task])
             except PlanError as error:
-                reason = f"the shipped plan does not fit the {task} of --task-file"
-                raise PlanError(f"--plans: {reason}; name your own plan for it last ({error})") from error
+                reason = f"the shipped plan does not fit the task {task!r} in --task-file"
+                raise PlanError(f"--plans: {reason}; put your own plan for this task last ({error})") from error
     return plans
 
 
 def use_one_thread() -> None:
-    """Use one PyTorch thread unless OMP_NUM_THREADS is set: networks this small gain little from a second."""
+    """Use one PyTorch thread unless OMP_NUM_THREADS is set: networks this small gain little from a second thread."""
     if "OMP_NUM_THREADS" not in os.environ:
         import torch
 

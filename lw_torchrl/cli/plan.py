@@ -1,4 +1,4 @@
-"""``lw-torchrl plan``: plans of language models, from the prompt to the repair."""
+"""The commands ``lw-torchrl plan ...``: request plans from language models, parse the plans and repair them."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _PLANNER_OPTIONS = (
     "model", "base_url", "constrain", "free_skills", "vocabulary", "temperature", "max_tokens", "seed", "name",
     "concurrency", "timeout", "cache",
 )  # fmt: skip
-_SOURCES = f"{options.PLANS}, a suite, or answers of `plan generate`, FORMAT/TASK-ATTEMPT.py"
+_SOURCES = f"{options.PLANS}, a suite, or answers written by `plan generate` (FORMAT/TASK-ATTEMPT.py)"
 Format = Annotated[str, arg(help=f"plan format: {_FORMATS}")]
 
 
 @dataclass(kw_only=True)
 class Prompt:
-    """Print the prompt that asks a language model for a plan: the plans of three other tasks, then the task.
+    """Print the prompt that asks a language model for a plan: plans of three other tasks as examples, then the task.
 
     Example: lw-torchrl plan prompt drawer-open --format chain_py
     """
@@ -39,7 +39,7 @@ class Prompt:
     task: options.TaskName
     format: Format = "chain_py"
     vocabulary: Flag = False  # also list the objects of the task and the supported queries
-    plans: Annotated[options.PlanSources, arg(help=f"plans of the examples: {options.PLANS}")] = ("MT10",)
+    plans: Annotated[options.PlanSources, arg(help=f"plans to use as examples: {options.PLANS}")] = ("MT10",)
     task_file: options.TaskFile = None
 
     def run(self) -> None:
@@ -52,30 +52,30 @@ class Prompt:
 
 @dataclass(kw_only=True)
 class _Model:
-    """Options of the commands that ask a language model."""
+    """The options of the commands that use a language model."""
 
     tasks: options.TaskNames
-    model: str  # the model's name at the server
-    base_url: Maybe[str] = None  # the server's address (default: OPENAI_BASE_URL, or OpenAI's)
-    attempts: Count = 1  # answers to each prompt
-    constrain: Flag = False  # force answers to follow a JSON schema, so that every plan can be carried out
-    free_skills: Flag = False  # with --constrain, allow free-form skills besides the scripted ones
+    model: str  # name of the model on the server
+    base_url: Maybe[str] = None  # address of the server (default: OPENAI_BASE_URL, or OpenAI's address)
+    attempts: Count = 1  # number of answers to request for each prompt
+    constrain: Flag = False  # force answers to follow a JSON schema, so that every plan is executable
+    free_skills: Flag = False  # with --constrain, also allow skills that are not scripted
     vocabulary: Flag = False  # also list the objects of the task and the supported queries in prompts
     temperature: Maybe[Scale] = None  # sampling temperature (default: the server's)
     max_tokens: Count = 1024  # maximum tokens per answer (reasoning models need more)
     seed: Maybe[Natural] = None  # seed of the first attempt; attempt k uses SEED + k (default: no seed)
     name: Maybe[str] = None  # folder name for the answers (default: the model's name)
-    plans: Annotated[options.PlanSources, arg(help=f"plans of the prompts' examples: {options.PLANS}")] = ("MT10",)
+    plans: Annotated[options.PlanSources, arg(help=f"plans to use as examples: {options.PLANS}")] = ("MT10",)
     skill_file: options.SkillFile = None
     task_file: options.TaskFile = None
     concurrency: Count = 4  # number of simultaneous requests
-    timeout: Positive = 300.0  # seconds for one request, until the end of its answer
-    cache: Path = Path("runs/answers")  # folder that caches all answers
-    out: Path = Path("runs/plans")  # folder for the answers: OUT/NAME/FORMAT/TASK-ATTEMPT.py or .md
+    timeout: Positive = 300.0  # timeout of a request, in seconds, including the whole answer
+    cache: Path = Path("runs/answers")  # folder in which all answers are cached
+    out: Path = Path("runs/plans")  # output folder; answers are OUT/NAME/FORMAT/TASK-ATTEMPT.py or .md
     json: options.Json = False
 
     def planner(self) -> tuple[lw.OpenAIPlanner, list[Task], Mapping[str, Task]]:
-        """Return the model, the selected tasks and all tasks."""
+        """Return the planner, the selected tasks, and a dict of all tasks by name."""
         known = options.read_tasks(self.task_file, self.tasks)
         own = {name: getattr(self, name) for name in _PLANNER_OPTIONS}
         skills = options.read_skills(self.skill_file, known) if self.skill_file else None
@@ -85,11 +85,11 @@ class _Model:
 
 @dataclass(kw_only=True)
 class Generate(_Model):
-    """Ask a language model for plans, and report how many of its answers are valid.
+    """Ask a language model for plans, and report how many answers are valid plans.
 
-    The model runs behind an OpenAI-compatible server: OpenAI's own, vLLM (http://127.0.0.1:8000/v1), Ollama
-    (http://127.0.0.1:11434/v1) or llama.cpp's (http://127.0.0.1:8080/v1). The key is read from OPENAI_API_KEY; a local
-    server needs none. Answers are cached: the same command only asks for answers that are missing.
+    The server must be OpenAI-compatible: OpenAI, vLLM (http://127.0.0.1:8000/v1), Ollama (http://127.0.0.1:11434/v1)
+    or llama.cpp (http://127.0.0.1:8080/v1). The API key is read from OPENAI_API_KEY; a local server needs no key.
+    Answers are cached: re-running the command requests only the missing ones.
 
     Example: lw-torchrl plan generate MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --attempts 4
     """
@@ -132,11 +132,11 @@ def _counts(answers: Sequence[lw.planners.Answer]) -> dict[str, int]:
 
 @dataclass(kw_only=True)
 class Repair(_Model):
-    """Run a language model's plans with scripted skills, report failures to the model, and ask it again.
+    """Run a language model's plans with scripted skills, report failures to the model, and ask for repaired plans.
 
-    The report names the step where the robot got stuck, conditions that never held, distances that stayed too large,
-    and text that could not be parsed. The answers of round k are kept in OUT/NAME-roundk. Answers of `plan generate`
-    with the same options are used again. If it is stopped, the same command resumes it.
+    The report lists the plan step in which the robot got stuck, conditions that never held, distances that stayed too
+    large, and text that could not be parsed. Answers of round k are written to OUT/NAME-roundk. Answers that `plan
+    generate` cached with the same options are reused. To resume an interrupted repair, run the same command again.
 
     Example: lw-torchrl plan repair MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --rounds 3
     """
@@ -144,7 +144,7 @@ class Repair(_Model):
     format: Format = "chain_py"
     rounds: Count = 3  # maximum number of repair rounds
     enough: Probability = 0.8  # success rate above which a plan is not repaired
-    episodes: Count = 10  # episodes of each plan
+    episodes: Count = 10  # number of episodes in which each plan is run
     episode_seed: Natural = 0  # random seed of the episodes (use a different one for evaluation)
 
     def run(self) -> Output:
@@ -167,7 +167,7 @@ class Repair(_Model):
         rounds = {f"round {k}" if k else "first": after(k) for k in range(self.rounds + 1)}
         columns: Columns = {"task": "task", "attempt": "attempt", **rounds}
         output = Output(self.json)
-        output.table("plans", rows, columns, f"success by scripted skills, {planner.model} in {self.format}")
+        output.table("plans", rows, columns, f"success rate, scripted skills, {planner.model}, format {self.format}")
         output.notes(note for repair in repairs for answer in repair.answers for note in answer.notes)
         requested = sum(not answer.cached for answer in first)
         print(f"{counted(len(first), 'first answer')}, {requested} requested now")
@@ -180,8 +180,8 @@ class Repair(_Model):
 class Read:
     """Show, step by step, how free-form plans are parsed, with a confidence score; --out writes them as .plan files.
 
-    The confidence is the fraction of typical states of the plan's motion in which the plan, as written, does the right
-    thing. A plan below 0.75 is completed: it keeps its motion and objects, and gets standard conditions. A plan without
+    The confidence is the fraction of typical states of the motion in which the plan, as written, chooses a correct
+    step. A plan with a confidence below 0.75 keeps its motion and objects, but gets standard conditions. A plan without
     any motion becomes the fallback plan: grasp the first object and move it to the goal.
 
     Example: lw-torchrl plan read my-plans/coffee-pull.plan
@@ -190,9 +190,9 @@ class Read:
     """
 
     sources: Positional[Annotated[tuple[str, ...], options.REQUIRED, arg(metavar="SOURCES", help=_SOURCES)]]
-    task: Maybe[str] = None  # show only this task (default, for an answer: its file name)
-    format: Maybe[str] = None  # plan format of an answer (default: its folder's name)
-    out: Maybe[Path] = None  # folder for .plan files: for each task the plan with the highest confidence
+    task: Maybe[str] = None  # show only the plan for this task (default for an answer: the task in the file name)
+    format: Maybe[str] = None  # plan format of an answer (default: the name of the answer's folder)
+    out: Maybe[Path] = None  # folder to which the most confident plan for each task is written as a .plan file
     task_file: options.TaskFile = None
     json: options.Json = False
 
@@ -226,7 +226,7 @@ class Read:
         return output
 
     def _plans(self, source: str) -> list[lw.ConditionalPlan]:
-        """Return the plans of one source, those of --task if it is given."""
+        """Return the plans in a source; with --task, only the plan for that task."""
         file = Path(source)
         if file.is_file() and file.suffix not in (".plan", ".json"):
             return self._decoded(file)
@@ -243,19 +243,21 @@ class Read:
         return [plans[self.task]]
 
     def _decoded(self, file: Path) -> list[lw.ConditionalPlan]:
-        """Return the plan of a language model's answer; none if several are read and this one has none."""
+        """Return a list with the plan in a language model's answer; an empty list if the answer, one of several, has no
+        plan."""
         from lw_torchrl.language.plan_decoding import decode_plan
 
         task, format = self.task or re.sub(r"-\d+$", "", file.stem), self.format or file.absolute().parent.name
         known = options.read_tasks(self.task_file, (task,) if self.task else ())
         if task not in known and self.task is None:
-            raise ValueError(f"--task is required: the file name {file.name!r} is not a task ({task!r})")
+            raise ValueError(f"--task is required: the file name {file.name!r} does not contain a task, got {task!r}")
         if format not in PLAN_FORMATS and self.format is None:
-            raise ValueError(f"--format is required, one of {', '.join(PLAN_FORMATS)}: {format!r} is not one")
+            known_formats = ", ".join(PLAN_FORMATS)
+            raise ValueError(f"--format is required (one of {known_formats}): folder {format!r} is not a format")
         decoded = decode_plan(read_text(file, ValueError), task, format, tasks=known)
         if decoded.plan is None and len(self.sources) == 1:
-            raise PlanError(f"{file}: no plan can be read, {decoded.reason}")
-        notes = decoded.notes if decoded.plan is not None else [f"no plan can be read, {decoded.reason}"]
+            raise PlanError(f"{file}: no plan can be read: {decoded.reason}")
+        notes = decoded.notes if decoded.plan is not None else [f"no plan can be read: {decoded.reason}"]
         for note in notes:
             print(f"{file}: {note}")
         return [] if decoded.plan is None else [decoded.plan]

@@ -1,4 +1,4 @@
-"""``lw-torchrl record`` and ``view``: record episodes of a policy and look at them in rerun."""
+"""The commands ``lw-torchrl record`` and ``view``: record episodes of a policy and view them in Rerun."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from lw_torchrl.cli.options import Flag, Maybe, Output
 
 @dataclass(kw_only=True)
 class Record:
-    """Record episodes: the robot in 3-D, the plan step by step, which conditions held, and how it ended.
+    """Record episodes: the robot in 3-D, the active plan step, the conditions that held, and the outcome.
 
     Example: lw-torchrl record drawer-open --policy runs/mt10.safetensors --compare scripted --episodes 0 1
     """
 
     tasks: options.TaskNames
     policy: options.Who = "expert"
-    compare: Maybe[str] = None  # a second policy, in the same initial states and with the same noise, side by side
+    compare: Maybe[str] = None  # second policy to show side by side, with the same initial states and noise
     episodes: tuple[Natural, ...] = (0,)  # indices of the episodes, as in an evaluation with the same seed
     out: Maybe[Path] = None  # .rrd file to write (default: runs/recordings/TASK-POLICY.rrd)
     json: options.Json = False
@@ -40,7 +40,7 @@ class Record:
         reference = rollout.trusted_plans
         policies = [(name, *rollout.policy(name, tasks)) for name in (self.policy, self.compare) if name is not None]
         rows: list[dict[str, Any]] = []
-        pages: list[list[str]] = []  # of each policy, the names of its episodes
+        pages: list[list[str]] = []  # the names of each policy's episodes
         with new_recording(out) as logger:
             for number, (name, policy, plans, evaluator) in enumerate(policies, 1):
                 run: dict[str, Any] = {"plans": plans, "episodes": self.episodes, "evaluator": evaluator, **arguments}
@@ -67,7 +67,7 @@ class Record:
         return output.show("recording", out, f"written to {out}\nopen it with: lw-torchrl view {out}")
 
     def _result(self, episodes: Any, failures: Any) -> lw.EvaluationResult:
-        """Return the recorded episodes and their failures as an evaluation's result."""
+        """Convert the recorded episodes and their failures to an evaluation result."""
         config = {
             "tasks": list(dict.fromkeys(episode.task for episode in episodes)),
             "episodes_per_task": len(self.episodes),
@@ -84,7 +84,7 @@ class Record:
 
 
 def _report(episode: Any, policy: str, failure: Any) -> dict[str, Any]:
-    """Print how an episode ended, and return it as a row of the JSON document."""
+    """Print how an episode ended, and return the row of the JSON document that describes the episode."""
     first = episode.first_success
     ended = "failed" if first is None else f"success at step {first}"
     ended += "" if failure is None else f", {failure.cause}: {failure.why}"
@@ -95,7 +95,7 @@ def _report(episode: Any, policy: str, failure: Any) -> dict[str, Any]:
 
 @dataclass(kw_only=True)
 class View:
-    """Open recordings in the rerun viewer, in a window or a browser, or write a picture of one.
+    """Open recordings in the Rerun viewer, in a window or a browser, or save a screenshot of the viewer.
 
     Several recordings are opened together in one viewer.
 
@@ -105,19 +105,19 @@ class View:
     """
 
     recordings: Positional[Annotated[tuple[Path, ...], options.REQUIRED, arg(metavar="FILES")]]
-    """.rrd files, or folders with one"""
+    """.rrd files, or folders of .rrd files"""
     episode: Maybe[str] = None  # title of the tab to open
-    step: Maybe[Natural] = None  # step to open at (default: the decisive one of an episode, or the last of a training)
+    step: Maybe[Natural] = None  # time step to open at (default: an episode's success or failure, or the last step)
     screenshot: Maybe[Path] = None  # .png file to write without a window; requires Vulkan (mesa-vulkan-drivers)
-    window_size: str = "1400x900"  # width x height of the window or picture, in pixels
-    web: Flag = False  # serve rerun's web viewer on this machine and print its address, until Ctrl-C
-    port: Natural = 0  # with --web, port of the web viewer (0 picks a free one)
+    window_size: str = "1400x900"  # width x height of the window or screenshot, in pixels
+    web: Flag = False  # serve Rerun's web viewer on this machine until Ctrl-C, and print the address
+    port: Natural = 0  # with --web, port of the web viewer (0 picks a free port)
 
     def run(self) -> None:
         from lw_torchrl.record import open_viewer
 
         if self.web and (self.screenshot is not None or self.step is not None):
-            raise ValueError("--web excludes --screenshot and --step")
+            raise ValueError("--web cannot be combined with --screenshot or --step")
         web_port = self.port if self.web else None
         tab: dict[str, Any] = {"episode": self.episode, "step": self.step}
         open_viewer(self.recordings, self.screenshot, self.window_size, web_port=web_port, **tab)

@@ -1,4 +1,4 @@
-"""``lw-torchrl train`` and ``train-evaluator``: train a policy, or a network that answers conditions."""
+"""The commands ``train`` and ``train-evaluator``: train a policy, or a network that evaluates conditions."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from lw_torchrl.cli import options
 from lw_torchrl.cli.options import Maybe, Output, read_evaluator
 
 _METHOD = (
-    "condition the policy on plans (pcbc), task descriptions (dc) or task numbers (one-hot), or the name of your own "
+    "condition the policy on plans (pcbc), task descriptions (dc) or task indices (one-hot), or the name of a custom "
     "method"
 )
 _LOSS = (
-    "bc (imitate the expert); on any data with rewards: advantage (learn a value, then imitate rows, weighted by their "
-    "advantage), iql, td3-bc or cql"
+    "bc (behavioral cloning of an expert); for any dataset with rewards: advantage (advantage-weighted behavioral "
+    "cloning with a learned value), iql, td3-bc or cql"
 )
 
 
 @dataclass(kw_only=True)
 class Train:
-    """Train a policy on demonstrations, or offline on any data. If it is stopped, the same command resumes it.
+    """Train a policy on demonstrations, or with offline RL on any dataset. To resume, run the same command again.
 
     Example: lw-torchrl train demos/mt10 --out runs/mt10.safetensors --evaluate-every 2000
 
@@ -36,8 +36,8 @@ class Train:
     Example: lw-torchrl train demos/mt10 --out runs/tuned.safetensors --begin runs/mt10.safetensors --steps 2000
     """
 
-    data: Positional[Annotated[Path, arg(metavar="DATA")]]  # dataset of `lw-torchrl collect`
-    out: Path  # .safetensors file of the policy
+    data: Positional[Annotated[Path, arg(metavar="DATA")]]  # dataset written by `lw-torchrl collect`
+    out: Path  # .safetensors file to which the policy is written
     tasks: Annotated[tuple[str, ...], options.OPTIONAL] = ()  # train on the demonstrations of these tasks only
     plans: options.PlanSources = ("MT10",)
     task_file: options.TaskFile = None
@@ -46,22 +46,22 @@ class Train:
     method: Annotated[str, arg(help=_METHOD)] = "pcbc"
     features: Maybe[Literal["raw", "differences", "relative", "both"]] = None
     """features of the state: raw (the observation), differences (between hand, objects and goal; the default), both, or
-    relative (differences without the hand's height and the gripper's opening)"""
+    relative (as differences, but without the hand's height and the gripper opening)"""
     width: Maybe[Count] = None  # units of each hidden layer (default: 256)
     depth: Maybe[Natural] = None  # number of hidden layers (default: 3)
-    after_success: Natural = 20  # with --loss bc, drop steps more than N steps after the first success
-    reward: Literal["sparse", "dense", "cost", "dense_cost"] = "dense_cost"  # reward of the losses other than bc
-    begin: Maybe[Path] = None  # fine-tune this policy file, with its plans, network and normalisation
+    after_success: Natural = 20  # with --loss bc, drop rows more than N time steps after the first success
+    reward: Literal["sparse", "dense", "cost", "dense_cost"] = "dense_cost"  # reward for losses other than bc
+    begin: Maybe[Path] = None  # policy file to fine-tune; its plans, network and normalization are kept
     evaluator: options.Evaluator = None
-    qaf_anchor: Scale = 0.0  # weight of the cross entropy with the exact answers; use 1 for a new evaluator
+    qaf_anchor: Scale = 0.0  # weight of the evaluator's cross-entropy loss (use 1 for an untrained evaluator)
     steps: Maybe[Count] = None  # number of minibatches (default: 8000 with --loss bc, else 4000)
-    batch_size: Maybe[Count] = None  # rows in a minibatch, equally many of each task (default: 500 with bc, else 250)
-    learning_rate: Scale = 1e-3  # learning rate at the start; a cosine brings it to 0
+    batch_size: Maybe[Count] = None  # rows per minibatch, balanced over tasks (default: 500 with --loss bc, else 250)
+    learning_rate: Scale = 1e-3  # initial learning rate, decayed to 0 with a cosine schedule
     seed: Natural = 0  # random seed of initial weights and minibatches
-    evaluate_every: Maybe[Count] = None  # evaluate every N steps and at the end, and log the success rate
-    evaluate_episodes: Count = 5  # episodes of each task in an evaluation
-    evaluate_seed: Natural = 1000  # random seed of these episodes (use a different one than for demonstrations)
-    logger: Maybe[Literal["csv", "tensorboard", "wandb", "rerun"]] = None  # log the training in logs/ beside OUT
+    evaluate_every: Maybe[Count] = None  # evaluate every N training steps and at the end, and log the success rate
+    evaluate_episodes: Count = 5  # number of episodes of each task per evaluation
+    evaluate_seed: Natural = 1000  # random seed of the evaluation (use a different one than for demonstrations)
+    logger: Maybe[Literal["csv", "tensorboard", "wandb", "rerun"]] = None  # log to the folder logs/ next to OUT
     device: options.Device = "cpu"
     json: options.Json = False
 
@@ -75,7 +75,7 @@ class Train:
         options.use_one_thread()
         dataset = read_metadata(self.data).config
         if self.evaluate_every is not None and self.evaluate_seed == dataset.seed:
-            raise ValueError(f"--evaluate-seed {dataset.seed} is the seed of the demonstrations; use a different one")
+            raise ValueError(f"--evaluate-seed {dataset.seed} is the seed of the demonstrations; use a different seed")
         known = options.read_tasks(self.task_file, dataset.tasks)
         plans = options.read_plans(self.plans, known)
         tasks = options.select_tasks(self.tasks or dataset.tasks, known)
@@ -102,13 +102,13 @@ class Train:
 
     def _check(self) -> None:
         if self.begin is not None and self.out.resolve() == self.begin.resolve():
-            raise ValueError("--out must be a different file from --begin")
+            raise ValueError(f"--out must differ from --begin, got {str(self.out)!r} for both")
         if self.loss != "bc" and (self.evaluator is not None or self.qaf_anchor):
             raise ValueError("--evaluator and --qaf-anchor only apply to --loss bc")
 
     @property
     def _numbers(self) -> dict[str, Any]:
-        """The options that the trainers' configs share."""
+        """The keyword arguments shared by the configs of all trainers."""
         steps, batch_size = (8000, 500) if self.loss == "bc" else (4000, 250)
         numbers = {"steps": self.steps or steps, "batch_size": self.batch_size or batch_size}
         return {**numbers, "learning_rate": self.learning_rate, "seed": self.seed}
@@ -122,7 +122,7 @@ class Train:
         return lw.BehavioralCloningTrainer(actor, replay, config, device=self.device, **run)
 
     def _learn(self, actor: Any, plans: lw.Plans, rows: Mapping[str, Any], run: Mapping[str, Any]) -> Any:
-        """Return the trainer of a loss other than bc; for advantages, first train the value that they need."""
+        """Return the trainer for a loss other than bc; for --loss advantage, first train the value network."""
         from lw_torchrl._util.devices import place
         from lw_torchrl.modules.policy import plans_of
         from lw_torchrl.training.offline import GAMMA, N_STEPS, learn_advantages, make_loss
@@ -150,7 +150,7 @@ class Train:
         return lw.OfflineTrainer(loss, data, config, actor=actor, **run)
 
     def _success_rates(self, step: int, actor: Any, tasks: list[str]) -> dict[str, float]:
-        """Print and return the success rates on held-out seeds, after ``step`` steps of the training."""
+        """Print and return the success rates on held-out seeds after ``step`` training steps."""
         result = lw.evaluate(
             actor, tasks=tasks, episodes_per_task=self.evaluate_episodes, seed=self.evaluate_seed,
             stop_at_success=True, suite=options.read_suite(None, tasks), progress=False,
@@ -161,7 +161,7 @@ class Train:
         return {name: float(rate) for name, rate in rates.items() if rate is not None}
 
     def _new_actor(self, plans: lw.Plans, tasks: tuple[str, ...]) -> Any:
-        """Return an untrained policy for ``tasks``, with its evaluator in front."""
+        """Return an untrained policy for ``tasks``, preceded by the evaluator if there is one."""
         import torch
         from tensordict.nn import TensorDictSequential
 
@@ -177,7 +177,7 @@ class Train:
             width, depth = self.width or 256, 3 if self.depth is None else self.depth
             parts["decoder"] = MLPDecoder(width=width, depth=depth, actions=plans.layout.action_size)
         actor = make_policy(self.method, plans, **parts)
-        if plans_of(actor) is None and len(plans) > len(tasks):  # only the tasks that are trained
+        if plans_of(actor) is None and len(plans) > len(tasks):  # keep only the tasks to train on
             torch.manual_seed(self.seed)
             actor = make_policy(self.method, lw.Plans({task: plans[task] for task in tasks}), **parts)
         if self.evaluator is None:
@@ -185,19 +185,19 @@ class Train:
         return TensorDictSequential(self._read_evaluator(plans, "soft"), actor)
 
     def _begun_actor(self) -> Any:
-        """Load the policy of --begin, with its evaluator in front."""
+        """Load the policy named by --begin, preceded by the evaluator if there is one."""
         from tensordict.nn import TensorDictSequential
 
         from lw_torchrl.modules.policy import plans_of
 
         assert self.begin is not None
         if self.method != "pcbc" or (self.features, self.width, self.depth) != (None, None, None):
-            raise ValueError("--begin has its own --method, --features, --width and --depth; leave them out")
+            raise ValueError("--begin fixes the network; remove --method, --features, --width and --depth")
         actor: Any = lw.load_actor(self.begin, text_encoder=options.read_encoder(self.text_encoder))
         if self.evaluator is None:
             return actor
         if "qaf" not in actor.in_keys or (own := plans_of(actor)) is None:
-            raise ValueError(f"--evaluator requires a policy that reads qaf, --begin is a {type(actor).__name__}")
+            raise ValueError(f"--evaluator requires a policy that reads qaf, but --begin is a {type(actor).__name__}")
         return TensorDictSequential(self._read_evaluator(own, "hard"), actor)
 
     def _read_evaluator(self, plans: lw.Plans, answers: Literal["soft", "hard"]) -> lw.QueryEvaluator:
@@ -208,7 +208,7 @@ class Train:
 
 
 def _read_transform(actor: Any, replay: Any, data: Path) -> None:
-    """Add to the rows what the actor reads besides the observation: answers to conditions, or pictures."""
+    """Add the actor's other inputs to the replay buffer: the truth values of conditions, or images."""
     from lw_torchrl.modules.policy import plans_of
     from lw_torchrl.modules.query_evaluator import evaluators_of
 
@@ -222,11 +222,11 @@ def _read_transform(actor: Any, replay: Any, data: Path) -> None:
 
 
 def _trained(steps: int, loss: float) -> str:
-    return f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}")  # NaN: nothing was left to train
+    return f"trained to step {steps}" + ("" if loss != loss else f", loss {loss:.4f}")  # NaN: no step was left
 
 
 def make_logger(kind: str, out: Path) -> Any:
-    """Return a TorchRL logger that writes to logs/ beside ``out``; rerun's begins a new recording each time."""
+    """Return a TorchRL logger that writes to logs/ next to ``out``; a RerunLogger starts a new recording each time."""
     if kind == "rerun":
         return lw.RerunLogger(out.parent / "logs" / f"{out.stem}.rrd", exp_name=f"{out.parent.name}/{out.stem}")
     from torchrl.record.loggers import get_logger
@@ -238,16 +238,16 @@ def make_logger(kind: str, out: Path) -> Any:
 
 
 _CAMERAS = (
-    "answer from pictures of these cameras instead of from the observation: corner, corner2, corner3, corner4, "
-    "topview, behindGripper, gripperPOV"
+    "predict from images of these cameras instead of the observation: corner, corner2, corner3, corner4, topview, "
+    "behindGripper, gripperPOV"
 )
 
 
 @dataclass(kw_only=True)
 class TrainEvaluator:
-    """Train a network that replaces the exact condition checker, and report its accuracy.
+    """Train a network that replaces the exact condition checker, and report the network's accuracy.
 
-    It is trained on all base queries of the tasks. If it is stopped, the same command resumes it.
+    The training set holds all base queries of the tasks. To resume, run the same command again.
 
     Example: lw-torchrl train-evaluator MT10 --out runs/evaluator --held-out-tasks push reach
 
@@ -257,23 +257,23 @@ class TrainEvaluator:
     tasks: options.TaskNames
     out: Path  # folder for evaluator.safetensors, report.json and the collected episodes
     data: Annotated[tuple[Path, ...], options.OPTIONAL] = ()
-    """datasets of `lw-torchrl collect` to use instead of collecting episodes"""
+    """datasets written by `lw-torchrl collect`, to use instead of collecting episodes"""
     behaviours: tuple[str, ...] = ("expert", "scripted", "spoilt-30", "random")
-    """policies that act, as for `collect --policy`"""
-    episodes: Count = 5  # episodes collected of each task and policy
-    max_steps: Count = 500  # steps of an episode
-    noise: tuple[Scale, ...] = (0.0, 0.1, 0.2)  # standard deviations of the expert's execution noise, used in turn
+    """policies that collect the episodes, as for `collect --policy`"""
+    episodes: Count = 5  # number of episodes to collect for each task and policy
+    max_steps: Count = 500  # time steps per episode
+    noise: tuple[Scale, ...] = (0.0, 0.1, 0.2)  # standard deviations of the expert's noise; episodes use them in turn
     cameras: Annotated[tuple[str, ...], options.OPTIONAL, arg(help=_CAMERAS)] = ()
-    picture: Count = 64  # with --cameras, height and width of a picture in pixels
-    every: Maybe[Count] = None  # use every N-th state of an episode (default: 1, with --cameras 5)
+    picture: Count = 64  # with --cameras, height and width of the images in pixels
+    every: Maybe[Count] = None  # use every N-th state of an episode (default: 1; 5 with --cameras)
     held_out_tasks: Annotated[tuple[str, ...], options.OPTIONAL] = ()
     """tasks to hold out from training, or the number of tasks to draw at random and hold out"""
     held_out_pairs: Probability = 0.1  # fraction of object pairs whose queries are excluded from training
     width: Count = 128  # units of each hidden layer
     depth: Natural = 3  # number of hidden layers
-    steps: Maybe[Count] = None  # number of minibatches (default: 6000, with --cameras 4000)
-    batch_size: Maybe[Count] = None  # checks in a minibatch (default: 1024; with --cameras 48 states)
-    learning_rate: Maybe[Scale] = None  # at the start (default: 0.003, with --cameras 0.002)
+    steps: Maybe[Count] = None  # number of minibatches (default: 6000; 4000 with --cameras)
+    batch_size: Maybe[Count] = None  # state-clause pairs per minibatch (default: 1024), or images (default: 48)
+    learning_rate: Maybe[Scale] = None  # initial learning rate (default: 0.003; 0.002 with --cameras)
     seed: Natural = 0  # random seed of episodes, held-out choices, initial weights and minibatches
     device: options.Device = "cpu"
     json: options.Json = False
@@ -301,7 +301,7 @@ class TrainEvaluator:
             replay.add_column("pixels", lw.data.load_pictures(replay, **pictures, every=config.every))
         labelled = lw.training.LabelledQueries(replay, config)
         if not any(queries for name, queries in labelled.parts.items() if name != "training"):
-            raise ValueError("nothing is held out to score the evaluator on; collect at least --episodes 2")
+            raise ValueError("no held-out queries to score the evaluator on; use --episodes 2 or more")
         file = self.out / "evaluator.safetensors"
         trainer = lw.training.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=file, device=self.device)
         loss = trainer.train()
@@ -324,7 +324,7 @@ class TrainEvaluator:
         return make(held_out_pairs=self.held_out_pairs, seed=self.seed, **numbers)
 
     def _replay(self, tasks: list[str]) -> lw.LanguageWorldExperienceReplay:
-        """Collect the episodes, unless --data names datasets, and return a buffer over those of the tasks."""
+        """Collect the episodes, unless --data is given, and return a replay buffer over the episodes of ``tasks``."""
         from lw_torchrl.data.dataset import read_metadata
 
         roots = self.data or tuple(self.out / "data" / name for name in self.behaviours)
@@ -333,10 +333,10 @@ class TrainEvaluator:
                 run: dict[str, Any] = {"max_steps": self.max_steps, "seed": self.seed}
                 run["noise_scale"] = self.noise if name == "expert" else 0.0
                 lw.collect_demonstrations(tasks, root=root, policy=name, episodes_per_task=self.episodes, **run)
-        chosen = []  # of each dataset, every episode of the tasks
+        chosen = []  # for each dataset, the tasks and their number of episodes
         for root in roots:
             dataset = read_metadata(root).config
             if not (shared := [task for task in tasks if task in dataset.tasks]):
-                raise ValueError(f"--data {root} has none of the tasks; it has {', '.join(dataset.tasks)}")
+                raise ValueError(f"--data {root} has none of the tasks; the dataset has {', '.join(dataset.tasks)}")
             chosen.append(dict.fromkeys(shared, dataset.episodes_per_task))
         return lw.LanguageWorldExperienceReplay(list(roots), label="executed", episodes=chosen)

@@ -1,4 +1,4 @@
-"""Suites of tasks, each with its robot and simulator; Meta-World and Fetch are shipped."""
+"""Suites of tasks, each with a robot and a simulator; Meta-World and Fetch are shipped."""
 
 from lw_torchrl.suites.checking import Finding, check_suite
 from lw_torchrl.suites.suite import SUITES, Suite, find_suite, known_suite, load_suite

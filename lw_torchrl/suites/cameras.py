@@ -1,4 +1,4 @@
-"""Camera images and poses of MuJoCo states; one OpenGL context serves all models."""
+"""Render camera images of MuJoCo states and read body poses; one OpenGL context serves all models."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from lw_torchrl.suites.engine import BodyPoses, RowModel
 _FINGER = re.compile("finger|claw|pad")
 _ROLLED = ("corner", "corner2", "corner3", "corner4")  # Meta-World mounts these upside down
 _MOST_GEOMS = 2000
-# Shadows and reflections would take a software renderer four times as long.
+# With shadows and reflections, a software renderer would be four times slower.
 _SWITCHED_OFF = (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION)
 
 
 def _open_gl() -> Any:
-    """Open an OpenGL context without a window, by the library in MUJOCO_GL, or else EGL without a display."""
-    # MuJoCo reads MUJOCO_GL at its import, but robosuite sets it later.
+    """Open a windowless OpenGL context with the library in MUJOCO_GL (if unset: EGL when there is no display)."""
+    # MuJoCo reads MUJOCO_GL when it is imported, but robosuite sets the variable later.
     headless = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
     backend = os.environ.get("MUJOCO_GL", "").lower().strip() or ("egl" if headless else "")
     if backend == "egl":
@@ -44,8 +44,8 @@ def _no_open_gl(error: Exception) -> ImportError:
     backend = os.environ.get("MUJOCO_GL", "").lower().strip()
     library = RENDER_LIBRARIES.get(backend or "egl", "OpenGL and a display")
     return ImportError(
-        f"camera images need OpenGL, which does not open with MUJOCO_GL={backend or '(unset)'}: install {library}, or "
-        f"start Python with MUJOCO_GL=egl or MUJOCO_GL=osmesa. Simulations and recordings do not need it. ({error})"
+        f"camera images need OpenGL, which failed to start with MUJOCO_GL={backend or '(unset)'}: install {library}, "
+        f"or start Python with MUJOCO_GL=egl or MUJOCO_GL=osmesa. Simulations and recordings need no OpenGL. ({error})"
     )
 
 
@@ -59,17 +59,17 @@ def _close_all() -> None:
 
 
 class Cameras:
-    """A renderer for one thread at a time; it loads a model's meshes and textures at the model's first image."""
+    """A renderer for one thread at a time that loads a model's meshes and textures when it first renders the model."""
 
     def __init__(self) -> None:
         if _processes - {os.getpid()}:
             raise RuntimeError(
-                "this process was forked from one that rendered, and OpenGL does not survive that: use "
-                "mp_start_method='spawn', or render nothing before the fork"
+                "the parent process rendered images before it forked this process, and OpenGL cannot be used after a "
+                "fork: use mp_start_method='spawn', or render nothing before the fork"
             )
         try:
             self._gl = _open_gl()
-        except Exception as error:  # each platform raises another type
+        except Exception as error:  # the type depends on the platform
             raise _no_open_gl(error) from error
         if not _open:
             atexit.unregister(_close_all)
@@ -79,12 +79,12 @@ class Cameras:
         self._loaded: dict[str, tuple[Any, Any]] = {}
 
     def picture(self, shown: RowModel, data: Any, *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        """Return an image of a state, (height, width, 3) uint8."""
+        """Render a state and return the image (height, width, 3) uint8."""
         self._gl.make_current()
         try:
             return self._picture(shown, data, camera, height, width)
         finally:
-            if type(self._gl).__module__ == "mujoco.egl":  # else no other thread could use the context
+            if type(self._gl).__module__ == "mujoco.egl":  # otherwise other threads could not use the context
                 from OpenGL import EGL  # type: ignore[import-untyped]
 
                 EGL.eglReleaseThread()
@@ -111,7 +111,7 @@ class Cameras:
         frame = mujoco.MjrRect(0, 0, width, height)
         pixels = np.empty((height, width, 3), dtype=np.uint8)
         mujoco.mjr_render(frame, view, context)
-        mujoco.mjr_readPixels(pixels, None, frame, context)  # from the bottom up
+        mujoco.mjr_readPixels(pixels, None, frame, context)  # the bottom row comes first
         return pixels[:, ::-1] if camera in _ROLLED else pixels[::-1]
 
     def close(self) -> None:
@@ -126,32 +126,32 @@ class Cameras:
 
 
 class SeenRows:
-    """A base class of engines with camera images, models and poses of their rows."""
+    """Base class for engines that provide camera images, and the MuJoCo model and body poses of each row."""
 
     _cameras: Cameras | None = None
-    _fingers: ClassVar[dict[str, NDArray[np.bool_]]] = {}  # for each model's file, which bodies are fingers
+    _fingers: ClassVar[dict[str, NDArray[np.bool_]]] = {}  # model file -> mask (bodies,) of the bodies that are fingers
 
     def _seen(self, row: int) -> tuple[RowModel, Any]:
-        """Return a row's model, with the row's own positions of bodies and sites, and its MuJoCo data."""
+        """Return a row's MuJoCo model (with the row's own positions of bodies and sites) and MuJoCo data."""
         raise NotImplementedError
 
     def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        """Return images of the rows' present states, (len(rows), height, width, 3) uint8, from the top down."""
+        """Render the current states of ``rows`` and return the images (len(rows), height, width, 3) uint8."""
         cameras = self._cameras = self._cameras or Cameras()
         return np.stack([cameras.picture(*self._seen(row), camera=camera, height=height, width=width) for row in rows])
 
     def model(self, row: int) -> RowModel:
-        """Return the model of a row."""
+        """Return a row's MuJoCo model."""
         return self._seen(row)[0]
 
     def poses(self, row: int) -> BodyPoses:
-        """Return the present poses of all bodies of a row."""
+        """Return the current poses of all bodies of a row."""
         data = self._seen(row)[1]
         return BodyPoses(data.xpos.copy(), data.xquat.copy())
 
     def touched(self, row: int) -> str | None:
-        """Return what a finger of a row touches, as the name of the outermost body, or "nothing"; None if the model has
-        no body called a finger, claw or pad."""
+        """Return the name of the root body that a row's fingers touch, or "nothing"; return None if no body name of the
+        model contains "finger", "claw" or "pad"."""
         (path, model), data = self._seen(row)
         if path not in self._fingers:
             names = [model.body(body).name for body in range(model.nbody)]

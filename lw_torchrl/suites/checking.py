@@ -1,4 +1,4 @@
-"""check_suite: measure in a suite's simulator whether its numbers mean what its layout says."""
+"""check_suite: simulate a suite's tasks and verify that observations and actions match the suite's layout."""
 
 from __future__ import annotations
 
@@ -18,19 +18,20 @@ from lw_torchrl.suites.engine import Engine, EngineStep
 from lw_torchrl.suites.suite import Suite
 
 Array = NDArray[np.float64]
-_Row = tuple[str, str, str, bool]  # a Finding without its task
+_Row = tuple[str, str, str, bool]  # the fields of a Finding, without the task
 _AXES = {"x": "right", "y": "away from the robot", "z": "up"}
-# A hand is measured over the last steps of a movement at a quarter of its speed: it takes some steps to get going.
+# The hand's speed is measured over the last time steps of a movement at a quarter of full speed, after it accelerated.
 _STEPS, _COUNTED, _SHARE = 14, 4, 0.25
-_SETTLING = 30  # steps in which a gripper opens or closes
-_LAG, _CLOSING = 4, 13  # measured in Meta-World: steps that its hand moves on for, and that its gripper needs to close
-_LOWEST = 0.15  # metres: the greatest height of a hand that is pressed down; Meta-World's is at 0.046
-_TABLE, _FLOATING = 0.02, 0.03  # metres: below, an object touches the table; above, it is meant to be somewhere else
+_SETTLING = 30  # time steps in which a gripper opens or closes
+_LAG, _CLOSING = 4, 13  # time steps in Meta-World in which the hand comes to rest, and in which the gripper closes
+_LOWEST = 0.15  # metres: the maximum height of a hand pressed down onto the table; 0.046 in Meta-World
+_TABLE, _FLOATING = 0.02, 0.03  # metres: an object below touches the table; an object above is deliberately elsewhere
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A measurement in a task: its subject, its result, the value that the layout requires, and whether they agree."""
+    """A measurement in a task: the quantity, the measured value, the value expected from the layout, and whether the
+    two agree."""
 
     task: str
     what: str
@@ -41,16 +42,16 @@ class Finding:
 
 @typed
 def check_suite(suite: Suite, *, seed: int = 0) -> list[Finding]:
-    """Run a few steps of each task and compare the result with the suite's layout.
+    """Run a few time steps of each task and compare the results with the suite's layout.
 
-    It checks the types and shapes that the engine returns, that a seed determines an episode, that inactive rows rest,
-    the numbers of the previous step, each axis of the displacement, how far the hand moves in a step (``reach``) and
-    for how long it moves on, that objects stay while it moves, that the gripper opens and closes, and no slower than
-    Meta-World's (``binary_gripper``), and how high objects rest above the table. It does not check success. The engine
-    runs two rows of each task.
+    The checks cover the types and shapes that the engine returns; that a seed determines an episode; that inactive rows
+    do not change; the observation's values of the previous step; the direction of each displacement axis; how far the
+    hand moves per time step (``reach``) and how soon it stops; that objects stay while the hand moves; that the gripper
+    opens and closes, no slower than in Meta-World (``binary_gripper``); and the height of objects above the table.
+    Success is not checked. The engine runs two rows of each task.
 
     Returns:
-        A :class:`Finding` for each measurement, in the order of the tasks.
+        A :class:`Finding` for each measurement, ordered by task.
 
     Example:
         >>> from lw_torchrl.suites import check_suite, load_suite
@@ -71,7 +72,7 @@ def check_suite(suite: Suite, *, seed: int = 0) -> list[Finding]:
 
 
 class _Bench:
-    """Two rows of a task: the first moves, the second rests."""
+    """A two-row test batch of one task: row 0 receives actions that move the hand, row 1 stays inactive."""
 
     def __init__(self, suite: Suite, task: str, engine: Engine, seed: int) -> None:
         self.suite, self.layout, self.engine, self.seed = suite, suite.layout, engine, seed
@@ -83,7 +84,7 @@ class _Bench:
         return np.array(self.engine.reset([0], [self.seed if seed is None else seed]))[0]
 
     def step(self, **effort: float) -> EngineStep:
-        """Step the first row with a displacement along ``x``, ``y`` or ``z`` and a gripper's effort ``close``."""
+        """Step row 0 with displacements ``x``, ``y``, ``z`` and a gripper effort ``close``, each in [-1, 1]."""
         layout, action = self.layout, np.zeros((2, self.layout.action_size), np.float32)
         if layout.displacement is not None:
             action[0, layout.displaced("check_suite")] = [effort.get(axis, 0.0) for axis in _AXES]
@@ -96,8 +97,8 @@ class _Bench:
     def rows(self) -> Iterator[_Row]:
         one, two = (f"({rows}, {self.layout.size}) float64" for rows in (1, 2))
         answers: dict[str, tuple[str, Callable[[], Any]]] = {
-            "observations of a reset": (two, lambda: self.engine.reset([0, 1], [self.seed, self.seed])),
-            "a reset of one row of two": (one, lambda: self.engine.reset([0], [self.seed])),
+            "observations after a reset": (two, lambda: self.engine.reset([0, 1], [self.seed, self.seed])),
+            "a reset of one of two rows": (one, lambda: self.engine.reset([0], [self.seed])),
             "a step": (f"EngineStep of {two}, (2,) float64, (2,) bool, (2,) bool", self.step),
         }
         for what, (wanted, call) in answers.items():
@@ -114,23 +115,23 @@ class _Bench:
         layout, first = self.layout, self.reset()
         walk = [first, *self.run(3, x=0.5)]
         finite = bool(np.isfinite(walk).all())
-        yield "the numbers", "finite" if finite else "NaN or infinite", "finite", finite
+        yield "observation values", "finite" if finite else "NaN or infinite", "finite", finite
         self.reset(self.seed + 1)
         again = [self.reset(), *self.run(3, x=0.5)]
         same = np.array_equal(walk, again, equal_nan=True)
-        yield "a seed determines the episode", "same numbers" if same else "other numbers", "same numbers", same
+        yield "a seed determines the episode", "same values" if same else "different values", "same values", same
         rested = self.step(x=0.5).observation[1]
         same = np.array_equal(rested, self.step(x=0.5).observation[1], equal_nan=True)
-        yield "a row that is not active", "rests" if same else "moves", "rests", same
+        yield "an inactive row", "unchanged" if same else "changed", "unchanged", same
         if layout.past is not None:
-            pairs = [(walk[0], walk[0]), *pairwise(walk)]  # a reset repeats the present numbers as the previous ones
+            pairs = [(walk[0], walk[0]), *pairwise(walk)]  # after a reset, both time steps have the same values
             kept = all(
                 np.array_equal(now[layout.a_step_before(part)], old[part])
                 for old, now in pairs
                 for part in layout.present
             )
-            wanted = "those of the previous step; after a reset, the present ones"
-            yield "numbers of the previous step", "right" if kept else "others", wanted, kept
+            wanted = "equal to the previous observation; after a reset, to the current one"
+            yield "values of the previous step", wanted if kept else "different", wanted, kept
         gripper = self.task.objects[0].position
         place = tuple(range(self.hand.start, self.hand.stop))
         right = typed_position(gripper) == typed_position(place)
@@ -140,7 +141,7 @@ class _Bench:
         layout, late = self.layout, []
         for axis, name in enumerate(_AXES):
             self.reset()
-            self.run(2 * _STEPS, z=_SHARE)  # away from the table and what stands on it
+            self.run(2 * _STEPS, z=_SHARE)  # away from the table and the objects on it
             self.run(_STEPS)
             path = self.run(_STEPS, **{name: _SHARE})
             moved = (path[-1] - path[-1 - _COUNTED])[self.hand] / _COUNTED / _SHARE
@@ -151,12 +152,12 @@ class _Bench:
             for number, slot in enumerate(layout.things, 1):
                 shift = float(np.abs(path[-1][slot.xyz] - path[0][slot.xyz]).max())
                 if shift > 0.5 * np.abs(moved).max() * _SHARE * (_STEPS - 1):
-                    yield f"object {number} as the hand moves", "moves along", "stays; in the table's frame", False
+                    yield f"object {number} as the hand moves", "moves with the hand", "stays on the table", False
             late.append((self.run(_STEPS)[-1] - path[-1])[self.hand][axis] / layout.reach / _SHARE)
         self.reset()
         self.heights += [state[self.hand][2] for state in self.run(int(0.6 / layout.reach) + 1, z=-1.0)]
         slow = float(max(late))
-        yield "the hand moves on for", f"{slow:.1f} steps", f"at most {_LAG}, as in Meta-World", slow < _LAG + 0.5
+        yield "the hand stops after", f"{slow:.1f} steps", f"at most {_LAG}, as in Meta-World", slow < _LAG + 0.5
 
     def _gripper(self) -> Iterator[_Row]:
         layout = self.layout
@@ -166,8 +167,8 @@ class _Bench:
         if max(opened) - min(closed) < 0.05:
             plan = None if self.suite.plans is None else self.suite.plans.get(self.task.name)
             needed = plan is not None and _needs_fingers(plan)
-            wanted = "0 to 1, since the plan has conditions on both" if needed else "fixed, or 0 to 1"
-            yield "gripper", "it does not move", wanted, not needed
+            wanted = "opens and closes, as the plan's conditions require" if needed else "fixed, or opens and closes"
+            yield "gripper", "does not move", wanted, not needed
             return
         yield "an open gripper", f"{opened[-1]:.2f}", "at least 0.95", opened[-1] >= 0.95
         yield "a closed gripper", f"{min(closed):.2f}", "at most 0.7", min(closed) <= 0.7
@@ -189,7 +190,7 @@ class _Bench:
 
 
 def _describe(answer: Any) -> str:
-    """Describe an engine's answer by its type, shape and dtype."""
+    """Describe the type, shape and dtype of an engine's result."""
     if isinstance(answer, EngineStep):
         return f"EngineStep of {', '.join(map(_describe, answer))}"
     return f"{answer.shape} {answer.dtype}" if isinstance(answer, np.ndarray) else type(answer).__name__

@@ -1,4 +1,4 @@
-"""Suite: the tasks of a simulator, their layout and words, and the engine that simulates them."""
+"""The Suite class (a simulator's tasks, layout, skills, plans and engine) and the registry of suites."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ class Suite:
     """The tasks of one simulator and robot, for every ``suite=`` argument.
 
     Attributes:
-        name: for example "fetch", whose tasks are called "fetch/push".
+        name: the suite's name, for example "fetch"; the tasks are then called "fetch/push" etc.
         layout: the layout of observations and actions.
-        tasks: full name to :class:`Task`, all of this layout.
+        tasks: a mapping from full names to :class:`Task` objects with this layout.
         make_engine: ``(row_tasks, *, reward, num_threads) -> Engine``, with a row for each full name in ``row_tasks``;
             ``reward`` is "sparse" or "dense".
-        skills, plans: scripted skills by their text, and plans by task; not every task needs one.
+        skills, plans: scripted skills by text, and plans by task; tasks may lack a plan.
         make_expert: ``(tasks) -> actor``, a demonstrator that writes ``action`` (N, A) float32 in [-1, 1] and
-            ``unclipped_action``; None if the plans with their scripted skills demonstrate.
-        max_steps: default length of episodes.
+            ``unclipped_action``; None if scripted skills demonstrate the plans.
+        max_steps: default episode length, in time steps.
         step_time: seconds between two actions.
 
     Raises:
-        ValueError: a task has another layout, or a name that does not begin with the suite's.
+        ValueError: a task has a different layout, or its name does not begin with the suite's name.
 
     Source: ours; like gymnasium's ``EnvSpec``.
     """
@@ -60,13 +60,14 @@ class Suite:
             if self.name != "metaworld" and not name.startswith(f"{self.name}/"):
                 raise ValueError(f"tasks of suite {self.name!r} must be named '{self.name}/...', got {name!r}")
         if self.plans is not None and (other := set(self.plans) - set(self.tasks)):
-            raise ValueError(f"plans of suite {self.name!r} are for tasks that it lacks: {', '.join(sorted(other))}")
+            unknown = ", ".join(sorted(other))
+            raise ValueError(f"plans of suite {self.name!r} must be for tasks in the suite, got plans for {unknown}")
         if not isinstance(self.tasks, ReadOnlyDict):
             object.__setattr__(self, "tasks", ReadOnlyDict(dict(sorted(self.tasks.items()))))
 
     def named_tasks(self, tasks: TaskList, own: Tasks | None = None) -> dict[str, Task]:
-        """Return tasks by their full names, sorted. ``tasks`` is the suite's name for all of them, a name with or
-        without the suite's in front, a :class:`Task`, or a list of these; names are also looked up in ``own``."""
+        """Return a sorted dict of tasks by full name. ``tasks`` is the suite's name (for all tasks), a task's name with
+        or without the suite's prefix, a :class:`Task`, or a list of these; names are also looked up in ``own``."""
         known = {**self.tasks, **own} if own else self.tasks
         if tasks == self.name:
             return dict(self.tasks)
@@ -83,20 +84,20 @@ class Suite:
 def _as_suite(name: str, entry: Any) -> Suite:
     suite = entry() if callable(entry) else entry
     if not isinstance(suite, Suite):
-        raise TypeError(f"suite {name!r} must be a Suite, or a function that makes one, got {shown(entry)}")
+        raise TypeError(f"suite {name!r} must be a Suite or a function that returns a Suite, got {shown(entry)}")
     return suite
 
 
 _SHIPPED = {name: f"lw_torchrl.suites.{name}:make_suite" for name in ("metaworld", "fetch")}
 SUITES = Registry("suite", "lw_torchrl.suites", _SHIPPED, _as_suite)
-"""Suites by name. Add yours to use it by name; every ``suite=`` also accepts the :class:`Suite`."""
+"""A registry of suites by name. Add your own suite to use it by name, or pass the :class:`Suite` as ``suite=``."""
 
 
 def load_suite(suite: str | Suite) -> Suite:
-    """Return the suite of a name, such as "fetch"; a :class:`Suite` is returned as it is.
+    """Return the suite with a given name, such as "fetch"; a :class:`Suite` is returned unchanged.
 
     Raises:
-        ValueError: the name is unknown; the message lists the nearest names.
+        ValueError: the name is unknown; the message suggests the closest names.
         ImportError: the simulator is not installed; the message names the extra.
 
     Example:
@@ -109,28 +110,29 @@ def load_suite(suite: str | Suite) -> Suite:
     if not isinstance(suite, str):
         raise TypeError(f"suite must be a suite's name or a Suite, got {shown(suite)}")
     if suite not in SUITES:
-        advice = f"pass your own Suite, or add it: lw.suites.SUITES[{suite!r}] = ... (in a module for --import)"
-        raise ValueError(f"{unknown_name('suite', suite, SUITES)} To use your own, {advice}")
+        advice = f"pass a Suite object, or register the suite: lw.suites.SUITES[{suite!r}] = ... (see also --import)"
+        raise ValueError(f"{unknown_name('suite', suite, SUITES)} For a custom suite, {advice}")
     return SUITES[suite]
 
 
 def suite_name(task: str) -> str:
-    """Return the suite that a task's name begins with, or is; Meta-World's tasks have no suite in front."""
-    # SUITES reads the entry points of all installed packages, which takes long: look at known names first.
+    """Return the name of the suite to which a task's name (or a suite's name) refers; names without a prefix are
+    Meta-World's."""
+    # SUITES reads the entry points of all installed packages, which is slow, so check known names first.
     is_metaworld = task in (*TASKS, "MT10", "MT50")
     return task.partition("/")[0] if "/" in task or (not is_metaworld and task in SUITES) else "metaworld"
 
 
 def listed_tasks(tasks: Any) -> Any:
-    """Return an iterator as a list, which can be read twice, and anything else as it is."""
+    """Convert an iterator to a list, which can be read twice; return any other object unchanged."""
     return list(tasks) if isinstance(tasks, Iterator) else tasks
 
 
 def find_suite(tasks: Any, suite: str | Suite | None = None) -> Suite:
-    """Return the given suite, or else the one that the tasks' names begin with; Meta-World without a prefix.
+    """Return ``suite``, or if None the suite named by the prefix of the tasks' names (Meta-World without a prefix).
 
     Raises:
-        ValueError: the names are of several suites or of an unknown one.
+        ValueError: the tasks belong to several suites or to an unknown suite.
     """
     if suite is not None:
         return load_suite(suite)
@@ -138,12 +140,12 @@ def find_suite(tasks: Any, suite: str | Suite | None = None) -> Suite:
     names = {task.name if isinstance(task, Task) else task for task in listed if isinstance(task, (str, Task))}
     suites = {suite_name(name) for name in names}
     if len(suites) > 1:
-        raise ValueError(f"tasks must be of one suite, got tasks of {', '.join(sorted(suites))}")
+        raise ValueError(f"tasks must belong to one suite, got tasks of {', '.join(sorted(suites))}")
     return load_suite(next(iter(suites), "metaworld"))
 
 
 def known_suite(task: str) -> Suite | None:
-    """Return the installed suite in :data:`SUITES` that has a task of this name; None for other tasks."""
+    """Return the installed suite in :data:`SUITES` that has a task with this name, or None if there is none."""
     name = suite_name(task)
     try:
         suite = SUITES.get(name)

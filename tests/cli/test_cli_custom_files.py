@@ -110,4 +110,4 @@ def test_a_task_without_a_simulator_is_an_error(capsys, tmp_path):
     assert "stack-cup" in fails(capsys, "evaluate", tmp_path / "single.safetensors", "--tasks", "stack-cup")
     assert "no simulator" in fails(capsys, "evaluate", tmp_path / "single.safetensors")
     printed = run(capsys, "evaluate", tmp_path / "both.safetensors", "--episodes", 1, "--max-steps", 5)
-    assert printed.startswith("evaluating 1 task of the policy's 2; choose others by --tasks\n")
+    assert printed.startswith("evaluating 1 task of the policy's 2; use --tasks to choose others\n")

@@ -97,7 +97,7 @@ def test_a_valid_plan_passes_the_check(capsys, tmp_path):
     path.write_text(PLAN)
     printed = run(capsys, "check", path)
     assert "push.plan: 2 steps, valid" in printed
-    assert "no scripted skill 'shove the puck over there' for push; the nearest is" in printed
+    assert "no scripted skill 'shove the puck over there' for push; the closest is" in printed
     (row,) = document(capsys, "check", path)["files"]
     assert (row["steps"], row["faults"], len(row["notes"])) == (2, [], 1)
 

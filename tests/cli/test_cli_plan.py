@@ -77,7 +77,7 @@ def test_read_parses_answers_of_language_models(capsys, tmp_path, format):
     assert [step["written"] for step in shown["read"]] == [step.skill for step in plan.steps]
     answer.with_name("push-0.txt").write_text("I cannot help with that.")
     printed = run(capsys, "plan", "read", *answer.parent.iterdir(), "--out", tmp_path / "mine")
-    assert "push-0.txt: no plan can be read, " in printed
+    assert "push-0.txt: no plan can be read: " in printed
     steps = lw.load_plans(tmp_path / "mine")["reach"].steps
     assert [(step.condition, step.skill) for step in steps] == [(step.condition, step.skill) for step in plan.steps]
     assert "no plan can be read" in fails(capsys, "plan", "read", answer.with_name("push-0.txt"))

@@ -90,7 +90,7 @@ def test_evaluate_writes_result_figure_and_recording(capsys, policy, tmp_path):
 
 def test_evaluate_runs_the_demonstrated_tasks_by_default(capsys, policy, tmp_path):
     printed = run(capsys, "evaluate", policy, *SHORT)
-    assert printed.startswith("evaluating 2 tasks of the policy's 10; choose others by --tasks\n")
+    assert printed.startswith("evaluating 2 tasks of the policy's 10; use --tasks to choose others\n")
     assert [line.split()[0] for line in printed.splitlines()[2:]] == ["push", "reach", "mean"]
     shown = document(capsys, "evaluate", policy, "--plans", "MT10", *SHORT, "--attribute")
     assert len(shown["tasks"]) == len(shown["failures"]) == 10
@@ -123,7 +123,7 @@ def test_a_policy_in_python_is_evaluated(capsys, tmp_path, monkeypatch):
     options = ("--tasks", "reach", "--episodes", 1, "--stop-at-success")
     assert document(capsys, "evaluate", "my_policies:policy", *options)["mean_success"] == 1.0
     assert "my_policies:number" in fails(capsys, "evaluate", "my_policies:number")
-    assert "must be like my_module:name" in fails(capsys, "evaluate", "my_policies:nothing")
+    assert "must have the form my_module:name" in fails(capsys, "evaluate", "my_policies:nothing")
 
 
 def test_info_describes_policies_datasets_and_recordings(capsys, demos, policy, tmp_path):

@@ -229,7 +229,7 @@ def test_suites_are_found_by_name(monkeypatch):
         ({"tasks": {"toy/other": TASKS["toy/touch-red"]}}, "tasks .*'toy/touch-red' as 'toy/other'"),
         ({"tasks": {"reach": lw.TASKS["reach"]}}, "task 'reach' must have the layout of suite 'toy'"),
         ({"name": "tay"}, "tasks of suite 'tay' must be named 'tay/...'"),
-        ({"plans": lw.load_plans("MT10")}, "plans of suite 'toy' are for tasks that it lacks"),
+        ({"plans": lw.load_plans("MT10")}, "plans of suite 'toy' must be for tasks in the suite"),
     ],
 )
 def test_contradictory_suites_raise(change, message):
@@ -280,12 +280,12 @@ class Broken(ToyEngine):
 @pytest.mark.parametrize(
     ("fault", "what"),
     [
-        ("NaN", "the numbers"),
+        ("NaN", "observation values"),
         ("floor", "the lowest object or hand"),
         ("objects from the hand", "object 1 as the hand moves"),
-        ("single", "observations of a reset"),
-        ("all rows", "a reset of one row of two"),
-        ("restless", "a row that is not active"),
+        ("single", "observations after a reset"),
+        ("all rows", "a reset of one of two rows"),
+        ("restless", "an inactive row"),
         ("tuple", "a step"),
     ],
 )
@@ -298,7 +298,7 @@ def test_check_finds_a_broken_engine(fault, what, monkeypatch):
     ("options", "findings"),
     [
         ({}, set()),
-        ({"inertia": 0.9}, {("the hand moves on for", "5.7 steps")}),
+        ({"inertia": 0.9}, {("the hand stops after", "5.7 steps")}),
         ({"closing": 0.05}, {("steps to close", "18")}),
     ],
     ids=str,
@@ -325,7 +325,7 @@ class NoPast(ToyEngine):
 
 
 def test_check_finds_a_past_that_is_zero():
-    assert what_is_wrong(replace(TOY, size=29, past=13, goal=26), NoPast) == {"numbers of the previous step"}
+    assert what_is_wrong(replace(TOY, size=29, past=13, goal=26), NoPast) == {"values of the previous step"}
 
 
 def test_check_finds_a_gripper_that_does_not_move():

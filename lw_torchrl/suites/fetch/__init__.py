@@ -1,4 +1,4 @@
-"""gymnasium-robotics' Fetch tasks as a suite: an arm with a parallel gripper reaches, pushes, slides and picks up."""
+"""The Fetch suite: gymnasium-robotics tasks for an arm with a parallel gripper (reach, push, slide, pick and place)."""
 
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ __all__ = ["FETCH", "TASKS", "FetchEngine", "load_plans", "load_skills", "make_s
 _DATA = files("lw_torchrl.suites.fetch") / "data"
 
 HELD = 0.55
-"""The opening below which the fingers hold the puck, whose edges are 5 cm; the pads touch it at 0.48."""
+"""The gripper opening (0 to 1) below which the fingers hold the puck (5 cm edges); the pads touch the puck at 0.48."""
 FETCH = Layout(
     "fetch",
     25,
@@ -33,26 +33,27 @@ FETCH = Layout(
     binary_gripper=True,
     thresholds={"open": HELD, "closed": HELD},
 )
-"""The 25 numbers of an observation: hand, opening, puck and its quaternion, these 11 at the previous step, goal."""
+"""The layout of the 25 values of an observation: hand (3), gripper opening (1), puck (3), puck quaternion (4), the same
+11 values at the previous time step, and goal (3)."""
 
 TASKS: Tasks = ReadOnlyDict(
     {name: Task.from_json(name, row, FETCH) for name, row in sorted(read_toml(_DATA / "tasks.toml", TaskError).items())}
 )
-"""The four tasks by name, sorted."""
+"""The four tasks, sorted by name."""
 
 
 def load_skills() -> Skills:
-    """Return Fetch's scripted skills by their text; some are Meta-World's under other texts."""
+    """Load Fetch's scripted skills by text; some equal Meta-World skills with different texts."""
     return skills.load_skills(str(_DATA / "skills.toml"), tasks=TASKS)
 
 
 def load_plans() -> Plans:
-    """Return a plan for each task; every step has a scripted skill of :func:`load_skills`."""
+    """Load a plan for each task; :func:`load_skills` has a scripted skill for every plan step."""
     return plan_files.load_plans(str(_DATA / "plans"), tasks=TASKS)
 
 
 def make_suite() -> Suite:
-    """Return Fetch as a suite; its episodes have 50 steps, as in gymnasium-robotics."""
+    """Return the Fetch suite; episodes have 50 time steps, as in gymnasium-robotics."""
     step_time = 0.04  # 20 simulation steps of 2 ms
     return Suite("fetch", FETCH, TASKS, _make_engine, load_skills(), load_plans(), max_steps=50, step_time=step_time)
 
@@ -62,7 +63,7 @@ def _make_engine(row_tasks: list[str], **options: Any) -> Any:
 
 
 def __getattr__(name: str) -> Any:
-    if name == "FetchEngine":  # imported when it is used, because tasks and plans need no MuJoCo
+    if name == "FetchEngine":  # imported on first use, because tasks and plans do not need MuJoCo
         from lw_torchrl.suites.fetch.engine import FetchEngine
 
         return FetchEngine

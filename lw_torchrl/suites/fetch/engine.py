@@ -1,7 +1,7 @@
-"""The Fetch engine: gymnasium-robotics bit for bit, with physics in threads and numbers in our axes.
+"""The Fetch engine: bit-identical to gymnasium-robotics, but multithreaded and with Meta-World's axes.
 
-Fetch's x points away from the robot, its y to the left, its z up from the floor; ours point right, away, and up from
-the table. Both are in metres.
+In Fetch's axes, x points away from the robot, y to the left, and z up from the floor. In Meta-World's axes, x points
+right, y away from the robot, and z up from the table. Both are in metres.
 """
 
 from collections.abc import Sequence
@@ -25,49 +25,52 @@ from lw_torchrl.suites.metaworld.simulated_rows import ThreadedEngine
 from lw_torchrl.suites.metaworld.task_programs import WARNED_ALREADY
 
 HAND_HEIGHT = 0.03
-"""Height of our hand above Fetch's grip site, which is between the finger pads, metres. Meta-World's hand is as high
-above an object that it holds, so relations such as "near" mean the same."""
+"""Height (metres) of the observed hand position above Fetch's grip site, which is between the finger pads. Meta-World's
+hand is equally high above a held object, so relations such as "near" have the same meaning."""
 OPEN = 0.1
-"""Distance between the fingers of an open gripper, metres."""
+"""Distance (metres) between the fingers of an open gripper."""
 
 
 def our_positions(positions: Array, origin: Array) -> Array:
-    """Convert positions (..., 3) float64 from Fetch's axes to ours, relative to ``origin`` (..., 3) in Fetch's axes."""
+    """Convert positions (..., 3) float64 from Fetch's to Meta-World's axes, whose origin is ``origin`` (..., 3) in
+    Fetch's axes."""
     offset = positions - origin
     return np.stack((-offset[..., 1], offset[..., 0], offset[..., 2]), -1)
 
 
 def our_quaternions(quaternions: Array) -> Array:
-    """Convert the rotation axis of quaternions (..., 4) float64, w first, to our axes; (1, 0, 0, 0) stays."""
+    """Convert rotations, quaternions (..., 4) float64 in w, x, y, z order, from Fetch's to Meta-World's axes. The
+    identity stays the identity."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     return np.stack((w, -y, x, z), -1)
 
 
 def turned_quaternions(quaternions: Array) -> Array:
-    """Convert orientations of bodies (..., 4) float64, w first, from Fetch's axes to ours: a quarter turn."""
+    """Turn body orientations (..., 4) float64, in w, x, y, z order, from Fetch's to Meta-World's axes."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     return np.sqrt(0.5) * np.stack((w - z, x - y, x + y, w + z), -1)
 
 
 def fetch_actions(action: NDArray[Any]) -> NDArray[Any]:
-    """Convert our actions (..., 4), where +1 closes, to gymnasium-robotics', of the same dtype, where +1 opens."""
+    """Convert actions (..., 4) in Meta-World's axes, where +1 closes the gripper, to gymnasium-robotics actions of the
+    same dtype, where +1 opens the gripper."""
     return np.stack((action[..., 1], -action[..., 0], action[..., 2], -action[..., 3]), -1)
 
 
 CAMERAS = ("external_camera_0", "head_camera_rgb", "gripper_camera_rgb", "lidar")
-"""The cameras of Fetch's scenes."""
+"""Names of the cameras in Fetch's scenes."""
 
-_NOW = FETCH.past or 0  # the number of numbers of the present step
-_READ = 12  # grip site (3), finger joints (2), object's site (3) and quaternion (4), in Fetch's axes
+_NOW = FETCH.past or 0  # number of values in an observation that describe the current time step
+_READ = 12  # grip site (3), finger joints (2), object site (3) and object quaternion (4), in Fetch's axes
 _FINGERS = ("robot0:r_gripper_finger_joint", "robot0:l_gripper_finger_joint")
 _TURN = np.array([1.0, 0.0, 1.0, 0.0])  # gymnasium-robotics adds this to the hand's quaternion: fingers down
-_METRES = 0.05  # of a displacement of 1
-_SUCCESS = 0.05  # metres
+_METRES = 0.05  # metres per unit of displacement
+_SUCCESS = 0.05  # maximum distance to the goal at success, metres
 
 
 class _Scene(NamedTuple):
-    """A task's class in gymnasium-robotics, and our origin in Fetch's axes, metres. An object on the table is then at
-    z = 0.018, 2 mm below the threshold of touching; hands start near x = 0, y = 0.6."""
+    """A task's class in gymnasium-robotics, and the origin of Meta-World's axes in Fetch's axes (metres). An object on
+    the table is then at z = 0.018, 2 mm below the threshold for touching; the hand starts near x = 0, y = 0.6."""
 
     module: str
     env: str
@@ -84,9 +87,10 @@ _SCENES = {
 
 @cache
 def _builder(task: str) -> Any:
-    """Build gymnasium-robotics' environment of a task. All rows of all engines share its model, which never changes."""
+    """Build the gymnasium-robotics environment of a task. All rows of all engines share the environment's model, which
+    never changes."""
     scene = _SCENES[task]
-    with naming_absent_renderer(), redirect_stderr(StringIO()):  # its import prints news about other environments
+    with naming_absent_renderer(), redirect_stderr(StringIO()):  # the import prints messages about other environments
         try:
             module = import_module(f"gymnasium_robotics.envs.fetch.{scene.module}")
         except ImportError as error:
@@ -95,7 +99,7 @@ def _builder(task: str) -> Any:
 
 
 class _Row:
-    """A MuJoCo state on a shared model. Resets run gymnasium-robotics' code on a light copy of its environment."""
+    """A MuJoCo state on a shared model. Resets run gymnasium-robotics' code on a shallow copy of the environment."""
 
     def __init__(self, task: str) -> None:
         built = _builder(task)
@@ -108,11 +112,11 @@ class _Row:
         self.goal: Array = np.zeros(3)
 
         hand = self._model.body("robot0:gripper_link").id
-        self.bodies = BodyPoses(data.xpos, data.xquat)  # views of the present state
+        self.bodies = BodyPoses(data.xpos, data.xquat)  # views of the current state
         self._hand = data.xpos[hand], data.xquat[hand]
         self._mocap = data.mocap_pos[0], data.mocap_quat[0]
         self._fingers = [int(self._model.joint(name).qposadr[0]) for name in _FINGERS]
-        # In the order of the actuators, whose controls count from the fingers' positions; two of the tasks have none.
+        # The joints that actuators drive; controls are relative to the joint positions. Two tasks have no actuators.
         self._driven = self._model.jnt_qposadr[self._model.actuator_trnid[:, 0]]
         self._target = self._model.site("target0").id
         self._sites = [data.site_xpos[self._model.site("robot0:grip").id]]
@@ -123,13 +127,14 @@ class _Row:
         self._warnings = data.warning.number
 
     def reset(self, seed: int, read: Array) -> None:
-        """Start an episode and fill ``read`` (12,)."""
+        """Start an episode and fill ``read`` (12,) with the initial state."""
         self.goal = self._env.reset(seed=seed)[0]["desired_goal"]
         self._warnings[:] = WARNED_ALREADY
         self._read(read)
 
     def simulate(self, displacement: Array, effort: np.float64, read: Array, warnings: NDArray[np.int32]) -> None:
-        """Simulate 20 steps of physics; fill ``read`` (12,) and ``warnings`` (3,). ``displacement`` is in metres."""
+        """Simulate 20 physics steps after moving the hand's target by ``displacement`` (3,) in metres. Fill ``read``
+        (12,) with the new state and ``warnings`` (3,) with MuJoCo's warning counts."""
         data = self.data
         np.add(self._hand[0], displacement, out=self._mocap[0])
         np.add(self._hand[1], _TURN, out=self._mocap[1])
@@ -149,7 +154,7 @@ class _Row:
             read[5:8], read[8:] = self._sites[1], self._quaternion
 
     def seen(self) -> tuple[RowModel, Any]:
-        """Return the model and the data, with the target's mark, which does not affect physics, at the goal."""
+        """Return the model and the data. The target marker, which does not affect physics, is placed at the goal."""
         self.data.site_xpos[self._target] = self.goal
         return RowModel(self.path, self._model), self.data
 
@@ -157,20 +162,20 @@ class _Row:
 class FetchEngine(ThreadedEngine):
     """An engine for FetchReach-v4, FetchPush-v4, FetchSlide-v4 and FetchPickAndPlace-v4.
 
-    States, goals and successes equal those of ``gymnasium.make(id)`` after ``reset(seed=seed)`` and the same actions,
-    bit for bit, for any number of threads. Our action (right, away, up, effort) is gymnasium-robotics' (away, -right,
-    up, -effort), in the same dtype. A displacement of 1 requests 5 cm, of which the hand moves 3.2 cm in a step. The
-    gripper's effort counts from the present position of the fingers, so 0 holds no puck. Reach, push and slide keep the
-    fingers closed.
+    For any number of threads, states, goals and success flags are bit-identical to those of ``gymnasium.make(id)``
+    after ``reset(seed=seed)`` and the same actions. An action (right, away, up, effort) becomes gymnasium-robotics'
+    (away, -right, up, -effort) of the same dtype. A displacement of 1 requests 5 cm, but the hand moves only 3.2 cm per
+    time step. The gripper effort is relative to the current finger positions, so an effort of 0 does not hold the puck.
+    Reach, push and slide keep the fingers closed.
 
-    Observations have 25 numbers (:data:`~lw_torchrl.suites.fetch.FETCH`), in metres and in Meta-World's axes. Reach has
-    zeros for its missing object, and its goal is the hand's, 3 cm above the grip site's. Rows fault as in
+    Observations (25 values, :data:`~lw_torchrl.suites.fetch.FETCH`) are in metres and in Meta-World's axes. In reach,
+    the missing object is zeros, and the goal is a hand position, 3 cm above the grip site's goal. Rows fault as in
     :class:`~lw_torchrl.suites.metaworld.vectorized_engine.VectorizedEngine`.
 
     Args:
         tasks: the task of each row.
-        reward: "sparse" for the success as 0 or 1; "dense" for minus the distance to the goal, metres.
-        num_threads: number of threads that simulate; None for one per core.
+        reward: "sparse" for 1 at success and 0 otherwise; "dense" for the negative distance to the goal in metres.
+        num_threads: number of simulation threads; None for one per core.
 
     Source: Plappert et al., 'Multi-Goal Reinforcement Learning'; gymnasium-robotics 1.4.2.
     """
@@ -182,7 +187,7 @@ class FetchEngine(ThreadedEngine):
         self._dense = reward == "dense"
         tasks = [check_choice("task", task, _SCENES) for task in tasks]
         n = len(tasks)
-        super().__init__([""] * n, FETCH, num_threads)  # shared models are only read, so rows need no grouping by model
+        super().__init__([""] * n, FETCH, num_threads)  # models are read-only, so rows need not be grouped by model
         self._rows = [_Row(task) for task in tasks]
         self._origin = np.array([_SCENES[task].origin for task in tasks]).reshape(n, 3)
         self._has_object = np.array([row.has_object for row in self._rows], dtype=bool)
@@ -201,7 +206,7 @@ class FetchEngine(ThreadedEngine):
     def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
         warnings = np.full((len(action), 3), WARNED_ALREADY, dtype=np.int32)
         action = fetch_actions(np.clip(action, -1, 1))
-        displacement = (action[:, :3] * _METRES).astype(np.float64)  # multiplied in the action's own precision
+        displacement = (action[:, :3] * _METRES).astype(np.float64)  # multiplied in the action's precision
         effort = action[:, 3].astype(np.float64)
 
         def simulate(row: int) -> None:
@@ -221,7 +226,7 @@ class FetchEngine(ThreadedEngine):
         self._observation[rows, :_NOW] = now
 
     def _now(self, rows: Index) -> Array:
-        """Return the first 11 numbers of the rows' observations."""
+        """Return the first 11 values (len(rows), 11) of the observations, which describe the current time step."""
         read, origin = self._read[rows], self._origin[rows]
         now = np.zeros((len(rows), _NOW))
         now[:, :3] = our_positions(read[:, :3], origin)
@@ -233,10 +238,10 @@ class FetchEngine(ThreadedEngine):
         return now
 
     def poses(self, row: int) -> BodyPoses:
-        """Return the present poses of all bodies of a row, in our axes."""
+        """Return the current poses of all bodies of a row, in Meta-World's axes."""
         position, quaternion = super().poses(row)
         return BodyPoses(our_positions(position, self._origin[row]), turned_quaternions(quaternion))
 
     def render(self, rows: Sequence[int], *, camera: str, height: int, width: int) -> NDArray[np.uint8]:
-        """Return images as :meth:`SeenRows.render` does, by one of Fetch's own cameras."""
+        """Render images as :meth:`SeenRows.render` does, with one of Fetch's cameras."""
         return super().render(rows, camera=check_choice("camera", camera, CAMERAS), height=height, width=width)

@@ -26,23 +26,24 @@ if TYPE_CHECKING:
 
 _SHIPPED = {"vectorized": VectorizedEngine, "metaworld": MetaWorldEngine}
 ENGINES = Registry("engine", "lw_torchrl.engines", _SHIPPED, is_function)
-"""Name to ``(row_tasks, *, reward, num_threads) -> Engine``."""
+"""A registry of engines: name -> ``(row_tasks, *, reward, num_threads) -> Engine``."""
 
 
 def make_engine(engine: str | Callable[..., Engine], row_tasks: Sequence[str], **options: Any) -> Engine:
-    """Return an engine, by its name in :data:`ENGINES` or from your own function, with a row for each task."""
+    """Return an engine with a row for each task; ``engine`` is a name in :data:`ENGINES` or a custom function."""
     make: Callable[..., Engine] = engine if callable(engine) else ENGINES[check_choice("engine", engine, ENGINES)]
     return make(list(row_tasks), **options)
 
 
 def make_suite() -> Suite:
-    """Return Meta-World as a suite, whose tasks need no prefix."""
+    """Return the Meta-World suite, whose task names have no prefix."""
     plans = load_plans("MT50")
     return Suite("metaworld", METAWORLD, TASKS, _make_engine, load_skills(), plans, make_expert=_make_expert)
 
 
 def _make_engine(row_tasks: Sequence[str], **options: Any) -> Engine:
-    """Return the vectorized engine, or the plain one for versions that the vectorized one was not compared with."""
+    """Return the vectorized engine, or the plain engine if the vectorized engine was not verified against the installed
+    versions."""
     if not (changes := version_changes(COMPARED_VERSIONS, COMPARED_VERSIONS)):
         return VectorizedEngine(row_tasks, **options)
     _warn_once(", ".join(changes))
@@ -53,15 +54,15 @@ def _make_engine(row_tasks: Sequence[str], **options: Any) -> Engine:
 def _warn_once(changes: str) -> None:
     installation = " ".join(f"{package}=={version}" for package, version in COMPARED_VERSIONS.items())
     warnings.warn(
-        f"engine: the vectorized engine was compared with other versions ({changes}), so Meta-World's own environments "
-        "run instead: about 4 times slower on one thread, 6 times on two. For the vectorized engine, pip install "
-        f"{installation}",
+        f"engine: the vectorized engine was verified against other versions ({changes}), so Meta-World's own "
+        "environments are used instead (4 times slower on one thread, 6 times on two). To use the vectorized engine, "
+        f"pip install {installation}",
         stacklevel=6,  # the caller of LanguageWorldEnv(...)
     )
 
 
 def _make_expert(tasks: Sequence[str]) -> ExpertActor:
-    # Imports TensorDict, which tasks and engines do not need.
+    # This module imports TensorDict, which tasks and engines do not need.
     from lw_torchrl.suites.metaworld.experts import ExpertActor
 
     return ExpertActor(tasks)

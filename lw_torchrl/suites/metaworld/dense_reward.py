@@ -1,4 +1,4 @@
-"""Meta-World's dense reward for many rows at once, bit for bit."""
+"""Meta-World's dense reward for many rows at once, bit-identical to Meta-World."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,7 +16,7 @@ FULL_REWARD = 10.0
 
 
 class EpisodeStarts:
-    """The numbers of an episode's first state that rewards need, with one entry per row."""
+    """The values of each episode's first state that the rewards depend on, with one entry per row."""
 
     def __init__(self, rewards: Sequence[TaskReward]) -> None:
         for reward in rewards:
@@ -43,7 +43,7 @@ class EpisodeStarts:
 
 
 class DenseReward:
-    """Computes the rewards of a fixed set of rows; ``starts`` are those of all rows of the engine."""
+    """A function that computes the rewards of a fixed set of rows; ``starts`` covers all rows of the engine."""
 
     def __init__(self, starts: EpisodeStarts, rows: Index) -> None:
         self._starts, self._rows = starts, rows
@@ -54,10 +54,10 @@ class DenseReward:
         self._lifts = [(LIFTS[name], np.flatnonzero(task.lift == name)) for name in np.unique(task.lift) if name]
         self._formulas = [(FORMULAS[name], np.flatnonzero(task.formula == name)) for name in np.unique(task.formula)]
 
-    @np.errstate(all="ignore")  # unstable rows, and branches that are not used, may hold any number
+    @np.errstate(all="ignore")  # unstable rows and unused branches may hold arbitrary numbers
     def __call__(self, sensors: Array, observation: Array, goal: Array, action: NDArray[Any]) -> Array:
-        """Return rewards (rows,) as Meta-World's ``compute_reward``, from sensors (rows, REWARD_WIDTH), observations
-        (rows, 39), goals (rows, 3) and actions (rows, 4) in their own precision."""
+        """Compute rewards (rows,) as Meta-World's ``compute_reward`` does, from sensors (rows, REWARD_WIDTH),
+        observations (rows, 39), goals (rows, 3) and actions (rows, 4), whose dtype is kept."""
         task, less, points = self._task, self._starts.less[self._rows], self._starts.points[self._rows]
         features = terms.gather_features(task, sensors, observation[:, CURRENT], goal, points)
         proximity = self._proximity(features, less)

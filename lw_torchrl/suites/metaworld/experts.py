@@ -17,19 +17,20 @@ from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import resolve_tasks, task_id
 from lw_torchrl.suites.metaworld.plain_engine import import_metaworld
 
-_quiet = Lock()  # warning filters belong to the process: two threads at once would not restore them
+_quiet = Lock()  # warning filters are global: two threads at the same time would not restore them correctly
 
 
 class ExpertActor(TensorDictModuleBase):
-    """Meta-World's scripted policies, one for each row's task.
+    """A module that runs the Meta-World scripted policy of each row's task.
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``action`` (B, 4) float32, clipped to [-1,
-    1], and ``unclipped_action`` (B, 4) float32, the script's action, usually far larger. Rows that a ``_step`` mask
-    (B,) excludes get zeros. Raises ValueError for a task_id that is not one of ``tasks``.
+    1], and ``unclipped_action`` (B, 4) float32, the script's action, which is usually far larger. Rows excluded by a
+    ``_step`` mask (B,) get zeros. Raises a ValueError for a task_id that is not in ``tasks``.
 
     Args:
-        tasks: the tasks of its rows, as for :func:`resolve_tasks`.
-        in_keys, out_keys: other names for these keys, in this order; nested keys are allowed.
+        tasks: the tasks to support, as for :func:`resolve_tasks`.
+        in_keys, out_keys: replacements for the default input and output keys, in the order above; nested keys are
+            allowed.
 
     Example:
         >>> import lw_torchrl as lw
@@ -40,7 +41,7 @@ class ExpertActor(TensorDictModuleBase):
     Source: ``metaworld.policies``.
     """
 
-    row_by_row = True  # a row's action depends only on that row, also bit for bit
+    row_by_row = True  # an action depends only on its row of the batch, bit for bit
 
     def __init__(
         self,
@@ -66,7 +67,7 @@ class ExpertActor(TensorDictModuleBase):
         task_ids = ids.reshape(-1).tolist()
         action = np.zeros((len(task_ids), METAWORLD.action_size), dtype=np.float32)
         with _quiet, warnings.catch_warnings():
-            # The scripts warn at nearly every step that their actions exceed [-1, 1].
+            # The scripts warn at nearly every time step that actions exceed [-1, 1].
             warnings.filterwarnings("ignore", message="Constant\\(s\\) may be too high")
             for row in np.flatnonzero(row_mask(tensordict, "_step", len(task_ids))):
                 if (task := task_ids[row]) not in self._policies:

@@ -1,4 +1,4 @@
-"""Sensors, the numbers read from each state after a step, and the observations and successes made of them."""
+"""Sensor values read from the state after each step, and the observations and success flags computed from them."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -13,8 +13,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-# Columns of the sensors. The first 18 have the order of the observation, whose number 3, the gripper's opening, is
-# computed. Columns that a task lacks hold arbitrary numbers.
+# Columns of the sensor array. The first 18 are in the order of the observation, but column 3 (gripper opening) is
+# computed. Columns that a task does not use hold arbitrary numbers.
 HAND = slice(0, 3)
 GRIPPER = 3
 OBJECT = slice(4, 7)
@@ -31,7 +31,7 @@ POINT = slice(39, 42)
 JOINT = slice(42, 43)
 WIDTH = 43
 
-# Only for the dense reward.
+# These columns are used only by the dense reward.
 LEFT_PAD = slice(43, 46)
 RIGHT_PAD = slice(46, 49)
 PLACE = slice(49, 52)
@@ -42,8 +42,8 @@ MATRIX_OF = "matrix of "
 
 
 class StateView:
-    """One array over all arrays of a MuJoCo state, which share a block of memory. A single ``take`` then reads from all
-    of them; joining ten small arrays would take four times as long. The state must outlive this view."""
+    """A flat view of all arrays of a MuJoCo state, which share one block of memory. A single ``take`` can read from all
+    arrays; concatenating ten small arrays would take four times as long. The state must outlive this view."""
 
     def __init__(self, model: Any, data: Any) -> None:
         self._model = model
@@ -54,16 +54,15 @@ class StateView:
         self._start = _address(first)
         size = max(_address(array) + array.nbytes for array in self._arrays.values()) - self._start
         if size > data.nbuffer:
-            raise RuntimeError("MuJoCo keeps this state in more than one block of memory")
+            raise RuntimeError("this version of MuJoCo stores a state in more than one block of memory")
         self.numbers = as_strided(first, shape=(size // first.itemsize,), strides=(first.itemsize,))
 
     def find(self, what: str) -> Index:
-        """Return the indices in ``numbers`` of the position of "body NAME", "geom NAME" or "site NAME"; of the nine
-        numbers of "matrix of geom NAME", also of a body or site; of the four of "quaternion of body NAME"; or of the
-        one of "joint NAME"."""
+        """Return the indices in ``numbers`` of a named quantity: the position (3) of "body NAME", "geom NAME" or "site
+        NAME"; "matrix of geom NAME" (9), or of a body or site; "quaternion of body NAME" (4); or "joint NAME" (1)."""
         kind, _, name = what.rpartition(" ")
         if kind not in self._arrays:
-            raise ValueError(f"a state has arrays of {', '.join(self._arrays)}, got {what!r}")
+            raise ValueError(f"quantity must begin with one of {', '.join(self._arrays)}, got {what!r}")
         named = getattr(self._model, kind.split()[-1])(name)
         row = named.qposadr[0] if kind == "joint" else named.id
         own = self._arrays[kind][row : row + 1]
@@ -75,7 +74,7 @@ def _address(array: Array) -> int:
 
 
 def sensor_index(window: StateView, sources: TaskSources, reward: TaskReward | None) -> Index:
-    """Return the indices of a task's sensors in the window, (WIDTH,), or (REWARD_WIDTH,) with a dense reward."""
+    """Return the indices in ``window`` of a task's sensors, (WIDTH,), or (REWARD_WIDTH,) with a dense reward."""
     success = sources.success
     parts = [(HAND, "body hand"), (OBJECT, sources.object)]
     parts += [(RIGHT_CLAW, "body rightclaw"), (LEFT_CLAW, "body leftclaw")]
@@ -113,7 +112,8 @@ DIAL_RADIUS = 0.05  # metres
 
 
 class Observer:
-    """Computes the observations of a fixed set of rows with Meta-World's operations in its order, bit for bit."""
+    """A class that computes the observations of a fixed set of rows, bit-identical to Meta-World: it does the same
+    operations in the same order."""
 
     def __init__(self, sources: Sequence[TaskSources]) -> None:
         self._matrices = np.flatnonzero([row.quaternion.startswith(MATRIX_OF) for row in sources])
@@ -130,7 +130,7 @@ class Observer:
             self._is_constant[k, SECOND_QUATERNION] = row.second is None or row.second_quaternion == "zeros"
 
     def current(self, sensors: Array) -> Array:
-        """Return the part of the observation that describes the present state, (rows, 18)."""
+        """Return the part (rows, 18) of the observation that describes the current state."""
         current = sensors[:, CURRENT].copy()
         np.copyto(current, self._constant, where=self._is_constant)
         span = row_norm(sensors[:, RIGHT_CLAW] - sensors[:, LEFT_CLAW])
@@ -148,19 +148,19 @@ class Observer:
 
 
 def row_norm(vectors: Array) -> Array:
-    """Return the length of each row, with the bits of ``np.linalg.norm`` of a single row. Both use BLAS's dot product;
-    a sum of squares over an axis rounds differently in one case out of nine."""
+    """Return the Euclidean norm of each row, bit-identical to calling ``np.linalg.norm`` on that row. Both use the BLAS
+    dot product; summing squares over an axis would round differently for one row in nine."""
     return np.sqrt(np.vecdot(vectors, vectors))
 
 
 def quaternion_of_matrix(matrix: Array) -> Array:
-    """Return quaternions (n, 4), x y z w, of rotation matrices (n, 9), with the bits of SciPy's
-    ``Rotation.from_matrix(...).as_quat()`` in a fraction of its time."""
+    """Convert rotation matrices (n, 9) to quaternions (n, 4) in x, y, z, w order. The result is bit-identical to
+    SciPy's ``Rotation.from_matrix(...).as_quat()``, which is much slower."""
     m00, m01, m02, m10, m11, m12, m20, m21, m22 = matrix.T
     trace = m00 + m11 + m22
     quaternion = np.stack((m21 - m12, m02 - m20, m10 - m01, 1.0 + trace))
-    # Most objects are nearly upright and have a large w. If another component is the largest, SciPy computes it first,
-    # from the diagonal, and the others from it, which loses fewer digits.
+    # Most objects are nearly upright, so w is the largest component. Otherwise SciPy first computes the largest
+    # component from the diagonal, then the other components from the largest one, which loses fewer digits.
     tilted = (trace <= m00) | (trace <= m11) | (trace <= m22)
     if tilted.any():
         for k in np.flatnonzero(tilted):
@@ -170,7 +170,8 @@ def quaternion_of_matrix(matrix: Array) -> Array:
 
 
 def _quaternion_of_tilted(m: list[list[float]], trace: float) -> list[float]:
-    """Return x, y, z, w, not yet of length 1, where w is not the largest. For few rows, plain numbers are fast."""
+    """Convert a rotation matrix to an unnormalized quaternion (x, y, z, w) if w is not the largest component. Python
+    numbers are fast here because few rows need this function."""
     i = max(range(3), key=lambda axis: m[axis][axis])
     j, k = (i + 1) % 3, (i + 2) % 3
     quaternion = [0.0, 0.0, 0.0, m[k][j] - m[j][k]]
@@ -181,8 +182,8 @@ def _quaternion_of_tilted(m: list[list[float]], trace: float) -> list[float]:
 
 
 class Scene(NamedTuple):
-    """The inputs of a rule, with one entry per row: whether the point is near the goal, the sensors, the first 18
-    numbers of the observations, the goals (rows, 3), and the points (rows, 3) that must reach them."""
+    """The inputs of a success rule: whether each row's point is near the goal (rows,), sensors (rows, WIDTH), the first
+    18 values of the observations (rows, 18), goals (rows, 3), and points (rows, 3) that must reach the goals."""
 
     near: Mask
     sensors: Array
@@ -191,14 +192,14 @@ class Scene(NamedTuple):
     point: Array
 
 
-STICK_LIFT = 0.01  # metres above where the stick lay
-STICK_SIDEWAYS = 0.04  # metres between the stick's end and the handle
+STICK_LIFT = 0.01  # height above the stick's initial position, metres
+STICK_SIDEWAYS = 0.04  # largest sideways distance between the stick's end and the handle, metres
 STICK_UPWARD = 0.06
 
 
 class SuccessFunction:
-    """Computes the success of a fixed set of rows. ``programs`` returns a row's present :class:`TaskProgram`, for the
-    one rule that reads contacts."""
+    """A function that computes the success of a fixed set of rows. ``programs`` maps a row to its current
+    :class:`TaskProgram`, for the one rule that reads contacts."""
 
     def __init__(self, sources: Sequence[TaskSources], programs: Callable[[int], Any]) -> None:
         success = [row.success for row in sources]
@@ -220,8 +221,7 @@ class SuccessFunction:
         ]
 
     def __call__(self, sensors: Array, current: Array, goal: Array) -> Mask:
-        """Return whether each row succeeds, (rows,), from sensors (rows, WIDTH), observations (rows, 18), goals (rows,
-        3)."""
+        """Compute the success (rows,) bool from sensors (rows, WIDTH), observations (rows, 18) and goals (rows, 3)."""
         point = current[:, OBJECT].copy()
         if self._seconds.size:
             point[self._seconds] = current[self._seconds, SECOND]
@@ -241,23 +241,23 @@ class SuccessFunction:
         return success
 
     def _point_below_goal(self, rows: Index, scene: Scene) -> Mask:
-        """The ring is around the peg, below its top."""
+        """Return whether the ring is around the peg, below the peg's top."""
         return scene.near[rows] & (scene.goal[rows, 2] - scene.point[rows, 2] > 0.0)
 
     def _object_above_goal(self, rows: Index, scene: Scene) -> Mask:
-        """The object is higher than the goal, wherever it is."""
+        """Return whether the object is higher than the goal, at any x and y."""
         return scene.current[rows, OBJECT.stop - 1] > scene.goal[rows, 2]
 
     def _joint_above(self, rows: Index, scene: Scene) -> Mask:
-        """The joint has moved further than ``above``."""
+        """Return whether the joint position is greater than ``above``."""
         return scene.sensors[rows, JOINT.start] > self._above[rows]
 
     def _joint_near(self, rows: Index, scene: Scene) -> Mask:
-        """The joint is within ``within`` of ``angle``."""
+        """Return whether the joint is at most ``within`` radians from ``angle``."""
         return np.abs(scene.sensors[rows, JOINT.start] - self._angle[rows]) <= self._within[rows]
 
     def _stick_inserted(self, rows: Index, scene: Scene) -> Mask:
-        """The container is at the goal, and the stick's end is through its handle."""
+        """Return whether the container is at the goal and the end of the stick is through the container's handle."""
         held = scene.near[rows]
         if held.any():
             end, handle = scene.sensors[rows, POINT], scene.current[rows, SECOND]
@@ -267,7 +267,7 @@ class SuccessFunction:
         return held
 
     def _stick_held(self, rows: Index, scene: Scene) -> Mask:
-        """The container is at the goal, and the gripper holds the stick up."""
+        """Return whether the container is at the goal and the gripper holds the stick above the table."""
         held = scene.near[rows]
         for k in np.flatnonzero(held):
             current, program = scene.current[rows[k]], self._programs(int(rows[k]))
@@ -275,7 +275,7 @@ class SuccessFunction:
             if not (current[GRIPPER] > 0.0 and lifted):
                 held[k] = False
                 continue
-            # Both pads must push against the stick, by the contact forces that Meta-World reads.
+            # Both pads must push against the stick; Meta-World reads these contact forces.
             model, data, pairs = program.model, program.data, program.data.contact.geom
             touched = (pairs == model.geom("objGeom").id).any(axis=1)
             for pad in ("leftpad_geom", "rightpad_geom"):

@@ -1,4 +1,4 @@
-"""The plain engine: Meta-World's own environments, one per row, stepped in a loop."""
+"""The plain engine, which steps one original Meta-World environment per row in a loop."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -15,11 +15,12 @@ from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import EngineStep, RowModel
 
 UNSTABLE = slice(int(mujoco.mjtWarning.mjWARN_BADQPOS), int(mujoco.mjtWarning.mjWARN_BADQACC) + 1)
-"""MuJoCo's three warnings about an unstable simulation: bad positions, velocities or accelerations."""
+"""A slice of MuJoCo's warnings that selects the three about an unstable simulation: bad positions, velocities and
+accelerations."""
 
 
 def import_metaworld() -> Any:
-    """Import Meta-World; an error names a missing rendering library."""
+    """Import Meta-World; raise an ImportError that names the rendering library if it is missing."""
     with naming_absent_renderer():
         import metaworld
         import metaworld.policies
@@ -27,8 +28,8 @@ def import_metaworld() -> Any:
 
 
 def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
-    """Return Meta-World's own environment of a task, with an observable goal and a new initial state at every reset.
-    Seed it with ``env.seed(seed)``: Meta-World ignores ``reset(seed=...)``."""
+    """Return Meta-World's environment for a task, with an observable goal and a new initial state at every reset. Seed
+    the environment with ``env.seed(seed)``: Meta-World ignores ``reset(seed=...)``."""
     import_metaworld()
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
 
@@ -41,14 +42,15 @@ def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
 
 
 class MetaWorldEngine(SeenRows):
-    """An engine that runs Meta-World's own environments in a loop, in one thread: slow; the others' oracle."""
+    """An engine that runs the original Meta-World environments in a loop, in one thread. It is slow and serves as the
+    reference for the vectorized engine."""
 
     @typed
     def __init__(
         self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: Count | None = None
     ) -> None:
         self._dense = reward == "dense"
-        # LanguageWorldEnv counts the steps; Meta-World's own limit must not come first.
+        # LanguageWorldEnv truncates episodes, so Meta-World must not.
         self._envs = [make_metaworld_env(task, max_steps=2**31 - 1) for task in tasks]
         self._last = np.zeros((len(self._envs), METAWORLD.size))
 
@@ -66,7 +68,7 @@ class MetaWorldEngine(SeenRows):
         for row in np.flatnonzero(active):
             env = self._envs[row]
             observation, dense, _, _, info = env.step(action[row])
-            # MuJoCo restarts an unstable simulation silently and only counts a warning, which a reset clears.
+            # MuJoCo silently restarts an unstable simulation and only counts a warning, which a reset clears.
             warned = env.data.warning.number[UNSTABLE].any()
             if warned or env._did_see_sim_exception or not np.isfinite(observation).all():
                 fault[row] = True

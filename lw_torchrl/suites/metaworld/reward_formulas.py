@@ -1,4 +1,4 @@
-"""The formula of each kind of reward, and the lifts, which measure a held object's progress to the goal."""
+"""The formulas of the dense rewards, and the lift functions, which measure a held object's progress to the goal."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,34 +12,34 @@ from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, row_norm
 from lw_torchrl.suites.metaworld.reward_terms import Numbers, hamacher_product, limited, square, tolerance
 
 Cast = Callable[[Any], Any]
-"""Converts numbers to the precision of a formula: single if a number of a float32 action takes part, because NumPy
-keeps single precision when Python's numbers are added."""
+"""A function that converts numbers to the precision of a formula. The precision is single if the reward depends on a
+float32 action, because NumPy keeps single precision when Python numbers are added."""
 
-Formula = Callable[["StepState", Index, Cast], Numbers]  # (state, rows, cast) -> (len(rows),) their rewards
+Formula = Callable[["StepState", Index, Cast], Numbers]  # (state, rows, cast) -> rewards (len(rows),)
 
 
 @dataclass
 class StepState:
-    """The state of all rows after a step, with one entry per row."""
+    """The quantities from which rewards are computed after a time step, with one entry per row."""
 
     task: terms.Parameters
     features: Array  # (rows, FEATURES)
     proximity: terms.Proximity
-    near: Array  # the values of these terms
+    near: Array  # the values of the terms near, placed and via, from 0 to 1
     placed: Array
     via: Array
-    above: Array  # how well the hand stays above the floor of the funnel
+    above: Array  # how well the hand stays above the floor of the funnel, from 0 to 1
     lift: Array  # the progress of a held object to the goal
-    wide: Mask  # where ``lift`` is a NumPy number in Meta-World, so that single precision becomes double
-    grasp: Array  # how well the object is gripped
-    narrow: Mask  # where a number of the action takes part, so that the reward has the action's precision
+    wide: Mask  # rows in which Meta-World's ``lift`` is a NumPy number, so that single precision becomes double
+    grasp: Array  # how well the object is gripped, from 0 to 1
+    narrow: Mask  # rows whose reward depends on the action and therefore has the action's precision
     closed: Numbers  # the gripper's closing command, from 0 to 1
-    effort: Numbers  # the gripper's action, from 0, open, to 1, closed
+    effort: Numbers  # the gripper's action, from 0 (open) to 1 (closed)
     held: Mask  # whether the object counts as held
 
 
 def _by_name(*functions: Any) -> dict[str, Any]:
-    """Functions by their names in data/rewards.toml."""
+    """Return the functions by their names in data/rewards.toml."""
     return {function.__name__.replace("_", " "): function for function in functions}
 
 
@@ -53,7 +53,7 @@ def reach(s: StepState, rows: Index, cast: Cast) -> Array:
 
 
 def press(s: StepState, rows: Index, cast: Cast) -> Array:
-    """Come near with the gripper open (``shut``: closed), then press, with two ``weights``."""
+    """Reward approaching with an open gripper (closed with ``shut``), then pressing, with one of ``weights`` each."""
     opening = s.features[rows, at.GRIPPER]
     opening = np.where(s.task.shut[rows], 1 - opening, opening)
     first, second = s.task.weights[rows].T
@@ -62,33 +62,33 @@ def press(s: StepState, rows: Index, cast: Cast) -> Array:
 
 
 def press_behind_wall(s: StepState, rows: Index, cast: Cast) -> Array:
-    """Come near with the gripper closed, then open it and press."""
+    """Reward approaching with a closed gripper, then opening the gripper and pressing."""
     opening = s.features[rows, at.GRIPPER]
     coming = 2 * hamacher_product((1 - opening) / 2.0, s.near[rows])
     return np.where(s.held[rows], 2 + 2 * (1 + opening) + 4 * square(s.placed[rows]), coming)
 
 
 def weighted_sum(s: StepState, rows: Index, cast: Cast) -> Array:
-    """Near and placed, with ``weights``, times ``factor``."""
+    """Return the sum of near and placed, weighted by ``weights``, times ``factor``."""
     first, second = s.task.weights[rows].T
     return (first * s.near[rows] + second * s.placed[rows]) * s.task.factor[rows]
 
 
 def both(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Near and placed, times ``factor``; with ``gripper``, also the closing command."""
+    """Return ``factor`` times the Hamacher product of near and placed (with ``gripper``, also the closing command)."""
     near = cast(s.near[rows])
     near = np.where(s.task.gripper[rows], hamacher_product(near, cast(s.closed[rows])), near)
     return cast(s.task.factor[rows]) * hamacher_product(near, cast(s.placed[rows]))
 
 
 def slide(s: StepState, rows: Index, cast: Cast) -> Array:
-    """Come near, then slide while low and near."""
+    """Reward approaching, then sliding the object while the hand is low and near."""
     low = s.features[rows, terms.TCP.start + 2] <= 0.03
     return np.where(low & s.held[rows], 2 + 7 * s.placed[rows], 1.5 * s.near[rows])
 
 
 def door(s: StepState, rows: Index, cast: Cast) -> Array:
-    """Come to the handle from above, close the gripper, and turn the door."""
+    """Reward approaching the handle from above, closing the gripper, and opening the door."""
     features = s.features[rows]
     handle, angle = features[:, at.OBJECT], -features[:, at.JOINT.start]
     near = tolerance(row_norm(features[:, at.HAND] - (handle + TO_HANDLE) - BESIDE_HANDLE), 0.0, 0.06, 0.5)
@@ -100,7 +100,8 @@ def door(s: StepState, rows: Index, cast: Cast) -> Array:
 
 
 def lid(s: StepState, rows: Index, cast: Cast) -> Array:
-    """Come to the lid from above, close the gripper, lift the lid and bring it over the box, upright all the time."""
+    """Reward approaching the lid from above, closing the gripper, lifting the lid and moving the lid over the box while
+    keeping the lid upright."""
     ready = hamacher_product(s.above[rows], s.near[rows])
     lifted = 0.2 * (s.features[rows, at.OBJECT.stop - 1] + 0.02 > 0.04) + 0.8 * s.placed[rows]
     reward = 2.0 * hamacher_product(s.effort[rows], ready) + 8.0 * lifted
@@ -109,7 +110,7 @@ def lid(s: StepState, rows: Index, cast: Cast) -> Array:
 
 
 def turned_like(quaternion: Array, ideal: Array, margin: float) -> Array:
-    """Return 1 for the ideal quaternion, and 0 from a distance of ``margin`` on."""
+    """Return 1 for the ideal quaternion, decreasing linearly to 0 at a distance of ``margin``."""
     return np.maximum(1.0 - row_norm(quaternion - ideal) / margin, 0.0)
 
 
@@ -118,7 +119,7 @@ LYING = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def carry(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Grip and place; if held, add 1 and ``bonus`` times the lift."""
+    """Reward gripping and placing the object; if the object is held, add 1 and ``bonus`` times the lift."""
     reward = hamacher_product(cast(s.grasp[rows]), cast(s.placed[rows]))
     more = 1.0 + s.task.bonus[rows] * s.lift[rows]
     carried = np.where(s.wide[rows], reward + more, reward + cast(more))
@@ -126,7 +127,7 @@ def carry(s: StepState, rows: Index, cast: Cast) -> Any:
 
 
 def _by_way(s: StepState, rows: Index, cast: Cast, gripped: Any) -> Any:
-    """Bring a held object first to a point at the wall, and beyond the wall to the goal."""
+    """Add a reward for moving a held object first to a point at the wall, then, beyond the wall, to the goal."""
     coming = gripped + 1.0 + cast(4.0 * s.via[rows])
     going = gripped + 1.0 + 4.0 + cast(3.0 * s.placed[rows])
     carried = np.where(s.features[rows, at.OBJECT.start + 1] > 0.75, going, coming)
@@ -147,7 +148,7 @@ def push(s: StepState, rows: Index, cast: Cast) -> Any:
 
 
 def unplug(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Grip; once the plug has moved a little, pull it to the goal."""
+    """Reward gripping the plug and, once the plug has moved 1.5 cm, pulling the plug to the goal."""
     reward = 2 * cast(s.grasp[rows])
     moved = s.features[rows, at.OBJECT.start] - s.features[rows, terms.START.start] > 0.015
     return np.where(s.held[rows] & moved, 1 + reward + cast(5 * s.placed[rows]), reward)
@@ -159,7 +160,7 @@ def sweep(s: StepState, rows: Index, cast: Cast) -> Any:
 
 
 def soccer(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Grip and place, less for a ball that crosses the goal line beside the goal."""
+    """Reward gripping and placing the ball, with a deduction if the ball crosses the goal line outside the goal."""
     ball, goal = s.features[rows, at.OBJECT], s.features[rows, terms.GOAL]
     placed, line = s.placed[rows], goal[:, 1] - 0.1
     missed = (ball[:, 1] > line) & (np.abs(ball[:, 0] - goal[:, 0]) > 0.1)
@@ -169,13 +170,13 @@ def soccer(s: StepState, rows: Index, cast: Cast) -> Any:
 
 
 def _with_tool(s: StepState, rows: Index, cast: Cast, placed: Array, upright: Array) -> Any:
-    """Grip and place a tool, times how well it is oriented."""
+    """Reward gripping and placing a tool, scaled by how well the tool is oriented."""
     turned = turned_like(s.features[rows, at.QUATERNION], upright, 0.4)
     return (2.0 * cast(s.grasp[rows]) + cast(6.0 * placed)) * cast(turned)
 
 
 def peg(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Bring the ring over the peg from high above, then down."""
+    """Reward moving the ring over the peg from above, then down."""
     ring = s.features[rows, at.PLACE]
     error = s.features[rows, terms.GOAL] - ring
     radius = row_norm(error[:, :2])
@@ -189,7 +190,7 @@ def peg(s: StepState, rows: Index, cast: Cast) -> Any:
 
 
 def unpeg(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Lift the ring from the peg."""
+    """Reward lifting the ring off the peg."""
     features = s.features[rows]
     placed = 0.1 * (features[:, at.PLACE.start + 2] > 0.02) + 0.9 * s.placed[rows]
     off_peg = features[:, at.OBJECT.start + 2] > features[:, terms.GOAL.start + 2]
@@ -197,7 +198,7 @@ def unpeg(s: StepState, rows: Index, cast: Cast) -> Any:
 
 
 def hammer(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Bring the hammer's head to the nail, and drive it in."""
+    """Reward moving the hammer's head to the nail and driving in the nail."""
     features = s.features[rows]
     placed = 0.1 * (features[:, at.OBJECT.start + 2] > 0.02) + 0.9 * s.placed[rows]
     reward = _with_tool(s, rows, cast, placed, LYING)
@@ -205,14 +206,14 @@ def hammer(s: StepState, rows: Index, cast: Cast) -> Any:
 
 
 def stick_push(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Grip the stick and push the container with it to the goal."""
+    """Reward gripping the stick and pushing the container to the goal with the stick."""
     carried = 2.0 + 5.0 * s.via[rows] + 3.0 * s.placed[rows]
     carried = np.where(s.proximity.distance[rows, terms.PLACED] <= 0.12, 10.0, carried)
     return np.where(s.held[rows], carried, cast(s.grasp[rows]))
 
 
 def stick_pull(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Grip the stick, put it through the handle, and pull the container to the goal."""
+    """Reward gripping the stick, putting the stick through the handle, and pulling the container to the goal."""
     features = s.features[rows]
     stick, handle = features[:, at.OBJECT], features[:, at.SECOND]
     end, goal = features[:, at.PLACE], features[:, terms.GOAL]
@@ -238,29 +239,30 @@ FORMULAS: dict[str, Formula] = {
 
 
 def over_funnel(s: StepState, rows: Index) -> None:
-    """The hand must come from above and stay above."""
+    """Set the lift so that the hand must approach from above and stay above the funnel's floor."""
     s.lift[rows] = hamacher_product(s.above[rows], s.placed[rows])
 
 
 def into_box(s: StepState, rows: Index) -> None:
-    """The peg's head is worth less within two corners of the box, where it would collide."""
+    """Reduce the lift while the peg's head is in one of two regions of the box where the head would collide."""
     features = s.features[rows]
     head = features[:, at.PLACE]
     zero_1, one_1, zero_2, one_2 = features[:, at.CORNERS].reshape(-1, 4, 3).transpose(1, 0, 2)
     (first, in_first), (second, in_second) = _within_prism(head, zero_1, one_1), _within_prism(head, zero_2, one_2)
     s.placed[rows] = s.lift[rows] = hamacher_product(s.placed[rows], hamacher_product(second, first))
-    s.narrow[rows] &= ~(in_first | in_second)  # in Meta-World then a NumPy number, which makes the reward double
+    s.narrow[rows] &= ~(in_first | in_second)  # in Meta-World, a NumPy number makes these rewards double precision
 
 
 def _within_prism(point: Array, zero: Array, one: Array) -> tuple[Array, Any]:
-    """Return the product of a point's relative positions along the axes of a box, or 1 outside; and if it is inside."""
+    """Return the product of a point's relative positions along the axes of a box (1 if outside), and whether the point
+    is inside the box."""
     inside = ((np.minimum(zero, one) <= point) & (point <= np.maximum(zero, one))).all(axis=1)
     x, y, z = ((point - zero) / (one - zero)).T
     return np.where(inside, x * y * z, 1.0), inside
 
 
 def onto_shelf(s: StepState, rows: Index) -> None:
-    """The object is worth less in front of the shelf and below its board, and nothing under the board."""
+    """Reduce the lift while the object is in front of the shelf and below the board; set the lift to 0 under the board."""
     features = s.features[rows]
     goal, placed = features[:, terms.GOAL], s.placed[rows]
     x, y, z = features[:, at.OBJECT].T

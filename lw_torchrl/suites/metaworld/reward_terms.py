@@ -1,4 +1,4 @@
-"""The parts of dense rewards: the numbers of data/rewards.toml as arrays, features, and terms, for all rows at once."""
+"""The building blocks of dense rewards: parameters from data/rewards.toml as arrays, features, and reward terms."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from lw_torchrl.suites.metaworld import tables
 from lw_torchrl.suites.metaworld.observation import Array, Mask, row_norm
 from lw_torchrl.suites.metaworld.tables import FIRST_DISTANCE, POINTS, Cage, Funnel, Held, TaskReward, Term
 
-# Columns of the features: the sensors, then these, of which the first four are constant in an episode.
+# Columns of the feature array: the sensors, then the following points. The first four are constant during an episode.
 START, TCP_START, MARK, CONSTANT, GOAL, TCP, GRIP = (
     slice(at.REWARD_WIDTH + 3 * number, at.REWARD_WIDTH + 3 * number + 3) for number in range(7)
 )
 EPISODE = slice(START.start, CONSTANT.stop)
 FEATURES = GRIP.stop
 
-# The columns of each of POINTS but the last, the waypoint.
+# The columns of each point in POINTS, except the last one (the waypoint).
 _COLUMNS = at.HAND, at.OBJECT, at.SECOND, GOAL, TCP, at.LEFT_PAD, GRIP, at.PLACE, START, TCP_START, MARK
 COLUMNS = {point: list(range(FEATURES)[columns]) for point, columns in zip(POINTS[:-1], _COLUMNS, strict=True)}
 
@@ -35,9 +35,9 @@ _NO_FUNNEL = Funnel(over="hand", about=("object",), rim=0.0, slope=0.0, height=0
 
 
 class Parameters(SimpleNamespace):
-    """Arrays over the rows with the numbers of :class:`TaskReward` and of its parts ``cage``, ``funnel`` and ``held``.
-    After the row, ``points`` and ``offset`` have the axes [distance or margin][first or second point][term][x, y, z];
-    the other arrays of terms have [term]."""
+    """The numeric fields of :class:`TaskReward`, and of ``cage``, ``funnel`` and ``held``, as arrays with one entry per
+    row. ``points`` has the axes [row][distance or margin][first or second point][term][x, y, z], ``offset`` has no axis
+    for the two points, and the other arrays of terms have the axes [row][term]."""
 
     def of(self, rows: Any) -> Parameters:
         own = vars(self).items()
@@ -94,8 +94,8 @@ def _points(reward: TaskReward) -> list[list[list[list[int]]]]:
 
 
 def _less(term: Term) -> float:
-    """Return the number subtracted from the distance of the margin's points. A margin that is a number has the same
-    point twice, so that this number is the margin."""
+    """Return the number to subtract from the distance between the margin's two points. If the margin is a number, both
+    points are the same, so that the (absolute) result equals the margin."""
     if isinstance(term.margin, tuple):
         return term.less
     if term.margin == FIRST_DISTANCE:
@@ -104,7 +104,7 @@ def _less(term: Term) -> float:
 
 
 def gather_features(task: Parameters, sensors: Array, current: Array, goal: Array, episode: Array) -> Array:
-    """Return features (rows, FEATURES): sensors and observation, then the points that only rewards use."""
+    """Return the features (rows, FEATURES): sensors, observation, and points that only the rewards use."""
     features = np.empty((len(sensors), FEATURES))
     features[:, : at.REWARD_WIDTH] = sensors
     features[:, at.CURRENT] = current
@@ -119,7 +119,8 @@ def gather_features(task: Parameters, sensors: Array, current: Array, goal: Arra
 
 
 Numbers = NDArray[np.floating]
-"""Single or double precision: Meta-World uses the action's precision where the gripper's action takes part."""
+"""An array in single or double precision: Meta-World uses the action's precision if a term depends on the gripper
+action."""
 
 AT_MARGIN = 0.1  # the value at a distance of one margin
 LONG_TAIL = np.sqrt(1 / AT_MARGIN - 1)
@@ -127,41 +128,41 @@ GAUSSIAN = np.sqrt(-2 * np.log(AT_MARGIN))
 
 
 def square(x: Array) -> Array:
-    """Return the square by C's ``pow``, as Python and NumPy do for a single number. For an array, NumPy multiplies,
-    which gives another last bit in one case out of a thousand."""
+    """Return the square computed with C's ``pow``, as Python and NumPy do for scalars. For arrays, NumPy multiplies
+    instead, which changes the last bit of one result in a thousand."""
     return np.float_power(x, 2.0)
 
 
 def long_tail(margins: Array) -> Array:
-    """Return a curve from 1 at 0 to 0.1 at 1, which then falls slowly."""
+    """Return a long-tailed curve that is 1 at 0 and 0.1 at 1, and then decreases slowly."""
     return 1 / (square(margins * LONG_TAIL) + 1)
 
 
 def gaussian(margins: Array) -> Array:
-    """Return a curve from 1 at 0 to 0.1 at 1, which then falls quickly to 0."""
+    """Return a Gaussian curve that is 1 at 0 and 0.1 at 1, and then decreases quickly to 0."""
     return np.exp(-0.5 * square(margins * GAUSSIAN))
 
 
 def tolerance(x: Array, lower: Array | float, upper: Array | float, margin: Array | float) -> Array:
-    """Return 1 from ``lower`` to ``upper``, and a long tail outside; a margin of 0 makes a sharp edge."""
+    """Return 1 for x from ``lower`` to ``upper``, and a long tail outside (0 if the margin is 0)."""
     margins = np.where(x < lower, lower - x, x - upper) / margin
     return np.where((lower <= x) & (x <= upper), 1.0, long_tail(margins))
 
 
 def hamacher_product(a: Numbers, b: Numbers) -> Numbers:
-    """Return the fuzzy "and" of two numbers from 0 to 1."""
+    """Return the Hamacher product, a fuzzy "and", of two numbers from 0 to 1."""
     product = a * b
     either = a + b - product
     return np.where(either > 0, product / either, product)
 
 
 def limited(x: Numbers, low: float, high: float) -> Numbers:
-    """Clip as ``np.clip``, in a third of its time for few numbers."""
+    """Clip x as ``np.clip`` does; for small arrays, this takes a third of the time."""
     return np.minimum(np.maximum(x, low), high)
 
 
 class Proximity(NamedTuple):
-    """How close two points are, for every term of every row; all arrays are (rows, 4)."""
+    """A measure of how close two points are, for each row and term; all arrays are (rows, 4)."""
 
     distance: Array
     margin: Array  # the further distance at which the value is 0.1
@@ -169,7 +170,7 @@ class Proximity(NamedTuple):
 
 
 class ProximityTerms:
-    """Measures how close pairs of points are, for a fixed set of rows."""
+    """A function that measures how close pairs of points are, for a fixed set of rows."""
 
     def __init__(self, task: Parameters) -> None:
         row = np.arange(len(task.within)).reshape(-1, 1, 1, 1, 1) * FEATURES
@@ -182,8 +183,8 @@ class ProximityTerms:
         self._gaussian = np.nonzero(task.gaussian)
 
     def __call__(self, features: Array, less: Array) -> Proximity:
-        """Measure features (rows, FEATURES). ``less`` (rows, 4) is subtracted from the distance of a margin's points;
-        NaN in it is replaced by the present distance, which becomes the margin."""
+        """Compute the proximity from features (rows, FEATURES). ``less`` (rows, 4) is subtracted from the distance
+        between a margin's points; NaN entries of ``less`` are replaced in place by the current distance."""
         numbers = features.reshape(-1)
         difference = numbers.take(self._first)
         difference += self._offset
@@ -201,14 +202,14 @@ class ProximityTerms:
         return Proximity(distance, margin, value)
 
 
-CAGED = 0.97  # above this value, closing the gripper counts
+CAGED = 0.97  # if the cage value is above this threshold, closing the gripper is rewarded
 CAGED_FOR_PINCH = 0.95
 PADS = np.array([at.LEFT_PAD.start + 1, at.RIGHT_PAD.start + 1])
 SIDES = np.array([1.0, -1.0])
 
 
 class CagingTerm:
-    """Measures how well the gripper encloses and grips the object, for a fixed set of rows."""
+    """A function that measures how well the gripper encloses and grips the object, for a fixed set of rows."""
 
     def __init__(self, task: Parameters) -> None:
         self._rows = np.flatnonzero(task.cage.used)
@@ -225,9 +226,9 @@ class CagingTerm:
         self._pinch = (cage.radius + cage.pinch)[self._pinching][:, None]
 
     def __call__(self, features: Array, near: Proximity, closed: Numbers, narrow: Mask) -> tuple[Array, Mask]:
-        """Return values (rows,) from 0 to 1 for features (rows, FEATURES), and in which rows they have the action's
-        precision because ``closed`` takes part. ``closed`` (rows,) is the gripper's closing command in that precision;
-        ``narrow`` (rows,) is true if it is a number of the action, not a bound of its range."""
+        """Return grasp values (rows,) from 0 to 1 for features (rows, FEATURES), and a mask (rows,) of the values that
+        depend on ``closed`` and therefore have the action's precision. ``closed`` (rows,) is the gripper's closing
+        command in that precision; ``narrow`` (rows,) is true where the command was not clipped."""
         rows = self._rows
         numbers = features.reshape(-1)
         pads, where = numbers.take(self._pads), numbers.take(self._object)
@@ -262,11 +263,11 @@ class CagingTerm:
         return np.where(high | medium, (both + other) / 2, both)
 
 
-FUNNEL_DEPTH = 0.01  # metres below the floor that still count as above it
+FUNNEL_DEPTH = 0.01  # up to this far below the floor (metres), a point still counts as above the floor
 
 
 class FunnelTerm:
-    """Measures whether the hand stays above a funnel's floor, for a fixed set of rows."""
+    """A function that measures whether the hand stays above a funnel's floor, for a fixed set of rows."""
 
     def __init__(self, task: Parameters) -> None:
         self._rows = np.flatnonzero(task.funnel.used)
@@ -280,7 +281,7 @@ class FunnelTerm:
         self._margin = funnel.margin
 
     def __call__(self, features: Array) -> Array:
-        """Return 1 above the floor and less below it, (rows,)."""
+        """Return values (rows,): 1 above the floor, and less than 1 below the floor."""
         above = np.ones(len(features))
         if self._rows.size:
             numbers = features.reshape(-1)

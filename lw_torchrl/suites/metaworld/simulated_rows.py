@@ -1,4 +1,4 @@
-"""Rows, each a MuJoCo state on a shared model, and a base class of engines whose threads simulate groups of rows."""
+"""Rows (MuJoCo states on shared models), and a base class for engines that simulate groups of rows in threads."""
 
 import os
 from abc import abstractmethod
@@ -26,8 +26,8 @@ _VELOCITIES_DONE = int(mujoco.mjtStage.mjSTAGE_VEL)
 
 
 class SimulatedRow:
-    """A MuJoCo state with the places of bodies and sites that its last reset chose, and a copy of Meta-World's program.
-    No other thread may use the ``shared`` model while this row simulates or resets."""
+    """A row of the engine: a MuJoCo state, the positions of bodies and sites chosen by the last reset, and a copy of
+    the Meta-World environment. No other thread may use the ``shared`` model while this row simulates or resets."""
 
     def __init__(self, sources: TaskSources, shared: SharedModel, builder: Any, reward: TaskReward | None) -> None:
         self.sources = sources
@@ -36,7 +36,7 @@ class SimulatedRow:
         self.builder = builder
         self._model = shared.model
         self._data = mujoco.MjData(shared.model)
-        self.bodies = BodyPoses(self._data.xpos, self._data.xquat)  # views of the present state
+        self.bodies = BodyPoses(self._data.xpos, self._data.xquat)  # views of the current state
         self._places = shared.compiled[0].copy(), shared.compiled[1].copy()
         self._substeps: int = builder.frame_skip
         self.mocap: Array = self._data.mocap_pos[0]  # a weld pulls the hand to this point
@@ -48,7 +48,7 @@ class SimulatedRow:
         self._warnings: NDArray[np.int32] = self._data.warning.number[UNSTABLE]
 
     def reset(self, seed: int) -> Array:
-        """Start an episode, which depends only on the seed; return the first observation."""
+        """Start an episode, which depends only on the seed, and return the first observation."""
         self.shared.restore()
         self._looked = False
         self.program = self.builder.on(self._data)
@@ -58,7 +58,7 @@ class SimulatedRow:
         return observation
 
     def simulate(self, mocap: Array, control: Array, sensors: Array, warnings: NDArray[np.int32]) -> None:
-        """Simulate five steps of physics; fill ``sensors`` and ``warnings`` (3,) while the state is in the cache."""
+        """Simulate five physics steps, then fill ``sensors`` and ``warnings`` (3,) while the state is cached."""
         self._take_model()
         self.mocap[...] = mocap
         self._control[...] = control
@@ -67,22 +67,22 @@ class SimulatedRow:
             mujoco.mj_step(self._model, self._data, self._substeps - 1)
         else:
             mujoco.mj_step(self._model, self._data, self._substeps)
-        mujoco.mj_forward(self._model, self._data)  # the next solver starts from its accelerations
+        mujoco.mj_forward(self._model, self._data)  # the next physics step starts its solver from these accelerations
         self._looked = True
         self._numbers.take(self._sensor_index, out=sensors, mode="clip")
         warnings[...] = self._warnings
 
     def seen(self) -> tuple[RowModel, Any]:
-        """Return the model, with this row's places in it, and the data."""
+        """Return the model, after loading this row's positions into it, and the data."""
         self._take_model()
         return RowModel(self.shared.path, self._model), self._data
 
     def _substep_after_look(self) -> None:
-        """Do one ``mj_step`` after an ``mj_forward`` since which only the controls and the mocap body changed.
+        """Do one ``mj_step`` when only the controls and the mocap body have changed since the last ``mj_forward``.
 
-        The mocap body touches nothing, and only its weld to the hand depends on it. So contacts, inertia and velocities
-        are still those of the ``mj_forward``, and skipping them saves a tenth of the step with the same bits. Newton's
-        solver needs no projection of constraints. The next substep detects numbers that are not finite or too large.
+        The mocap body has no contacts and affects only the weld to the hand. So the contacts, inertia and velocities of
+        the ``mj_forward`` are still valid, and reusing them saves a tenth of the time with bit-identical results. The
+        Newton solver needs no projection of constraints. The next substep detects non-finite and too large values.
         """
         model, data = self._model, self._data
         mujoco.mj_kinematics(model, data)
@@ -98,14 +98,15 @@ class SimulatedRow:
 
 @dataclass
 class RowGroup:
-    """Rows that share a model and therefore take turns; ``seconds`` is the time that a row took last."""
+    """A group of rows that share a model and therefore run one after another; ``seconds`` is the last measured time per
+    row."""
 
     rows: tuple[int, ...]
     seconds: float = 1.0
 
 
 def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
-    """Group rows by their key, and split a group that would keep a thread busy for more than half of its share."""
+    """Group rows by key, and split each group that is larger than half of a thread's share of all rows."""
     by_key: dict[str, list[int]] = defaultdict(list)
     for row, key in enumerate(keys):
         by_key[key].append(row)
@@ -115,15 +116,15 @@ def split_into_groups(keys: Sequence[str], num_threads: int) -> list[RowGroup]:
 
 
 class WorkerPool:
-    """Threads that work through groups of rows, slow groups first. One thread at a time works on a group, so its rows
-    may share a model; results do not depend on which thread it is."""
+    """A pool of threads that process groups of rows, slowest groups first. Only one thread at a time processes a group,
+    so the group's rows may share a model. The results do not depend on the thread."""
 
     def __init__(self, num_threads: int) -> None:
         self._helpers = num_threads - 1
         self._threads = ThreadPoolExecutor(self._helpers, "lw_torchrl") if self._helpers else None
 
     def work(self, groups: Iterable[tuple[RowGroup, Sequence[int]]], do: Callable[[int], None]) -> None:
-        """Call ``do(item)`` for every item of every ``(group, items)``; items of one group in order."""
+        """Call ``do(item)`` for every item of every ``(group, items)`` pair; the items of one group run in order."""
         if self._threads is None:
             for _, items in groups:
                 for item in items:
@@ -162,7 +163,8 @@ def available_cores() -> int:
 
 
 class ThreadedEngine(SeenRows):
-    """A base class of engines with physics in threads, by default one per core; rows with one key share a model."""
+    """Base class for engines that simulate physics in threads (by default one per core). Rows with the same key share a
+    model."""
 
     _rows: list[Any]  # each has ``seen`` and ``bodies``
 
@@ -176,19 +178,19 @@ class ThreadedEngine(SeenRows):
 
     @abstractmethod
     def _reset_row(self, row: int, seed: int) -> None:
-        """Start an episode in a row, in a thread."""
+        """Start an episode in a row; called in a worker thread."""
 
     @abstractmethod
     def _observe_first(self, rows: Index) -> None:
-        """Write the first observations of rows that were reset."""
+        """Write the first observations of the rows that were just reset."""
 
     @abstractmethod
     def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
-        """Step ``rows``, given the actions of all, and write their observations, rewards, successes and faults."""
+        """Step ``rows``, given the actions of all rows, and write observations, rewards, success flags and faults."""
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
         index, seed_of = seeds_of_rows(rows, seeds)
-        # If a reset fails half-way, its rows must not be stepped.
+        # If a reset fails half-way, the rows must not be stepped.
         self._started[index] = False
         self._pool.work(self._by_group(index), lambda row: self._reset_row(row, seed_of[row]))
         self._observe_first(index)
@@ -214,12 +216,12 @@ class ThreadedEngine(SeenRows):
         return self._rows[row].seen()
 
     def poses(self, row: int) -> BodyPoses:
-        """Return the present poses of all bodies of a row; no model is needed, so another row may use it."""
+        """Return the current poses of all bodies of a row. The shared model is not used, so another row may hold it."""
         position, quaternion = self._rows[row].bodies
         return BodyPoses(position.copy(), quaternion.copy())
 
     def close(self) -> None:
-        """End the threads."""
+        """Stop the threads."""
         super().close()
         self._pool.close()
         self._rows = []

@@ -1,4 +1,4 @@
-"""Tables of all tasks: data/simulation.toml (observations, successes) and data/rewards.toml (dense rewards)."""
+"""Data classes for the task tables data/simulation.toml (observations, success) and data/rewards.toml (rewards)."""
 
 import tomllib
 from collections.abc import Mapping
@@ -13,12 +13,12 @@ Vector = tuple[float, float, float]
 Pair = tuple[float, float]
 
 NO_OFFSET: Vector = (-0.0, -0.0, -0.0)
-"""Adding -0.0 changes no number; adding 0.0 would turn -0.0 into 0.0."""
+"""An offset that changes no number, bit for bit: adding 0.0 would turn -0.0 into 0.0."""
 
 
 @dataclass(frozen=True)
 class SuccessSources:
-    """The condition of a task's success; data/simulation.toml explains the fields."""
+    """A task's success condition; data/simulation.toml explains the fields."""
 
     within: float = inf
     under: float = inf
@@ -35,7 +35,8 @@ class SuccessSources:
 
 @dataclass(frozen=True)
 class TaskSources:
-    """The sources of a task's observation; data/simulation.toml explains the fields."""
+    """The MuJoCo bodies, geoms, sites and joints that a task's observation is read from; data/simulation.toml explains
+    the fields."""
 
     object: str
     quaternion: str
@@ -55,7 +56,7 @@ FIRST_DISTANCE = "first distance"
 
 @dataclass(frozen=True)
 class Term:
-    """How close two points are; data/rewards.toml explains the fields."""
+    """A reward term that measures how close two points are; data/rewards.toml explains the fields."""
 
     between: tuple[str, str] = ("object", "object")
     offset: Vector = NO_OFFSET
@@ -69,7 +70,7 @@ class Term:
 
 @dataclass(frozen=True)
 class Cage:
-    """How the gripper must enclose the object."""
+    """A reward term that measures how well the gripper encloses the object; data/rewards.toml explains the fields."""
 
     radius: float
     pad: float
@@ -85,7 +86,7 @@ class Cage:
 
 @dataclass(frozen=True)
 class Funnel:
-    """A floor above which a point must stay on its way."""
+    """A reward term that keeps a point above a funnel-shaped floor; data/rewards.toml explains the fields."""
 
     over: str
     about: tuple[str, ...]
@@ -98,7 +99,7 @@ class Funnel:
 
 @dataclass(frozen=True)
 class Held:
-    """When the object counts as held; by default always."""
+    """The conditions under which the object counts as held (by default always); data/rewards.toml explains the fields."""
 
     near: float = inf
     within: float = inf
@@ -113,7 +114,7 @@ class Held:
 
 @dataclass(frozen=True)
 class TaskReward:
-    """One task's dense reward."""
+    """The dense reward of one task; data/rewards.toml explains the fields."""
 
     formula: str
     near: Term = field(default_factory=Term)
@@ -139,7 +140,7 @@ class TaskReward:
 
     @property
     def terms(self) -> tuple[Term, Term, Term, Term]:
-        """The terms near, placed and via, and the gripper's distance across the object."""
+        """The terms near, placed and via, and the distance of tcp and object along x and z."""
         across = Term()
         if (cage := self.cage) is not None:
             margin = cage.start, "tcp at start"
@@ -148,7 +149,8 @@ class TaskReward:
 
 
 def _read(file: str, task: Any, parts: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the tables of a TOML file by task, with the classes of their ``parts``."""
+    """Read a TOML file and return a mapping from task names to ``task`` objects; ``parts`` maps the key of each nested
+    table to the table's class."""
 
     def plain(table: Mapping[str, Any]) -> dict[str, Any]:
         return {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}

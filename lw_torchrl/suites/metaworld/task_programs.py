@@ -1,4 +1,4 @@
-"""Meta-World's own resets, on compiled models that rows share."""
+"""Run Meta-World's own resets on compiled models that rows share."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from lw_torchrl.suites.metaworld.plain_engine import import_metaworld
 
 COMPARED_VERSIONS = {"metaworld": "3.1.1", "mujoco": "3.3.0"}
-"""The versions whose numbers the vectorized engine was compared with, bit for bit."""
+"""The versions of Meta-World and MuJoCo against which the vectorized engine was verified bit for bit."""
 
 Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class SharedModel:
-    """A compiled model that many rows use in turn. Meta-World's resets move bodies and sites of the model itself, so
-    each row keeps its own places of both and loads them unless it is still the ``holder``."""
+    """A compiled model that many rows use in turn. Meta-World's resets move bodies and sites in the model itself, so
+    each row stores its own positions of both and loads them into the model unless the row is still the ``holder``."""
 
     def __init__(self, path: str, model: Any, compiled: Places | None = None) -> None:
         self.path, self.model = path, model
@@ -39,28 +39,28 @@ class SharedModel:
         self.load(None, self.compiled)
 
 
-# Reentrant, because Python may collect an engine, which returns its models, inside borrow_model.
+# Reentrant, because Python may garbage-collect an engine, which calls return_models, inside borrow_model.
 _lock = threading.RLock()
 _compiled: dict[str, SharedModel] = {}
 _idle: dict[str, SharedModel] = {}
 
 
 def borrow_model(path: str) -> SharedModel:
-    """Return a model of an XML file that no other engine uses; a process compiles each file once."""
+    """Return a model of an XML file that no other engine is using; each process compiles a file only once."""
     with _lock:
         if (idle := _idle.pop(path, None)) is not None:
             return idle
         if (known := _compiled.get(path)) is None:
             _compiled[path] = SharedModel(path, mujoco.MjModel.from_xml_path(path))
             return _compiled[path]
-        # The known model may be in use: its arrays are copied, and then reset to the compiled places.
+        # The known model may be in use: copy it, then reset the copy to the compiled positions.
         twin = SharedModel(path, copy.copy(known.model), known.compiled)
         twin.restore()
         return twin
 
 
 def return_models(models: Iterable[SharedModel]) -> None:
-    """Return borrowed models; one of each XML file is kept for the next engine."""
+    """Give back borrowed models; one model of each XML file is kept for the next engine."""
     with _lock:
         for model in models:
             model.restore()
@@ -68,13 +68,13 @@ def return_models(models: Iterable[SharedModel]) -> None:
 
 
 WARNED_ALREADY = 1000
-"""MuJoCo prints a warning and writes MUJOCO_LOG.TXT only if its count of that kind is zero. We start the counts at this
-number: nothing is written, and any other count means that a warning occurred."""
+"""The initial value of MuJoCo's warning counts. MuJoCo prints a warning and writes MUJOCO_LOG.TXT only if the count for
+that warning is zero, so nothing is written, and any other value means that a warning occurred."""
 
 
 class TaskProgram:
-    """A mixin that takes the simulator away from one of Meta-World's environments. It is built once for each model;
-    every episode of every row runs on a light copy (:meth:`on`), which shares everything but the state."""
+    """A mixin that separates a Meta-World environment from its simulator. One program is built for each model; every
+    episode of every row runs on a shallow copy (:meth:`on`), which shares everything except the simulator state."""
 
     model: Any
     data: Any
@@ -89,7 +89,7 @@ class TaskProgram:
     def __init__(self, model: Any) -> None:
         self.model = model
         super().__init__()
-        # The goal is observable, and each reset draws a new initial state and goal from the seed.
+        # Make the goal observable, and let each reset draw a new initial state and goal from the seed.
         self._partially_observable = False
         self.__dict__.pop("sawyer_observation_space", None)
         self._set_task_called = True
@@ -102,20 +102,20 @@ class TaskProgram:
         return self.model, mujoco.MjData(self.model)
 
     def on(self, data: Any) -> TaskProgram:
-        """Return a copy of this program that works on ``data``."""
+        """Return a shallow copy of this program that uses the simulator state ``data``."""
         program = object.__new__(type(self))
         program.__dict__.update(self.__dict__)
         program.data = data
-        # In Meta-World these two are views of the state, which follow the fingers.
+        # In Meta-World, these two are views of the state, so they follow the fingers.
         program.init_left_pad = program.get_body_com("leftpad")  # type: ignore[attr-defined]
         program.init_right_pad = program.get_body_com("rightpad")  # type: ignore[attr-defined]
         return program
 
     def start_episode(self, seed: int) -> NDArray[np.float64]:
-        """Reset as Meta-World's ``env.seed(seed); env.reset()`` does; return the first observation.
+        """Reset as Meta-World's ``env.seed(seed); env.reset()`` does, and return the first observation.
 
-        Meta-World does everything twice. Only random draws and places of bodies and sites survive the first round, and
-        they do not depend on the hand, so here the first round does not move it.
+        Meta-World resets twice. The first reset affects the second only through the random draws and the positions of
+        bodies and sites. These do not depend on the hand, so here the first reset does not move the hand.
         """
         self.np_random, _ = seeding.np_random(seed)
         for self._moves_hand in (False, True):
@@ -150,5 +150,5 @@ def program_class(task: str) -> Any:
 
 
 def model_path(task: str) -> str:
-    """Return the XML file of a task; 36 files serve the 50 tasks."""
+    """Return the path of a task's XML file; the 50 tasks share 36 files."""
     return object.__new__(_task_class(task)).model_name

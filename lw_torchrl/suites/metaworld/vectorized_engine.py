@@ -1,4 +1,4 @@
-"""The vectorized engine: Meta-World bit for bit, at nearly the speed of its physics."""
+"""The vectorized engine: bit-identical to Meta-World, at nearly the speed of the physics alone."""
 
 import weakref
 from collections.abc import Sequence
@@ -17,25 +17,26 @@ from lw_torchrl.suites.metaworld.dense_reward import DenseReward, EpisodeStarts
 from lw_torchrl.suites.metaworld.observation import Array, Index, Mask, Observer, SuccessFunction
 from lw_torchrl.suites.metaworld.tables import reward_table, simulation_table
 
-FINGERS = np.array([1.0, -1.0])  # one number of the action moves both fingers, in opposite directions
+FINGERS = np.array([1.0, -1.0])  # one action value moves both fingers, in opposite directions
 
 
 class VectorizedEngine(simulated_rows.ThreadedEngine):
-    """An engine that simulates all rows together: physics in threads, everything else in NumPy over all rows.
+    """An engine that simulates physics in threads and computes everything else in NumPy for all rows at once.
 
-    Its numbers equal those of :class:`~lw_torchrl.suites.metaworld.plain_engine.MetaWorldEngine`, bit for bit, for any
-    number of threads. Rows of one XML file share a compiled model.
+    For any number of threads, the results are bit-identical to those of
+    :class:`~lw_torchrl.suites.metaworld.plain_engine.MetaWorldEngine`. Rows with the same XML file share a compiled
+    model.
 
-    A row faults if its action is not finite or its simulation becomes unstable. It then repeats its last stable
-    observation and is not simulated until its reset; other rows are not affected.
+    A row faults if the action is not finite or the simulation becomes unstable. The row then repeats the last stable
+    observation and is not simulated until it is reset; other rows are not affected.
 
     Args:
         tasks: the task of each row.
-        reward: "sparse" for the success as 0 or 1, or "dense" for Meta-World's own.
-        num_threads: number of threads that simulate; None for one per core.
+        reward: "sparse" for 1 at success and 0 otherwise, or "dense" for Meta-World's dense reward.
+        num_threads: number of simulation threads; None for one per core.
 
     Raises:
-        ImportError: this engine was not compared with the installed version of Meta-World or MuJoCo.
+        ImportError: this engine was not verified against the installed version of Meta-World or MuJoCo.
 
     Example:
         >>> engine = VectorizedEngine(["reach", "push"], num_threads=1)
@@ -53,15 +54,15 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
         compared = task_programs.COMPARED_VERSIONS
         if changes := version_changes(compared, compared):
             raise ImportError(
-                f"engine: the vectorized engine was compared with other versions ({', '.join(changes)}); install "
-                "those, or use engine='metaworld', which runs any version"
+                f"engine: the vectorized engine was verified against other versions ({', '.join(changes)}); install "
+                "those, or use engine='metaworld', which supports any version"
             )
         dense, tasks = reward == "dense", [check_task(task) for task in tasks]
         super().__init__([task_programs.model_path(task) for task in tasks], METAWORLD, num_threads)
         rewards = [reward_table()[task] if dense else None for task in tasks]
         rows: dict[int, simulated_rows.SimulatedRow] = {}
         models: list[task_programs.SharedModel] = []
-        # Models are returned even if the engine is never closed.
+        # The models are given back even if the engine is never closed.
         self._return_models = weakref.finalize(self, task_programs.return_models, models)
         for group in self._groups:
             models.append(task_programs.borrow_model(task_programs.model_path(tasks[group.rows[0]])))
@@ -97,13 +98,13 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
         self._current[rows] = self._observation[rows, at.CURRENT]
 
     def close(self) -> None:
-        """End the threads and return the models, for the next engine of this process."""
+        """Stop the threads and give the models back, so that the next engine in this process can use them."""
         super().close()
         self._running = None
         self._return_models()
 
     def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
-        if self._running is None or not np.array_equal(self._running.rows, rows):  # they seldom change
+        if self._running is None or not np.array_equal(self._running.rows, rows):  # the running rows seldom change
             self._running = _RunningRows(self, rows)
         running, action = self._running, action[rows]
         shift = np.minimum(np.maximum(action[:, :3], -1), 1) * self._action_scale
@@ -137,7 +138,7 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
 
 
 class _RunningRows:
-    """The constants of a set of running rows, prepared once."""
+    """The precomputed constants of a set of running rows."""
 
     def __init__(self, engine: VectorizedEngine, rows: Index) -> None:
         self.rows = rows
