@@ -151,7 +151,7 @@ def test_second_writer_raises_or_waits(tmp_path, holding, folder):
     place = tmp_path / "runs" / "mine.txt"
     release = holding(place, folder=folder)
     other = "folder" if folder else "file"
-    message = f"out: another training is writing to '{place}'; let it finish, or choose another {other}"
+    message = f"out: another training is writing to '{place}'; wait until it finishes, or use a different {other}"
     with pytest.raises(OwnError) as caught, locked(place, "out", "training", folder=folder, error=OwnError):
         pytest.fail("another process has the lock")
     assert str(caught.value) == message
@@ -195,7 +195,7 @@ def test_text_has_plain_line_ends_and_no_byte_order_mark(tmp_path):
     with pytest.raises(OwnError, match=r"a\.txt: must have at most 3 bytes, got"):
         read_text(tmp_path / "a.txt", OwnError, limit=3)
     (tmp_path / "a.txt").write_bytes(b"\xff")
-    with pytest.raises(OwnError, match=r"a\.txt: must be a text file in UTF-8"):
+    with pytest.raises(OwnError, match=r"a\.txt: must be a UTF-8 text file"):
         read_text(tmp_path / "a.txt", OwnError)
 
 
@@ -210,9 +210,9 @@ BAD = {
     "half": (b'{"a": ', "Expecting value"),
     "not UTF-8": (b'{"a": "\xff"}', "utf-8"),
     "nested": (b'{"a": ' + b"[" * 100_000 + b"]" * 100_000 + b"}", "nested too deeply"),
-    "NaN": (b'{"a": NaN}', "it holds NaN, which is not a finite number"),
-    "a float beyond": (b'{"a": 1e999}', "1e999, which is not a finite number"),
-    "twice": (b'{"a": 1, "b": {"c": 1, "c": 2}}', "it names 'c' more than once"),
+    "NaN": (b'{"a": NaN}', "only finite numbers, got NaN"),
+    "a float beyond": (b'{"a": 1e999}', "only finite numbers, got 1e999"),
+    "twice": (b'{"a": 1, "b": {"c": 1, "c": 2}}', "the key 'c' more than once"),
     "a list": (b"[1]", "must be an object, got list"),
 }
 

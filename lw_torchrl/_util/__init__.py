@@ -1,1 +1,1 @@
-"""Helpers for all folders: argument checks, files, tensordict keys, devices, progress, registries, seeds, versions."""
+"""Helpers used by all subpackages: argument checks, files, tensordict keys, devices, progress, registries and seeds."""

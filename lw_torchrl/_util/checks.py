@@ -1,4 +1,4 @@
-"""Checks of arguments: types and ranges by beartype, names by hand; and the words of errors."""
+"""Argument checks (types and ranges with beartype, names by lookup) and helpers for error messages."""
 
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -17,7 +17,7 @@ from beartype.vale import Is, IsInstance
 
 _NOT_BOOL = ~IsInstance[bool]
 _MOST = float(np.finfo(float).max)
-# True is not an integer; NaN, and an integer too large for a float, are not numbers.
+# Reject bools as numbers, NaN, and integers that are too large for a float.
 _CONF = BeartypeConf(
     hint_overrides=FrozenDict(
         {
@@ -53,17 +53,18 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 class ArgumentError(TypeError, ValueError):
-    """An argument has the wrong type or is out of range."""
+    """An error for an argument that has the wrong type or is out of range."""
 
 
 def typed(function: Function) -> Function:
-    """Check a function's arguments by their annotations; raise :class:`ArgumentError` for the first wrong one.
+    """Decorate a function to check arguments against their annotations, and raise an :class:`ArgumentError` for the
+    first invalid argument.
 
-    NumPy's numbers arrive as Python's. Annotations are read at the first call, so each name in them must be imported
-    by then, and not only for type checkers. ``*args`` and ``**kwargs`` are not checked.
+    NumPy scalars are converted to Python numbers. Annotations are evaluated at the first call, so all names in them
+    must be imported at run time, not only for type checkers. ``*args`` and ``**kwargs`` are not checked.
     """
 
-    def read_hints() -> dict[str, Any]:  # not the result's, whose type may be in a package that is not installed
+    def read_hints() -> dict[str, Any]:  # skip the return type, which may come from a package that is not installed
         arguments = {name: hint for name, hint in function.__annotations__.items() if name != "return"}
         return get_type_hints(SimpleNamespace(__annotations__=arguments), function.__globals__, include_extras=True)
 
@@ -71,7 +72,7 @@ def typed(function: Function) -> Function:
 
 
 def typed_fields(kind: Class) -> Class:
-    """Check the fields of a dataclass by their annotations, as :func:`typed` does, when an instance is made."""
+    """Decorate a dataclass to check fields against their annotations, as :func:`typed` does, on construction."""
     init = _checked(kind.__init__, lambda: get_type_hints(kind, include_extras=True))  # type: ignore[misc]
     kind.__init__ = init  # type: ignore[misc]
     return kind
@@ -97,7 +98,8 @@ def _checked(function: Any, read_hints: Callable[[], dict[str, Any]]) -> Any:
 
 
 def check_value(argument: str, value: Any, hint: Any) -> Any:
-    """Return ``value``, a NumPy number as Python's, if it matches a type hint; else raise :class:`ArgumentError`."""
+    """Return ``value`` (NumPy scalars as Python numbers) if it matches a type hint; otherwise raise an
+    :class:`ArgumentError`."""
     if not checker(hint)(value):
         choices = [
             choice for part in (hint, *get_args(hint)) if get_origin(part) is Literal for choice in get_args(part)
@@ -113,8 +115,8 @@ def _plain(value: Any) -> Any:
 
 @cache
 def checker(hint: Any) -> Callable[[Any], bool]:
-    """Return a function that tells whether a value matches a type hint: beartype for all but containers, of which
-    beartype looks at one random item only: it would miss wrong ones, and advance Python's random generator."""
+    """Return a function that checks whether a value matches a type hint. Containers are checked item by item, because
+    beartype checks only one random item, which misses wrong items and advances Python's random generator."""
     kind, parts = get_origin(hint), get_args(hint)
     if kind in (Union, UnionType):
         alternatives = [checker(part) for part in parts]
@@ -152,7 +154,8 @@ def _words(hint: Any) -> str:
 
 
 def check_choice(argument: str, value: Any, allowed: Iterable[str]) -> Any:
-    """Return ``value`` if it is one of ``allowed``; else raise :class:`ValueError` with the nearest name."""
+    """Return ``value`` if it is in ``allowed``; otherwise raise a :class:`ValueError` that suggests the closest allowed
+    names."""
     names = list(allowed)
     if value not in names:
         raise unknown_name(argument, value, names)
@@ -160,7 +163,7 @@ def check_choice(argument: str, value: Any, allowed: Iterable[str]) -> Any:
 
 
 def unknown_name(argument: str, value: object, allowed: Iterable[str]) -> ValueError:
-    """Return the error for a name that is not in a set of names, with those of similar spelling."""
+    """Return the error for a name that is not in ``allowed``; the message suggests names with a similar spelling."""
     names = list(allowed)
     listed = ", ".join(map(repr, names[:12])) + (", ..." if len(names) > 12 else "")
     close = " or ".join(map(repr, nearest(value, names))) if isinstance(value, str) else ""
@@ -169,32 +172,32 @@ def unknown_name(argument: str, value: object, allowed: Iterable[str]) -> ValueE
 
 
 def nearest(value: str, allowed: Iterable[str], *, n: int = 3) -> list[str]:
-    """Return the ``n`` allowed names of most similar spelling, best first."""
+    """Return up to ``n`` allowed names with the most similar spelling, most similar first."""
     return get_close_matches(value, list(allowed), n=n, cutoff=0.4)
 
 
 def did_you_mean(value: str, allowed: Iterable[str]) -> str:
-    """Return the end of an error message that suggests an allowed name; "" if none is similar."""
+    """Return the end of an error message that suggests a similar allowed name, or "" if no name is similar."""
     return "".join(f"; did you mean {name!r}?" for name in nearest(value, allowed, n=1))
 
 
 def missing_keys(present: Iterable[Any], *needed: str) -> ValueError:
-    """Return the error for a tensordict with the keys ``present`` that lacks some of the ``needed`` ones."""
+    """Return the error for a tensordict with the keys ``present`` that lacks some of the ``needed`` keys."""
     names = [str(key) for key in present]
     absent = [key for key in needed if key not in names]
-    hint = ": QAFTransform(plans) in the environment, and in the buffer, writes it" if "qaf" in absent else ""
+    hint = "; add QAFTransform(plans), which writes qaf, to the environment or buffer" if "qaf" in absent else ""
     return ValueError(
-        f"{' and '.join(needed)} are needed, got {', '.join(names)}; without {' and '.join(absent)}{hint}"
+        f"the tensordict must have {' and '.join(needed)}, got {', '.join(names)}: {' and '.join(absent)} missing{hint}"
     )
 
 
 def counted(number: int, noun: str) -> str:
-    """Return a number with its noun: "1 task", "50 tasks"."""
+    """Return a number followed by a noun, which is plural unless the number is 1: "1 task", "50 tasks"."""
     return f"{number} {noun}" + "s" * (number != 1)
 
 
 def differences(was: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
-    """Return the names whose values differ in two nested mappings, with short values: "steps (40, now 30)"."""
+    """Return the keys whose values differ between two nested mappings, with both values if short: "steps (40, now 30)"."""
     names = []
     for key in sorted({**was, **now}):
         before, after = was.get(key), now.get(key)
@@ -213,7 +216,7 @@ _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlist, _SHORT.maxtu
 
 
 def shown(value: object) -> str:
-    """Return a short ``repr`` for an error message, which does not fail for huge integers or deep nesting."""
+    """Return a short ``repr`` of a value for an error message; huge integers and deep nesting do not raise errors."""
     try:
         return _SHORT.repr(value)
     except (ValueError, RecursionError):  # Python refuses to print integers of more than 4,300 digits

@@ -1,4 +1,4 @@
-"""Devices: their names, checks of tensors that do not wait for them, seeds, and networks in blocks of rows."""
+"""Device helpers: device names, tensor checks without synchronization, seeding, and policies run in blocks of rows."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -14,11 +14,12 @@ from torch._subclasses.fake_tensor import FakeTensor
 
 from lw_torchrl._util.checks import shown, unknown_name
 
-_ASSERTING = {"cuda"}  # devices on which torch._assert_async checks without waiting
+_ASSERTING = {"cuda"}  # devices on which torch._assert_async checks without synchronization
 
 
 def plain(*tensors: Tensor) -> bool:
-    """Return whether the tensors hold numbers: not while compiling or exporting, nor in a ``torch.func`` transform."""
+    """Return whether the tensors hold actual values: False while compiling or exporting, or in a ``torch.func``
+    transform."""
     if torch.compiler.is_compiling():
         return False
     for tensor in tensors:  # noqa: SIM110 - called at every step, and a generator takes twice as long
@@ -28,7 +29,7 @@ def plain(*tensors: Tensor) -> bool:
 
 
 def waits(*tensors: Tensor) -> bool:
-    """Return whether reading the tensors would wait for a device that can check them itself."""
+    """Return whether reading a tensor would synchronize with a device that supports ``torch._assert_async``."""
     for tensor in tensors:  # noqa: SIM110 - as above
         if not tensor.is_cpu and tensor.device.type in _ASSERTING:
             return True
@@ -36,12 +37,13 @@ def waits(*tensors: Tensor) -> bool:
 
 
 def readable(*tensors: Tensor) -> bool:
-    """Return whether Python may read the tensors: they are :func:`plain`, and none is on a CUDA device."""
+    """Return whether Python may read the tensors: all are :func:`plain`, and none is on a CUDA device."""
     return plain(*tensors) and not waits(*tensors)
 
 
 def asserted(*tensors: Tensor) -> bool:
-    """Return whether ``torch._assert_async`` can check the tensors: compiled or on a CUDA device, not in ``vmap``."""
+    """Return whether ``torch._assert_async`` can check the tensors: in compiled code or on a CUDA device, but not in
+    ``vmap``."""
     if not torch.compiler.is_compiling():
         return waits(*tensors) and plain(*tensors)
     for tensor in tensors:  # noqa: SIM110 - as above
@@ -51,7 +53,8 @@ def asserted(*tensors: Tensor) -> bool:
 
 
 def check_values(holds: Callable[[Tensor], Tensor], tensor: Tensor, problem: str) -> None:
-    """Raise :class:`ValueError` unless ``holds(tensor)``, () bool; if compiled or on a GPU, a later RuntimeError."""
+    """Raise a :class:`ValueError` unless ``holds(tensor)``, a bool scalar, is true. In compiled code or on a GPU, a
+    RuntimeError is raised later instead."""
     if asserted(tensor):
         torch._assert_async(holds(tensor), problem)
     elif readable(tensor) and not holds(tensor):
@@ -59,13 +62,13 @@ def check_values(holds: Callable[[Tensor], Tensor], tensor: Tensor, problem: str
 
 
 def finite(tensor: Tensor) -> bool:
-    """Return whether all numbers are finite."""
-    # The sum is faster than isfinite(), but may overflow.
+    """Return whether all elements of a tensor are finite."""
+    # The sum is faster than isfinite(), but can overflow.
     return math.isfinite(tensor.sum().item()) or bool(tensor.isfinite().all())
 
 
 def check_finite(argument: str, tensor: Tensor) -> None:
-    """Raise as :func:`check_values` unless all numbers of a tensor are finite."""
+    """Raise an error, as :func:`check_values` does, unless all elements of a tensor are finite."""
     if not (readable(tensor) and finite(tensor)):
         problem = f"{argument} must hold finite numbers, got NaN or infinity"
         check_values(lambda values: values.isfinite().all(), tensor, problem)
@@ -73,15 +76,15 @@ def check_finite(argument: str, tensor: Tensor) -> None:
 
 _NAMES = ("cpu", "cuda", "cuda:0", "mps", "auto")
 CPU = torch.device("cpu")
-BLOCK = 64  # rows on which networks run at once
+BLOCK = 64  # number of rows that a network processes at once
 
 
 def check_device(argument: str, value: Any) -> torch.device:
-    """Return a device with its number. ``value`` is a :class:`torch.device`, a name that PyTorch knows, such as "cuda"
-    or "cuda:0", or "auto" for this machine's accelerator, or the CPU without one. Raise :class:`ValueError` for a
-    device that does not exist or is not in this machine, and :class:`TypeError` for another object."""
+    """Return a device with an explicit index. ``value`` is a :class:`torch.device`, a PyTorch device name such as
+    "cuda" or "cuda:0", or "auto" for this machine's accelerator (the CPU if there is none). Raise a
+    :class:`ValueError` for an unknown or unavailable device, and a :class:`TypeError` for any other type."""
     if not isinstance(value, (str, torch.device)):
-        raise TypeError(f"{argument} must be a device's name, got {shown(value)}")
+        raise TypeError(f"{argument} must be a device or a device name, got {shown(value)}")
     accelerator = torch.accelerator.current_accelerator(check_available=True)
     available = ["cpu"]
     if accelerator is not None:
@@ -104,7 +107,7 @@ def check_device(argument: str, value: Any) -> torch.device:
 
 
 def device_of(module: Any) -> torch.device:
-    """Return the device of a module's first parameter or buffer; the CPU for anything without them."""
+    """Return the device of a module's first parameter or buffer, or the CPU if the object has neither."""
     if not isinstance(module, torch.nn.Module):
         return CPU
     first = next(chain(module.parameters(), module.buffers()), None)
@@ -112,7 +115,7 @@ def device_of(module: Any) -> torch.device:
 
 
 def place(module: Any, device: str | torch.device | None) -> torch.device:
-    """Move a module to a device, unless that is None, and return the module's device."""
+    """Move a module to ``device``, unless ``device`` is None, and return the module's device."""
     if device is None:
         return device_of(module)
     checked = check_device("device", device)
@@ -123,7 +126,7 @@ def place(module: Any, device: str | torch.device | None) -> torch.device:
 
 @contextmanager
 def seeded(device: torch.device, seed: int) -> Iterator[None]:
-    """Seed the default generators of the CPU and of a device within the block, and restore them afterwards."""
+    """Seed the default generators of the CPU and of ``device`` inside the block, then restore their states."""
     others = [] if device.type == "cpu" else [device]
     with torch.random.fork_rng(devices=others, device_type=device.type):
         torch.default_generator.manual_seed(seed)
@@ -135,7 +138,8 @@ def seeded(device: torch.device, seed: int) -> Iterator[None]:
 
 
 def in_blocks(policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[TensorDictBase], TensorDictBase]:
-    """Return ``policy`` run on blocks of one size, so that an action depends only on its row, bit for bit."""
+    """Return a function that runs ``policy`` on blocks of a fixed size, so that each action depends only on its own row
+    of the batch, bit for bit."""
     modules = policy.modules() if isinstance(policy, torch.nn.Module) else [policy]
     size = min(getattr(module, "rows_at_once", BLOCK) for module in modules)
 
@@ -145,7 +149,7 @@ def in_blocks(policy: Callable[[TensorDictBase], TensorDictBase]) -> Callable[[T
         padded = torch.cat([tensordict, tensordict[:1].expand(padding)]) if padding else tensordict
         outputs = [policy(block.copy()) for block in padded.split(size)]
         if not isinstance(outputs[0], TensorDictBase):
-            raise TypeError(f"a policy must return the TensorDict that it is given, got a {type(outputs[0]).__name__}")
+            raise TypeError(f"policy must return its input TensorDict, got {type(outputs[0]).__name__}")
         return tensordict.update(torch.cat(outputs)[:n])
 
     return run

@@ -1,4 +1,4 @@
-"""Read text, JSON and TOML; write whole files; lock a file or a folder for one writer."""
+"""Read text, JSON and TOML files, write files atomically, and lock a file or folder for one writer."""
 
 from __future__ import annotations
 
@@ -18,37 +18,38 @@ from pathlib import Path
 from typing import Any
 
 AnyPath = str | os.PathLike[str]
-_ABANDONED = 3600.0  # seconds after which a temporary file is the leftover of a killed process
-PATIENCE = 1.0  # seconds that `locked` waits for another writer, which may be about to finish
+_ABANDONED = 3600.0  # age in seconds at which a temporary file counts as a leftover of a killed process
+PATIENCE = 1.0  # seconds that `locked` waits for another writer to finish
 
 _SHIPPED = Path(__file__).parents[1] / "training" / "data"
 
 
 def shipped_policy(name: AnyPath) -> Path | None:
-    """Return the file of a shipped policy ("few-shot-mt50"); None if there is a file, or no policy, of that name."""
+    """Return the path of a shipped policy, such as "few-shot-mt50". Return None if no shipped policy has this name, or
+    if a user's file has the same name."""
     path = _SHIPPED / f"{name}.safetensors"
     return path if Path(name).name == str(name) and not Path(name).exists() and path.is_file() else None
 
 
 def absent_policy(path: AnyPath, writer: str = "train") -> str:
-    """Return the error message for a policy file that does not exist."""
+    """Return the error message for a missing policy file; ``writer`` is the command that writes such files."""
     near = [file.stem for file in _SHIPPED.glob("*.safetensors") if file.stem.startswith(Path(path).name[:8])]
     hint = f"; did you mean the shipped policy {near[0]!r}?" if near and Path(path).name == str(path) else ""
-    return f"no file {str(path)!r}; `lw-torchrl {writer}` writes one{hint}"
+    return f"no file {str(path)!r}; create it with `lw-torchrl {writer}`{hint}"
 
 
 @contextmanager
 def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
-    """Yield a temporary path to write to, which is renamed to ``path`` when the block ends without an error.
+    """Yield a temporary path to write to, and rename the file to ``path`` when the block ends without an error.
 
-    If the process is killed, ``path`` is the whole old or the whole new file. If the machine stops, that holds only
-    with ``sync``, which takes some 10 ms.
+    If the process is killed, ``path`` is either the complete old file or the complete new file. With ``sync``, which
+    takes about 10 ms, the same is true if the machine crashes.
     """
-    target = Path(os.path.realpath(path))  # keeps a link and replaces the file to which it points
+    target = Path(os.path.realpath(path))  # a symbolic link is kept, and the file it points to is replaced
     target.parent.mkdir(parents=True, exist_ok=True)
-    if sync:  # else listing a folder with many small files would take long
+    if sync:  # without sync, there may be many small files, which would make listing the folder slow
         _remove_abandoned(target)
-    # Writers choose the format by the suffix.
+    # Keep the suffix, because some writers choose the file format by the suffix.
     temporary = target.with_name(f".{target.stem}.{secrets.token_hex(8)}.tmp{target.suffix}")
     try:
         yield temporary
@@ -62,7 +63,7 @@ def replacing(path: AnyPath, *, sync: bool = True) -> Iterator[Path]:
 
 
 def _remove_abandoned(target: Path) -> None:
-    """Remove temporary files of killed processes."""
+    """Remove temporary files that killed processes left behind."""
     for left in target.parent.glob(f".{glob.escape(target.stem)}.*.tmp{target.suffix}"):
         with suppress(OSError):
             if time.time() - left.stat().st_mtime > _ABANDONED:
@@ -71,7 +72,8 @@ def _remove_abandoned(target: Path) -> None:
 
 @contextmanager
 def replacing_folder(path: AnyPath) -> Iterator[Path]:
-    """Yield a temporary folder, which is renamed to ``path``, new or empty, when the block ends."""
+    """Yield a temporary folder, and rename the folder to ``path``, which must not exist or be empty, when the block
+    ends."""
     target = Path(path).absolute()
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
     temporary.mkdir(parents=True)
@@ -86,7 +88,7 @@ def replacing_folder(path: AnyPath) -> Iterator[Path]:
 
 
 def flush(path: Path) -> None:
-    """Wait until the content of a file or folder is on the disk."""
+    """Wait until a file or folder is written to disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -107,10 +109,10 @@ def locked(
     wait: bool = False,
     error: type[ValueError] = ValueError,
 ) -> Iterator[None]:
-    """Lock a file or a folder against other threads and processes while the block writes to it.
+    """Lock a file or folder against other threads and processes while the block writes to the file or folder.
 
-    A killed process releases its lock. Without ``wait``, raise ``error``, which names the ``argument``, if another
-    ``who`` keeps the lock for more than a second.
+    If a process is killed, its lock is released. If another ``who`` (such as "process") holds the lock for more than a
+    second, raise ``error`` with a message that names ``argument``, or with ``wait``, wait for the lock.
     """
     from filelock import FileLock, Timeout
 
@@ -122,7 +124,7 @@ def locked(
     except Timeout:
         if not wait:
             kind = "folder" if folder else "file"
-            message = f"another {who} is writing to {str(place)!r}; let it finish, or choose another {kind}"
+            message = f"another {who} is writing to {str(place)!r}; wait until it finishes, or use a different {kind}"
             raise error(f"{argument}: {message}") from None
         print(f"waiting for another {who}, which is writing to {str(place)!r}", file=sys.stderr, flush=True)
         lock.acquire()
@@ -134,29 +136,30 @@ def locked(
 
 
 def write_text(path: AnyPath, text: str) -> None:
-    """Write a text file whole or not at all."""
+    """Write a text file atomically."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: AnyPath, value: Any) -> None:
-    """Write a JSON file whole or not at all; raise :class:`ValueError` for NaN, which JSON does not have."""
+    """Write a JSON file atomically; raise a :class:`ValueError` for NaN and infinity, which JSON does not support."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def read_text(path: Path | Traversable, error: type[ValueError], *, limit: int | None = None) -> str:
-    """Return a UTF-8 file's text, without a byte order mark and with ``\\n`` as line ends; else raise ``error``."""
+    """Read a UTF-8 text file, remove the byte order mark and convert line ends to ``\\n``. Raise ``error`` if the file
+    is longer than ``limit`` bytes or is not UTF-8."""
     content = path.read_bytes()
     if limit is not None and len(content) > limit:
-        raise error(f"{path}: must have at most {limit} bytes, got {len(content)}")
+        raise error(f"{path}: must have at most {limit} bytes, got {len(content)} bytes")
     try:
         return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except ValueError as fault:
-        raise error(f"{path}: must be a text file in UTF-8: {fault}") from fault
+        raise error(f"{path}: must be a UTF-8 text file: {fault}") from fault
 
 
 def read_toml(path: Path | Traversable, error: type[ValueError]) -> dict[str, Any]:
-    """Return the content of a TOML file; raise ``error`` with its name if it cannot be parsed."""
+    """Read a TOML file; raise ``error``, with the file's path, if the file cannot be parsed."""
     text = read_text(path, error)
     try:
         return tomllib.loads(text)
@@ -165,7 +168,8 @@ def read_toml(path: Path | Traversable, error: type[ValueError]) -> dict[str, An
 
 
 def read_json(path: AnyPath, what: str) -> dict[str, Any]:
-    """Return the object in a JSON file; a :class:`ValueError` begins with ``what``, such as "root: the metadata"."""
+    """Read a JSON file that holds an object. Raise a :class:`ValueError` that begins with ``what``, such as "root: the
+    metadata", if the file is invalid."""
     try:
         return parse_json(Path(path).read_bytes())
     except ValueError as error:
@@ -173,37 +177,38 @@ def read_json(path: AnyPath, what: str) -> dict[str, Any]:
 
 
 def parse_json(content: bytes) -> dict[str, Any]:
-    """Return the object in JSON; raise :class:`ValueError` for other values, NaN, infinity and repeated names."""
+    """Parse JSON text that holds an object; raise a :class:`ValueError` for other values, NaN, infinity and repeated
+    keys."""
     try:
         value = json.loads(content.decode(), object_pairs_hook=_unique, parse_constant=_finite, parse_float=_finite)
     except RecursionError:
-        raise ValueError("it is nested too deeply") from None
+        raise ValueError("the JSON is nested too deeply") from None
     if not isinstance(value, dict):
-        raise ValueError(f"it must be an object, got {type(value).__name__}")
+        raise ValueError(f"the JSON must be an object, got {type(value).__name__}")
     return value
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     names = [name for name, _ in pairs]
     if repeated := [name for name in names if names.count(name) > 1] if len({*names}) < len(names) else []:
-        raise ValueError(f"it names {repeated[0][:100]!r} more than once")
+        raise ValueError(f"the JSON has the key {repeated[0][:100]!r} more than once")
     return dict(pairs)
 
 
 def _finite(text: str) -> float:
-    if abs(number := float(text)) < float("inf"):  # false for NaN too
+    if abs(number := float(text)) < float("inf"):  # also false for NaN
         return number
-    raise ValueError(f"it holds {text[:40]}, which is not a finite number")
+    raise ValueError(f"the JSON must contain only finite numbers, got {text[:40]}")
 
 
 @contextmanager
 def reading(path: AnyPath, what: str) -> Iterator[None]:
-    """Add the ``path`` of a folder, and ``what`` it should hold, to errors raised in the block."""
+    """Add the folder's ``path`` and the expected content ``what`` to errors raised in the block."""
     try:
         yield
     except FileNotFoundError as error:
         raise FileNotFoundError(
-            f"path: {str(path)!r} holds no {what} ({error.filename} is missing); dumps writes one"
+            f"path: {str(path)!r} holds no {what} ({error.filename} is missing); write one with dumps()"
         ) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
         raise ValueError(f"path: {str(path)!r} holds no {what} ({error})") from error

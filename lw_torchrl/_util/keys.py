@@ -1,4 +1,4 @@
-"""Keys of tensordicts as arguments, and modules that accept a tensordict or tensors."""
+"""Helpers for tensordict keys as arguments, and for modules that accept either a tensordict or tensors."""
 
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -15,46 +15,48 @@ from torch import Tensor
 from lw_torchrl._util.checks import checker, missing_keys
 from lw_torchrl._util.rendering import naming_absent_renderer
 
-with naming_absent_renderer():  # rooms that use TorchRL import this module first
+with naming_absent_renderer():  # subpackages that use TorchRL import this module first
     import torchrl.envs  # noqa: F401
 
 Keys = Sequence[NestedKey]
 
 
 def _key(value: Any) -> NestedKey | None:
-    """Return a key; None if it is not one. A list is a nested key too, since JSON has no tuples."""
+    """Convert a value to a tensordict key; return None if it is not a valid key. A list becomes a nested key, since
+    JSON has no tuples."""
     value = tuple(value) if isinstance(value, list) else value
     return unravel_key(value) if checker(NestedKey)(value) and value else None
 
 
 def as_keys(argument: str, value: Sequence[NestedKey] | None, default: Sequence[str]) -> list[NestedKey]:
-    """Return keys that replace the default ones, in their order; None means the default ones.
+    """Return the keys in ``value``, which replace the ``default`` keys in order, or the default keys if it is None.
 
-    Raises :class:`ValueError` for another number of keys, a repeated key, or an object that is not a key.
+    Raises:
+        ValueError: ``value`` has a wrong number of keys, a repeated key, or an object that is not a key.
     """
     if value is None:
         return list(default)
     is_list = isinstance(value, Sequence) and not isinstance(value, str)
     keys = [key for item in value if (key := _key(item)) is not None] if is_list else []
     if not is_list or len({*keys}) != len(default) or len(value) != len(default):
-        raise ValueError(f"{argument} must be {len(default)} different keys, for {', '.join(default)}; got {value!r}")
+        raise ValueError(f"{argument} must be {len(default)} distinct keys, for {', '.join(default)}; got {value!r}")
     return keys
 
 
 def check_key(argument: str, value: Any) -> None:
-    """Raise :class:`TypeError` unless ``value`` is a key of a tensordict."""
+    """Raise a :class:`TypeError` unless ``value`` is a valid tensordict key."""
     if isinstance(value, list) or _key(value) is None:
         raise TypeError(f"{argument} must be a key (a string or a tuple of strings), got {value!r}")
 
 
 def check_apart(in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> None:
-    """Raise :class:`ValueError` if a module would overwrite its inputs."""
+    """Raise a :class:`ValueError` if a module would overwrite its inputs."""
     if both := [key for key in out_keys if key in in_keys]:
-        raise ValueError(f"out_keys must differ from in_keys, {list(in_keys)}: {both} would be overwritten")
+        raise ValueError(f"out_keys must differ from in_keys ({list(in_keys)}): {both} would be overwritten")
 
 
 def key_beside(key: NestedKey, ending: str) -> NestedKey:
-    """Return ``key`` with a suffix added to its name."""
+    """Return ``key`` with a suffix added to the last name."""
     return key + ending if isinstance(key, str) else (*key[:-1], key[-1] + ending)
 
 
@@ -64,7 +66,7 @@ def last_name(key: NestedKey) -> str:
 
 
 def read(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> list[Tensor]:
-    """Return the tensors of ``keys``; raise :class:`ValueError` with the missing keys."""
+    """Return the tensors at ``keys``; raise a :class:`ValueError` that names the missing keys."""
     tensors = [tensordict.get(key, None) for key in keys]
     if any(tensor is None for tensor in tensors):
         raise missing_keys(tensordict.keys(True, True), *map(str, keys))
@@ -72,15 +74,16 @@ def read(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> list[Tensor]:
 
 
 def write(tensordict: TensorDictBase, module: TensorDictModuleBase, values: Sequence[Tensor]) -> TensorDictBase:
-    """Write a tensor to each of the module's keys; TensorDict's ``select_out_keys`` removes some afterwards."""
+    """Write one value to each of the module's output keys. TensorDict's ``select_out_keys`` removes unselected keys
+    later."""
     for key, value in zip(module.out_keys_source, values, strict=True):
         tensordict.set(key, value)
     return tensordict
 
 
 def dispatched(forward: Callable[[Any, TensorDictBase], TensorDictBase]) -> Callable[..., Any]:
-    """Decorate a module's ``forward`` to accept a tensordict, or the tensors of ``in_keys`` by position or by name, as
-    ``torch.export`` passes them. Under ``set_skip_existing(True)`` it does nothing if all ``out_keys`` exist."""
+    """Decorate a module's ``forward`` to accept a tensordict, or (as ``torch.export`` requires) the tensors of
+    ``in_keys`` by position or name. With ``set_skip_existing(True)``, nothing is done if all ``out_keys`` exist."""
 
     @wraps(forward)
     def run(self: TensorDictModuleBase, tensordict: TensorDictBase) -> TensorDictBase:
@@ -88,7 +91,7 @@ def dispatched(forward: Callable[[Any, TensorDictBase], TensorDictBase]) -> Call
             return tensordict
         return forward(self, tensordict)
 
-    # An automatic batch size would take all dimensions of a single tensor (B, F).
+    # An automatic batch size would include all dimensions of a single tensor (B, F).
     return any_arguments(dispatch(auto_batch_size=False)(run))
 
 
@@ -102,7 +105,7 @@ _ANY = Parameter("args", Parameter.VAR_POSITIONAL), Parameter("kwargs", Paramete
 
 
 def row_mask(tensordict: TensorDictBase | None, key: str, n: int) -> np.ndarray:
-    """Return a mask of rows such as "_reset", (n,) bool; all rows without one."""
+    """Return a row mask (n,) bool, such as the one with the key "_reset"; without a mask, all rows are True."""
     mask = None if tensordict is None else tensordict.get(key, None)
     if mask is None:
         return np.ones(n, dtype=bool)

@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal or in a notebook, otherwise a line of text every 30 seconds."""
+"""Progress reports for long tasks: a bar on a terminal or in a notebook, otherwise a line of text every 30 seconds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 import time
 from typing import Any
 
-DELAY, EVERY = 1.0, 30.0  # seconds: before a bar is shown, and between lines
+DELAY, EVERY = 1.0, 30.0  # seconds before a bar is shown, and seconds between lines of text
 
 
 def _duration(seconds: float) -> str:
@@ -16,7 +16,7 @@ def _duration(seconds: float) -> str:
 
 
 class Progress:
-    """Progress on stderr; ``initial`` of ``total`` units were done before."""
+    """A progress report on stderr; ``initial`` of the ``total`` units are already done."""
 
     def __init__(self, what: str, total: int, unit: str, *, initial: int = 0, show: bool = True) -> None:
         self.what, self.total, self.unit, self.initial = what, total, unit, initial
@@ -38,7 +38,7 @@ class Progress:
             self._bar.close()
 
     def update(self, units: int = 1) -> None:
-        """Count more units as done."""
+        """Add ``units`` to the number of finished units."""
         self.done += units
         if self._bar is not None:
             self._bar.update(units)
@@ -49,13 +49,13 @@ class Progress:
             print(f"{self.what}: {self.done}/{self.total} {self.unit}s{left}{self.notes}", file=sys.stderr, flush=True)
 
     def set_done(self, units: int) -> None:
-        """Set the number of finished units, which falls if some must be repeated."""
+        """Set the number of finished units, which decreases if some units must be repeated."""
         self.done = units
         if self._bar is not None:
             self._bar.n = units
 
     def note(self, **notes: str) -> None:
-        """Show notes too, for example ``loss="0.012"``."""
+        """Show notes next to the progress, for example ``loss="0.012"``."""
         self.notes = "".join(f", {name} {value}" for name, value in notes.items())
         if self._bar is not None:
             self._bar.set_postfix(notes, refresh=False)

@@ -1,4 +1,4 @@
-"""Registry: objects by name, to which users and installed packages can add."""
+"""The Registry class: a mapping from names to objects that users and installed packages can extend."""
 
 import re
 from collections import UserDict
@@ -18,14 +18,14 @@ _PLACE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
 @cache
 def entry_points_of(group: str) -> "dict[str, EntryPoint]":
-    """Return the entry points of installed packages in a group, by name; nothing is imported."""
+    """Return the entry points in a group, by name, from all installed packages, without importing the packages."""
     from importlib.metadata import entry_points
 
     return {point.name: point for point in entry_points(group=group)}
 
 
 class ReadOnlyDict(Mapping[str, Entry]):
-    """A mapping that cannot be changed. Unlike ``types.MappingProxyType``, it can be pickled."""
+    """A read-only mapping that, unlike ``types.MappingProxyType``, can be pickled."""
 
     def __init__(self, items: Mapping[str, Entry]) -> None:
         self._items = items
@@ -44,20 +44,21 @@ class ReadOnlyDict(Mapping[str, Entry]):
 
 
 class Registry(UserDict[str, Entry]):
-    """A mapping from names to objects of one kind: ours, yours, and those of installed packages.
+    """A mapping from names to objects of one kind: shipped with this library, added by users, or provided by installed
+    packages.
 
-    ``REGISTRY["mine"] = entry`` adds an entry and ``del`` removes it. A string "module:object", or the entry point of
-    an installed package, is imported at its first use.
+    ``REGISTRY["mine"] = entry`` adds an entry and ``del REGISTRY["mine"]`` removes it. A string "module:object", or the
+    entry point of an installed package, is imported on first use.
 
     Args:
-        kind: the word for an entry in errors, such as "method".
-        group: the group of entry points, such as "lw_torchrl.methods".
-        entries: our entries.
-        check: a function from a name and an object to the entry; it raises for an object of the wrong kind.
+        kind: the word for an entry in error messages, such as "method".
+        group: the entry point group, such as "lw_torchrl.methods".
+        entries: the shipped entries.
+        check: a function that maps a name and an object to the entry, and raises an error for an invalid object.
 
     Raises:
-        KeyError: the name is unknown; the message has the nearest names.
-        ImportError: an entry cannot be imported or is of the wrong kind; the message names its package.
+        KeyError: the name is unknown; the message suggests the closest names.
+        ImportError: an entry cannot be imported or is invalid; the message names the entry's package.
 
     Example:
         >>> from lw_torchrl.modules import METHODS
@@ -96,22 +97,22 @@ class Registry(UserDict[str, Entry]):
         package = ""
         if place is None:
             point = entry_points_of(self.group)[name]
-            place, package = point.value, f" of the package {point.dist.name}" if point.dist else ""
+            place, package = point.value, f" from the package {point.dist.name}" if point.dist else ""
         try:
             module, _, attributes = place.partition(":")
             entry: Any = import_module(module)
             for attribute in attributes.split("."):
                 entry = getattr(entry, attribute)
             return self.check(name, entry)
-        except Exception as error:  # a plugin may fail in any way
+        except Exception as error:  # a plugin can raise any exception
             if place.startswith("lw_torchrl."):
-                raise  # errors of our own modules name the extra to install
+                raise  # errors in this library's modules already name the extra to install
             reason = f"{type(error).__name__}: {error}"
-            raise ImportError(f"{self.kind} {name!r}, {place}{package}, cannot be loaded ({reason})") from error
+            raise ImportError(f"{self.kind} {name!r} ({place}{package}) cannot be loaded ({reason})") from error
 
 
 def is_function(name: str, entry: Any) -> Callable[..., Any]:
-    """Return a function or class; raise :class:`TypeError` for another object."""
+    """Return ``entry`` if it is callable; otherwise raise a :class:`TypeError`."""
     if not callable(entry):
         raise TypeError(f"{name!r} must be a function, got {entry!r:.80}")
     return entry

@@ -1,4 +1,4 @@
-"""Names of cameras, sizes of images, and an error that names a missing rendering library."""
+"""Checks of camera names and image sizes, and an error that names a missing rendering library."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -10,12 +10,12 @@ RENDER_LIBRARIES = {
     "egl": "libEGL (Debian: apt-get install libegl1)",
     "osmesa": "OSMesa (Debian: apt-get install libosmesa6)",
 }
-CAMERAS = ("corner2", "corner", "corner3", "corner4", "topview", "behindGripper", "gripperPOV")  # Meta-World's
+CAMERAS = ("corner2", "corner", "corner3", "corner4", "topview", "behindGripper", "gripperPOV")  # Meta-World's cameras
 _LARGEST = 4096  # pixels along a side
 
 
 def check_picture(camera: str, height: int, width: int) -> None:
-    """Raise :class:`ValueError` for an unknown camera or a size of an image outside 1 to 4096."""
+    """Raise a :class:`ValueError` if the camera is unknown or the height or width is not from 1 to 4096 pixels."""
     check_choice("camera", camera, CAMERAS)
     for name, size in (("height", height), ("width", width)):
         if check_value(name, size, Count) > _LARGEST:
@@ -23,10 +23,11 @@ def check_picture(camera: str, height: int, width: int) -> None:
 
 
 def check_cameras(cameras: str | Sequence[str], height: int, width: int) -> tuple[str, ...]:
-    """Return the names of cameras; raise :class:`ValueError` for an unknown or repeated one, none, or a wrong size."""
+    """Return the camera names as a tuple; raise a :class:`ValueError` if the tuple is empty, a name is unknown or
+    repeated, or the image size is out of range."""
     names = (cameras,) if isinstance(cameras, str) else tuple(cameras)
     if not names or len({*names}) < len(names):
-        raise ValueError(f"cameras must be different names, at least one, got {cameras!r}")
+        raise ValueError(f"cameras must be one or more distinct names, got {cameras!r}")
     for name in names:
         check_picture(name, height, width)
     return names
@@ -34,7 +35,7 @@ def check_cameras(cameras: str | Sequence[str], height: int, width: int) -> tupl
 
 @contextmanager
 def naming_absent_renderer() -> Iterator[None]:
-    """Turn MuJoCo's AttributeError into an ImportError that names the missing library of MUJOCO_GL."""
+    """Convert MuJoCo's AttributeError to an ImportError that names the missing library for MUJOCO_GL."""
     try:
         yield
     except AttributeError as error:

@@ -1,4 +1,4 @@
-"""Reproducibility: the random numbers of an episode, and the versions of packages that results depend on."""
+"""Reproducibility helpers: episode-specific random generators, and the package versions that results depend on."""
 
 import warnings
 from collections.abc import Iterable, Mapping
@@ -12,25 +12,26 @@ from lw_torchrl import __version__
 from lw_torchrl._util.checks import Natural, check_value, shown
 from lw_torchrl.language.tasks import Task, get_task
 
-SIMULATORS: tuple[str, ...] = ("metaworld", "mujoco")  # of the physics of episodes
-LIBRARIES: tuple[str, ...] = ("lw_torchrl", "numpy", "tensordict", "torch", "torchrl")  # of the last bits of results
+SIMULATORS: tuple[str, ...] = ("metaworld", "mujoco")  # packages that determine the physics
+LIBRARIES: tuple[str, ...] = ("lw_torchrl", "numpy", "tensordict", "torch", "torchrl")  # may change the last bits
 
 
 def episode_hash(purpose: str, task: str | Task, seed: int, episode: int) -> int:
-    """Return a stable number in [0, 2**63), different for each purpose, task, seed and episode."""
-    # The suite of a name such as "desk/push" need not be installed.
+    """Return a hash in [0, 2**63) of a purpose, task, seed and episode; the hash is the same on every machine."""
+    # For a name such as "desk/push", the suite need not be installed.
     name = task if isinstance(task, str) and "/" in task else get_task(task).name
     text = f"lw_torchrl/{purpose}/{name}/{check_value('seed', seed, int)}/{check_value('episode', episode, Natural)}"
     return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "little") >> 1
 
 
 def episode_generator(purpose: str, task: str | Task, seed: int, episode: int) -> np.random.Generator:
-    """Return a new generator of random numbers for one purpose in an episode."""
+    """Return a new random number generator for one purpose in an episode."""
     return np.random.Generator(np.random.Philox(episode_hash(purpose, task, seed, episode)))
 
 
 def package_versions() -> dict[str, str]:
-    """Return the versions of the packages that results depend on, by name; ours is that of the running code."""
+    """Return the versions, by package name, of the packages that results depend on. For lw_torchrl, this is the version
+    of the running code."""
     return {name: _installed(name) for name in ("lw_torchrl", *sorted({*SIMULATORS, *LIBRARIES} - {"lw_torchrl"}))}
 
 
@@ -39,17 +40,17 @@ def _installed(name: str) -> str:
 
 
 def version_changes(recorded: Any, names: Iterable[str]) -> list[str]:
-    """Return the packages whose installed version is not the recorded one: "mujoco 3.2.0, now 3.3.0"."""
+    """Return the packages whose installed version differs from the recorded one, as "mujoco 3.2.0, now 3.3.0"."""
     before = recorded if isinstance(recorded, Mapping) else {}
     pairs = [(name, before[name], _installed(name)) for name in names if isinstance(before.get(name), str)]
     return [f"{name} {shown(was)[1:-1]}, now {now}" for name, was, now in pairs if was != now]
 
 
 def warn_of_other_versions(path: object, recorded: Any, names: Iterable[str] = LIBRARIES) -> None:
-    """Warn that a training which began under other versions will not continue bit for bit."""
+    """Warn if a checkpoint was written with other package versions, so that training will not resume bit-exactly."""
     if changes := version_changes(recorded, names):
         warnings.warn(
-            f"checkpoint: {str(path)!r} was written under other versions ({'; '.join(changes)}): training continues, "
-            "but results will not be bit-identical to an uninterrupted run; install these versions for that",
+            f"checkpoint: {str(path)!r} was written with other versions ({'; '.join(changes)}): training continues, "
+            "but results will not be bit-identical to an uninterrupted run; install the recorded versions for that",
             stacklevel=4,
         )

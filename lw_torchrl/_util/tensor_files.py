@@ -1,4 +1,4 @@
-"""Write and read tensors with a JSON description as one .safetensors file, without pickling."""
+"""Write and read .safetensors files that hold tensors and a JSON description, without pickling."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from lw_torchrl._util.files import AnyPath, parse_json, replacing
 from lw_torchrl._util.reproducibility import package_versions
 
 SUFFIX = ".safetensors"
-_METADATA = "lw_torchrl"  # the name of our JSON in the file's metadata
+_METADATA = "lw_torchrl"  # key of the JSON description in the file's metadata
 _CHECKSUM = "crc32"
-_STATE = "state/"  # the prefix of the names of a state's tensors
+_STATE = "state/"  # name prefix of tensors that belong to the state
 
 
 def write_tensors(
     path: AnyPath, description: Mapping[str, Any], tensors: Mapping[str, Tensor], state: Any = None
 ) -> None:
-    """Write tensors by name and their description as JSON, to which ``versions`` of packages are added. ``state``,
-    nested numbers, strings and tensors, is restored by :func:`pop_state`."""
+    """Write named tensors with a JSON description, to which the package ``versions`` are added. :func:`pop_state`
+    restores ``state``, a nested structure of numbers, strings and tensors."""
     tensors, described = dict(tensors), {"versions": package_versions(), **description}
     if state is not None:
         described["state"] = _split(state, tensors)
-    parse_json(_text(described).encode())  # raises for names that JSON cannot tell apart, such as 1 and "1"
+    parse_json(_text(described).encode())  # raises for keys that are equal in JSON, such as 1 and "1"
     copies = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     described[_CHECKSUM] = _checksum(described, copies)
     content = save(copies, metadata={_METADATA: _text(described)})
@@ -40,22 +40,23 @@ def write_tensors(
 
 
 def read_tensors(path: AnyPath) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return the description and the tensors of a file; raise :class:`ValueError` if it is damaged or another file."""
+    """Read the description and the tensors from a file; raise a :class:`ValueError` if the file is corrupted or was not
+    written by :func:`write_tensors`."""
     if Path(path).is_dir():
         inside = ", ".join(file.name for file in sorted(Path(path).glob(f"*{SUFFIX}"))[:3])
-        raise ValueError(f"it is a folder; name a file in it: {inside}" if inside else "it is a folder")
-    Path(path).open("rb").close()  # safetensors' own error does not name a missing file
+        raise ValueError("the path is a folder" + (f"; use a file in the folder: {inside}" if inside else ""))
+    Path(path).open("rb").close()  # raises FileNotFoundError with the path, which safetensors' error lacks
     try:
         with safe_open(path, framework="pt") as file:
             description = parse_json((file.metadata() or {})[_METADATA].encode())
             stored = description.pop(_CHECKSUM)
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}
     except KeyError:
-        raise ValueError("it is a .safetensors file, but was not written by lw_torchrl") from None
+        raise ValueError("the .safetensors file was not written by lw_torchrl") from None
     except SafetensorError as error:
-        raise ValueError(f"it is damaged or not a .safetensors file: {error}") from error
+        raise ValueError(f"the file is corrupted or not a .safetensors file: {error}") from error
     if _checksum(description, tensors) != stored:
-        raise ValueError("it is damaged: the checksum is wrong")
+        raise ValueError("the file is corrupted: checksum mismatch")
     return description, tensors
 
 
@@ -64,7 +65,7 @@ def _text(description: Mapping[str, Any]) -> str:
 
 
 def _checksum(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> str:
-    """Return the CRC-32 of a description and tensors, in the order of their names."""
+    """Return the CRC-32 checksum of a description and of the tensors, sorted by name."""
     value = zlib.crc32(_text(description).encode())
     for name in sorted(tensors):
         content = memoryview(tensors[name].reshape(-1).view(torch.uint8).numpy())  # type: ignore[arg-type]
@@ -73,18 +74,18 @@ def _checksum(description: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
 
 
 def pop_state(description: dict[str, Any], tensors: dict[str, Tensor]) -> Any:
-    """Remove the state from a file's description and tensors, and return it."""
+    """Remove the state from a file's description and tensors, and return the state."""
     try:
         state = _join(description.pop("state"), tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"it holds no state, or a damaged one ({type(error).__name__}: {error})") from error
+        raise ValueError(f"the file holds no valid state ({type(error).__name__}: {error})") from error
     for name in [name for name in tensors if name.startswith(_STATE)]:
         del tensors[name]
     return state
 
 
 def _split(state: Any, tensors: dict[str, Tensor]) -> Any:
-    """Return JSON for a nested state, whose tensors are added to ``tensors``."""
+    """Convert a nested state to JSON, and add the state's tensors to ``tensors``."""
     if isinstance(state, Tensor):
         name = f"{_STATE}{len(tensors)}"
         tensors[name] = state
@@ -92,17 +93,17 @@ def _split(state: Any, tensors: dict[str, Tensor]) -> Any:
     if isinstance(state, TensorDictBase):
         device = None if state.device is None else str(state.device)
         return {"tensordict": [list(state.batch_size), device, _split(state.to_dict(), tensors)]}
-    if isinstance(state, Mapping):  # keys may be numbers, which JSON does not have
+    if isinstance(state, Mapping):  # keys may be numbers, which JSON does not allow
         return {"dict": [[_split(key, tensors), _split(value, tensors)] for key, value in state.items()]}
     if isinstance(state, (list, tuple)):
         return {type(state).__name__: [_split(value, tensors) for value in state]}
     if state is None or isinstance(state, (bool, int, float, str)):
         return state
-    raise TypeError(f"a state holds {type(state).__name__}, which cannot be saved without pickling")
+    raise TypeError(f"state must not contain {type(state).__name__} objects, which cannot be saved without pickling")
 
 
 def _join(tree: Any, tensors: Mapping[str, Tensor]) -> Any:
-    """Return the state that :func:`_split` took apart."""
+    """Rebuild the state that :func:`_split` took apart."""
     if not isinstance(tree, dict):
         return tree
     ((kind, value),) = tree.items()

@@ -1,6 +1,6 @@
-"""Recordings in rerun: a TorchRL logger that writes them, and viewers that show them.
+"""Rerun recordings: a TorchRL logger that writes recordings, and functions that open them in a viewer.
 
-Importing this package does not import rerun; making a :class:`RerunLogger` does.
+Importing this package does not import rerun; creating a :class:`RerunLogger` does.
 """
 
 import lw_torchrl._util.keys  # noqa: F401

@@ -1,4 +1,4 @@
-"""Entity paths, timelines, colours and images that all parts of a recording share."""
+"""Helpers for all parts of a recording: entity paths, timelines, colors and images."""
 
 import io
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 else:
 
     class _LazyModule:
-        """Import a module when one of its attributes is first used: rerun takes a second, and few programs record."""
+        """A module that is imported on first use, because importing rerun takes a second and few programs record."""
 
         def __init__(self, name: str) -> None:
             self._name = name
@@ -28,7 +28,7 @@ else:
     rr, rrb = _LazyModule("rerun"), _LazyModule("rerun.blueprint")
 
 EPISODE_TIMELINE, SECONDS_TIMELINE, METRIC_TIMELINE = "step", "time", "global_step"
-STEP_TIME = 0.0125  # seconds per step where the suite is unknown: Meta-World's 80 Hz
+STEP_TIME = 0.0125  # seconds per time step if the suite is unknown: Meta-World's 80 Hz
 JPEG_QUALITY = 90
 
 Color = tuple[int, ...]
@@ -39,28 +39,28 @@ SERIES_COLORS: tuple[Color, ...] = tuple(tuple(bytes.fromhex(color)) for color i
 
 
 def step_color(step: int) -> Color:
-    """Return the colour of a plan's step, counted from 0; the same in all views."""
+    """Return the color of a plan step (0-based index), which is the same in all views."""
     return SERIES_COLORS[step % len(SERIES_COLORS)]
 
 
 def entity_path(*parts: str) -> str:
-    """Return an absolute entity path; its parts may hold any character."""
+    """Join parts, which may contain any character, to an absolute entity path."""
     return "".join("/" + rr.escape_entity_path_part(part) for part in parts)
 
 
 def changes(values: NDArray[Any]) -> NDArray[np.int64]:
-    """Return the first row of T×K values and all rows that differ from the row before."""
+    """Return the index of the first row of T×K values, and of all rows that differ from the previous row."""
     return np.flatnonzero(np.concatenate([[True], (values[1:] != values[:-1]).any(axis=1)]))
 
 
 def time_columns(steps: NDArray[np.int64], step_time: float) -> list[Any]:
-    """Return an episode's two timelines: steps, and seconds, ``step_time`` for each step."""
+    """Return the columns of an episode's two timelines: time steps, and seconds (``step_time`` per time step)."""
     nanoseconds = (steps * round(step_time * 1e9)).astype("timedelta64[ns]")
     return [rr.TimeColumn(EPISODE_TIMELINE, sequence=steps), rr.TimeColumn(SECONDS_TIMELINE, duration=nanoseconds)]
 
 
 def check_image(name: str, image: Any) -> NDArray[np.uint8]:
-    """Return an image as H×W×C uint8: from H×W, H×W×C or C×H×W with C = 1 or 3, of uint8 or of floats in [0, 1]."""
+    """Convert an image of shape H×W, H×W×C or C×H×W (C = 1 or 3), uint8 or float in [0, 1], to H×W×C uint8."""
     pixels = torch.as_tensor(image).detach().cpu()
     shape = tuple(pixels.shape)
     if pixels.ndim == 2:
@@ -70,13 +70,13 @@ def check_image(name: str, image: Any) -> NDArray[np.uint8]:
     if pixels.is_floating_point() and bool(((pixels >= 0) & (pixels <= 1)).all()):
         pixels = (pixels * 255).round().to(torch.uint8)
     if pixels.ndim != 3 or pixels.shape[-1] not in (1, 3) or not pixels.numel() or pixels.dtype != torch.uint8:
-        allowed = "uint8, or floats in [0, 1], of shape H×W, H×W×C or C×H×W with C = 1 or 3"
-        raise ValueError(f"image {name!r} must be {allowed}, got {pixels.dtype} of shape {shape}")
+        allowed = "uint8 or float in [0, 1], with shape H×W, H×W×C or C×H×W (C = 1 or 3)"
+        raise ValueError(f"image {name!r} must be {allowed}, got {pixels.dtype} with shape {shape}")
     return pixels.contiguous().numpy()
 
 
 def send_images(stream: Any, path: str, times: Any, images: Iterable[NDArray[np.uint8]]) -> None:
-    """Add images H×W×C, each a JPEG at its time."""
+    """Log images H×W×C at the given times, encoded as JPEG."""
     from PIL import Image
 
     jpegs = []

@@ -1,4 +1,4 @@
-"""Draw MuJoCo models: one mesh for each body and recording, which each episode moves in its own views."""
+"""Draw MuJoCo models: each body's mesh is logged once per recording, and every episode moves it in its own views."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from lw_torchrl.record.entities import entity_path, rr, time_columns
 from lw_torchrl.suites.engine import RowModel
 
 SHOWN_GROUPS = (0, 1, 2)  # Meta-World keeps geoms that only collide in group 4
-DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom without a colour: its material's is used instead
+DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default color, which is replaced by the material's color
 
-FINEST, COARSEST = 0.0015, 0.010  # edges of the smallest and largest cube in which corners are merged, metres
-CUBES_ALONG = 18.0  # the number of cubes along the longest side of a mesh
-AROUND, ALONG = 24, 7  # the number of corners of a round shape around its axis, and of a quarter circle along it
+FINEST, COARSEST = 0.0015, 0.010  # smallest and largest edge of the cubes in which vertices are merged, metres
+CUBES_ALONG = 18.0  # number of cubes along the longest side of a mesh
+AROUND, ALONG = 24, 7  # number of vertices of a round shape around the axis, and of a quarter circle along the axis
 GHOST_COLOR = (150, 190, 255, 90)
 
 Vertices = dict[str, NDArray[Any]]
@@ -28,31 +28,31 @@ _prepared: dict[str, ModelGeometry] = {}
 
 @dataclass(frozen=True)
 class Motion:
-    """The poses of a model's B bodies in T states, and what the fingers touched."""
+    """The poses of a model's B bodies in T states, and the bodies that the fingers touched."""
 
     model: RowModel
     position: NDArray[np.float32]  # T×B×3, metres
-    quaternion: NDArray[np.float32]  # T×B×4, w first
-    touched: tuple[str, ...] | None = None  # T names of bodies, or "nothing"; None if the engine cannot tell
+    quaternion: NDArray[np.float32]  # T×B×4, in w, x, y, z order
+    touched: tuple[str, ...] | None = None  # T body names, or "nothing"; None if the engine does not report contacts
 
 
 @dataclass(frozen=True)
 class ModelGeometry:
-    """The geometry of a model. Bodies that are fixed to a moving body are drawn with it."""
+    """The geometry of a model. A body that is fixed to a moving body is part of the moving body's mesh."""
 
-    bodies: dict[int, str]  # their names by number
-    meshes: tuple[tuple[int, str, Vertices], ...]  # body, name and mesh; equal meshes have equal names in all models
+    bodies: dict[int, str]  # body index -> name
+    meshes: tuple[tuple[int, str, Vertices], ...]  # body index, mesh name and mesh; equal meshes have equal names
 
 
 def model_geometry(model: RowModel) -> ModelGeometry:
-    """Return the geometry of a model; it is prepared once for each XML file, which takes about half a second."""
+    """Return the geometry of a model. The first call for an XML file takes about half a second; later calls are cached."""
     if model.path not in _prepared:
         _prepared[model.path] = _prepare(model.model)
     return _prepared[model.path]
 
 
 LoggedMeshes = dict[str, bytes]
-"""The meshes that a recording already has with their static poses, b"" for a pose that each episode sets."""
+"""A mapping from the meshes already in a recording to their static poses (b"" if each episode sets the pose)."""
 
 
 def log_motion(
@@ -65,10 +65,11 @@ def log_motion(
     *,
     ghost: bool = False,
 ) -> dict[str, str]:
-    """Log the poses of the bodies below ``root``, row t at step t, and their meshes below /meshes, once a recording.
+    """Log the bodies' poses below ``root`` (row t at time step t), and their meshes below /meshes (once per recording).
 
-    ``drawn`` are the rows to draw, the first one among them; None for all. A ``ghost`` has translucent meshes of moving
-    bodies, below /ghosts. Return each mesh's entity and the frame in which a view shows it; "" if it does not move.
+    ``drawn`` holds the rows to draw, including the first; None draws all rows. A ``ghost`` has translucent meshes below
+    /ghosts, for moving bodies only. Return a dict from each mesh's entity to the coordinate frame in which a view shows
+    the mesh ("" if the mesh does not move).
     """
     geometry = model_geometry(motion.model)
     last = len(motion.position) - 1
@@ -92,13 +93,13 @@ def log_motion(
             if pose:
                 static_pose = rr.Transform3D(translation=position[0], quaternion=rr.Quaternion(xyzw=quaternion[0]))
                 stream.log(path, static_pose, static=True)
-        # A mesh with the same pose as in the first episode needs no frame, which costs a page two kilobytes.
+        # A mesh with the same pose as in the first episode needs no frame; each frame adds two kilobytes to a page.
         if pose and logged[path] == pose:
             frames[path] = ""
             continue
         frames[path] = f"{stream.get_recording_id()[-8:]}{root}/{geometry.bodies[body]}"
         frame_poses.setdefault(frames[path], (drawn[moved], poses[moved, body]))
-    if frame_poses:  # all in one entity: an entity for each body would double the size
+    if frame_poses:  # log all frames to one entity: an entity for each body would double the size
         rows, values = (np.concatenate(parts) for parts in zip(*frame_poses.values(), strict=True))
         order = np.argsort(rows, kind="stable")
         names = np.repeat([*frame_poses], [len(own) for own, _ in frame_poses.values()])[order].tolist()
@@ -137,7 +138,7 @@ def _prepare(model: Any) -> ModelGeometry:
 
 
 def _joined(shapes: Iterable[tuple[Vertices, NDArray[np.uint8]]]) -> Vertices:
-    """Join shapes, each of one colour."""
+    """Join single-color shapes into one mesh with vertex colors."""
     parts: dict[str, list[NDArray[Any]]] = {}
     start = 0
     for vertices, color in shapes:
@@ -150,7 +151,7 @@ def _joined(shapes: Iterable[tuple[Vertices, NDArray[np.uint8]]]) -> Vertices:
 
 
 def _placed(shape: Vertices, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> Vertices:
-    """Return a shape moved to a pose, w first."""
+    """Move a shape to a pose; the quaternion is in w, x, y, z order."""
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quaternion)
     turn = matrix.reshape(3, 3).T
@@ -161,7 +162,7 @@ def _placed(shape: Vertices, position: NDArray[np.float64], quaternion: NDArray[
 
 
 def _shape(model: Any, geom: int) -> Vertices | None:
-    """Return a geom's surface in its own frame, None for a plane."""
+    """Return a geom's surface in the geom's own frame, or None for a plane."""
     kind, size = mujoco.mjtGeom(int(model.geom_type[geom])).name, model.geom_size[geom]
     angle = np.linspace(0, np.pi / 2, ALONG)
     quarter, up, out = np.stack([np.cos(angle), np.sin(angle)], axis=1), np.array([0, 1]), np.array([1, 0])
@@ -187,7 +188,7 @@ def _shape(model: Any, geom: int) -> Vertices | None:
         side = np.stack([bottom[1], top[0]])
         ones = np.ones((2, 1))
         return _turned([(bottom, ones * -up), (side, ones * out), (top, ones * up)])
-    raise NotImplementedError(f"geom {geom} is of type {kind}, which cannot be drawn")
+    raise NotImplementedError(f"geom {geom} has the type {kind}, which cannot be drawn")
 
 
 def _box(half: NDArray[np.float64]) -> Vertices:
@@ -202,7 +203,8 @@ def _box(half: NDArray[np.float64]) -> Vertices:
 
 
 def _turned(profile: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> Vertices:
-    """Turn lines of corners (K×2: from the axis, along it) and their normals around z, from bottom to top."""
+    """Create a surface of revolution around z from polylines, each with K vertices (K×2: radius and height, from bottom
+    to top) and their normals (K×2)."""
     angle = np.arange(AROUND) * 2 * np.pi / AROUND
     circle = np.stack([np.cos(angle), np.sin(angle), np.ones(AROUND)], axis=1)
     corners, normals = (
@@ -221,7 +223,7 @@ def _turned(profile: Sequence[tuple[NDArray[np.float64], NDArray[np.float64]]]) 
 
 
 def _corners(model: Any, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the corners of a mesh's triangles and their normals, each F×3×3; MuJoCo numbers them separately."""
+    """Return the vertices of a mesh's triangles (F×3×3) and their normals (F×3×3), which MuJoCo indexes separately."""
 
     def part(values: Any, start: Any, count: Any) -> NDArray[np.float64]:
         return np.asarray(values[start[mesh] : start[mesh] + count[mesh]])
@@ -234,7 +236,7 @@ def _corners(model: Any, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 
 def _color(model: Any, geom: int) -> NDArray[np.uint8]:
-    """Return a geom's colour, or its material's, times the mean of its texture, (4,) uint8."""
+    """Return the color (4,) uint8 of a geom: its own or the material's color, times the mean color of the texture."""
     material = model.geom_matid[geom]
     rgba = np.array(model.geom_rgba[geom], np.float64)
     if material >= 0:
@@ -249,9 +251,9 @@ def _color(model: Any, geom: int) -> NDArray[np.uint8]:
 
 
 def _clustered(corners: NDArray[np.float64], normals: NDArray[np.float64]) -> dict[str, Any]:
-    """Simplify a mesh of triangles' corners (F×3×3, metres) and their unit normals (F×3×3).
+    """Simplify a mesh given by the triangles' vertices (F×3×3, metres) and unit normals (F×3×3).
 
-    The corners in a cube move to their mean, so no gap opens; corners with different normals stay separate.
+    All vertices in a cube of a grid move to their mean, so no gaps open; vertices with different normals stay separate.
     """
     points, directions = corners.reshape(-1, 3), normals.reshape(-1, 3)
     low = points.min(axis=0)
@@ -274,11 +276,11 @@ def _clustered(corners: NDArray[np.float64], normals: NDArray[np.float64]) -> di
 
 
 def _packed(indices: NDArray[np.int64], base: int = 1 << 20) -> NDArray[np.int64]:
-    """Return N×3 indices below ``base`` as one number each."""
+    """Pack N×3 integer indices, each less than ``base``, into one integer per row."""
     return (indices[:, 0] * base + indices[:, 1]) * base + indices[:, 2]
 
 
 def _means(values: NDArray[np.float64], group: NDArray[np.int64], groups: int) -> NDArray[np.float64]:
-    """Return the mean of N×3 values in each group."""
+    """Return the mean (groups×3) of N×3 values in each group."""
     count = np.bincount(group, minlength=groups)
     return np.stack([np.bincount(group, column, minlength=groups) / count for column in values.T], axis=1)

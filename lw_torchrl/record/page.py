@@ -1,4 +1,4 @@
-"""The page of an episode: the data that is logged, and its views, in a tab or in a column next to others."""
+"""The page of a recorded episode: the logged data and the views, shown in a tab of their own or side by side."""
 
 from __future__ import annotations
 
@@ -36,39 +36,41 @@ _WRONG = "false, answered true", "true, answered false"
 FAILED: Color = (215, 75, 75)
 WRONG: Color = (200, 60, 140)
 TOUCHES_CLOSED, TOUCHES_OPEN = (225, 130, 60), (150, 165, 220)
-MANY_LANES = 9  # with more lanes, a small window has little room for the verdict
+MANY_LANES = 9  # with more timeline lanes, a small window has little room for the verdict
 CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
     "distance": ("Distance to the target, cm", None),
     "action": ("Action", (-1.2, 1.2)),
     "reward": ("Reward", None),
     "skill_weights": ("Skill weights", (-0.1, 1.1)),
-    "corrected": ("How much of the correction counts", (-0.1, 1.1)),
+    "corrected": ("Weight of the correction", (-0.1, 1.1)),
 }
-"""Each curve's title, and the range of its numbers where it is fixed."""
+"""A mapping from curves to their titles and value ranges (None: no fixed range)."""
 
 
 @dataclass
 class Lanes:
-    """Lanes below ``root``: a lane has an entry where its state changes, and an empty entry at the end.
+    """The lanes (rows) of an episode's timeline view, logged below ``root``. A lane has an entry for each change of its
+    state, and an empty entry at the end.
 
-    The viewer shows a lane's path as its title, with a backslash before anything but letters, digits and underscores,
-    and sorts the lanes; so paths are short, and names begin with numbers.
+    The viewer sorts the lanes and uses their paths as titles, with a backslash before every character except letters,
+    digits and underscores. Therefore paths are short, and names begin with numbers.
     """
 
     root: str
     step_time: float
-    states: dict[str, tuple[str, Color]] = field(default_factory=dict)  # text and colour, shared by a view's lanes
+    states: dict[str, tuple[str, Color]] = field(default_factory=dict)  # state -> (text, color), shared by all lanes
     paths: list[str] = field(default_factory=list)
-    conditions: list[str] = field(default_factory=list)  # paths of the lanes of conditions
+    conditions: list[str] = field(default_factory=list)  # paths of the condition lanes
 
     def send(self, stream: Any, name: str, first: int, states: NDArray[np.str_], looks: Mapping[str, Any]) -> str:
-        """Add a lane that begins at step ``first`` and return its path; ``looks`` are colours, or texts and colours."""
+        """Log a lane that begins at time step ``first`` and return the lane's path; ``looks`` maps each state to a
+        color, or to a text and a color."""
         for state, look in looks.items():
             self.states[state] = look if isinstance(look[0], str) else (state, look)
         rows = changes(states[:, None])
         entries = [*states[rows].tolist(), ""]
         times = time_columns(np.array([*rows, len(states)]) + first, self.step_time)
-        # The viewer takes this apostrophe for a letter.
+        # The viewer treats this apostrophe as a letter.
         path = self.root + entity_path(name.replace("'", "\u02bc").replace(" ", "_"))
         stream.send_columns(path, times, rr.StateChange.columns(state=entries))
         self.paths.append(path)
@@ -83,7 +85,8 @@ def log_lanes(
     touched: Sequence[str] | None,
     ghost: Ghost | None,
 ) -> Lanes:
-    """Log the lanes of an episode below ``root``; ``ended`` is its verdict, ``touched`` what its fingers touched."""
+    """Log the timeline lanes of an episode below ``root``; ``ended`` is the verdict, and ``touched`` holds the object
+    that the fingers touch in each row."""
     lanes = Lanes(root, episode.step_time)
     widths = [a.shape[1] for a in (episode.qaf, episode.believed, episode.skill_weights) if a is not None]
     columns = max([len(episode.steps), *widths])
@@ -123,7 +126,7 @@ def log_lanes(
 
 
 def _log_active_step(stream: Any, lanes: Lanes, name: str, episode: RecordedEpisode, kind: str = "") -> None:
-    """Log the active step, numbered from 1; the steps of another ``kind`` of plan have separate names."""
+    """Log the active plan step (1-based) as a lane; ``kind`` distinguishes the steps of another plan."""
     assert episode.active is not None
     count = max(len(episode.steps), int(episode.active.max()) + 1)
     labels = [f"{i} {skill}" for i, (_, skill) in enumerate(episode.steps, 1)] or map(str, range(1, count + 1))
@@ -136,41 +139,41 @@ def _log_active_step(stream: Any, lanes: Lanes, name: str, episode: RecordedEpis
 
 @dataclass(frozen=True)
 class Page:
-    """The part of an episode's data on which its views depend; it can be written as JSON."""
+    """The data of an episode from which the page's views are built; a page can be written as JSON."""
 
     root: str
-    trails: Collection[str]  # entities that are shown up to the cursor
-    eye: tuple[Point, Point]  # the position from which the scene is seen, and the position looked at
+    trails: Collection[str]  # entities that are shown up to the time cursor
+    eye: tuple[Point, Point]  # the camera position, and the position that the camera looks at
     has_scene: bool  # whether anything is drawn in 3-D
-    shown: tuple[int, int]  # the first and last step to show
-    decisive: int  # the step to open it at
+    shown: tuple[int, int]  # the first and last time step to show
+    decisive: int  # the time step at which the page opens
     curves: Collection[str]
-    lines: int  # of the plan's text, in a small window; 0 without a plan
-    lanes: Sequence[str]  # their entities
-    conditions: Sequence[str]  # entities of the lanes of conditions
-    states: dict[str, tuple[str, Color]]  # of the lanes: text and colour
+    lines: int  # number of lines of the plan text in a small window; 0 without a plan
+    lanes: Sequence[str]  # entities of the timeline lanes
+    conditions: Sequence[str]  # entities of the condition lanes
+    states: dict[str, tuple[str, Color]]  # state -> (text, color), for all lanes
     farthest: float  # the largest distance to a skill's target, cm
-    row: dict[str, Any]  # in the overview
-    frames: dict[str, str]  # as log_motion returns them
-    pictures: float  # width over height of the policy's pictures, 0 without any
+    row: dict[str, Any]  # the episode's row in the overview table
+    frames: dict[str, str]  # the result of log_motion
+    pictures: float  # aspect ratio (width / height) of the policy's images; 0 without images
     step_time: float  # seconds between two actions
     bounded: bool  # whether all actions are in [-1, 1]
 
     def title(self, policy: bool = True) -> str:
-        """Return the tab's title: the episode's name, the policy unless it is left out, and how it ended."""
+        """Return the tab's title: the episode's name, the policy (if ``policy``), and the outcome."""
         ended = {"failed": "failed", "success": f"success at {self.row['at']}"}.get(self.row["ended"])
         if self.row["cause"]:
             ended = f"failed: {self.row['cause']}"
         return " · ".join(filter(None, [self.row["name"], self.row["policy"] if policy else None, ended]))
 
     def tab(self, title: str) -> rrb.Horizontal:
-        """Return a tab with scene and curves on the left, texts and lanes on the right."""
-        # Shares are the pixels that a view needs in a window of 1100×700; longer texts scroll.
+        """Return a tab with the scene, plan and curves on the left, and the verdict and timeline on the right."""
+        # Shares are the heights in pixels that the views need in a window of 1100×700; longer texts scroll.
         plan = 60 + 15 * self.lines if self.lines else 0
         scene: Any = self._scene()
         if not self.has_scene and self.pictures:
             scene = self._pictures()
-        elif self.pictures:  # 0.3 of the width for one picture, 0.4 for two side by side
+        elif self.pictures:  # 0.3 of the width for one image, 0.4 for two images side by side
             share = min(0.2 + 0.1 * self.pictures, 0.5)
             scene = rrb.Horizontal(scene, self._pictures(), column_shares=[1 - share, share])
         left: list[tuple[float, Any]] = [(max(150, 500 - plan), scene)] if self.has_scene or self.pictures else []
@@ -181,9 +184,10 @@ class Page:
         return rrb.Horizontal(_stacked(left), _stacked(right), column_shares=[9, 10], name=title)
 
     def column(self, title: str, shown: tuple[int, int], farthest: float) -> rrb.Vertical:
-        """Return a column of verdict, scene, distance and main lanes; those of conditions are behind the scene."""
+        """Return a column with the verdict, scene, distance and main lanes; the condition lanes are in a tab behind the
+        scene."""
         page = replace(self, shown=shown, farthest=farthest)
-        behind: list[Any] = [view for _, view in page._lanes(self.conditions, "What held")]
+        behind: list[Any] = [view for _, view in page._lanes(self.conditions, "Conditions")]
         below: list[tuple[float, Any]] = [(100, page._curve("distance"))] if "distance" in page.curves else []
         below += page._lanes([lane for lane in self.lanes if lane not in self.conditions])
         behind += [page._pictures()] if page.pictures else []
@@ -207,12 +211,12 @@ class Page:
         )
 
     def _pictures(self) -> rrb.Spatial2DView:
-        return rrb.Spatial2DView(origin=f"{self.root}/seen", name="What it saw")
+        return rrb.Spatial2DView(origin=f"{self.root}/seen", name="Policy input")
 
     def _text(self, part: str, name: str) -> rrb.TextDocumentView:
         return rrb.TextDocumentView(origin=f"{self.root}/{part}", name=name)
 
-    def _lanes(self, lanes: Sequence[str], name: str = "What went on") -> list[tuple[float, Any]]:
+    def _lanes(self, lanes: Sequence[str], name: str = "Timeline") -> list[tuple[float, Any]]:
         if not lanes:
             return []
         labels, colors = zip(*self.states.values(), strict=True)
@@ -224,7 +228,7 @@ class Page:
     def _curve(self, name: str) -> rrb.TimeSeriesView:
         title, limits = CURVES[name]
         limits = None if name == "action" and not self.bounded else limits
-        if name == "distance":  # a small view has no room for the axis' numbers
+        if name == "distance":  # a small view has no room for axis labels, so the range is in the title
             limits, title = (-0.05 * self.farthest, 1.05 * self.farthest), f"{title} (up to {self.farthest:.0f})"
         return rrb.TimeSeriesView(
             origin=f"{self.root}/{name}",
@@ -253,7 +257,7 @@ def send_page(
     ghost: Ghost | None,
     meshes: LoggedMeshes,
 ) -> Page:
-    """Log the recording's ``number``-th episode, under ``name``, and return its page."""
+    """Log the ``number``-th episode of a recording under ``name``, and return the episode's page."""
     root = entity_path(name)
     touched = None if motion is None else touched_objects(motion, episode)
     lanes = log_lanes(stream, entity_path(f"e{number}"), episode, heading.ended(episode), touched, ghost)

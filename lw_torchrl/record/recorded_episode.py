@@ -1,4 +1,4 @@
-"""RecordedEpisode: one episode as checked arrays, and the targets of its plan's skills."""
+"""The RecordedEpisode class: one episode as validated arrays, and the targets of the skills in the plan."""
 
 from __future__ import annotations
 
@@ -23,85 +23,86 @@ from lw_torchrl.record.entities import STEP_TIME, check_image, time_columns
 from lw_torchrl.record.meshes import Motion
 from lw_torchrl.suites.suite import Suite
 
-APART = 0.01  # two episodes part when the hand or an object is this far apart, metres
-NO_STEP = -1  # instead of a plan step's number: no single step is active
+APART = 0.01  # two episodes diverge when the hand or an object is this far apart, metres
+NO_STEP = -1  # used instead of a plan step's index if no single step is active
 
 
 @runtime_checkable
 class PlanLike(Protocol):
-    """Anything with ``steps`` that have a ``condition``, shown as ``str`` gives it, and a ``skill``, a string."""
+    """An object with ``steps``, each with a ``condition`` (shown with ``str``) and a ``skill`` (a string)."""
 
     @property
     def steps(self) -> Sequence[Any]: ...
 
 
 class TargetPose(NamedTuple):
-    """Positions of a skill's moved object and target, T×3, metres; equal on an axis that the skill does not control."""
+    """Positions (T×3, metres) of a skill's target and moved object, equal on axes that the skill does not control."""
 
     position: NDArray[np.float32]
     moved: NDArray[np.float32]
-    relative: bool  # the target moves with the hand, which never reaches it
+    relative: bool  # whether the target moves with the hand, so that the hand never reaches the target
 
     @property
     def distance(self) -> NDArray[np.float32]:
-        """The distance between both, T, metres; NaN for a relative target."""
+        """The distance (T,) in metres between moved object and target; NaN for a relative target."""
         distance = np.linalg.norm(self.position - self.moved, axis=1)
         return np.full_like(distance, np.nan) if self.relative else distance
 
 
 @dataclass(frozen=True)
 class RecordedEpisode:
-    """One episode of T rows as checked arrays on the CPU; S is the number of steps of its plan."""
+    """One episode of T rows as validated arrays on the CPU; S is the number of plan steps."""
 
-    action: NDArray[np.float32]  # T×A, of Meta-World displacement xyz and gripper effort, in [-1,1]; A may be 0
-    objects: dict[str, NDArray[np.float32]]  # name -> T×3 position in metres, with a layout also the gripper's
-    layout: Layout | None = METAWORLD  # None for a robot of unknown layout: only objects are drawn
-    observation: NDArray[np.float32] | None = None  # T×D, as the layout describes it; metres, gripper opening in [0,1]
-    qaf: NDArray[np.bool_] | None = None  # T×S, truth of each condition
-    believed: NDArray[np.bool_] | None = None  # T×S, the answers of a learned evaluator
-    skill_weights: NDArray[np.float32] | None = None  # T×S, attention over the steps
-    success: NDArray[np.bool_] | None = None  # T, in the state after the row's action
-    reward: NDArray[np.float32] | None = None  # T, likewise
-    corrected: NDArray[np.float32] | None = None  # T, the weight of a correction
-    steps: tuple[tuple[str, str], ...] = ()  # the S (condition, skill) texts; empty without a plan
-    short_conditions: tuple[str, ...] = ()  # S
-    reasons: tuple[str, ...] = ()  # S: a step's comment in the plan, or the skill as it was written
-    confidence: float | None = None  # of a canonical plan
-    target_poses: tuple[TargetPose | None, ...] = ()  # S; None for a skill that is not a scripted one
-    pixels: NDArray[np.uint8] | None = None  # T×H×W×C, the input of the policy or its evaluator
+    action: NDArray[np.float32]  # T×A in [-1, 1], in Meta-World displacement xyz and gripper effort; A may be 0
+    objects: dict[str, NDArray[np.float32]]  # name -> T×3 positions in metres; includes the gripper if layout is given
+    layout: Layout | None = METAWORLD  # None if the robot's layout is unknown: only objects are drawn
+    observation: NDArray[np.float32] | None = None  # T×D, described by the layout; metres, gripper opening in [0, 1]
+    qaf: NDArray[np.bool_] | None = None  # T×S, whether each condition holds
+    believed: NDArray[np.bool_] | None = None  # T×S, whether each condition holds according to a learned evaluator
+    skill_weights: NDArray[np.float32] | None = None  # T×S, attention over the plan steps
+    success: NDArray[np.bool_] | None = None  # T, success in the state after the row's action
+    reward: NDArray[np.float32] | None = None  # T, reward of the row's action
+    corrected: NDArray[np.float32] | None = None  # T, the weight of a learned correction to the action
+    steps: tuple[tuple[str, str], ...] = ()  # S (condition, skill) texts; empty without a plan
+    short_conditions: tuple[str, ...] = ()  # S shortened condition texts
+    reasons: tuple[str, ...] = ()  # S texts: a plan step's comment, or the skill as originally written
+    confidence: float | None = None  # confidence score of a canonical plan
+    target_poses: tuple[TargetPose | None, ...] = ()  # S; None for a skill that is not scripted
+    pixels: NDArray[np.uint8] | None = None  # T×H×W×C, the input images of the policy or the evaluator
     step_time: float = STEP_TIME  # seconds between two actions
 
     def __len__(self) -> int:
         return len(self.action)
 
     def times(self, steps: NDArray[np.int64]) -> list[Any]:
-        """Return the columns of the episode's two timelines at ``steps``."""
+        """Return the columns of the episode's two timelines for the time steps ``steps``."""
         return time_columns(steps, self.step_time)
 
     def at(self, step: int) -> str:
-        """Return a time step as text, "t = 80 (1.00 s)", unlike a plan's step."""
+        """Return a time step as text: "t = 80 (1.00 s)"."""
         return f"t = {step} ({step * self.step_time:.2f} s)"
 
     @property
     def answers(self) -> NDArray[np.bool_] | None:
-        """The answers that the policy used: the learned evaluator's if there is one."""
+        """The truth values (T×S) that the policy used: the learned evaluator's if there is one, else the exact ones."""
         return self.qaf if self.believed is None else self.believed
 
     @property
     def goal(self) -> NDArray[np.float32] | None:
-        """The position of the task's target, T×3, if there is a layout."""
+        """The goal positions (T×3, metres), or None without a layout."""
         if self.observation is None or self.layout is None:
             return None
         return np.ascontiguousarray(self.observation[:, self.layout.positions[-1]])
 
     @property
     def opening(self) -> NDArray[np.float32] | None:
-        """The gripper's opening, T, from 0 to 1, if there is a layout."""
+        """The gripper opening (T,) from 0 to 1, or None without a layout."""
         return None if self.observation is None or self.layout is None else self.observation[:, self.layout.opening]
 
     @cached_property
     def active(self) -> NDArray[np.int64] | None:
-        """The active step, T: the one with the largest weight, or without weights the first true one; -1 for none."""
+        """The index (T,) of the active plan step: the step with the largest weight (without weights, the first step
+        whose condition holds), or -1 if there is none."""
         if self.skill_weights is not None:
             weights = self.skill_weights
             if weights.shape[1] == 1:
@@ -114,14 +115,14 @@ class RecordedEpisode:
 
     @property
     def first_success(self) -> int | None:
-        """The first step at which the task is done: one after the row whose action did it."""
+        """The first time step at which the task is solved: one after the row whose action solved the task."""
         if self.success is None or not self.success.any():
             return None
         return int(self.success.argmax()) + 1
 
     @cached_property
     def distance(self) -> NDArray[np.float32] | None:
-        """The distance to the active skill's target, T float32, metres; NaN where it has none."""
+        """The distance (T,) float32 in metres to the active skill's target; NaN in rows without a target."""
         if self.active is None:
             return None
         distance = np.full(len(self), np.nan, np.float32)
@@ -132,7 +133,7 @@ class RecordedEpisode:
         return None if np.isnan(distance).all() else distance
 
     def with_target_poses(self, task: Task, suite: Suite | None) -> RecordedEpisode:
-        """Return the episode with the target poses of its plan's skills in ``task``."""
+        """Return a copy of the episode with the target poses of the plan's scripted skills in ``task``."""
         skills = load_skills() if suite is None or suite.skills is None else suite.skills
         assert self.observation is not None
         positions = task.positions(torch.from_numpy(self.observation))
@@ -155,7 +156,7 @@ class RecordedEpisode:
         layout: Layout | None = METAWORLD,
         step_time: float = STEP_TIME,
     ) -> RecordedEpisode:
-        """Check a rollout, as :meth:`lw_torchrl.RerunLogger.log_episode` describes it."""
+        """Validate a rollout, which :meth:`lw_torchrl.RerunLogger.log_episode` describes, and return the episode."""
         if len(rollout.batch_size) != 1 or not rollout.batch_size[0]:
             hint = "; select one episode, rollout[i]" if len(rollout.batch_size) > 1 else ""
             raise ValueError(f"rollout must have batch size (T,) with T >= 1, got {tuple(rollout.batch_size)}{hint}")
@@ -169,7 +170,8 @@ class RecordedEpisode:
             return _array(value, f"rollout[{key!r}]", (length, size))
 
         def optional(key: Any, *, flat: bool = False, truth: bool = False) -> NDArray[Any] | None:
-            """Return T×S, a column for each plan step without padding, or T if ``flat``; numbers above 0.5 are true."""
+            """Return an array T×S with one column per plan step, without padding, or T if ``flat``. If ``truth``,
+            numbers above 0.5 become True."""
             if rollout.get(key, None) is None:
                 return None
             array, needed = column(key, None), 1 if flat else len(steps)
@@ -210,14 +212,15 @@ class RecordedEpisode:
 
 @dataclass(frozen=True)
 class Ghost:
-    """The same episode after a part was replaced ``by`` something; it is drawn translucent in the episode's scene."""
+    """A re-run of the episode with one part of the policy replaced by ``by``, drawn translucently in the same scene."""
 
     by: str
     episode: RecordedEpisode
     motion: Motion | None = None
 
     def parts_at(self, other: RecordedEpisode) -> int:
-        """Return the first row in which the hand or an object is elsewhere by over a centimetre, else the last."""
+        """Return the first row in which the hand or an object differs from ``other`` by more than 1 cm, or the last row
+        if there is none."""
         length = min(len(self.episode), len(other))
         if self.episode.observation is None or other.observation is None or other.layout is None:
             return length - 1
@@ -228,11 +231,11 @@ class Ghost:
 
 
 def short_condition(condition: Any) -> str:
-    """Shorten a condition: "gripper above and not left or right of puck"; a text that is not a query stays as it is."""
+    """Shorten a condition, for example to "gripper above and not left or right of puck"; only queries are shortened."""
     if not isinstance(condition, Query):
         return str(condition)
     parts, last_subject = [], ""
-    # Consecutive clauses about the same two objects make one part; a clause without an object is its own part.
+    # Consecutive clauses about the same two objects form one part; a clause without an object forms its own part.
     numbered = [(c.subject, c.object, i if c.object is None else -1) for i, c in enumerate(condition.clauses)]
     for (subject, target, _), pairs in groupby(zip(numbered, condition.clauses, strict=True), lambda pair: pair[0]):
         clauses = [clause for _, clause in pairs]
@@ -253,7 +256,7 @@ def short_condition(condition: Any) -> str:
 
 
 def _reason(step: Any) -> str:
-    """Return the comment of a plan's step, or how a canonical step was written."""
+    """Return the comment on a plan step, or, for a canonical plan, the original text of the step."""
     role = getattr(step, "role", None)
     if role is None:
         return str(getattr(step, "reason", ""))
@@ -262,7 +265,7 @@ def _reason(step: Any) -> str:
 
 
 def _array(value: Any, label: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
-    """Return ``value`` as an array of ``shape`` (None: any size); another shape or NaN is a ValueError."""
+    """Convert ``value`` to an array; raise a ValueError unless it has ``shape`` (None: any size) and is finite."""
     tensor = torch.as_tensor(value).detach().cpu()
     if tensor.ndim != len(shape) or any(s not in (None, n) for s, n in zip(shape, tensor.shape, strict=True)):
         allowed = "×".join("S" if size is None else str(size) for size in shape)

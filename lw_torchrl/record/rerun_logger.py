@@ -1,4 +1,4 @@
-"""RerunLogger: a TorchRL logger that writes a rerun recording (.rrd)."""
+"""The RerunLogger class: a TorchRL logger that writes a Rerun recording (.rrd)."""
 
 from __future__ import annotations
 
@@ -44,31 +44,31 @@ from lw_torchrl.record.tabs import OVERVIEW, TITLES, Tabs
 from lw_torchrl.record.verdict import Heading
 from lw_torchrl.suites.suite import known_suite
 
-MOST_CURVES = 64  # under one name
+MOST_CURVES = 64  # maximum number of curves with the same name
 BAR_COLOR = (80, 170, 255)
 BUFFERED_SCALARS = 1024
 SEND_SECONDS, SEND_SHARE = 0.5, 0.01
-"""Buffered numbers are sent after SEND_SECONDS or SEND_SHARE of the logger's age, whichever is longer."""
+"""The minimum time in seconds, and as a fraction of the logger's age, between two transmissions of buffered scalars."""
 FLUSH_SECONDS = 5.0
 
 
 class RerunLogger(Logger):
-    """A TorchRL logger that writes one rerun recording: metrics, images, videos, and whole episodes in 3-D.
+    """A TorchRL logger that writes one Rerun recording: metrics, images, videos, and whole episodes in 3-D.
 
-    Rerun writes the file in its own thread while the program runs, so a killed program leaves a recording that
-    :func:`open_viewer` can open. A full disk or a lost viewer never stops the program: rerun prints an error, and the
+    Rerun writes the file in a background thread while the program runs, so a killed program leaves a recording that
+    :func:`open_viewer` can open. A full disk or a lost viewer never stops the program: Rerun prints an error, and the
     rest of the recording is lost. A recording is never overwritten: if "run.rrd" exists, the logger writes "run-2.rrd".
 
     Args:
-        path: the file, ending in ".rrd"; missing folders are created. None writes no file.
+        path: the file to write, ending in ".rrd"; missing folders are created. None writes no file.
         connect: the address of a running viewer that shows the recording as it grows, "127.0.0.1:9876" or
-            "rerun+http://127.0.0.1:9876/proxy"; start it with ``rerun``. If no viewer answers, rerun waits five seconds
-            at the start and at the end.
+            "rerun+http://127.0.0.1:9876/proxy"; start the viewer with ``rerun``. If no viewer responds, Rerun waits
+            five seconds at the start and at the end.
         exp_name: the name of the run; None for the file's name without ".rrd".
 
     Attributes:
-        path: the file that is written, or None.
-        experiment: rerun's RecordingStream, for other rerun calls. It is not rerun's global recording.
+        path: the path of the written file, or None.
+        experiment: the rerun RecordingStream, for direct use of the rerun API. It is not Rerun's global recording.
 
     Example:
         >>> import tempfile, os
@@ -86,7 +86,7 @@ class RerunLogger(Logger):
     @typed
     def __init__(self, path: AnyPath | None = None, *, connect: str | None = None, exp_name: str | None = None) -> None:
         if path is None and connect is None:
-            raise ValueError("path (a file to write) or connect (a running viewer) is required, or both; got neither")
+            raise ValueError("path (a file to write), connect (a running viewer) or both are required, got neither")
         if path is not None and Path(path).suffix != ".rrd":
             raise ValueError(f"path must end in '.rrd', got {str(path)!r}")
         self.path = None if path is None else _new_file(Path(path))
@@ -103,14 +103,14 @@ class RerunLogger(Logger):
         super().__init__(exp_name=name, log_dir=str(self.path.parent) if self.path else os.curdir)
 
     def _create_experiment(self) -> rr.RecordingStream:
-        # Rerun's viewer gives all recordings of one application the same layout, so each is its own application.
+        # The Rerun viewer gives all recordings of one application the same layout, so each is its own application.
         stream = rr.RecordingStream(f"{self.exp_name}-{uuid.uuid4().hex[:8]}", recording_id=uuid.uuid4())
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
         sinks = [] if self.connect is None else [rr.GrpcSink(self.connect)]
         stream.set_sinks(*sinks, *([] if self.path is None else [rr.FileSink(self.path)]))
         stream.send_recording_name(self.exp_name)
-        # In another process (service_backend="process") torchrl ends the experiment, not the logger.
+        # In another process (service_backend="process"), TorchRL closes the experiment instead of the logger.
         stream.finish = self.shutdown
         atexit.register(self.shutdown)
         return stream
@@ -128,16 +128,17 @@ class RerunLogger(Logger):
 
     def _open(self) -> rr.RecordingStream:
         if self._service_shutdown:
-            raise RuntimeError(f"{self!r} was shut down; make a new RerunLogger")
+            raise RuntimeError(f"{self!r} was shut down; create a new RerunLogger")
         return self.experiment
 
     def log_scalar(self, name: str, value: Any, step: int | None = None) -> None:
-        """Add a number, or several, to the curves "metrics/<name>", on the timeline "global_step".
+        """Add one or more numbers to the curves "metrics/<name>" on the timeline "global_step".
 
         Args:
-            name: "loss/bc"; the part before the first slash is a group with its own view.
-            value: a number, or up to 64 of them (a tensor, an array, a list), each a curve; NaN leaves a gap.
-            step: the training step; None counts the calls with this name from 0.
+            name: the metric's name, such as "loss/bc"; the part before the first slash is a group with its own view.
+            value: a number, or up to 64 numbers (a tensor, an array, a list), each with its own curve; NaN leaves a
+                gap.
+            step: the training step; None counts the calls with this name, starting at 0.
         """
         stream = self._open()
         row, parts = _numbers(name, value), _name_parts(name)
@@ -154,9 +155,10 @@ class RerunLogger(Logger):
             self._send(now=len(values) >= BUFFERED_SCALARS)
 
     def log_image(self, name: str, image: Any, step: int | None = None) -> None:
-        """Add an image "images/<name>", a JPEG on the timeline "global_step"; ``step`` as in :meth:`log_scalar`.
+        """Add an image "images/<name>", encoded as JPEG, on the timeline "global_step".
 
-        It is H×W, H×W×C or C×H×W, C = 1 or 3, of uint8 or of floats in [0, 1].
+        The image has the shape H×W, H×W×C or C×H×W (C = 1 or 3) and is uint8 or float in [0, 1]. For ``step``, see
+        :meth:`log_scalar`.
         """
         stream, pixels = self._open(), check_image(name, image)
         with self._lock:
@@ -164,12 +166,12 @@ class RerunLogger(Logger):
             self._send()
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
-        """Add a video as JPEG images "videos/<name>", frame i at step i of the episodes' timelines.
+        """Add a video "videos/<name>" as JPEG images, with frame i at time step i of the episodes' timelines.
 
         Args:
-            video: T×C×H×W uint8, C = 1 or 3; or N×T×C×H×W, stored as "videos/<name>/0" and so on.
-            step: the training step; it becomes part of the path, "videos/<name>/step 1000".
-            **kwargs: ``fps``, frames per second (80, one for each of Meta-World's steps); others are ignored.
+            video: a video T×C×H×W uint8 (C = 1 or 3), or N videos N×T×C×H×W, stored as "videos/<name>/0" etc.
+            step: the training step, which becomes part of the path: "videos/<name>/step 1000".
+            **kwargs: ``fps``, frames per second (default: 80, as in Meta-World); other arguments are ignored.
         """
         video = torch.as_tensor(video).detach().cpu()
         if video.ndim == 5 and len(video) != 1:
@@ -179,7 +181,7 @@ class RerunLogger(Logger):
         video = video[0] if video.ndim == 5 else video
         if video.ndim != 4 or video.shape[1] not in (1, 3) or not video.numel() or video.dtype != torch.uint8:
             given = f"{video.dtype} of shape {tuple(video.shape)}"
-            raise ValueError(f"video {name!r} must be uint8 of shape T×C×H×W with C = 1 or 3, got {given}")
+            raise ValueError(f"video {name!r} must be uint8 of shape T×C×H×W (C = 1 or 3), got {given}")
         frames = video.permute(0, 2, 3, 1).contiguous().numpy()
         stream, parts = self._open(), _name_parts(name)
         if step is not None:
@@ -192,7 +194,7 @@ class RerunLogger(Logger):
 
     @typed
     def log_hparams(self, cfg: Mapping[Any, Any]) -> None:
-        """Add a mapping (a DictConfig too) to the table "hparams"; nested keys are written "actor.width"."""
+        """Add a mapping (such as a dict or DictConfig) to the table "hparams"; nested keys become "actor.width"."""
         stream = self._open()
         with self._lock:
             self._hparams.update(_flatten(cfg))
@@ -204,11 +206,12 @@ class RerunLogger(Logger):
             self._send()
 
     def log_histogram(self, name: str, data: Sequence[float] | Tensor | NDArray[Any], **kwargs: Any) -> None:
-        """Add the counts of finite numbers as a bar chart "histograms/<name>", on the timeline "global_step".
+        """Add a histogram "histograms/<name>", a bar chart on the timeline "global_step".
 
         Args:
-            data: the numbers, of any shape.
-            **kwargs: ``step`` as in :meth:`log_scalar`; ``bins``, the number or the edges of the bins (30).
+            name: the histogram's name.
+            data: finite numbers, in any shape.
+            **kwargs: ``step``, as in :meth:`log_scalar`; ``bins``, the number of bins or the bin edges (default: 30).
         """
         values = np.asarray(torch.as_tensor(data).detach().cpu().to(torch.float64)).ravel()
         if not values.size or not np.isfinite(values).all():
@@ -221,20 +224,20 @@ class RerunLogger(Logger):
             self._send()
 
     def _place(self, kind: str, name: str, step: int | None) -> tuple[str, list[Any]]:
-        """Add a view for a value logged at a training step; return its entity path and its time."""
+        """Add a view for a value logged at a training step; return the value's entity path and time columns."""
         path = entity_path(kind, *_name_parts(name))
         self._tabs.add_view(kind, name)
         return path, [rr.TimeColumn(METRIC_TIMELINE, sequence=[self._count(path, step)])]
 
     def flush(self, timeout: float | None = None) -> None:
-        """Send everything to the file and the viewer, and wait at most ``timeout`` seconds (5) until it arrived."""
+        """Send all data to the file and the viewer, and wait at most ``timeout`` seconds (default: 5) for delivery."""
         if not self._service_shutdown:
             self._send(now=True, layout=self.connect is not None)
-            with suppress(RuntimeError):  # a full disk or a lost viewer; rerun has printed an error
+            with suppress(RuntimeError):  # a full disk or a lost viewer; Rerun has already printed an error
                 self.experiment.flush(timeout_sec=FLUSH_SECONDS if timeout is None else timeout)
 
     def shutdown(self, timeout: float | None = None) -> None:
-        """Flush and close the file; a second call does nothing."""
+        """Flush and close the file; further calls do nothing."""
         if self._service_shutdown:
             return
         self._send(now=True, layout=True)
@@ -243,7 +246,7 @@ class RerunLogger(Logger):
         atexit.unregister(self.shutdown)
         self.experiment.disconnect()
         if self.path is not None and not is_complete(self.path):
-            warnings.warn(f"recording {str(self.path)!r} is incomplete: its end could not be written", stacklevel=2)
+            warnings.warn(f"recording {str(self.path)!r} is incomplete: the end could not be written", stacklevel=2)
 
     def _checkpoint_state(self) -> dict[str, Any]:
         return {"counters": dict(self._counters)}
@@ -257,9 +260,10 @@ class RerunLogger(Logger):
         return number
 
     def _send(self, *, now: bool = False, layout: bool = False) -> None:
-        """Save new tabs, and send buffered numbers if they are due or ``now``.
+        """Save new tabs, and send the buffered scalars if enough time has passed or if ``now``.
 
-        Rerun accepts a layout only whole, 0.1 MB a page, so a file gets it at its end and a live viewer now and then.
+        Rerun accepts only complete layouts (0.1 MB per page), so the layout is sent to a file only at the end, and to a
+        live viewer only occasionally.
         """
         with self._lock:
             stream, time_now = self.experiment, time.monotonic()
@@ -294,23 +298,24 @@ class RerunLogger(Logger):
     ) -> str:
         """Add one episode of any TorchRL environment: objects in 3-D, the verdict, the plan, the timeline and curves.
 
-        A hand and its gripper are drawn if the observation has a known layout: that of the plan's task, of the suite
-        that has the task, or Meta-World's 39 numbers. For a robot's own meshes, see :func:`lw_torchrl.log_rollout`. Row
-        t is drawn at step t; success and reward, which result from its action, at t + 1. Return the episode's name.
+        A hand with a gripper is drawn if the layout of the observation is known, from the plan's task, from the suite
+        that has the task, or because the observation has Meta-World's 39 values. To show the robot's own meshes, use
+        :func:`lw_torchrl.log_rollout`. Row t is drawn at time step t, but the row's success and reward at t + 1. Return
+        the episode's name.
 
         Args:
-            rollout: batch size (T,). All keys are optional without a layout: "action" T×A, ("next", "success") T×1,
-                ("next", "reward") T×1 float32, "pixels" T×H×W×C or T×C×H×W. With a layout "observation" T×D float32
-                (metres) and "action" are required. More keys are those of :func:`lw_torchrl.log_rollout`. Columns
-                beyond the plan's S steps are padding and left out.
+            rollout: one episode of batch size (T,). Without a layout, all keys are optional: "action" T×A, ("next",
+                "success") T×1, ("next", "reward") T×1 float32, "pixels" T×H×W×C or T×C×H×W. With a layout,
+                "observation" T×D float32 (metres) and "action" are required. The other keys of
+                :func:`lw_torchrl.log_rollout` are also accepted. Columns beyond the plan's S steps are ignored padding.
             task: the task's name.
             objects: name -> T×3 positions in metres; "robot's gripper" is added if the layout is known.
-            plan: its ``steps`` each have a ``condition`` and a ``skill``; None shows numbered columns.
-            name: the tab's title and the entity that contains everything; None for ``task``, then "task-2".
-            step_time: seconds per step; None for that of the suite that has the task, else 0.0125.
+            plan: an object whose ``steps`` each have a ``condition`` and a ``skill``; None shows numbered columns.
+            name: the tab's title and the root entity; None for ``task``, then "task-2" etc.
+            step_time: seconds per time step; None for the value of the suite that has the task, otherwise 0.0125.
 
         Raises:
-            ValueError: a column has another shape or is not finite, or the name is taken.
+            ValueError: a column has a wrong shape or is not finite, or the name is already used.
 
         Example:
             >>> import tempfile, torch
@@ -340,7 +345,7 @@ class RerunLogger(Logger):
         ghost: Ghost | None = None,
         name: str | None = None,
     ) -> str:
-        """Add the page of a checked episode and return its name; with a motion, the robot's own meshes are shown."""
+        """Add the page of a validated episode and return its name; with a motion, the robot's meshes are shown."""
         stream = self._open()
         with self._lock:
             reserved, first = (*TITLES, OVERVIEW, *self._tabs.pages), heading.name if name is None else name
@@ -354,7 +359,7 @@ class RerunLogger(Logger):
         return name
 
     def show_causes(self, result: EvaluationResult) -> None:
-        """Put :func:`lw_torchrl.evaluation.plot_failures` of a result into the overview of several episodes."""
+        """Add the figure of :func:`lw_torchrl.evaluation.plot_failures` for ``result`` to the overview tab."""
         picture, path = io.BytesIO(), entity_path(OVERVIEW, "causes")
         plot_failures(result).savefig(picture, format="png", dpi=100)
         with self._lock:
@@ -363,23 +368,24 @@ class RerunLogger(Logger):
 
     @typed
     def compare(self, names: Sequence[str], title: str = "Side by side") -> None:
-        """Show the episodes of these names side by side, in a tab before their own; one cursor moves in all of them."""
+        """Show the named episodes side by side in a tab before the episodes' own tabs, with a common time cursor."""
         self._open()
         if isinstance(names, str) or len(names) < 2:
-            raise ValueError(f"names must be of two episodes or more, got {names!r}")
+            raise ValueError(f"names must hold at least two episode names, got {names!r}")
         with self._lock:
             self._tabs.add("compare", [title, [check_choice("names", name, self._tabs.pages) for name in names]])
 
 
 def is_complete(path: Path) -> bool:
-    """Return whether a recording was closed: rerun then ends the file with an index."""
+    """Return whether a recording was closed, in which case the file ends with an index."""
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - 32))
         return b"RRF2FOOT" in file.read()
 
 
 def _new_file(path: Path) -> Path:
-    """Create ``path``, or if it exists the first free one of "run-2.rrd", "run-3.rrd", ..., and return it."""
+    """Create the file ``path``, or if it exists, the first unused one of "run-2.rrd", "run-3.rrd", ...; return the path
+    of the new file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     for free in chain([path], (path.with_stem(f"{path.stem}-{i}") for i in count(2))):
         with suppress(FileExistsError):
@@ -391,26 +397,26 @@ def _new_file(path: Path) -> Path:
 def _name_parts(name: str) -> list[str]:
     parts = name.split("/") if isinstance(name, str) else []
     if not parts or not all(part.strip() for part in parts):
-        raise ValueError(f"name must be words joined by single slashes like 'loss/bc', got {name!r}")
+        raise ValueError(f"name must be non-empty parts joined by slashes, such as 'loss/bc', got {name!r}")
     return parts
 
 
 def _numbers(name: str, value: Any) -> list[float]:
-    """Return a metric's value as a list of numbers."""
-    if type(value) is float or type(value) is int:  # the usual case, without a tensor
+    """Convert a metric's value to a list of numbers."""
+    if type(value) is float or type(value) is int:  # fast path for the usual case
         return [float(value)]
     try:
         value = value.detach().cpu() if isinstance(value, Tensor) else value
         values = torch.as_tensor(value, dtype=torch.float64).ravel().tolist()
     except (TypeError, ValueError, RuntimeError) as error:
-        raise ValueError(f"value of {name!r} must be a number or several, got {value!r}") from error
+        raise ValueError(f"value of {name!r} must be one or more numbers, got {value!r}") from error
     if not 1 <= len(values) <= MOST_CURVES:
-        raise ValueError(f"value of {name!r} must be 1 to {MOST_CURVES} numbers (see log_histogram), got {len(values)}")
+        raise ValueError(f"value of {name!r} must be 1 to {MOST_CURVES} numbers, got {len(values)}; use log_histogram")
     return values
 
 
 def _flatten(cfg: Mapping[Any, Any], prefix: str = "") -> dict[str, str]:
-    """Flatten nested mappings: "actor.width" to the text of its value."""
+    """Flatten nested mappings to a dict from keys such as "actor.width" to the values as text."""
     flat: dict[str, str] = {}
     for key, value in cfg.items():
         if isinstance(value, Mapping) and value:

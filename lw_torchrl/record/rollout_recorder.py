@@ -1,4 +1,4 @@
-"""RolloutRecorder: record episodes of chosen rows of an environment while they run."""
+"""RolloutRecorder: a transform that records episodes of selected environment rows while they run."""
 
 from __future__ import annotations
 
@@ -20,34 +20,34 @@ from lw_torchrl.record.rerun_logger import RerunLogger
 from lw_torchrl.record.rollouts import read_rollout
 from lw_torchrl.transforms.environment import base_env, refuse_changed
 
-# The keys of a LanguageWorldEnv that are recorded before a step, and after it.
+# The keys of a LanguageWorldEnv that are recorded before a time step, and after a time step.
 _BEFORE = {"task_id", "episode", "qaf_plan", "observation", "qaf", "qaf_logits", "skill_weights", "action_corrected"}
 _BEFORE |= {"pixels"}
 _AFTER = {"executed_action", "success", "reward"}
 
 
 class RolloutRecorder(Transform):
-    """Record episodes of chosen rows of an environment while they run.
+    """A transform that records episodes of selected environment rows while they run.
 
-    When an episode ends, its page is added to the recording, as by :func:`lw_torchrl.log_rollout`, or in an environment
-    other than :class:`~lw_torchrl.LanguageWorldEnv` as by :meth:`RerunLogger.log_episode`. An episode that is cut by a
-    reset, or by closing the environment, is recorded up to there. Put the recorder after
+    When an episode ends, its page is added to the recording as :func:`lw_torchrl.log_rollout` does (or, if the
+    environment is not a :class:`~lw_torchrl.LanguageWorldEnv`, as :meth:`RerunLogger.log_episode` does). An episode
+    that a reset or ``close()`` interrupts is recorded up to that point. Put the recorder after
     :class:`~lw_torchrl.QAFTransform` and before transforms of the observation, and close the environment before the
     logger. A LanguageWorldEnv in another process cannot be recorded.
 
     Args:
-        logger: the recording.
-        rows: indices of the environment's rows.
-        plans: the plans that ``qaf`` answers, one for the task of each row; None without plans.
+        logger: the logger of the recording.
+        rows: indices of the environment rows to record.
+        plans: the plans whose conditions ``qaf`` holds, with one plan for the task of each row; None without plans.
         every: record the first and then every N-th episode of a row.
-        policy: the policy's name, for the tab of a LanguageWorldEnv's episode.
-        objects: for other environments, a function from a rollout (T,) to the objects to draw: name -> T×3 positions
-            in metres.
+        policy: the policy's name, shown in the tab of a LanguageWorldEnv's episode.
+        objects: for other environments, a function that maps a rollout (T,) to the objects to draw: name -> T×3
+            positions in metres.
         task: for other environments, the task's name; None for the name of the environment's class.
 
     Raises:
-        ValueError: a row is not in the environment, the plans lack a row's task, or a transform before the recorder
-            changes the observation.
+        ValueError: a row is not in the environment, ``plans`` has no plan for a row's task, or a transform before the
+            recorder changes the observation.
         TypeError: the environment is a LanguageWorldEnv in another process.
 
     Example:
@@ -85,7 +85,7 @@ class RolloutRecorder(Transform):
         self._running: dict[int, _Row] = {}
 
     def clone(self) -> RolloutRecorder:
-        """Return a recorder into the same recording, without any episode."""
+        """Return a recorder for the same recording, with no episode in progress."""
         copied = super().clone()
         copied._running = {}
         return copied
@@ -102,7 +102,7 @@ class RolloutRecorder(Transform):
         count = max(1, env.batch_size.numel())
         for row in self.rows:
             if row >= count:
-                raise ValueError(f"rows must be below {count}, the environment's rows, got {row}")
+                raise ValueError(f"rows must be less than {count} (the number of environment rows), got {row}")
         if isinstance(env, LanguageWorldEnv) and self.plans is not None:
             self.plans.require(env.row_tasks[row] for row in self.rows)
         self._running = {row: _Row(env, row, self) for row in self.rows}
@@ -115,7 +115,7 @@ class RolloutRecorder(Transform):
         return tensordict_reset
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        # All keys at once: to get them one by one takes as long as the rest.
+        # Read all keys at once: reading one key after another takes as long as everything else in this method.
         before, after = dict(tensordict.items()), dict(next_tensordict.items())
         done = after["done"].numpy(force=True).reshape(-1) if "done" in after else None
         for row in _masked(before.get("_step"), self.rows):
@@ -126,13 +126,13 @@ class RolloutRecorder(Transform):
         return next_tensordict
 
     def close(self) -> None:
-        """Record unfinished episodes; a second call does nothing."""
+        """Record unfinished episodes; further calls do nothing."""
         for running in self._running.values():
             running.end()
 
 
 class _Row:
-    """The running episode of an environment's row; in a LanguageWorldEnv also the robot's motion."""
+    """The running episode of one environment row; in a LanguageWorldEnv, also the robot's motion."""
 
     def __init__(self, env: Any, row: int, recorder: RolloutRecorder) -> None:
         self.env, self.row, self.recorder = env, row, recorder
@@ -153,7 +153,7 @@ class _Row:
         self._add_pose()
 
     def add_step(self, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
-        """Keep a step: the state and action, and their result."""
+        """Store a time step: the tensordict entries before the step, and those after the step."""
         self._stepped = True
         dims = len(self.env.batch_size)
         for columns, entries, own in ((self._before, before, _BEFORE), (self._after, after, _AFTER)):
@@ -161,7 +161,7 @@ class _Row:
                 if key in own if self._is_own else isinstance(values, Tensor) and not key.startswith("_"):
                     array = values.numpy(force=True)
                     value = array.reshape(-1, *array.shape[dims:])[self.row] if dims else array
-                    # A copy: some environments write into the same tensors at the next step.
+                    # Copy, because some environments overwrite the same tensors at the next time step.
                     columns.setdefault(key, []).append(np.array(value))
         self._add_pose()
 
@@ -171,7 +171,7 @@ class _Row:
             self._poses.append((np.array(position, np.float32), np.array(quaternion, np.float32)))
 
     def end(self) -> None:
-        """Add the page of the episode if a step of it was recorded."""
+        """Add the episode's page to the recording if at least one time step was recorded."""
         number, noted, poses = self.ended, (self._before, self._after), self._poses
         seed = self._seed if self._is_own else None
         self.ended += self._stepped
@@ -202,5 +202,5 @@ class _Row:
 
 
 def _masked(mask: Tensor | None, rows: Sequence[int]) -> Sequence[int]:
-    """Return the rows that a mask selects, all without a mask."""
+    """Return the rows that a mask selects, or all rows without a mask."""
     return rows if mask is None else [row for row in rows if mask.reshape(-1)[row]]

@@ -1,4 +1,4 @@
-"""Log rollouts as pages of a recording, with the robot's motion from a second simulation; run episodes to record."""
+"""Log rollouts as pages of a recording, re-simulate episodes to show the robot's motion, and run episodes to record."""
 
 from __future__ import annotations
 
@@ -59,28 +59,28 @@ def log_rollout(
 ) -> Any:
     """Add a rollout to a recording: the robot in 3-D, a verdict, the plan at the cursor, the timeline and curves.
 
-    With the environment's seed, the episode is simulated again from its task, ``seed``, ``episode`` and actions to show
-    the robot's motion. If its observations are not equal bit for bit, a warning is issued, and a simple hand over a
-    table is drawn instead of the robot, as without a seed.
+    If ``seed`` is given, the episode is re-simulated from the task, ``seed``, ``episode`` and actions to show the
+    robot's motion. If the simulated observations are not bit-identical to the recorded ones, a warning is issued, and a
+    simple hand over a table is drawn instead of the robot, as without a seed.
 
     Args:
-        logger: the recording.
-        rollout: batch size (T,), one episode from its first state on: "observation" T×39 float32 (metres), "task_id" T
-            int64, "action" T×4 float32 in [-1, 1], as executed, and ("next", "success") T×1 bool. Optional are
-            ("next", "executed_action") T×4, which replaces the action, "episode" T int64, "qaf" T×S bool, "qaf_plan" T
-            int64, "qaf_logits" T×S float32 (positive: true), "skill_weights" T×S float32, "action_corrected" T×1,
-            ("next", "reward") T×1 float32 and "pixels" T×H×W×3 uint8, the policy's input. Or batch size (N, T), an
-            episode in each row.
-        plans: the plans that ``qaf`` answers; None without plans.
-        seed: the environment's seed; with ``episode`` it determines how the episode began.
-        name: the episode's name in the recording, for batch size (T,); None for task and episode, "push-7".
-        policy: the policy's name, for the tab.
-        failure: why the episode failed, for the verdict; for N rows a list with one entry each, or None.
+        logger: the logger of the recording.
+        rollout: one episode of batch size (T,), starting at the first state, or N episodes of batch size (N, T). The
+            keys are "observation" T×39 float32 (metres), "task_id" T int64, "action" T×4 float32 in [-1, 1] (as
+            executed) and ("next", "success") T×1 bool. Optional keys are ("next", "executed_action") T×4, which
+            replaces the action, "episode" T int64, "qaf" T×S bool, "qaf_plan" T int64, "qaf_logits" T×S float32
+            (positive: true), "skill_weights" T×S float32, "action_corrected" T×1, ("next", "reward") T×1 float32 and
+            "pixels" T×H×W×3 uint8 (the policy's input).
+        plans: the plans whose conditions ``qaf`` holds; None without plans.
+        seed: the environment's seed, which determines the initial state together with ``episode``.
+        name: the episode's name in the recording, for batch size (T,); None for the task and episode ("push-7").
+        policy: the policy's name, shown in the tab.
+        failure: the cause of the episode's failure, shown in the verdict; for N episodes, a list with one entry each.
         tasks: custom tasks that the plans do not define.
-        suite: the suite that simulates the episode again; None for the registered suite that has the task.
+        suite: the suite in which the episode is re-simulated; None for the registered suite that has the task.
 
     Returns:
-        The episode's name; for N rows a list of names.
+        The episode's name, or a list of names for N episodes.
 
     Example:
         >>> import tempfile
@@ -98,7 +98,7 @@ def log_rollout(
         rows = zip(rollout, failures, strict=True)
         return [log_rollout(logger, row, plans, failure=row_failure, **same) for row, row_failure in rows]
     if isinstance(failure, Sequence):
-        raise TypeError(f"failure must be one Failure for one episode, got {len(failure)}")
+        raise TypeError(f"failure must be a Failure of exactly one episode, got a list of {len(failure)}")
     if suite is not None:
         suite = load_suite(suite)
         tasks = [*tasks, *suite.tasks.values()]
@@ -123,7 +123,7 @@ def read_rollout(
     suite: Suite | None = None,
     step_time: float | None = None,
 ) -> tuple[Heading, RecordedEpisode]:
-    """Return heading and episode of a rollout (T,), checked as :func:`log_rollout` describes it."""
+    """Check a rollout (T,), which :func:`log_rollout` describes, and return the heading and the recorded episode."""
     plans = None if plans is None else as_plans(plans)
     number = _constant(rollout, "task_id", required=True)
     index = _constant(rollout, "episode", required=seed is not None)
@@ -139,10 +139,10 @@ def read_rollout(
         plan = plans[label]
         answered = rollout.get("qaf_plan", None)
         if answered is not None and not bool((answered == Plans([plan]).numbers[label]).all()):
-            raise ValueError(f"plans must hold the plan that rollout['qaf'] answers; that of {label!r} is another one")
+            raise ValueError(f"plans must hold the plan from which rollout['qaf'] was computed; {label!r} has another")
     if failure is not None and (failure.task, failure.episode) != (label, failure.episode if index is None else index):
         given = f"{failure.task} {failure.episode}"
-        raise ValueError(f"failure must be of the rollout's episode, {label} {index}, got {given}")
+        raise ValueError(f"failure must be of the rollout's episode ({label} {index}), got {given}")
     observation = rollout.get("observation", None)
     objects: dict[str, Tensor] = {}
     if task is not None and observation is not None and observation.shape[1:] == (task.layout.size,):
@@ -159,7 +159,8 @@ def read_rollout(
 
 
 class DiffersError(ValueError):
-    """A second simulation of an episode differs; the message says where first, and by how much."""
+    """An error for a re-simulated episode that differs from the recorded one. The message gives the first time step
+    that differs, and the difference."""
 
 
 def simulate_again(
@@ -170,10 +171,10 @@ def simulate_again(
     observation: NDArray[np.float32],
     suite: Suite | None = None,
 ) -> Motion | None:
-    """Simulate an episode again from its executed actions, T×A, and return the motion, of T + 1 rows.
+    """Re-simulate an episode from its executed actions (T, A) and return the motion (T + 1 rows).
 
-    Return None if the engine has no ``poses``. Raise :class:`DiffersError` unless the observations, T×D, are equal bit
-    for bit: then the motion is equal too.
+    Return None if the engine has no ``poses``. Raise a :class:`DiffersError` if the simulated observations (T, D) are
+    not bit-identical to the recorded ones; if they are, so is the motion.
     """
     suite = load_suite("metaworld") if suite is None else suite
     engine: Any = suite.make_engine([task], reward="sparse", num_threads=1)
@@ -191,7 +192,7 @@ def simulate_again(
                 break
             if not np.array_equal(simulated, observation[step]):
                 error = np.abs(simulated.astype(np.float64) - observation[step])
-                raise DiffersError(f"step {step}: number {error.argmax()} differs by {error.max():.3g}")
+                raise DiffersError(f"step {step}: observation value {error.argmax()} differs by {error.max():.3g}")
             simulated = engine.step(action[step : step + 1], active).observation[0].astype(np.float32)
         return Motion(engine.model(0), positions, quaternions, None if None in touched else tuple(map(str, touched)))
     finally:
@@ -206,15 +207,15 @@ def _motion(heading: Heading, episode: RecordedEpisode, suite: Suite | None) -> 
     except DiffersError as error:
         label = f"{heading.task}, episode {heading.episode} of seed {heading.seed}"
         warnings.warn(
-            f"a second simulation of {label} differs at {error}; a hand over a table is drawn instead of the robot. "
-            "Check the seed, and that these are the executed actions",
+            f"the re-simulation of {label} differs at {error}; a hand over a table is drawn instead of the robot. "
+            "Check that the seed is correct and that the rollout holds the executed actions",
             stacklevel=3,
         )
         return None
 
 
 def _constant(rollout: TensorDictBase, key: str, *, required: bool) -> int | None:
-    """Return the number that all rows of an integer column hold."""
+    """Return the value of an integer column, which must be the same in all rows; None if an optional key is missing."""
     if (column := rollout.get(key, None)) is None:
         if required:
             raise missing_keys(rollout.keys(True, True), key)
@@ -225,7 +226,7 @@ def _constant(rollout: TensorDictBase, key: str, *, required: bool) -> int | Non
         raise ValueError(f"rollout[{key!r}] must be integers of shape {length}, got {given}")
     values = torch.unique(column).tolist()
     if len(values) != 1:
-        raise ValueError(f"rollout must be one episode of one task, got {key!r} {values[:5]}; split it")
+        raise ValueError(f"rollout must be one episode of one task, got {key!r} {values[:5]}; split the rollout")
     return int(values[0])
 
 
@@ -245,10 +246,11 @@ def run_recorded(
     device: str | torch.device | None = None,
     progress: bool = False,
 ) -> list[FinishedEpisode]:
-    """Run episodes as :func:`lw_torchrl.evaluate` does, with all keys that :func:`lw_torchrl.log_rollout` shows.
+    """Run episodes as :func:`lw_torchrl.evaluate` does, and keep all keys that :func:`lw_torchrl.log_rollout` shows.
 
-    The other arguments are those of :func:`lw_torchrl.evaluate`; ``episodes`` are indices of each task's episodes.
-    Return the episodes, by task in the given order and episode, with an evaluator's answers and the exact ones.
+    ``episodes`` are indices of each task's episodes; see :func:`lw_torchrl.evaluate` for the other arguments. Return
+    the episodes, sorted by task (in the given order) and index. With an evaluator, the steps hold both the evaluator's
+    and the exact truth values of the conditions.
     """
     answered = actor_plans(actor, plans)
     own_suite, chosen = suite_tasks(tasks, answered, suite)
@@ -261,7 +263,7 @@ def run_recorded(
         steps = episode.steps
         if learned and "qaf_logits" not in steps.keys():
             steps = learned[0](steps.to(device_of(learned[0]))).cpu()
-        if has_answers and answered is not None:  # the exact answers, next to those that the policy used
+        if has_answers and answered is not None:  # add the exact truth values to those that the policy used
             if "qaf_logits" not in steps.keys():
                 steps.set("qaf_logits", 10.0 * steps.get("qaf").float() - 5.0)
             steps = QAFTransform(answered)(steps)
@@ -288,7 +290,7 @@ def run_recorded(
 
 @contextmanager
 def new_recording(path: AnyPath) -> Iterator[RerunLogger]:
-    """Yield a logger whose file replaces ``path`` at the end; an error or a full disk leaves the old file."""
+    """Yield a logger whose file replaces ``path`` when the block ends; after an error, the old file is unchanged."""
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=target.parent, prefix=".") as folder:
@@ -296,14 +298,15 @@ def new_recording(path: AnyPath) -> Iterator[RerunLogger]:
         with RerunLogger(file) as logger:
             yield logger
         if not is_complete(file):
-            raise OSError(f"recording {str(target)!r} could not be written: is the disk full?")
+            raise OSError(f"recording {str(target)!r} could not be written completely; check whether the disk is full")
         os.replace(file, target)
 
 
 def write_recording(
     path: AnyPath, episodes: Iterable[FinishedEpisode], plans: Plans | None = None, **options: Any
 ) -> None:
-    """Write episodes of :func:`run_recorded` to a rerun file as :func:`lw_torchrl.log_rollout` does, or replace it."""
+    """Write the episodes returned by :func:`run_recorded` to a Rerun file, replacing an existing file. ``options`` are
+    passed to :func:`lw_torchrl.log_rollout`."""
     with new_recording(path) as logger:
         for episode in episodes:
             log_rollout(logger, episode.steps, plans, **options)

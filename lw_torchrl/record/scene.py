@@ -1,7 +1,7 @@
-"""The 3-D scene of an episode: the robot, the objects, and the target of the active skill.
+"""Draw the 3-D scene of an episode: the robot, the objects, and the target of the active skill.
 
-Meta-World's frame: metres, x to the robot's right, y away from the robot, z up, the table's top at z = 0. If the
-robot's layout is unknown, only the objects are drawn, seen from a position that shows them all.
+The scene uses Meta-World's frame: metres, x to the robot's right, y away from the robot, z up, table top at z = 0. If
+the robot's layout is unknown, only the objects are drawn, and the camera is placed so that all are visible.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from lw_torchrl.record.recorded_episode import Ghost, RecordedEpisode
 
 OBJECT_COLORS: tuple[Color, ...] = ((80, 170, 255), (255, 120, 90), (200, 130, 255), (90, 220, 210))
 
-# Measured in Meta-World's model: obs[3] is the distance between the fingers over 0.1 m; they slide along y
-# and reach 4.5 cm below obs[0:3], the position of the hand.
+# Measured in Meta-World's model: obs[3] is the distance between the fingers divided by 0.1 m. The fingers slide along y
+# and reach 4.5 cm below the hand position obs[0:3].
 FINGER_TRAVEL, FINGER_HALF, FINGER_DROP = 0.1, (0.010, 0.006, 0.024), 0.026
 PALM_HALF, PALM_RISE = (0.018, 0.062, 0.014), 0.012
 WRIST_HALF, WRIST_RISE = (0.012, 0.012, 0.055), 0.081
@@ -28,16 +28,17 @@ TABLE_CENTER, TABLE_HALF = (0.0, 0.6, -0.010), (0.7, 0.4, 0.010)
 TABLE, GRID = (58, 64, 74), (92, 99, 112)
 SAME_PLACE = 0.05  # largest distance, metres, between the origin of a body and the position of its object
 FOCAL, LABEL, LETTER = 160.0, 26.0, 6.5
-"""Focal length, height of a name and width of a letter, in pixels of the scene in a window of 1100×700."""
+"""Focal length, height of a label and width of a letter, in pixels of the scene view in a window of 1100×700."""
 
 Point = tuple[float, float, float]
-# From behind the robot's right shoulder, over a table whose middle is at (0, 0.6, 0); with the arm, from the front.
+# Camera position and target: from behind the robot's right shoulder; with the arm, from the front. The center of the
+# table is at (0, 0.6, 0).
 SIMPLE_EYE: tuple[Point, Point] = ((0.54, 0.23, 0.46), (0.03, 0.63, 0.10))
 ROBOT_EYE: tuple[Point, Point] = ((0.54, 0.18, 0.47), (-0.02, 0.62, 0.13))
 
 
 def scene_size(episode: RecordedEpisode) -> float:
-    """Return the size of a scene in metres: 1 for a robot at its table, else the extent of its objects."""
+    """Return the size of a scene in metres: 1 for a robot at a table, otherwise the extent of the objects."""
     if episode.layout is not None or not episode.objects:
         return 1.0
     places = np.concatenate([*episode.objects.values()])
@@ -45,7 +46,7 @@ def scene_size(episode: RecordedEpisode) -> float:
 
 
 def eye_of(episode: RecordedEpisode, motion: Motion | None) -> tuple[Point, Point]:
-    """Return the position from which a scene is seen, and the position that is looked at."""
+    """Return the camera position of a scene, and the position that the camera looks at."""
     if episode.layout is not None or not episode.objects:
         return SIMPLE_EYE if motion is None else ROBOT_EYE
     places, size = np.concatenate([*episode.objects.values()]), scene_size(episode)
@@ -63,10 +64,11 @@ def log_scene(
     eye: tuple[Point, Point],
     ghost: Ghost | None = None,
 ) -> tuple[list[str], dict[str, str]]:
-    """Draw robot, objects, goal, the hand's path and the target pose under ``root``/scene, seen from ``eye``.
+    """Draw the robot, objects, goal, hand path and target pose below ``root``/scene, for a camera at ``eye``.
 
-    Return the trails' paths and the result of :func:`log_motion`. A trail is one short line per row that is ``drawn``,
-    shown up to the cursor. Without a motion, the robot is a hand over a table; without a layout, it is not drawn.
+    Return the entity paths of the trails, and the result of :func:`log_motion`. A trail has one short line per row in
+    ``drawn`` and is shown up to the time cursor. Without a motion, a hand over a table is drawn instead of the robot;
+    without a layout, no robot is drawn.
     """
     frames: dict[str, str] = {}
     scene, size = f"{root}/scene", scene_size(episode)
@@ -86,7 +88,7 @@ def log_scene(
             stream.send_columns(f"{scene}/{path}", episode.times(rows), rr.Points3D.columns(positions=position[rows]))
 
     def named_point(path: str, name: str, radius: float, color: Color) -> None:
-        """Draw a point with its name, which is moved away if it would cover another name."""
+        """Draw a point with a label, which is moved away if it would overlap another label."""
         away = offsets[name]
         point(path, positions[name], None if away.any() else name, radius, color)
         if away.any():
@@ -98,7 +100,7 @@ def log_scene(
         stream.send_columns(f"{scene}/{path}", episode.times(drawn), rr.LineStrips3D.columns(strips=strips, **look))
 
     goal = episode.goal
-    # Objects that are the goal, like "target location", have its colour, and their own label.
+    # Objects at the goal, such as "target location", have the goal's color but their own label.
     goals = [] if goal is None else [name for name, at in episode.objects.items() if np.allclose(goal, at, atol=1e-3)]
     positions = {name: position for name, position in episode.objects.items() if name != GRIPPER}
     colors: dict[str, Color] = {GRIPPER: GOLD} if GRIPPER in episode.objects else {}
@@ -113,7 +115,7 @@ def log_scene(
             named_point(f"objects{part}", name, 0.016 if motion is None else 0.008, color)
         elif motion is None:
             point(f"objects{part}", position, None, 0.005, color)
-        if motion is None and episode.layout is not None:  # from each row straight down, or up, to the table's top
+        if motion is None and episode.layout is not None:  # a vertical line from each position to the table top
             foot = position * np.array([1, 1, 0], np.float32)
             lines(f"heights{part}", np.stack([position, foot], axis=1)[drawn], 0.0012, (*color, 150))
         if motion is None or name == GRIPPER:
@@ -135,7 +137,8 @@ def log_scene(
 
 
 def touched_objects(motion: Motion, episode: RecordedEpisode) -> tuple[str, ...] | None:
-    """Return what the fingers touched in each row: the object at the touched body's position, else the body's name."""
+    """Return the name of the object that the fingers touched in each row: the object at the touched body's position, or
+    the body's name if there is no such object."""
     if motion.touched is None:
         return None
     touched, model = np.array(motion.touched[: len(episode)]), motion.model.model
@@ -151,7 +154,8 @@ def touched_objects(motion: Motion, episode: RecordedEpisode) -> tuple[str, ...]
 
 
 def log_pictures(stream: Any, root: str, episode: RecordedEpisode, drawn: NDArray[np.int64]) -> float:
-    """Log the policy's pictures to ``root``/seen, where they change in ``drawn`` rows; return width over height."""
+    """Log the policy's input images to ``root``/seen for the ``drawn`` rows in which they change; return the images'
+    aspect ratio (width / height)."""
     if episode.pixels is None:
         return 0.0
     rows = drawn[changes(episode.pixels[drawn].reshape(len(drawn), -1))]
@@ -161,21 +165,22 @@ def log_pictures(stream: Any, root: str, episode: RecordedEpisode, drawn: NDArra
 
 
 def name_offsets(positions: dict[str, NDArray[np.float32]], eye: tuple[Point, Point]) -> dict[str, NDArray[Any]]:
-    """Return the offset (3,) of each name from its object, T×3 metres, so that names overlap least from ``eye``."""
+    """Return an offset (3,) in metres of each label from its object's positions (T×3), chosen so that the labels
+    overlap least when seen from ``eye``."""
     place, ahead = np.array(eye[0], np.float32), np.subtract(eye[1], eye[0]).astype(np.float32)
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, [0, 0, 1]).astype(np.float32)
     right /= np.linalg.norm(right)
     up = np.cross(right, ahead)
     offsets: dict[str, NDArray[Any]] = {}
-    placed: list[tuple[NDArray[Any], float]] = []  # positions in pixels, and width, of the names so far
+    placed: list[tuple[NDArray[Any], float]] = []  # positions in pixels, and width, of the labels placed so far
     for name, position in positions.items():
         depth = np.maximum((position - place) @ ahead, 0.05)
         pixels = np.stack([(position - place) @ right, (position - place) @ up], axis=1) * (FOCAL / depth)[:, None]
         width = LETTER * len(name) + 2 * LETTER
 
         def overlap(lines: int, pixels: Any = pixels, width: float = width) -> float:
-            """Return the fraction of rows, summed over names, in which this name would cover another one."""
+            """Return the fraction of rows in which this label would overlap another label, summed over labels."""
             shifted = pixels + np.array([0, lines * LABEL])
             gaps = [(np.abs(shifted - other), (width + other_width) / 2) for other, other_width in placed]
             return sum(float(((gap[:, 0] < reach) & (gap[:, 1] < 0.85 * LABEL)).mean()) for gap, reach in gaps)
@@ -203,7 +208,7 @@ def _log_simple_robot(stream: Any, scene: str, episode: RecordedEpisode, drawn: 
     grid += [[(at, y - depth, z), (at, y + depth, z)] for at in along.tolist()]
     stream.log(f"{scene}/table/grid", rr.LineStrips3D(grid, colors=[GRID], radii=[0.0007]), static=True)
     box("gripper/palm", [(0.0, 0.0, PALM_RISE)], [PALM_HALF], STEEL)
-    # The name is above the hand, away from the objects that it handles.
+    # The label is above the hand, away from the objects that the hand moves.
     box("gripper/wrist", [(0.0, 0.0, WRIST_RISE)], [WRIST_HALF], STEEL, [GRIPPER])
     box("gripper/fingers", None, [FINGER_HALF] * 2, GOLD)
     stream.send_columns(f"{scene}/gripper", times, rr.Transform3D.columns(translation=episode.objects[GRIPPER][drawn]))
@@ -215,7 +220,7 @@ def _log_simple_robot(stream: Any, scene: str, episode: RecordedEpisode, drawn: 
 
 
 def _log_target(stream: Any, scene: str, episode: RecordedEpisode, drawn: NDArray[np.int64]) -> None:
-    """Draw an arrow from what the active scripted skill moves to its target, in the step's colour."""
+    """Draw an arrow, in the plan step's color, from the object that the active scripted skill moves to the target."""
     if episode.active is None or not any(episode.target_poses):
         return
     start, end = np.zeros((2, len(episode), 3), np.float32)

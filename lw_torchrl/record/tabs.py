@@ -1,4 +1,4 @@
-"""The tabs of a recording: an overview, one page per episode, and the curves and tables of a training."""
+"""The tabs of a recording: an overview, one page per episode, and the curves and tables of a training run."""
 
 from __future__ import annotations
 
@@ -14,44 +14,46 @@ from lw_torchrl.record.entities import EPISODE_TIMELINE, METRIC_TIMELINE, STEP_T
 from lw_torchrl.record.page import Page
 
 OVERVIEW = "overview"
-"""The name of the overview, and its entity."""
+"""The name of the overview tab and of the overview's entity."""
 TITLES = {kind: kind.title() for kind in ("metrics", "histograms", "images", "videos")} | {"hparams": "Hyperparameters"}
-"""Titles of the tabs without episodes. Their keys begin entity paths, so no episode may have such a name."""
+"""Titles of the tabs without episodes, by key. The keys are the first part of entity paths, so no episode may have such
+a name."""
 ON_METRIC_TIMELINE = {"metrics", "histograms", "images"}
 _PROPERTY = "layout"
 
 
 class Tab(NamedTuple):
-    """A tab, named after its episode, or by its title."""
+    """A viewer tab, labeled with a title or the name of an episode."""
 
     name: str
     title: str
-    view: Callable[[], Any]  # makes rerun's view
+    view: Callable[[], Any]  # a function that creates the tab's Rerun view
     episodes: list[str]
     timeline: str = EPISODE_TIMELINE
 
 
 class Tabs:
-    """The tabs of a recording, which make rerun's blueprint.
+    """The tabs of a recording, from which the Rerun blueprint is built.
 
-    They are also saved as properties of the recording: a recording that was never closed has no blueprint.
+    The tabs are also saved as properties of the recording, because a recording that was never closed has no blueprint.
     """
 
     def __init__(self) -> None:
         self.pages: dict[str, Page] = {}
         self._compared: list[tuple[str, list[str]]] = []
-        self._figures: list[str] = []  # entities of pictures in the overview
+        self._figures: list[str] = []  # entities of the figures in the overview
         self._views: dict[str, list[str]] = {kind: [] for kind in TITLES}  # names of logged values
         self._entries: list[str] = []
         self._saved = self._sent = 0
 
     def add_view(self, kind: str, name: str = "") -> None:
-        """Show the values logged as ``kind``/``name``, unless they are shown already."""
+        """Add a view of the values logged as ``kind``/``name``, unless there is one already."""
         if name not in self._views[kind]:
             self.add("view", [kind, name])
 
     def add(self, kind: str, content: Any) -> None:
-        """Add an episode's "page", title and names to "compare" in a tab, a "figure" in the overview, or a "view"."""
+        """Add content of one ``kind``: an episode's "page", a "compare" tab (a title and the names of the episodes to
+        compare), a "figure" in the overview, or a "view" of logged values."""
         self._entries.append(json.dumps([kind, content]))
         if kind == "page":
             self.pages[content["row"]["name"]] = Page(**content)
@@ -64,7 +66,7 @@ class Tabs:
 
     @classmethod
     def read(cls, reader: Any) -> Tabs | None:
-        """Return the tabs of a recording, or None if another program or version wrote it."""
+        """Read the tabs of a recording; return None if the recording was written by another program or version."""
         entries = {}
         for chunk in reader.stream().filter(content=f"/__properties/{_PROPERTY}/**"):
             number = int(str(chunk.entity_path).rpartition("/")[2])
@@ -77,7 +79,7 @@ class Tabs:
         return tabs if entries else None
 
     def save(self, stream: Any) -> None:
-        """Write the new tabs as properties of a recording."""
+        """Save new tabs as properties of the recording."""
         for number in range(self._saved, len(self._entries)):
             entry = rr.AnyValues(entry=self._entries[number])
             stream.log(f"__properties/{_PROPERTY}/{number}", entry, static=True)
@@ -85,11 +87,11 @@ class Tabs:
 
     @property
     def has_grown(self) -> bool:
-        """Whether the tabs have grown by a quarter or more since :meth:`send`."""
+        """Whether the number of entries has grown by at least a quarter since the last :meth:`send`."""
         return 4 * (len(self._entries) - self._sent) >= self._sent
 
     def send(self, stream: Any) -> None:
-        """Send the blueprint and the table of the overview if there are new tabs."""
+        """Send the blueprint and the overview table to the recording if there are new tabs."""
         if self._sent == len(self._entries):
             return
         self._sent = len(self._entries)
@@ -100,7 +102,7 @@ class Tabs:
         stream.send_blueprint(self.blueprint())
 
     def blueprint(self, front: str | None = None) -> rrb.Blueprint:
-        """Return rerun's layout, with the tab ``front``, or the first one, in front."""
+        """Return the Rerun blueprint, with the tab ``front`` (or the first tab) in front."""
         tabs = self.tabs()
         closed = {"state": "collapsed"}
         fps = 1 / next((page.step_time for page in self.pages.values()), STEP_TIME)
@@ -110,11 +112,11 @@ class Tabs:
         return rrb.Blueprint(rrb.Tabs(*(tab.view() for tab in tabs), active_tab=active), *panels, auto_views=False)
 
     def tabs(self) -> list[Tab]:
-        """Return the tabs from left to right. The few tabs of a training come before many episodes."""
+        """Return the tabs from left to right. The tabs of a training run come before a large number of episodes."""
         pages, has_overview = list(self.pages.values()), self._has_overview()
         if has_overview:
             pages.sort(key=lambda page: _order(page.row))
-        # Titles name the policy unless several episodes have the same one.
+        # Titles include the policy unless several episodes all have the same policy.
         name_policies = len({page.row["policy"] for page in pages}) > 1 or len(pages) == 1
         titles = {page.row["name"]: page.title(policy=name_policies) for page in pages}
         compared = [
@@ -138,7 +140,7 @@ class Tabs:
         return rrb.Horizontal(*views, column_shares=[1] * len(views), name=OVERVIEW.title())
 
     def _comparison(self, title: str, names: list[str], titles: dict[str, str]) -> Any:
-        """Return a view with a column for each episode, all with the same axes."""
+        """Return a view with a column for each episode; all columns have the same axes."""
         pages = [self.pages[name] for name in names]
         shown = min(page.shown[0] for page in pages), max(page.shown[1] for page in pages)
         farthest = max(page.farthest for page in pages)
@@ -146,18 +148,19 @@ class Tabs:
         return rrb.Horizontal(*columns, name=title)
 
     def tab(self, name: str | None = None) -> Tab:
-        """Return the tab of a name, or the first one."""
+        """Return the tab with the given name or title, or the first tab if None."""
         tabs = self.tabs()
         if not tabs and name is None:
             return Tab("", "", rrb.Tabs, [], METRIC_TIMELINE)
         return tabs[self.index(name)]
 
     def opening_step(self, tab: str | None = None) -> int | None:
-        """Return the step to open a tab at: the earliest decisive one of its episodes; None without episodes."""
+        """Return the time step at which a tab opens: the earliest decisive step of its episodes, or None without
+        episodes."""
         return min((self.pages[name].decisive for name in self.tab(tab).episodes), default=None)
 
     def index(self, name: str | None) -> int:
-        """Return the index of the tab with this name or title, or of the only one whose title contains it."""
+        """Return the index of the tab with this name or title, or of the only tab whose title contains ``name``."""
         tabs = self.tabs()
         exact = [i for i, tab in enumerate(tabs) if name in (tab.name, tab.title, None)]
         containing = [i for i, tab in enumerate(tabs) if str(name).lower() in tab.title.lower()]
@@ -166,7 +169,7 @@ class Tabs:
         raise unknown_name("episode", str(name), [tab.name for tab in tabs])
 
     def _has_overview(self) -> bool:
-        """Return whether there are several episodes, other than the two of one comparison."""
+        """Return whether there is an overview tab: there are several episodes, and not exactly one comparison."""
         return len(self.pages) > 1 and len(self._compared) != 1
 
 
@@ -187,12 +190,13 @@ def _value_view(kind: str, name: str) -> Any:
 
 
 def _order(row: dict[str, Any]) -> tuple[Any, ...]:
-    """Return the sorting key of episodes: failures first, then by task and episode."""
+    """Return the sort key of an episode: failures come first, then episodes are sorted by task and index."""
     return row["ended"] != "failed", row["task"], row["episode"] or 0
 
 
 def overview(rows: Iterable[dict[str, Any]]) -> str:
-    """Return a Markdown table with a row per episode, failures first, below the counts of failures and causes."""
+    """Return a Markdown text with the counts of failures and causes, and a table with one row per episode, failures
+    first."""
     rows = sorted(rows, key=_order)
     ended = Counter(row["ended"] for row in rows)
     causes = Counter(row["cause"] for row in rows if row["cause"])

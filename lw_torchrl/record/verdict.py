@@ -1,4 +1,4 @@
-"""The texts and curves of an episode's page: heading, verdict, and the plan at the cursor."""
+"""The texts and curves of an episode's page: heading, verdict, and the plan at the time cursor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,17 +15,18 @@ from lw_torchrl.record.entities import FALSE, STEEL, Color, changes, rr, step_co
 from lw_torchrl.record.recorded_episode import NO_STEP, Ghost, RecordedEpisode
 
 AFTER_SUCCESS, AROUND_FAILURE = 8, 60
-"""The number of steps to show after a first success, and before and after the step at which a failure shows."""
-LONGEST = 200  # the largest number of steps to show at once, from where a ghost parts to where the failure shows
+"""The number of time steps to show after the first success, and before and after the time step at which a failure first
+shows."""
+LONGEST = 200  # maximum number of time steps to show from the ghost's divergence to the failure
 PLAN_LINES, LINE = 13, 78
-"""The number of lines of a plan that leave room for the scene in a window of 1100×700, and of characters in a line."""
-SPARSE = 8  # steps between two drawings of the scene outside the shown steps: a tenth of a second
+"""The maximum number of plan lines that leave room for the scene in a 1100×700 window, and of characters per line."""
+SPARSE = 8  # outside the shown range, the scene is drawn every 8th time step (a tenth of a second)
 MARKS = {True: "✓", False: "✗", None: "·"}
 
 
 @dataclass(frozen=True)
 class Heading:
-    """The heading of a page: the episode, the environment's seed, the policy, and why it failed."""
+    """The heading of a page: the episode, the environment's seed, the policy, and the episode's failure."""
 
     task: str
     episode: int | None = None
@@ -39,13 +40,13 @@ class Heading:
         return self.task if self.episode is None else f"{self.task}-{self.episode}"
 
     def parts(self) -> list[str]:
-        """Return task, episode, seed and policy, as far as they are known."""
+        """Return the task, episode, seed and policy as texts, omitting unknown ones."""
         numbers = {"episode": self.episode, "seed": self.seed}
         known = [f"{name} {number}" for name, number in numbers.items() if number is not None]
         return [self.task, *known, *([] if self.policy is None else [self.policy])]
 
     def row(self, episode: RecordedEpisode, name: str) -> dict[str, Any]:
-        """Return the overview's row of an episode called ``name``."""
+        """Return the overview row of an episode with the given name."""
         at = episode.first_success or len(episode)
         ended = "" if episode.success is None else "failed" if episode.first_success is None else "success"
         cause = self.failure.cause if self.failure is not None and ended == "failed" else None
@@ -54,7 +55,7 @@ class Heading:
         return known | {"ended": ended, "cause": cause, "at": at, "seconds": at * episode.step_time}
 
     def ended(self, episode: RecordedEpisode) -> str:
-        """Return how the episode ended, in a few words."""
+        """Return a short description of the episode's outcome."""
         if episode.first_success is not None:
             return f"SUCCESS at {episode.at(episode.first_success)} of {len(episode)}"
         if self.failure is None:
@@ -63,9 +64,9 @@ class Heading:
 
 
 def decisive_step(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None = None) -> int:
-    """Return the step to look at first: the failure's, else the first success, else the last.
+    """Return the time step at which a page opens: the failure, otherwise the first success, otherwise the last step.
 
-    It is the step of a ghost's success if the ghost has not parted at that step, or if that step is not shown.
+    If that time step is not shown, or the ghost has not diverged by then, return the ghost's first success instead.
     """
     (_, last), step = shown_steps(heading, episode, ghost), _own_decisive_step(heading, episode)
     if ghost is None or ghost.episode.first_success is None or ghost.parts_at(episode) < step <= last:
@@ -80,9 +81,10 @@ def _own_decisive_step(heading: Heading, episode: RecordedEpisode) -> int:
 
 
 def shown_steps(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None = None) -> tuple[int, int]:
-    """Return the first and last step to show: up to a success, around the step at which a failure shows, or all.
+    """Return the first and last time step to show: up to the first success, around the failure, or all steps.
 
-    With a ghost, they begin where the two part and, if the failure shows much later, end with the ghost's success.
+    With a ghost, the range begins where the two episodes diverge, and ends at the ghost's success if the failure shows
+    much later.
     """
     at, length = _own_decisive_step(heading, episode), len(episode)
     if ghost is not None:
@@ -98,7 +100,8 @@ def shown_steps(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None 
 
 
 def drawn_steps(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None) -> NDArray[np.int64]:
-    """Return the steps at which the scene is drawn: the shown ones, a few others, the decisive one, and the last."""
+    """Return the time steps at which the scene is drawn: every one or two in the shown range, a few others, the
+    decisive step and the last step."""
     first, last = shown_steps(heading, episode, ghost)
     steps, stride = np.arange(len(episode)), 1 if last - first <= AROUND_FAILURE else 2
     drawn = (steps >= first) & (steps <= last) & (steps % stride == 0) | (steps % SPARSE == 0)
@@ -107,12 +110,12 @@ def drawn_steps(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None)
 
 
 def verdict(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None = None, small: bool = False) -> str:
-    """Return the verdict in Markdown, with a ``small`` heading or a large one."""
+    """Return the verdict as Markdown, with a small heading if ``small``, otherwise a large heading."""
     lines = [f"{len(episode)} steps"] if episode.success is None else [heading.ended(episode)]
     if episode.success is not None and episode.success.any():
         if not episode.success[-1]:
             done = int(episode.success.sum())
-            lines.append(f"It did not last: the task was done in {done} steps, but not in the last one.")
+            lines.append(f"The success did not last: the task was solved in {done} steps, but not in the last one.")
     elif heading.failure is not None:
         lines += _reasons(heading.failure, episode)
     elif episode.success is not None:
@@ -120,8 +123,8 @@ def verdict(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None = No
     if ghost is not None:
         end, parting = ghost.episode.first_success, ghost.parts_at(episode)
         ended = "does not succeed" if end is None else f"succeeds at {episode.at(end)}"
-        lines.insert(1, f"**The blue ghost**, with {ghost.by}, {ended}; they part at **t = {parting}**.")
-    # Single line breaks, since paragraphs would not fit into a small window.
+        lines.insert(1, f"**The blue ghost**, with {ghost.by}, {ended}; the two diverge at **t = {parting}**.")
+    # Use single line breaks, because paragraphs would not fit into a small window.
     head = f"**{lines[0]}**  \n" if small else f"#### {lines[0]}\n\n"
     return head + "  \n".join([*lines[1:], " · ".join(heading.parts())]) + "\n"
 
@@ -139,7 +142,8 @@ def _reasons(failure: Failure, episode: RecordedEpisode) -> list[str]:
 
 
 def _observations(episode: RecordedEpisode) -> list[str]:
-    """Describe a failed episode without an attributed cause: its last active step, distance, conditions never true."""
+    """Describe a failed episode without an attributed cause: the last active plan step, the distance to that step's
+    target, and the conditions that were never true."""
     if episode.active is None or not episode.steps:
         return []
     lines = []
@@ -148,14 +152,14 @@ def _observations(episode: RecordedEpisode) -> list[str]:
         lines.append("At the end no single plan step was active.")
     else:
         steps = int((episode.active == last).sum())
-        lines.append(f"At the end {_step(episode, last)}, was active, as in {steps} of {len(episode)} steps.")
+        lines.append(f"At the end {_step(episode, last)}, was active, as in {steps} of {len(episode)} time steps.")
         pose = episode.target_poses[last] if episode.target_poses else None
         if pose is not None and not pose.relative:
             distance = np.where(episode.active == last, pose.distance, np.inf)
             nearest = int(distance.argmin())
             lines.append(
-                f"It came within **{distance[nearest] * 100:.1f} cm** of its target, at "
-                f"{episode.at(nearest)}; at the end it was {pose.distance[-1] * 100:.1f} cm away."
+                f"The smallest distance to the target was **{distance[nearest] * 100:.1f} cm**, at "
+                f"{episode.at(nearest)}; the distance at the end was {pose.distance[-1] * 100:.1f} cm."
             )
     answers = episode.answers
     never = [] if answers is None else [i for i in range(len(episode.steps)) if not answers[:, i].any()]
@@ -169,9 +173,9 @@ def _step(episode: RecordedEpisode, step: int) -> str:
 
 
 def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
-    """Log the plan in ``root``/plan, as a text in Markdown at each step where a truth or the active step changes.
+    """Log the plan to ``root``/plan as Markdown, for each time step in which a condition or the active step changes.
 
-    Return the number of lines that it takes in a small window. If these are too many, conditions are shortened.
+    If the plan needs too many lines, conditions are shortened. Return the number of lines in a small window.
     """
     conditions = [condition for condition, _ in episode.steps]
     if _line_count(conditions, episode) > PLAN_LINES:
@@ -203,7 +207,7 @@ def log_plan(stream: Any, root: str, episode: RecordedEpisode) -> int:
 
 
 def _line_count(conditions: Sequence[str], episode: RecordedEpisode) -> int:
-    """Return the lines that a plan takes with these conditions, and the longest reason, in a small window."""
+    """Return the number of lines that the plan and the longest reason need in a small window."""
     answer = "  (evaluator: x)" if episode.believed is not None else ""
     texts = [f"x  1.  if {condition}{answer}" for condition in conditions] + [skill for _, skill in episode.steps]
     texts += [max(episode.reasons, key=len, default="")]
@@ -211,7 +215,8 @@ def _line_count(conditions: Sequence[str], episode: RecordedEpisode) -> int:
 
 
 def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
-    """Log ``root``/action, /distance (cm), /reward, /skill_weights and /corrected, and return those that exist."""
+    """Log the curves ``root``/action, /distance (cm), /reward, /skill_weights and /corrected; return the names of those
+    that exist."""
     rows, logged = np.arange(len(episode)), []
 
     def send(name: str, values: NDArray[Any], names: Sequence[str], *color: Color, later: int = 0) -> None:
@@ -224,19 +229,19 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
     if numbers := episode.action.shape[1]:
         send("action", episode.action, action_names(episode.layout) if episode.layout else [*map(str, range(numbers))])
     if (distance := episode.distance) is not None:
-        # One line in centimetres, in the colour of the active step.
+        # One line in centimetres, in the color of the active plan step.
         assert episode.active is not None
         steps = range(int(episode.active.max()) + 1)
-        colors = np.array([*map(step_color, steps), FALSE], np.uint8)[episode.active]  # NO_STEP, -1: the last colour
+        colors = np.array([*map(step_color, steps), FALSE], np.uint8)[episode.active]  # NO_STEP is -1: the last color
         columns = [*rr.Scalars.columns(scalars=distance * 100), *rr.SeriesLines.columns(colors=colors)]
         stream.send_columns(f"{root}/distance", episode.times(rows), columns)
         logged.append("distance")
-    # A sparse reward equals the success, which has a row in the timeline.
+    # A sparse reward equals the success, which already has a lane in the timeline.
     reward: Any = episode.reward
     if reward is not None and not (episode.success is not None and np.array_equal(reward, episode.success)):
         send("reward", reward[:, None], ["reward"], STEEL, later=1)
     weights = episode.skill_weights
-    if weights is not None and bool(((weights > 1e-3) & (weights < 1 - 1e-3)).any()):  # else the timeline shows them
+    if weights is not None and bool(((weights > 1e-3) & (weights < 1 - 1e-3)).any()):  # else see the timeline
         texts = [f" {skill}" for _, skill in episode.steps] or [""] * weights.shape[1]
         send("skill_weights", weights, [f"{i}{text}" for i, text in enumerate(texts, 1)])
     if episode.corrected is not None:
@@ -245,7 +250,7 @@ def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
 
 
 def action_names(layout: Layout) -> list[str]:
-    """Return the names of an action's A numbers: "dx", "dy", "dz" and "gripper", or an index."""
+    """Return a name for each of the A values of an action: "dx", "dy", "dz", "gripper", or the index."""
     names = [str(number) for number in range(layout.action_size)]
     if layout.displacement is not None:
         names[layout.displacement : layout.displacement + 3] = "dx", "dy", "dz"

@@ -1,4 +1,4 @@
-"""Open recordings in rerun's viewer, in a window or a browser, or take a picture of one without a screen."""
+"""Open recordings in the Rerun viewer, in a window or a browser, or take a screenshot without a display."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ PAINT_SECONDS, SETTLE_SECONDS = 0.7, 15.0
 REASONS = {
     r"render context|[Nn]o (graphics|wgpu) adapter|libvulkan": "no graphics driver was found. Without a GPU, install "
     "Vulkan's loader and Mesa's software driver (Debian: apt-get install libvulkan1 mesa-vulkan-drivers)",
-    r"DISPLAY is set|EventLoopError|failed to open display": "there is no screen. Take a picture with --screenshot, "
+    r"DISPLAY is set|EventLoopError|failed to open display": "there is no display. Write an image with --screenshot, "
     "or open the viewer in a browser with --web",
 }
-"""Patterns in the output of a failed viewer, and the reason and remedy to report."""
+"""A mapping from patterns in a failed viewer's output to the cause and remedy to report."""
 
 
 @typed
@@ -45,25 +45,27 @@ def open_viewer(
     episode: str | None = None,
     web_port: Natural | None = None,
 ) -> None:
-    """Open recordings in rerun's viewer and wait until it is closed; or save a picture of the viewer.
+    """Open recordings in the Rerun viewer and wait until the viewer is closed, or save a screenshot of the viewer.
 
-    A recording that was not closed, since its program was killed or still runs, is shown as far as it was written, with
-    a warning.
+    A recording that was not closed, because its program was killed or is still running, is shown as far as it was
+    written, with a warning.
 
     Args:
-        path: a .rrd file, a folder of such files, or several of these; the viewer shows the last one and lists all.
+        path: a .rrd file, a folder of .rrd files, or several of these; the viewer lists all recordings and opens the
+            last one.
         screenshot: a PNG file to write instead of opening a window.
-        window_size: of the picture or the window, "1400x900" points.
-        step: the step to open at; None for an episode's first success or failure, and a training's last step.
-        episode: the tab to open at, by its title ("Metrics") or its episode's name, in the recordings that have it;
-            None opens the first one.
-        web_port: serve rerun's web viewer at this port of 127.0.0.1 until Ctrl-C instead of opening a window, and print
-            its address; 0 picks a free port. It opens at the viewer's own default step.
+        window_size: width and height of the window or screenshot, "1400x900" points.
+        step: the time step to open at; None for an episode's first success or failure, or the last step of a training
+            run.
+        episode: the tab to open, by title ("Metrics") or episode name, in each recording that has it; None opens the
+            first tab.
+        web_port: serve Rerun's web viewer on this port of 127.0.0.1 until Ctrl-C, instead of opening a window, and
+            print the address; 0 picks a free port. The web viewer opens at its own default step.
 
     Raises:
-        FileNotFoundError: there is no such file, or rerun's viewer is not installed.
-        ValueError: a file is not a rerun recording, or no recording has the episode.
-        RuntimeError: the viewer ended with an error; the message says what to do about it.
+        FileNotFoundError: the file does not exist, or the Rerun viewer is not installed.
+        ValueError: a file is not a Rerun recording, or no recording has the episode.
+        RuntimeError: the viewer ended with an error; the message includes a remedy if one is known.
 
     Example:
         >>> open_viewer("runs/demo", screenshot="rollout.png", episode="drawer-open", step=75)  # doctest: +SKIP
@@ -75,7 +77,7 @@ def open_viewer(
     if screenshot is not None and Path(screenshot).suffix != ".png":
         raise ValueError(f"screenshot must end in '.png', got {str(screenshot)!r}")
     if web_port is not None and (screenshot is not None or step is not None):
-        raise ValueError("web_port excludes screenshot and step")
+        raise ValueError("web_port cannot be combined with screenshot or step")
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         files: list[Path] = []
@@ -93,8 +95,8 @@ def open_viewer(
                     unknown.append(error)
                     front = at = None
             openings[known.recording_id] = Opening.of(tabs, front, at)
-            own_front = None if web_port is None else front  # a web viewer's front tab is set by a layout
-            if own_front is not None:  # a copy without its own layout, which would replace ours
+            own_front = None if web_port is None else front  # only a blueprint can set a web viewer's front tab
+            if own_front is not None:  # write a copy without the recording's blueprint, which would take precedence
                 files[-1] = folder / f"{known.recording_id}.rrd"
                 ids = {"application_id": known.application_id, "recording_id": known.recording_id}
                 reader.stream().write_rrd(files[-1], **ids)
@@ -111,7 +113,7 @@ def open_viewer(
             print(f"http://{LOCAL}:{web}/?url={quote(f'rerun+http://{LOCAL}:{port}/proxy', '')}", flush=True)
         elif screenshot is None:
             process, output = stack.enter_context(rerun_process(*arguments, "--window-size", window_size))
-            with suppress(ConnectionError, TimeoutError):  # the window may have been closed at once
+            with suppress(ConnectionError, TimeoutError):  # the user may have closed the window immediately
                 _go_to(_connect(process, port, len(openings)), openings)
         if screenshot is None:
             with suppress(KeyboardInterrupt):
@@ -127,16 +129,16 @@ def open_viewer(
         except (ConnectionError, TimeoutError) as error:
             time.sleep(0.5)  # the viewer takes a moment to print its error
             if process.poll() is None:
-                raise RuntimeError(f"rerun's viewer did not answer: {error}") from error
+                raise RuntimeError(f"the Rerun viewer did not respond: {error}") from error
             raise viewer_error(output) from error
 
 
 def find_recordings(path: AnyPath) -> list[Path]:
-    """Return the recording ``path``, or all recordings in the folder ``path``, oldest first."""
+    """Return ``path`` itself if it is a file, or all recordings in the folder ``path``, oldest first."""
     recording = Path(path)
     if not recording.is_dir():
         if not recording.is_file():
-            raise FileNotFoundError(f"no recording {str(recording)!r}; give a .rrd file or a folder of .rrd files")
+            raise FileNotFoundError(f"no recording {str(recording)!r}; pass a .rrd file or a folder of .rrd files")
         return [recording]
     recordings = [file for file in recording.glob("*.rrd") if not file.name.startswith(".")]
     if not recordings:
@@ -146,7 +148,8 @@ def find_recordings(path: AnyPath) -> list[Path]:
 
 @contextmanager
 def readable(recording: Path) -> Iterator[Path]:
-    """Yield the recording, or if it was not closed a complete copy: rerun waits for the rest of an incomplete file."""
+    """Yield the path of a recording, or of a repaired copy if the recording was not closed: Rerun would wait for the
+    rest of an incomplete file."""
     from rerun.chunk import RrdReader
 
     if is_complete(recording):
@@ -158,12 +161,12 @@ def readable(recording: Path) -> Iterator[Path]:
         command = [rerun_program(), "rrd", "merge", str(recording), "-o", str(copy)]
         merge = subprocess.run(command, capture_output=True, check=False)
         if merge.returncode or not RrdReader(copy).recordings():
-            raise ValueError(f"{str(recording)!r} is not a rerun recording, or nothing was written to it")
+            raise ValueError(f"{str(recording)!r} is not a Rerun recording, or is empty")
         yield copy
 
 
 class Opening(NamedTuple):
-    """Where to open a recording: the index of a tab, a timeline and a step; None leaves the viewer's choice."""
+    """The view in which a recording opens: a tab index, a timeline and a time step; None keeps the viewer's default."""
 
     tab: int | None
     timeline: str | None
@@ -171,7 +174,8 @@ class Opening(NamedTuple):
 
     @classmethod
     def of(cls, tabs: Tabs | None, episode: str | None, step: int | None) -> Opening:
-        """Return where to open a tab; another program's recording, without our tabs, has its own layout."""
+        """Return the opening of the tab ``episode``. If ``tabs`` is None, another program wrote the recording, which
+        keeps its layout."""
         if tabs is None:
             return cls(None, None, step)
         number = None if episode is None else tabs.index(episode)
@@ -179,7 +183,7 @@ class Opening(NamedTuple):
 
 
 def _connect(process: subprocess.Popen[bytes], port: str, recordings: int) -> Any:
-    """Return a client of the viewer once it has loaded the recordings."""
+    """Wait until the viewer has loaded the recordings, then return a client connected to the viewer."""
     from rerun.experimental import ViewerClient
 
     client: Any = None
@@ -191,11 +195,11 @@ def _connect(process: subprocess.Popen[bytes], port: str, recordings: int) -> An
             if len(state.recordings) >= recordings and state.active_recording and not state.loading:
                 return client
         time.sleep(0.1)
-    raise TimeoutError(f"the recording was not loaded within {START_SECONDS:g} seconds")
+    raise TimeoutError(f"the viewer did not load the recording within {START_SECONDS:g} seconds")
 
 
 def _go_to(client: Any, openings: dict[str, Opening]) -> None:
-    """Bring tabs to the front, set cursors, and show the last recording. The default step is a timeline's last one."""
+    """Select tabs, set time cursors, and show the last recording. The default is the last step of a timeline."""
     recordings = {recording.store_id.rpartition(":")[2]: recording for recording in client.get_state().recordings}
     for recording_id, (tab, name, step) in openings.items():
         recording = recordings[recording_id]
@@ -203,7 +207,7 @@ def _go_to(client: Any, openings: dict[str, Opening]) -> None:
             layout = client.get_blueprint(store_id=recording.store_id).blueprint
             root = f"/container/{layout['/viewport']['ViewportBlueprint']['root_container']}"
             container = layout[root]["ContainerBlueprint"]
-            if isinstance(container["contents"], list):  # else there is only one tab
+            if isinstance(container["contents"], list):  # otherwise there is only one tab
                 container["active_tab"] = container["contents"][tab]
                 client.set_blueprint(layout, store_id=recording.store_id)
         name = name or recording.current_timeline
@@ -214,12 +218,12 @@ def _go_to(client: Any, openings: dict[str, Opening]) -> None:
             client.set_time(name, sequence=step, play_state="paused", recording=recording.store_id)
     if len(openings) > 1:
         client.set_location(recording.location)
-        client.run_command("ui.expand_blueprint_panel")  # it lists the recordings
+        client.run_command("ui.expand_blueprint_panel")  # this panel lists the recordings
 
 
 def _take_picture(client: Any, picture: Path) -> None:
-    """Save pictures until two in a row are the same: then everything is loaded and nothing moves."""
-    client.run_command("ui.toggle_top_panel")  # its messages would cover the views
+    """Save screenshots until two in a row are equal, which means that everything is loaded and nothing moves."""
+    client.run_command("ui.toggle_top_panel")  # the panel's messages would cover the views
     before, deadline = b"", time.monotonic() + SETTLE_SECONDS
     while True:
         time.sleep(PAINT_SECONDS)
@@ -234,18 +238,18 @@ def _take_picture(client: Any, picture: Path) -> None:
 
 
 def rerun_program() -> str:
-    """Return the path of rerun's program."""
+    """Return the path of the ``rerun`` executable."""
     if override := os.environ.get("RERUN_CLI_PATH"):
         return override
-    package = find_spec("rerun_cli")  # a folder with the program; the module would start it in another process
+    package = find_spec("rerun_cli")  # running the module instead of the executable would start a second process
     if package is None or package.origin is None:
-        raise FileNotFoundError("rerun's viewer is not installed; pip install 'rerun-sdk>=0.41,<0.42'")
+        raise FileNotFoundError("the Rerun viewer is not installed; pip install 'rerun-sdk>=0.41,<0.42'")
     name = {"win32": "rerun.exe", "darwin": "Rerun.app/Contents/MacOS/Rerun"}.get(sys.platform, "rerun")
     return str(Path(package.origin).parent / name)
 
 
 def free_port() -> int:
-    """Return a free port of this machine."""
+    """Return a free TCP port on this machine."""
     with socket.socket() as free:
         free.bind((LOCAL, 0))
         return int(free.getsockname()[1])
@@ -253,10 +257,10 @@ def free_port() -> int:
 
 @contextmanager
 def rerun_process(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[bytes], IO[bytes]]]:
-    """Run rerun's program until the end of the block; yield the process and the file with its output."""
+    """Run the ``rerun`` executable until the block ends; yield the process and a file with the process's output."""
     with tempfile.TemporaryFile() as output:
         command = [rerun_program(), *map(str, arguments), "--bind", LOCAL]
-        # Its notes about software drawing would cover the picture.
+        # The viewer's messages about software rendering would cover the screenshot.
         quiet = {"RUST_LOG": "error"} if "--headless" in command else {}
         process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT, env=quiet | dict(os.environ))
         try:
@@ -271,12 +275,12 @@ def rerun_process(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[byt
 
 
 def viewer_error(output: IO[bytes]) -> RuntimeError:
-    """Return an error with the reason why rerun's program ended, from its output."""
+    """Return an error that explains, from the viewer's output, why the viewer ended."""
     output.seek(0)
-    text = re.sub(r"\x1b\[[0-9;]*m", "", output.read().decode("utf-8", "replace"))  # without colours
+    text = re.sub(r"\x1b\[[0-9;]*m", "", output.read().decode("utf-8", "replace"))  # remove color codes
     for pattern, reason in REASONS.items():
         if re.search(pattern, text):
-            return RuntimeError(f"rerun's viewer stopped: {reason}.")
-    # Neither the stack nor the routine lines.
+            return RuntimeError(f"the Rerun viewer stopped: {reason}.")
+    # Omit the stack trace and info messages.
     lines = [line for line in text.splitlines() if line.strip() and not re.match(r"\s+(\d+:|at )|.* INFO ", line)]
-    return RuntimeError("rerun's viewer ended with an error:\n" + "\n".join(lines[-12:]))
+    return RuntimeError("the Rerun viewer ended with an error:\n" + "\n".join(lines[-12:]))

@@ -59,7 +59,7 @@ def test_renamed_keys_are_read_and_written(kind):
 def test_error_names_the_missing_key(kind):
     module, rows = make(kind), state()
     for key in module.in_keys:
-        with pytest.raises(ValueError, match=rf"needed, got .*; without {key}"):
+        with pytest.raises(ValueError, match=rf"must have .*, got .*: {key} missing"):
             module(rows.exclude(key))
 
 

@@ -192,7 +192,8 @@ def test_the_repaired_episode_is_a_ghost(tmp_path, pushed, failed):
     _, recording = logged(tmp_path / "a.rrd", failed, plans=PLANS, failure=failure)
     verdict = recording.text("/push-0/verdict")
     assert (
-        "**The blue ghost**, with the reference plan, succeeds at t = 41 (0.51 s); they part at **t = 30**" in verdict
+        "**The blue ghost**, with the reference plan, succeeds at t = 41 (0.51 s); the two diverge at **t = 30**"
+        in verdict
     )
     steps = [f"ghost{step}" for step in mended[:41]["skill_weights"].argmax(-1).tolist()]
     assert recording.states("/e1/0c_ghost_with_the_reference_plan", 41) == steps
@@ -277,7 +278,7 @@ def test_verdict_of_a_success(tmp_path, pushed):
     _, recording = logged(tmp_path / "a.rrd", succeeded)
     verdict = recording.text("/push-0/verdict")
     assert verdict.startswith("#### SUCCESS at t = 41 (0.51 s) of 60")
-    assert "did not last: the task was done in 1 steps" in verdict
+    assert "did not last: the task was solved in 1 steps" in verdict
     assert Tabs.read(recording.reader).opening_step() == 41
 
 

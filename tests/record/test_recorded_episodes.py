@@ -240,4 +240,4 @@ def test_the_policys_pictures_are_shown_next_to_the_scene(tmp_path):
     assert [picture.shape for picture in pictures] == [(32, 64, 3)] * 4
     assert [round(float(picture.mean()), -1) for picture in pictures] == [0, 60, 120, 180]
     views = [value for (_, field), value in recording.blueprint().items() if field == "display_name"]
-    assert ["What it saw"] in views
+    assert ["Policy input"] in views

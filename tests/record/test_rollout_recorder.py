@@ -121,7 +121,7 @@ def test_a_single_environment_without_rows(tmp_path):
 def test_wrong_rows_plans_and_environments_are_errors(tmp_path):
     norm = ObservationNorm(loc=0.0, scale=2.0, in_keys=["observation"])
     with lw.RerunLogger(tmp_path / "a.rrd") as logger:
-        with pytest.raises(ValueError, match="rows must be below 2"):
+        with pytest.raises(ValueError, match="rows must be less than 2"):
             make(logger, rows=(7,))
         with pytest.raises(ValueError, match="plans lack soccer"):
             TransformedEnv(lw.LanguageWorldEnv("soccer"), RolloutRecorder(logger, plans=PLANS))

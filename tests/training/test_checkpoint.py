@@ -232,7 +232,7 @@ def test_saving_draws_no_random_numbers(path):
     [
         ({"format": 3}, "about must not use the reserved name format"),
         ({"state": 3}, "about must not use the reserved name state"),
-        ({"note": {1: "a", "1": "b"}}, "names '1' more than once"),
+        ({"note": {1: "a", "1": "b"}}, "the key '1' more than once"),
         ({"note": float("nan")}, "JSON"),
     ],
 )
@@ -258,10 +258,10 @@ def test_the_error_for_a_missing_file_names_the_file(path):
 
 
 def test_files_of_another_kind_are_refused(saved, tmp_path, path):
-    assert_refused(tmp_path, "cannot be read: it is a folder")
+    assert_refused(tmp_path, "cannot be read: the path is a folder")
     for content in (b"", b"\x80\x04K\x01.", b"PK\x03\x04", b"words"):
         path.write_bytes(content)
-        assert_refused(path, "cannot be read: it is damaged or not a .safetensors file")
+        assert_refused(path, "cannot be read: the file is corrupted or not a .safetensors file")
     save_file({"weight": torch.ones(2)}, path)
     assert_refused(path, "not written by lw_torchrl")
     assert_refused(saved[0].with_name("policy.training.safetensors"), "must be a policy .*'lw_torchrl.training'")
@@ -309,5 +309,5 @@ def test_a_flipped_bit_is_detected(path):
         damaged = bytearray(content)
         damaged[place] ^= 0x10
         path.write_bytes(damaged)
-        with pytest.raises(ValueError, match="it is damaged"):
+        with pytest.raises(ValueError, match="is corrupted"):
             lw.load_actor(path)

@@ -179,7 +179,7 @@ def test_other_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"must be an evaluator of version 2, got format 'lw_torchrl\.actor'"):
         lw.training.load_evaluator(path, PLANS)
     path.write_bytes(b"PK")
-    with pytest.raises(ValueError, match=r"is damaged or not a \.safetensors file"):
+    with pytest.raises(ValueError, match=r"is corrupted or not a \.safetensors file"):
         lw.training.load_evaluator(path, PLANS)
 
 

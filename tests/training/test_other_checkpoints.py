@@ -116,7 +116,7 @@ def test_a_file_of_another_program_is_refused(demos, tmp_path, content):
     path.write_bytes(content)
     assert_refused(path, "exists, but not its training state", lambda: make_trainer(demos, path))
     state.write_bytes(content)
-    assert_refused(state, "damaged or not a .safetensors file", lambda: make_trainer(demos, path))
+    assert_refused(state, "corrupted or not a .safetensors file", lambda: make_trainer(demos, path))
 
 
 def test_a_policy_without_a_training_state_is_not_overwritten(demos, tmp_path):
@@ -130,7 +130,7 @@ def test_a_training_file_without_a_state_is_refused(demos, checkpoint, tmp_path)
     description, tensors = read_tensors(training_file(checkpoint))
     del description["state"]
     write_tensors(training_file(path), description, tensors)
-    assert_refused(training_file(path), "it holds no state", lambda: make_trainer(demos, path))
+    assert_refused(training_file(path), "the file holds no valid state", lambda: make_trainer(demos, path))
 
 
 OFFLINE = lw.OfflineConfig(steps=12, batch_size=8, checkpoint_every=5)
@@ -168,7 +168,7 @@ def test_one_training_at_a_time_writes_a_checkpoint(demos, tmp_path, holding, mo
     monkeypatch.setattr(
         "lw_torchrl._util.reproducibility.version", lambda name: "9.9.9" if name == "torch" else real(name)
     )
-    with pytest.warns(UserWarning, match=r"under other versions \(torch .*, now 9.9.9\)") as caught:
+    with pytest.warns(UserWarning, match=r"with other versions \(torch .*, now 9.9.9\)") as caught:
         make(demos, path)
     assert len(caught) == 1
 

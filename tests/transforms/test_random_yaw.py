@@ -190,7 +190,7 @@ def test_plans_require_their_answers():
 
 @pytest.mark.parametrize("name", ["observation", "action"])
 def test_missing_key_is_named(name):
-    with pytest.raises(ValueError, match=f"observation and action are needed, got (?!{name})"):
+    with pytest.raises(ValueError, match=f"must have observation and action, got (?!{name})"):
         lw.RandomYaw(0.1)(rows().exclude(name))
 
 
