@@ -197,7 +197,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def differences(was: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
-    """Return the keys whose values differ between two nested mappings, with both values if short: "steps (40, now 30)"."""
+    """Return the keys whose values differ in two nested mappings, with both values if short: "steps (40, now 30)"."""
     names = []
     for key in sorted({**was, **now}):
         before, after = was.get(key), now.get(key)

@@ -79,8 +79,8 @@ def replacing_folder(path: AnyPath) -> Iterator[Path]:
     temporary.mkdir(parents=True)
     try:
         yield temporary
-        for written in [*temporary.rglob("*"), temporary]:
-            flush(written)
+        for entry in [*temporary.rglob("*"), temporary]:
+            flush(entry)
         os.replace(temporary, target)
         flush(target.parent)
     finally:

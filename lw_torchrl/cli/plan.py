@@ -25,7 +25,7 @@ _PLANNER_OPTIONS = (
     "model", "base_url", "constrain", "free_skills", "vocabulary", "temperature", "max_tokens", "seed", "name",
     "concurrency", "timeout", "cache",
 )  # fmt: skip
-_SOURCES = f"{options.PLANS}, a suite, or answers written by `plan generate` (FORMAT/TASK-ATTEMPT.py)"
+_SOURCES = f"{options.PLANS}; also a suite, or answers written by `plan generate` (FORMAT/TASK-ATTEMPT.py)"
 Format = Annotated[str, arg(help=f"plan format: {_FORMATS}")]
 
 
@@ -171,8 +171,8 @@ class Repair(_Model):
         output.notes(note for repair in repairs for answer in repair.answers for note in answer.notes)
         requested = sum(not answer.cached for answer in first)
         print(f"{counted(len(first), 'first answer')}, {requested} requested now")
-        done = max(len(repair.checks) for repair in repairs) - 1
-        folders = [self.out / planner.name, *(self.out / f"{planner.name}-round{k}" for k in range(1, done + 1))]
+        last_round = max(len(repair.checks) for repair in repairs) - 1
+        folders = [self.out / planner.name, *(self.out / f"{planner.name}-round{k}" for k in range(1, last_round + 1))]
         return output.show("folders", folders, f"written to {', '.join(map(str, folders))}")
 
 
@@ -199,8 +199,8 @@ class Read:
     def run(self) -> Output:
         from lw_torchrl.language.canonical import explain_canonical, most_confident
 
-        written = [plan for source in self.sources for plan in self._plans(source)]
-        reports, steps = [explain_canonical(plan) for plan in written], []
+        plans = [plan for source in self.sources for plan in self._plans(source)]
+        reports, steps = [explain_canonical(plan) for plan in plans], []
         for report in reports:
             source = f"{report.source}, confidence {report.plan.confidence:.2f}"
             steps += [{"task": report.written.task, "source": source, **note} for note in report.notes()]
@@ -220,8 +220,8 @@ class Read:
         ]
         output.show("plans", rows)
         if self.out is not None:
-            tasks = dict.fromkeys(plan.task for plan in written)
-            best = [most_confident(plan for plan in written if plan.task == task) for task in tasks]
+            tasks = dict.fromkeys(plan.task for plan in plans)
+            best = [most_confident(plan for plan in plans if plan.task == task) for task in tasks]
             output.show("files", lw.save_plans(Plans(best), self.out), f"{counted(len(best), 'plan')} in {self.out}")
         return output
 

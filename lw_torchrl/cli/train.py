@@ -316,8 +316,8 @@ class TrainEvaluator:
 
     def _config(self) -> Any:
         numbers: dict[str, Any] = {"learning_rate": 2e-3} if self.cameras else {"steps": 6000}
-        given = {name: getattr(self, name) for name in ("steps", "batch_size", "learning_rate", "every")}
-        numbers |= {name: value for name, value in given.items() if value is not None}
+        overrides = {name: getattr(self, name) for name in ("steps", "batch_size", "learning_rate", "every")}
+        numbers |= {name: value for name, value in overrides.items() if value is not None}
         drawn = len(self.held_out_tasks) == 1 and self.held_out_tasks[0].isdigit()
         numbers["held_out_tasks"] = int(self.held_out_tasks[0]) if drawn else self.held_out_tasks
         make = lw.training.ImageQueryEvaluatorConfig if self.cameras else lw.training.QueryEvaluatorConfig

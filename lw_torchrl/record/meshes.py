@@ -45,7 +45,7 @@ class ModelGeometry:
 
 
 def model_geometry(model: RowModel) -> ModelGeometry:
-    """Return the geometry of a model. The first call for an XML file takes about half a second; later calls are cached."""
+    """Return the geometry of a model, cached by XML file; the first call for a file takes about half a second."""
     if model.path not in _prepared:
         _prepared[model.path] = _prepare(model.model)
     return _prepared[model.path]

@@ -180,8 +180,8 @@ class RerunLogger(Logger):
             return
         video = video[0] if video.ndim == 5 else video
         if video.ndim != 4 or video.shape[1] not in (1, 3) or not video.numel() or video.dtype != torch.uint8:
-            given = f"{video.dtype} of shape {tuple(video.shape)}"
-            raise ValueError(f"video {name!r} must be uint8 of shape T×C×H×W (C = 1 or 3), got {given}")
+            actual = f"{video.dtype} of shape {tuple(video.shape)}"
+            raise ValueError(f"video {name!r} must be uint8 of shape T×C×H×W (C = 1 or 3), got {actual}")
         frames = video.permute(0, 2, 3, 1).contiguous().numpy()
         stream, parts = self._open(), _name_parts(name)
         if step is not None:

@@ -172,11 +172,11 @@ class _Row:
 
     def end(self) -> None:
         """Add the episode's page to the recording if at least one time step was recorded."""
-        number, noted, poses = self.ended, (self._before, self._after), self._poses
+        number, recorded, poses = self.ended, (self._before, self._after), self._poses
         seed = self._seed if self._is_own else None
         self.ended += self._stepped
         self.begin(recorded=False)
-        before, after = ({key: torch.from_numpy(np.stack(rows)) for key, rows in some.items()} for some in noted)
+        before, after = ({key: torch.from_numpy(np.stack(rows)) for key, rows in some.items()} for some in recorded)
         if not after:
             return
         length = len(next(iter(after.values())))

@@ -137,12 +137,12 @@ def read_rollout(
     if plans is not None:
         plans.require([label])
         plan = plans[label]
-        answered = rollout.get("qaf_plan", None)
-        if answered is not None and not bool((answered == Plans([plan]).numbers[label]).all()):
+        plan_numbers = rollout.get("qaf_plan", None)
+        if plan_numbers is not None and not bool((plan_numbers == Plans([plan]).numbers[label]).all()):
             raise ValueError(f"plans must hold the plan from which rollout['qaf'] was computed; {label!r} has another")
     if failure is not None and (failure.task, failure.episode) != (label, failure.episode if index is None else index):
-        given = f"{failure.task} {failure.episode}"
-        raise ValueError(f"failure must be of the rollout's episode ({label} {index}), got {given}")
+        failed = f"{failure.task} {failure.episode}"
+        raise ValueError(f"failure must be of the rollout's episode ({label} {index}), got {failed}")
     observation = rollout.get("observation", None)
     objects: dict[str, Tensor] = {}
     if task is not None and observation is not None and observation.shape[1:] == (task.layout.size,):
@@ -222,8 +222,8 @@ def _constant(rollout: TensorDictBase, key: str, *, required: bool) -> int | Non
         return None
     length = tuple(rollout.batch_size)
     if column.is_floating_point() or tuple(column.shape) not in (length, (*length, 1)):
-        given = f"{column.dtype} {tuple(column.shape)}"
-        raise ValueError(f"rollout[{key!r}] must be integers of shape {length}, got {given}")
+        actual = f"{column.dtype} {tuple(column.shape)}"
+        raise ValueError(f"rollout[{key!r}] must be integers of shape {length}, got {actual}")
     values = torch.unique(column).tolist()
     if len(values) != 1:
         raise ValueError(f"rollout must be one episode of one task, got {key!r} {values[:5]}; split the rollout")
@@ -252,21 +252,21 @@ def run_recorded(
     the episodes, sorted by task (in the given order) and index. With an evaluator, the steps hold both the evaluator's
     and the exact truth values of the conditions.
     """
-    answered = actor_plans(actor, plans)
-    own_suite, chosen = suite_tasks(tasks, answered, suite)
+    own_plans = actor_plans(actor, plans)
+    own_suite, chosen = suite_tasks(tasks, own_plans, suite)
     options: dict[str, Any] = {"seed": seed, "max_steps": max_steps, "suite": own_suite, "engine": engine}
     learned = [evaluator] if isinstance(evaluator, QueryEvaluator) else own_evaluators(actor)
-    has_answers = answered is not None and (evaluator is not None or bool(learned))
+    has_answers = own_plans is not None and (evaluator is not None or bool(learned))
     finished: dict[tuple[str, int], FinishedEpisode] = {}
 
     def keep(episode: FinishedEpisode) -> None:
         steps = episode.steps
         if learned and "qaf_logits" not in steps.keys():
             steps = learned[0](steps.to(device_of(learned[0]))).cpu()
-        if has_answers and answered is not None:  # add the exact truth values to those that the policy used
+        if has_answers and own_plans is not None:  # add the exact truth values to those that the policy used
             if "qaf_logits" not in steps.keys():
                 steps.set("qaf_logits", 10.0 * steps.get("qaf").float() - 5.0)
-            steps = QAFTransform(answered)(steps)
+            steps = QAFTransform(own_plans)(steps)
         finished[episode.task, episode.episode] = episode._replace(steps=steps)
 
     run_rollout(
@@ -275,11 +275,15 @@ def run_recorded(
         chosen,
         dict.fromkeys(chosen, episodes),
         keep,
-        plans=answered,
+        plans=own_plans,
         evaluator=evaluator,
         env_options=options,
         keys=_KEYS,
-        optional=[*(_PLAN_KEYS if answered is not None else ()), *(learned[0].in_keys if learned else ()), "pixels"],
+        optional=[
+            *(_PLAN_KEYS if own_plans is not None else ()),
+            *(learned[0].in_keys if learned else ()),
+            "pixels",
+        ],
         noise_scale=noise_scale,
         after_success=0 if stop_at_success else None,
         device=device,

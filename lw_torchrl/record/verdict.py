@@ -114,8 +114,8 @@ def verdict(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None = No
     lines = [f"{len(episode)} steps"] if episode.success is None else [heading.ended(episode)]
     if episode.success is not None and episode.success.any():
         if not episode.success[-1]:
-            done = int(episode.success.sum())
-            lines.append(f"The success did not last: the task was solved in {done} steps, but not in the last one.")
+            solved = int(episode.success.sum())
+            lines.append(f"The success did not last: the task was solved in {solved} steps, but not in the last one.")
     elif heading.failure is not None:
         lines += _reasons(heading.failure, episode)
     elif episode.success is not None:

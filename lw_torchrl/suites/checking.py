@@ -95,11 +95,11 @@ class _Bench:
         return [self.step(**effort).observation[0].copy() for _ in range(steps)]
 
     def rows(self) -> Iterator[_Row]:
-        one, two = (f"({rows}, {self.layout.size}) float64" for rows in (1, 2))
+        one_row, two_rows = (f"({rows}, {self.layout.size}) float64" for rows in (1, 2))
         answers: dict[str, tuple[str, Callable[[], Any]]] = {
-            "observations after a reset": (two, lambda: self.engine.reset([0, 1], [self.seed, self.seed])),
-            "a reset of one of two rows": (one, lambda: self.engine.reset([0], [self.seed])),
-            "a step": (f"EngineStep of {two}, (2,) float64, (2,) bool, (2,) bool", self.step),
+            "observations after a reset": (two_rows, lambda: self.engine.reset([0, 1], [self.seed, self.seed])),
+            "a reset of one of two rows": (one_row, lambda: self.engine.reset([0], [self.seed])),
+            "a step": (f"EngineStep of {two_rows}, (2,) float64, (2,) bool, (2,) bool", self.step),
         }
         for what, (wanted, call) in answers.items():
             measured = _describe(call())

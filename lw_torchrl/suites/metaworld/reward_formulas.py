@@ -262,7 +262,7 @@ def _within_prism(point: Array, zero: Array, one: Array) -> tuple[Array, Any]:
 
 
 def onto_shelf(s: StepState, rows: Index) -> None:
-    """Reduce the lift while the object is in front of the shelf and below the board; set the lift to 0 under the board."""
+    """Reduce the lift if the object is in front of the shelf and below the board; set the lift to 0 under the board."""
     features = s.features[rows]
     goal, placed = features[:, terms.GOAL], s.placed[rows]
     x, y, z = features[:, at.OBJECT].T

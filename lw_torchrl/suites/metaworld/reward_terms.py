@@ -73,15 +73,17 @@ def make_parameters(rewards: Sequence[TaskReward]) -> Parameters:
             **_numbers(Funnel, funnels),
             used=np.array([reward.funnel is not None for reward in rewards]),
             over=np.array([COLUMNS[funnel.over][2] for funnel in funnels]),
-            about=np.array([[COLUMNS[point][:2] for point in (one.about[0], one.about[-1])] for one in funnels]),
+            about=np.array(
+                [[COLUMNS[point][:2] for point in (funnel.about[0], funnel.about[-1])] for funnel in funnels]
+            ),
         ),
         held=Parameters(**_numbers(Held, [reward.held for reward in rewards])),
     )
 
 
 def _numbers(kind: Any, parts: Sequence[Any]) -> dict[str, Any]:
-    numeric: list[Any] = [one for one in fields(kind) if one.type in _DTYPES]
-    return {one.name: np.array([getattr(part, one.name) for part in parts], _DTYPES[one.type]) for one in numeric}
+    numeric: list[Any] = [f for f in fields(kind) if f.type in _DTYPES]
+    return {f.name: np.array([getattr(part, f.name) for part in parts], _DTYPES[f.type]) for f in numeric}
 
 
 def _points(reward: TaskReward) -> list[list[list[list[int]]]]:
@@ -277,7 +279,7 @@ class FunnelTerm:
         self._from = (row + funnel.over)[:, None, None] + (-2, -1)
         self._about = row[:, None, None] + funnel.about
         self._offset = funnel.offset[:, None, :2]
-        self._rim, self._slope, self._height = (one[:, None] for one in (funnel.rim, funnel.slope, funnel.height))
+        self._rim, self._slope, self._height = (array[:, None] for array in (funnel.rim, funnel.slope, funnel.height))
         self._margin = funnel.margin
 
     def __call__(self, features: Array) -> Array:

@@ -99,7 +99,7 @@ class Funnel:
 
 @dataclass(frozen=True)
 class Held:
-    """The conditions under which the object counts as held (by default always); data/rewards.toml explains the fields."""
+    """The conditions for an object to count as held (by default always); data/rewards.toml explains the fields."""
 
     near: float = inf
     within: float = inf
