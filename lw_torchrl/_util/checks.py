@@ -139,7 +139,7 @@ def checker(hint: Any) -> Callable[[Any], bool]:
 
 
 def _words(hint: Any) -> str:
-    """Describe a type hint in English."""
+    """Describe a type hint in words, such as "an integer of at least 1"."""
     kind, parts = get_origin(hint), get_args(hint)
     if kind in (Union, UnionType):
         return " or ".join(map(_words, parts))

@@ -132,7 +132,7 @@ def seeded(device: torch.device, seed: int) -> Iterator[None]:
         torch.default_generator.manual_seed(seed)
         if others:
             module = torch.get_device_module(device.type)
-            generators = getattr(module, "default_generators", None)  # manual_seed would seed the current device only
+            generators = getattr(module, "default_generators", None)  # manual_seed only seeds the current device
             (module if generators is None else generators[device.index]).manual_seed(seed)
         yield
 

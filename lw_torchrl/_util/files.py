@@ -109,10 +109,10 @@ def locked(
     wait: bool = False,
     error: type[ValueError] = ValueError,
 ) -> Iterator[None]:
-    """Lock a file or folder against other threads and processes while the block writes to the file or folder.
+    """Lock a file or folder against other threads and processes until the block ends.
 
-    If a process is killed, its lock is released. If another ``who`` (such as "process") holds the lock for more than a
-    second, raise ``error`` with a message that names ``argument``, or with ``wait``, wait for the lock.
+    The lock is released if the process is killed. If another ``who`` (such as "process") holds the lock for more than a
+    second, raise ``error`` with a message that names ``argument``; with ``wait``, wait until the lock is released.
     """
     from filelock import FileLock, Timeout
 
@@ -208,7 +208,7 @@ def reading(path: AnyPath, what: str) -> Iterator[None]:
         yield
     except FileNotFoundError as error:
         raise FileNotFoundError(
-            f"path: {str(path)!r} holds no {what} ({error.filename} is missing); write one with dumps()"
+            f"path: {str(path)!r} holds no {what} ({error.filename} is missing); use dumps() to save the {what}"
         ) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, RuntimeError) as error:
         raise ValueError(f"path: {str(path)!r} holds no {what} ({error})") from error

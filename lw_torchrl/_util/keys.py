@@ -22,14 +22,14 @@ Keys = Sequence[NestedKey]
 
 
 def _key(value: Any) -> NestedKey | None:
-    """Convert a value to a tensordict key; return None if it is not a valid key. A list becomes a nested key, since
-    JSON has no tuples."""
+    """Convert a value to a tensordict key, or to None if the value is not a valid key. A list becomes a nested key,
+    since JSON has no tuples."""
     value = tuple(value) if isinstance(value, list) else value
     return unravel_key(value) if checker(NestedKey)(value) and value else None
 
 
 def as_keys(argument: str, value: Sequence[NestedKey] | None, default: Sequence[str]) -> list[NestedKey]:
-    """Return the keys in ``value``, which replace the ``default`` keys in order, or the default keys if it is None.
+    """Return the keys in ``value``, which replace the ``default`` keys in order, or ``default`` if ``value`` is None.
 
     Raises:
         ValueError: ``value`` has a wrong number of keys, a repeated key, or an object that is not a key.
@@ -96,7 +96,7 @@ def dispatched(forward: Callable[[Any, TensorDictBase], TensorDictBase]) -> Call
 
 
 def any_arguments(forward: Any) -> Any:
-    """Give a dispatched ``forward`` a signature to which ``torch.export`` can bind the tensors of ``in_keys``."""
+    """Set the signature of a dispatched ``forward`` so that ``torch.export`` can pass the tensors of ``in_keys``."""
     forward.__signature__ = Signature([Parameter("self", Parameter.POSITIONAL_OR_KEYWORD), *_ANY])
     return forward
 
@@ -105,7 +105,7 @@ _ANY = Parameter("args", Parameter.VAR_POSITIONAL), Parameter("kwargs", Paramete
 
 
 def row_mask(tensordict: TensorDictBase | None, key: str, n: int) -> np.ndarray:
-    """Return a row mask (n,) bool, such as the one with the key "_reset"; without a mask, all rows are True."""
+    """Return the row mask (n,) bool with the given key, such as "_reset"; if there is no mask, all rows are True."""
     mask = None if tensordict is None else tensordict.get(key, None)
     if mask is None:
         return np.ones(n, dtype=bool)

@@ -190,7 +190,7 @@ def _skill_notes(plan: lw.ConditionalPlan, skills: Mapping[str, ScriptedSkill]) 
                 hint = f"the closest is {skill.text!r} ({score:.2f})"
             except ValueError:
                 hint = "add your own with --skill-file"
-            notes.append(f"no scripted skill {step.skill!r} for {plan.task}; {hint}. Learned policies do not need one")
+            notes.append(f"no scripted skill {step.skill!r} for {plan.task}; {hint}. Only scripted policies need it")
     return notes
 
 

@@ -118,7 +118,7 @@ def _check_ranges(command: Any) -> None:
 
 
 def _parts(hint: Any) -> Iterator[Any]:
-    """Yield all types and validators in a type hint, including nested ones."""
+    """Yield all types and validators in a type hint, including nested types and validators."""
     yield hint
     for part in get_args(hint):
         yield from _parts(part)

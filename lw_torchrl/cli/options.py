@@ -189,7 +189,7 @@ def policy_name(policy: str) -> str:
 
 
 def read_encoder(name: str | None) -> TextEncoder | None:
-    """Import the function named by --text-encoder; return None without one."""
+    """Import the function named by --text-encoder; return None if ``name`` is None."""
     return None if name is None else import_object("--text-encoder", name)
 
 

@@ -178,7 +178,7 @@ class Repair(_Model):
 
 @dataclass(kw_only=True)
 class Read:
-    """Show, step by step, how free-form plans are parsed, with a confidence score; --out writes them as .plan files.
+    """Show, step by step, how free-form plans are parsed, with a confidence score; --out saves the parsed plans.
 
     The confidence is the fraction of typical states of the motion in which the plan, as written, chooses a correct
     step. A plan with a confidence below 0.75 keeps its motion and objects, but gets standard conditions. A plan without
@@ -243,8 +243,8 @@ class Read:
         return [plans[self.task]]
 
     def _decoded(self, file: Path) -> list[lw.ConditionalPlan]:
-        """Return a list with the plan in a language model's answer; an empty list if the answer, one of several, has no
-        plan."""
+        """Return a list with the plan in a language model's answer. If the answer has no plan, raise a PlanError, or
+        return an empty list if there are several sources."""
         from lw_torchrl.language.plan_decoding import decode_plan
 
         task, format = self.task or re.sub(r"-\d+$", "", file.stem), self.format or file.absolute().parent.name

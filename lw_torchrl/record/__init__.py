@@ -1,4 +1,4 @@
-"""Rerun recordings: a TorchRL logger that writes recordings, and functions that open them in a viewer.
+"""Rerun recordings: a TorchRL logger that writes recordings, and a function that opens recordings in a viewer.
 
 Importing this package does not import rerun; creating a :class:`RerunLogger` does.
 """

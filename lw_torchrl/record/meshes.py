@@ -1,4 +1,4 @@
-"""Draw MuJoCo models: each body's mesh is logged once per recording, and every episode moves it in its own views."""
+"""Draw MuJoCo models. A body's mesh is logged once per recording; each episode logs the body's poses."""
 
 from __future__ import annotations
 
@@ -236,7 +236,7 @@ def _corners(model: Any, mesh: int) -> tuple[NDArray[np.float64], NDArray[np.flo
 
 
 def _color(model: Any, geom: int) -> NDArray[np.uint8]:
-    """Return the color (4,) uint8 of a geom: its own or the material's color, times the mean color of the texture."""
+    """Return a geom's color (4,) uint8: the color of the geom or material, times the mean color of the texture."""
     material = model.geom_matid[geom]
     rgba = np.array(model.geom_rgba[geom], np.float64)
     if material >= 0:

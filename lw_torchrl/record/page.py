@@ -49,8 +49,8 @@ CURVES: dict[str, tuple[str, tuple[float, float] | None]] = {
 
 @dataclass
 class Lanes:
-    """The lanes (rows) of an episode's timeline view, logged below ``root``. A lane has an entry for each change of its
-    state, and an empty entry at the end.
+    """The lanes (rows) of an episode's timeline view, logged below ``root``. A lane has an entry for each state change,
+    and an empty entry at the end.
 
     The viewer sorts the lanes and uses their paths as titles, with a backslash before every character except letters,
     digits and underscores. Therefore paths are short, and names begin with numbers.

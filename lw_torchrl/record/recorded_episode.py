@@ -84,7 +84,7 @@ class RecordedEpisode:
 
     @property
     def answers(self) -> NDArray[np.bool_] | None:
-        """The truth values (T×S) that the policy used: the learned evaluator's if there is one, else the exact ones."""
+        """The truth values (T×S) that the policy used, from a learned evaluator if there is one."""
         return self.qaf if self.believed is None else self.believed
 
     @property
@@ -212,7 +212,7 @@ class RecordedEpisode:
 
 @dataclass(frozen=True)
 class Ghost:
-    """A re-run of the episode with one part of the policy replaced by ``by``, drawn translucently in the same scene."""
+    """A re-run of an episode with a repaired part of the policy, drawn translucently; ``by`` describes the repair."""
 
     by: str
     episode: RecordedEpisode

@@ -103,7 +103,7 @@ class RerunLogger(Logger):
         super().__init__(exp_name=name, log_dir=str(self.path.parent) if self.path else os.curdir)
 
     def _create_experiment(self) -> rr.RecordingStream:
-        # The Rerun viewer gives all recordings of one application the same layout, so each is its own application.
+        # The Rerun viewer gives all recordings of an application the same layout, so each recording is an application.
         stream = rr.RecordingStream(f"{self.exp_name}-{uuid.uuid4().hex[:8]}", recording_id=uuid.uuid4())
         stream.set_log_time_enabled(False)
         stream.set_log_tick_enabled(False)
@@ -282,7 +282,7 @@ class RerunLogger(Logger):
 
     @property
     def episodes(self) -> list[str]:
-        """The names of the recorded episodes."""
+        """The names of the episodes recorded so far."""
         return list(self._tabs.pages)
 
     @typed
@@ -384,8 +384,8 @@ def is_complete(path: Path) -> bool:
 
 
 def _new_file(path: Path) -> Path:
-    """Create the file ``path``, or if it exists, the first unused one of "run-2.rrd", "run-3.rrd", ...; return the path
-    of the new file."""
+    """Create the file ``path``, or if it exists, "run-2.rrd", "run-3.rrd", etc. (the first unused name), and return the
+    path of the new file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     for free in chain([path], (path.with_stem(f"{path.stem}-{i}") for i in count(2))):
         with suppress(FileExistsError):

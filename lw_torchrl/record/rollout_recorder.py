@@ -29,8 +29,8 @@ _AFTER = {"executed_action", "success", "reward"}
 class RolloutRecorder(Transform):
     """A transform that records episodes of selected environment rows while they run.
 
-    When an episode ends, its page is added to the recording as :func:`lw_torchrl.log_rollout` does (or, if the
-    environment is not a :class:`~lw_torchrl.LanguageWorldEnv`, as :meth:`RerunLogger.log_episode` does). An episode
+    When an episode ends, the recorder adds a page to the recording, with :func:`lw_torchrl.log_rollout` for a
+    :class:`~lw_torchrl.LanguageWorldEnv` and with :meth:`RerunLogger.log_episode` for other environments. An episode
     that a reset or ``close()`` interrupts is recorded up to that point. Put the recorder after
     :class:`~lw_torchrl.QAFTransform` and before transforms of the observation, and close the environment before the
     logger. A LanguageWorldEnv in another process cannot be recorded.
@@ -153,7 +153,7 @@ class _Row:
         self._add_pose()
 
     def add_step(self, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
-        """Store a time step: the tensordict entries before the step, and those after the step."""
+        """Store a time step: the tensordict's entries before and after the step."""
         self._stepped = True
         dims = len(self.env.batch_size)
         for columns, entries, own in ((self._before, before, _BEFORE), (self._after, after, _AFTER)):

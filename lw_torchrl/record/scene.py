@@ -26,7 +26,7 @@ PALM_HALF, PALM_RISE = (0.018, 0.062, 0.014), 0.012
 WRIST_HALF, WRIST_RISE = (0.012, 0.012, 0.055), 0.081
 TABLE_CENTER, TABLE_HALF = (0.0, 0.6, -0.010), (0.7, 0.4, 0.010)
 TABLE, GRID = (58, 64, 74), (92, 99, 112)
-SAME_PLACE = 0.05  # largest distance, metres, between the origin of a body and the position of its object
+SAME_PLACE = 0.05  # maximum distance (metres) between a body's origin and the position of the object it belongs to
 FOCAL, LABEL, LETTER = 160.0, 26.0, 6.5
 """Focal length, height of a label and width of a letter, in pixels of the scene view in a window of 1100×700."""
 
@@ -165,8 +165,8 @@ def log_pictures(stream: Any, root: str, episode: RecordedEpisode, drawn: NDArra
 
 
 def name_offsets(positions: dict[str, NDArray[np.float32]], eye: tuple[Point, Point]) -> dict[str, NDArray[Any]]:
-    """Return an offset (3,) in metres of each label from its object's positions (T×3), chosen so that the labels
-    overlap least when seen from ``eye``."""
+    """Return, by name, an offset (3,) in metres between an object's positions (T×3) and the object's label. The offsets
+    are chosen so that the labels overlap least when seen from ``eye``."""
     place, ahead = np.array(eye[0], np.float32), np.subtract(eye[1], eye[0]).astype(np.float32)
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, [0, 0, 1]).astype(np.float32)

@@ -155,8 +155,8 @@ class Tabs:
         return tabs[self.index(name)]
 
     def opening_step(self, tab: str | None = None) -> int | None:
-        """Return the time step at which a tab opens: the earliest decisive step of its episodes, or None without
-        episodes."""
+        """Return the time step at which a tab opens: the earliest decisive step of the tab's episodes, or None if the
+        tab has no episodes."""
         return min((self.pages[name].decisive for name in self.tab(tab).episodes), default=None)
 
     def index(self, name: str | None) -> int:
@@ -169,7 +169,7 @@ class Tabs:
         raise unknown_name("episode", str(name), [tab.name for tab in tabs])
 
     def _has_overview(self) -> bool:
-        """Return whether there is an overview tab: there are several episodes, and not exactly one comparison."""
+        """Return whether there is an overview tab: if there are several episodes, unless they form one comparison."""
         return len(self.pages) > 1 and len(self._compared) != 1
 
 

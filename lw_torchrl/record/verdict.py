@@ -100,8 +100,8 @@ def shown_steps(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None 
 
 
 def drawn_steps(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None) -> NDArray[np.int64]:
-    """Return the time steps at which the scene is drawn: every one or two in the shown range, a few others, the
-    decisive step and the last step."""
+    """Return the time steps at which the scene is drawn: every step (or every second step) of the shown range, every
+    8th step elsewhere, the decisive step and the last step."""
     first, last = shown_steps(heading, episode, ghost)
     steps, stride = np.arange(len(episode)), 1 if last - first <= AROUND_FAILURE else 2
     drawn = (steps >= first) & (steps <= last) & (steps % stride == 0) | (steps % SPARSE == 0)
@@ -215,8 +215,8 @@ def _line_count(conditions: Sequence[str], episode: RecordedEpisode) -> int:
 
 
 def log_curves(stream: Any, root: str, episode: RecordedEpisode) -> list[str]:
-    """Log the curves ``root``/action, /distance (cm), /reward, /skill_weights and /corrected; return the names of those
-    that exist."""
+    """Log the curves ``root``/action, /distance (cm), /reward, /skill_weights and /corrected; return the names of the
+    logged curves."""
     rows, logged = np.arange(len(episode)), []
 
     def send(name: str, values: NDArray[Any], names: Sequence[str], *color: Color, later: int = 0) -> None:

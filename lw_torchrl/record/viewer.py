@@ -100,7 +100,7 @@ def open_viewer(
                 files[-1] = folder / f"{known.recording_id}.rrd"
                 ids = {"application_id": known.application_id, "recording_id": known.recording_id}
                 reader.stream().write_rrd(files[-1], **ids)
-            if tabs is not None and (own_front is not None or not reader.blueprints()):  # if it was never closed
+            if tabs is not None and (own_front is not None or not reader.blueprints()):  # it was never closed
                 layouts.append(folder / f"{known.recording_id}.rbl")
                 tabs.blueprint(own_front).save(known.application_id, str(layouts[-1]))
         if len(unknown) == len(files):
@@ -174,8 +174,8 @@ class Opening(NamedTuple):
 
     @classmethod
     def of(cls, tabs: Tabs | None, episode: str | None, step: int | None) -> Opening:
-        """Return the opening of the tab ``episode``. If ``tabs`` is None, another program wrote the recording, which
-        keeps its layout."""
+        """Return the opening of the tab ``episode``. If another program wrote the recording (``tabs`` is None), only
+        the time step is set."""
         if tabs is None:
             return cls(None, None, step)
         number = None if episode is None else tabs.index(episode)

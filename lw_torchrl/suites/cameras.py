@@ -50,7 +50,7 @@ def _no_open_gl(error: Exception) -> ImportError:
 
 
 _open: WeakSet[Cameras] = WeakSet()
-_processes: set[int] = set()  # this process and its parents, if they opened OpenGL
+_processes: set[int] = set()  # IDs of this process and its parent processes, if a process opened OpenGL
 
 
 def _close_all() -> None:
@@ -59,13 +59,13 @@ def _close_all() -> None:
 
 
 class Cameras:
-    """A renderer for one thread at a time that loads a model's meshes and textures when it first renders the model."""
+    """A renderer for one thread at a time. A model's meshes and textures are loaded at the model's first image."""
 
     def __init__(self) -> None:
         if _processes - {os.getpid()}:
             raise RuntimeError(
-                "the parent process rendered images before it forked this process, and OpenGL cannot be used after a "
-                "fork: use mp_start_method='spawn', or render nothing before the fork"
+                "this process was forked from a process that had rendered images, and OpenGL does not work after a "
+                "fork: use mp_start_method='spawn', or render no images before the fork"
             )
         try:
             self._gl = _open_gl()
@@ -73,7 +73,7 @@ class Cameras:
             raise _no_open_gl(error) from error
         if not _open:
             atexit.unregister(_close_all)
-            atexit.register(_close_all)  # last, so that it runs before OpenGL's own cleanup
+            atexit.register(_close_all)  # registered last, so that _close_all runs before OpenGL's cleanup
         _open.add(self)
         _processes.add(os.getpid())
         self._loaded: dict[str, tuple[Any, Any]] = {}

@@ -46,9 +46,9 @@ def check_suite(suite: Suite, *, seed: int = 0) -> list[Finding]:
 
     The checks cover the types and shapes that the engine returns; that a seed determines an episode; that inactive rows
     do not change; the observation's values of the previous step; the direction of each displacement axis; how far the
-    hand moves per time step (``reach``) and how soon it stops; that objects stay while the hand moves; that the gripper
-    opens and closes, no slower than in Meta-World (``binary_gripper``); and the height of objects above the table.
-    Success is not checked. The engine runs two rows of each task.
+    hand moves per time step (``reach``) and how soon it stops; that objects stay in place while the hand moves; that
+    the gripper opens and closes, no slower than in Meta-World (``binary_gripper``); and how high objects rest above the
+    table. Success is not checked. The engine runs two rows of each task.
 
     Returns:
         A :class:`Finding` for each measurement, ordered by task.
@@ -130,7 +130,7 @@ class _Bench:
                 for old, now in pairs
                 for part in layout.present
             )
-            wanted = "equal to the previous observation; after a reset, to the current one"
+            wanted = "equal to the previous observation (after a reset: to the current observation)"
             yield "values of the previous step", wanted if kept else "different", wanted, kept
         gripper = self.task.objects[0].position
         place = tuple(range(self.hand.start, self.hand.stop))

@@ -116,8 +116,8 @@ def load_suite(suite: str | Suite) -> Suite:
 
 
 def suite_name(task: str) -> str:
-    """Return the name of the suite to which a task's name (or a suite's name) refers; names without a prefix are
-    Meta-World's."""
+    """Return the name of a task's suite: the prefix of the task's name, or "metaworld" for a name without a prefix. The
+    name of a suite is returned unchanged."""
     # SUITES reads the entry points of all installed packages, which is slow, so check known names first.
     is_metaworld = task in (*TASKS, "MT10", "MT50")
     return task.partition("/")[0] if "/" in task or (not is_metaworld and task in SUITES) else "metaworld"
@@ -129,7 +129,7 @@ def listed_tasks(tasks: Any) -> Any:
 
 
 def find_suite(tasks: Any, suite: str | Suite | None = None) -> Suite:
-    """Return ``suite``, or if None the suite named by the prefix of the tasks' names (Meta-World without a prefix).
+    """Return ``suite``, or, if ``suite`` is None, the suite to which the tasks' names belong (see :func:`suite_name`).
 
     Raises:
         ValueError: the tasks belong to several suites or to an unknown suite.

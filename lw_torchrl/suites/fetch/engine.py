@@ -32,8 +32,8 @@ OPEN = 0.1
 
 
 def our_positions(positions: Array, origin: Array) -> Array:
-    """Convert positions (..., 3) float64 from Fetch's to Meta-World's axes, whose origin is ``origin`` (..., 3) in
-    Fetch's axes."""
+    """Convert positions (..., 3) float64 from Fetch's to Meta-World's axes. ``origin`` (..., 3) is the origin of
+    Meta-World's axes in Fetch's axes."""
     offset = positions - origin
     return np.stack((-offset[..., 1], offset[..., 0], offset[..., 2]), -1)
 

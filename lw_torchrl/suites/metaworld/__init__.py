@@ -1,4 +1,4 @@
-"""Meta-World's 50 tasks: the engines that simulate them, and the scripted experts."""
+"""The Meta-World suite: the engines that simulate the 50 tasks, and the scripted experts."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _warn_once(changes: str) -> None:
         f"engine: the vectorized engine was verified against other versions ({changes}), so Meta-World's own "
         "environments are used instead (4 times slower on one thread, 6 times on two). To use the vectorized engine, "
         f"pip install {installation}",
-        stacklevel=6,  # the caller of LanguageWorldEnv(...)
+        stacklevel=6,  # reports the line that called LanguageWorldEnv(...)
     )
 
 

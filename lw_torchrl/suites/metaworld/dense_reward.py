@@ -16,7 +16,7 @@ FULL_REWARD = 10.0
 
 
 class EpisodeStarts:
-    """The values of each episode's first state that the rewards depend on, with one entry per row."""
+    """The values from each row's first state of the episode that the row's reward depends on."""
 
     def __init__(self, rewards: Sequence[TaskReward]) -> None:
         for reward in rewards:
@@ -57,7 +57,7 @@ class DenseReward:
     @np.errstate(all="ignore")  # unstable rows and unused branches may hold arbitrary numbers
     def __call__(self, sensors: Array, observation: Array, goal: Array, action: NDArray[Any]) -> Array:
         """Compute rewards (rows,) as Meta-World's ``compute_reward`` does, from sensors (rows, REWARD_WIDTH),
-        observations (rows, 39), goals (rows, 3) and actions (rows, 4), whose dtype is kept."""
+        observations (rows, 39), goals (rows, 3) and actions (rows, 4) in the environment's action dtype."""
         task, less, points = self._task, self._starts.less[self._rows], self._starts.points[self._rows]
         features = terms.gather_features(task, sensors, observation[:, CURRENT], goal, points)
         proximity = self._proximity(features, less)

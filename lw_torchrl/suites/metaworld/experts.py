@@ -1,4 +1,4 @@
-"""Meta-World's scripted experts as a TensorDictModule."""
+"""The ExpertActor class: Meta-World's scripted policies as a TensorDictModule."""
 
 from __future__ import annotations
 

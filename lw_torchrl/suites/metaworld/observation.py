@@ -62,7 +62,7 @@ class StateView:
         NAME"; "matrix of geom NAME" (9), or of a body or site; "quaternion of body NAME" (4); or "joint NAME" (1)."""
         kind, _, name = what.rpartition(" ")
         if kind not in self._arrays:
-            raise ValueError(f"quantity must begin with one of {', '.join(self._arrays)}, got {what!r}")
+            raise ValueError(f"what must be a name after one of {', '.join(self._arrays)}, got {what!r}")
         named = getattr(self._model, kind.split()[-1])(name)
         row = named.qposadr[0] if kind == "joint" else named.id
         own = self._arrays[kind][row : row + 1]
@@ -112,8 +112,8 @@ DIAL_RADIUS = 0.05  # metres
 
 
 class Observer:
-    """A class that computes the observations of a fixed set of rows, bit-identical to Meta-World: it does the same
-    operations in the same order."""
+    """A function object that computes the observations of a fixed set of rows, with Meta-World's operations in
+    Meta-World's order, so that the results are bit-identical."""
 
     def __init__(self, sources: Sequence[TaskSources]) -> None:
         self._matrices = np.flatnonzero([row.quaternion.startswith(MATRIX_OF) for row in sources])

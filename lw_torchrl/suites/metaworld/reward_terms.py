@@ -35,9 +35,9 @@ _NO_FUNNEL = Funnel(over="hand", about=("object",), rim=0.0, slope=0.0, height=0
 
 
 class Parameters(SimpleNamespace):
-    """The numeric fields of :class:`TaskReward`, and of ``cage``, ``funnel`` and ``held``, as arrays with one entry per
-    row. ``points`` has the axes [row][distance or margin][first or second point][term][x, y, z], ``offset`` has no axis
-    for the two points, and the other arrays of terms have the axes [row][term]."""
+    """The numeric fields of :class:`TaskReward`, ``cage``, ``funnel`` and ``held``, as arrays with one entry per row.
+    ``points`` has the axes (row, distance or margin, first or second point, term, xyz), ``offset`` the axes (row,
+    distance or margin, term, xyz), and the other arrays of terms the axes (row, term)."""
 
     def of(self, rows: Any) -> Parameters:
         own = vars(self).items()
@@ -124,7 +124,7 @@ Numbers = NDArray[np.floating]
 """An array in single or double precision: Meta-World uses the action's precision if a term depends on the gripper
 action."""
 
-AT_MARGIN = 0.1  # the value at a distance of one margin
+AT_MARGIN = 0.1  # the value of a term whose distance equals the margin
 LONG_TAIL = np.sqrt(1 / AT_MARGIN - 1)
 GAUSSIAN = np.sqrt(-2 * np.log(AT_MARGIN))
 
@@ -167,8 +167,8 @@ class Proximity(NamedTuple):
     """A measure of how close two points are, for each row and term; all arrays are (rows, 4)."""
 
     distance: Array
-    margin: Array  # the further distance at which the value is 0.1
-    value: Array  # 1 if the points are close, less if they are not
+    margin: Array  # the additional distance at which the value is 0.1
+    value: Array  # 1 if the points are close, otherwise less than 1
 
 
 class ProximityTerms:

@@ -73,7 +73,7 @@ class SimulatedRow:
         warnings[...] = self._warnings
 
     def seen(self) -> tuple[RowModel, Any]:
-        """Return the model, after loading this row's positions into it, and the data."""
+        """Load this row's positions of bodies and sites into the shared model, then return the model and the data."""
         self._take_model()
         return RowModel(self.shared.path, self._model), self._data
 
@@ -216,7 +216,7 @@ class ThreadedEngine(SeenRows):
         return self._rows[row].seen()
 
     def poses(self, row: int) -> BodyPoses:
-        """Return the current poses of all bodies of a row. The shared model is not used, so another row may hold it."""
+        """Return the current poses of all bodies of a row. The shared model is not used, so other rows may use it."""
         position, quaternion = self._rows[row].bodies
         return BodyPoses(position.copy(), quaternion.copy())
 

@@ -22,8 +22,8 @@ Places = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class SharedModel:
-    """A compiled model that many rows use in turn. Meta-World's resets move bodies and sites in the model itself, so
-    each row stores its own positions of both and loads them into the model unless the row is still the ``holder``."""
+    """A compiled model that many rows use in turn. Meta-World's resets change the positions of bodies and sites in the
+    model itself. So each row stores its positions, and loads them into the model unless the row is the ``holder``."""
 
     def __init__(self, path: str, model: Any, compiled: Places | None = None) -> None:
         self.path, self.model = path, model
@@ -60,7 +60,7 @@ def borrow_model(path: str) -> SharedModel:
 
 
 def return_models(models: Iterable[SharedModel]) -> None:
-    """Give back borrowed models; one model of each XML file is kept for the next engine."""
+    """Return borrowed models to the pool; for each XML file, one idle model is kept for the next engine."""
     with _lock:
         for model in models:
             model.restore()
@@ -73,8 +73,8 @@ that warning is zero, so nothing is written, and any other value means that a wa
 
 
 class TaskProgram:
-    """A mixin that separates a Meta-World environment from its simulator. One program is built for each model; every
-    episode of every row runs on a shallow copy (:meth:`on`), which shares everything except the simulator state."""
+    """A mixin that separates a Meta-World environment from its simulator state. One program is built for each model and
+    task. Every episode runs on a shallow copy (:meth:`on`), which shares everything except the state."""
 
     model: Any
     data: Any

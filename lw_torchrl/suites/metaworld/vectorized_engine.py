@@ -55,7 +55,7 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
         if changes := version_changes(compared, compared):
             raise ImportError(
                 f"engine: the vectorized engine was verified against other versions ({', '.join(changes)}); install "
-                "those, or use engine='metaworld', which supports any version"
+                "the verified versions, or use engine='metaworld', which supports any version"
             )
         dense, tasks = reward == "dense", [check_task(task) for task in tasks]
         super().__init__([task_programs.model_path(task) for task in tasks], METAWORLD, num_threads)
@@ -81,7 +81,7 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
         self._high = np.array([space.high for space in bounds]).reshape(n, METAWORLD.size)
         self._mocap_low = np.array([builder.mocap_low for builder in builders]).reshape(n, 3)
         self._mocap_high = np.array([builder.mocap_high for builder in builders]).reshape(n, 3)
-        (self._action_scale,) = {builder.action_scale for builder in builders} or {0.01}  # all tasks share one
+        (self._action_scale,) = {builder.action_scale for builder in builders} or {0.01}  # the same for all tasks
 
         self._mocap = np.zeros((n, 3))
         self._current = np.zeros((n, 18))
@@ -98,7 +98,7 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
         self._current[rows] = self._observation[rows, at.CURRENT]
 
     def close(self) -> None:
-        """Stop the threads and give the models back, so that the next engine in this process can use them."""
+        """Stop the threads and make the models available to the next engine in this process."""
         super().close()
         self._running = None
         self._return_models()
