@@ -19,6 +19,9 @@ import reference
 ROOT = Path(__file__).parents[2]
 TOUR = "examples/tour.ipynb"
 PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", TOUR: "tour.md"}
+for results_page in (ROOT / "benchmarks" / "results").glob("*.md"):
+    name = "index" if results_page.stem == "README" else results_page.stem
+    PAGES[f"benchmarks/results/{results_page.name}"] = f"results/{name}.md"
 LANGUAGES = {".py": "python", ".toml": "toml", ".cff": "yaml"}
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\[\]]*\])*)\]\(([^)\s#]*)(#[^)\s]*)?\)")
 CODE = re.compile(r"^ *(?P<fence>`{3,}).*?^ *(?P=fence)", re.MULTILINE | re.DOTALL)
