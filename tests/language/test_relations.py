@@ -109,14 +109,14 @@ def test_the_senses_differ_at_the_threshold_itself():
 
 
 def written(part, opening):
-    """A comparison as docs/queries.md writes it."""
+    """A comparison as docs/reference.md writes it."""
     value = f"‖{part.axes}‖" if part.length else "opening" if opening else part.axes
     raised = f", z raised by {part.raise_z:g}" if part.raise_z else ""
     return f"{value} {part.sense} {part.threshold:g}{raised}"
 
 
 def test_the_page_on_queries_says_every_threshold():
-    page = (Path(__file__).parents[2] / "docs" / "queries.md").read_text("utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "reference.md").read_text("utf-8")
     table = page[page.index("| predicate | holds where |") :].split("\n\n")[0]
     rows = dict(re.findall(r"^\| ([a-z ]+) \| ([^|]+) \|$", table, re.MULTILINE))
     for name, parts in PREDICATES.items():
