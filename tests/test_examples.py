@@ -76,6 +76,14 @@ def test_other_environments_train(tmp_path):
 
 
 @pytest.mark.slow
+def test_an_own_robot_is_checked_trained_and_recorded(tmp_path):
+    done = run("your_robot/your_robot.py", tmp_path, "--steps", 20, "--episodes", 2)
+    assert "arm/touch-red" in done.stdout
+    assert (tmp_path / "runs/arm/policy.safetensors").is_file()
+    assert len(RrdReader(tmp_path / "runs/arm/arm.rrd").recordings()) == 1
+
+
+@pytest.mark.slow
 def test_plain_pytorch_trains_on_an_exported_dataset(tmp_path):
     done = run("plain_pytorch.py", tmp_path, "--steps", 500, "--demonstrations", 1, "--episodes", 1)
     assert "step   500  loss" in done.stdout
