@@ -23,6 +23,7 @@ from lw_torchrl.suites.engine import EngineStep, RowModel, checked_step, seeds_o
 
 XML = Path(__file__).with_name("arm.xml")
 COLORS = ("red", "green", "blue")
+BASE = (0.0, 0.4)  # the shoulder, in front of the camera of recordings
 SUBSTEPS = 10  # of 0.005 s, for each action
 SPEED = 2.0  # radians a second at an action of 1
 
@@ -66,7 +67,7 @@ class ArmEngine(SeenRows):
             data.qpos[:] = random.uniform([0.6, 0.8], [1.2, 1.6])
             angle = np.radians([50, 90, 130]) + random.uniform(-0.2, 0.2, 3)
             radius = random.uniform(0.25, 0.4, 3)
-            data.mocap_pos[:, :2] = np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
+            data.mocap_pos[:, :2] = BASE + np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)
             mujoco.mj_forward(self.simulator, data)
             self.started[row] = True
             self.observe(row)
