@@ -48,7 +48,7 @@ FORMAT_VERSION = 1
 
 @dataclass(frozen=True)
 class Arguments:
-    """Measure speed and memory of lw_torchrl against alternatives in the same run; see benchmarks/results/performance.md."""
+    """Measure speed and memory against alternatives in the same run; see benchmarks/results/performance.md."""
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()
     """Benchmarks to run, all by default; see benchmarks/results/performance.md for their names."""

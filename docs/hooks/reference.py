@@ -37,20 +37,28 @@ def room_page(room: str) -> str:
 
 
 def commands() -> str:
-    """What ``--help`` says of each command."""
+    """Return a page with the ``--help`` of each command, by group."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "NO_COLOR": "1", "COLUMNS": "100"}
-    parts = ["# Commands", "", "What `lw-torchrl COMMAND --help` says. [Exit status, pipes and JSON](cli.md)", ""]
-    for name in COMMANDS:
+    about = "The `--help` of each command. [Exit status, pipes and JSON](reference.md#commands)"
+    parts, group = ["# Commands", "", about, ""], ""
+    for name, (its_group, _, _) in COMMANDS.items():
+        if its_group != group:
+            group = its_group
+            parts += [f"## {group}", ""]
         line = [sys.executable, "-m", "lw_torchrl", *name.split(), "--help"]
-        told = subprocess.run(line, env=environment, capture_output=True, text=True, check=True).stdout
-        parts += [f"## {name}", "", "``` {.text .wrap}", told.strip(), "```", ""]
+        text = subprocess.run(line, env=environment, capture_output=True, text=True, check=True).stdout
+        parts += [f"### {name}", "", "``` {.text .wrap}", text.strip(), "```", ""]
     return "\n".join(parts)
 
 
+FIRST = ("PlanConditionedActor", "load_plans", "LanguageWorldEnv", "QAFTransform", "evaluate")
+
+
 def top_level() -> str:
+    names = sorted(NAMES, key=lambda name: FIRST.index(name[1]) if name[1] in FIRST else len(FIRST))
     rows = [
         f'| <autoref identifier="{module}.{name}" optional>`lw.{name}`</autoref> | [{room}]({room}.md) |'
-        for module, name in NAMES
+        for module, name in names
         if module != "lw_torchrl"
         for room in [module.split(".")[1]]
     ]
@@ -66,14 +74,14 @@ Made from the library's data when the site is built.
 
 x, y, z are the first position minus the second, in metres; ‖·‖ is the length over the named axes. An opening is from 0,
 closed, to 1, open. A logit is the distance to the threshold divided by the temperature.
-[More](queries.md#what-the-relations-mean).
+[More](reference.md#relations).
 
 | predicate | holds where | temperature | published |
 |---|---|---|---|"""
 LAYOUTS = """
 ## Layouts
 
-Indices of the numbers of an observation and of an action. [Suites](suites.md).
+Indices of the numbers of an observation and of an action. [Your robot](your-robot.md).
 
 | | metaworld | fetch |
 |---|---|---|"""
