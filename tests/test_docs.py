@@ -1,4 +1,4 @@
-"""What the documentation shows runs: every docstring's example, and every Python block of README and docs."""
+"""The examples of docstrings and the Python blocks of README and docs run, and links lead somewhere."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MODULES = sorted(module.name for module in pkgutil.walk_packages(lw_torchrl.__pa
 
 
 def blocks(page):
-    """(line, kind, code) of each block that is to run."""
+    """Yield (line, kind, code) of each block that runs."""
     text = page.read_text("utf-8")
     for match in BLOCK.finditer(text):
         if not match["skip"]:
@@ -47,7 +47,7 @@ def examples(name):
 
 @pytest.fixture(autouse=True)
 def _elsewhere(tmp_path, monkeypatch):
-    """Examples run in a folder of their own, and TorchRL's own warning is no fault of theirs."""
+    """Run examples in an empty folder, without a warning of TorchRL's."""
     monkeypatch.chdir(tmp_path)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*target_actor_network_params.*")
@@ -64,17 +64,13 @@ def test_examples_of_docstrings_run(name):
     assert runner.summarize(verbose=False).failed == 0, "".join(report)
 
 
-def test_docstrings_have_examples():
-    assert sum(len(examples(name)) > 0 for name in MODULES) >= 10
-
-
 def test_every_public_class_has_a_docstring():
     rooms = [importlib.import_module(f"lw_torchrl.{room}") for room in lw_torchrl._ROOMS]
-    named = [(name, getattr(room, name)) for room in (lw_torchrl, *rooms) for name in getattr(room, "__all__", ())]
-    classes = {name: found for name, found in named if inspect.isclass(found)}
+    public = {name: getattr(room, name) for room in (lw_torchrl, *rooms) for name in getattr(room, "__all__", ())}
+    classes = {name: one.__doc__ for name, one in public.items() if inspect.isclass(one)}
     assert len(classes) > 80
-    # A dataclass without a docstring has its signature for one.
-    assert not [name for name, found in classes.items() if not found.__doc__ or found.__doc__.startswith(f"{name}(")]
+    # The docstring of a dataclass is its signature by default.
+    assert not [name for name, docstring in classes.items() if not docstring or docstring.startswith(f"{name}(")]
 
 
 @pytest.mark.parametrize(
@@ -98,16 +94,12 @@ def test_code_of_a_page_runs(page):
             assert runner.summarize(verbose=False).failed == 0, "".join(report)
             namespace.update(test.globs)
         else:
-            # Empty lines in front, so that a traceback names the page's own line.
+            # The empty lines make tracebacks name the page's line.
             exec(compile("\n" * line + code, str(page), "exec"), namespace)
 
 
-def test_readme_shows_python():
-    assert any(blocks(ROOT / "README.md"))
-
-
 def anchors(page):
-    """What a link may name after its #: the headings, as GitHub and the site write them."""
+    """Return the anchors of a page's headings, as GitHub and the site make them."""
     text = re.sub(r"^ *```.*?^ *```", "", page.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)
     headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
@@ -118,29 +110,29 @@ def test_links_of_pages_lead_somewhere(page):
     text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
     for target, anchor in re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]+))?\)", text):
         if "://" not in target and not target.startswith("mailto:"):
-            there = page.parent / target if target else page
-            assert there.exists(), target
-            assert not anchor or there.suffix != ".md" or anchor in anchors(there), f"{target}#{anchor}"
+            path = page.parent / target if target else page
+            assert path.exists(), target
+            assert not anchor or path.suffix != ".md" or anchor in anchors(path), f"{target}#{anchor}"
 
 
 def test_files_that_pages_name_exist():
     named = re.findall(r"`([a-z_/]+(?:\.py|\.toml|/))`", (ROOT / "docs" / "design.md").read_text("utf-8"))
     tops = [ROOT / name for name in ("lw_torchrl", "benchmarks", "examples", "tests", "docs")]
     paths = [path for top in tops for path in (top, *top.rglob("*"))]
-    there = [f"{path.as_posix()}/" if path.is_dir() else path.as_posix() for path in paths]
+    existing = [f"{path.as_posix()}/" if path.is_dir() else path.as_posix() for path in paths]
     assert len(named) > 50
-    assert not [name for name in named if not any(path.endswith(f"/{name}") for path in there)]
+    assert not [name for name in named if not any(path.endswith(f"/{name}") for path in existing)]
 
 
 def test_every_page_is_in_the_site():
-    told = (ROOT / "mkdocs.yml").read_text("utf-8")
-    listed = re.findall(r"^ +- (?:.+: )?(\S+\.md)$", told[told.index("\nnav:") :], re.MULTILINE)
+    navigation = (ROOT / "mkdocs.yml").read_text("utf-8").partition("\nnav:")[2]
+    listed = re.findall(r"^ +- (?:.+: )?(\S+\.md)$", navigation, re.MULTILINE)
     lost = {page.name for page in (ROOT / "docs").glob("*.md")} - set(listed)
     assert not lost, f"add to the nav of mkdocs.yml: {', '.join(sorted(lost))}"
 
 
 class Page(HTMLParser):
-    """The links of a page of the site, and what links to it may name."""
+    """The links and the anchors of a page of the site."""
 
     def __init__(self, path):
         super().__init__()
@@ -173,9 +165,9 @@ def test_site_is_built_without_warnings_and_its_links_lead_somewhere(tmp_path):
             parts = urlsplit(link)
             if parts.scheme or parts.netloc:
                 continue
-            there = (path.parent / unquote(parts.path)).resolve() if parts.path else path
-            there = there / "index.html" if there.is_dir() else there
-            if not there.is_file() or (parts.fragment and unquote(parts.fragment) not in pages[there].names):
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            target = target / "index.html" if target.is_dir() else target
+            if not target.is_file() or (parts.fragment and unquote(parts.fragment) not in pages[target].names):
                 lost.append(f"{path.relative_to(site)}: {link}")
     assert lost == []
 

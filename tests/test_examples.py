@@ -1,10 +1,13 @@
-"""The examples: short, composed by hand from the library's parts, and they run."""
+"""The examples: short programs on public names, and they run."""
 
 from __future__ import annotations
 
 import ast
 import json
 import os
+import re
+import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -14,30 +17,55 @@ import pytest
 from rerun.chunk import RrdReader
 
 import lw_torchrl as lw
+from lw_torchrl.cli.main import main
+from lw_torchrl.language.relations import RELATIONS
+from lw_torchrl.modules import METHODS
+from lw_torchrl.suites import SUITES
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
-TRAIN_BC = EXAMPLES / "train_bc.py"
+ROOT = Path(__file__).parent.parent
+EXAMPLES = ROOT / "examples"
 TOUR = EXAMPLES / "tour.ipynb"
+PAGES = sorted([*EXAMPLES.glob("*.py"), *EXAMPLES.glob("online/*.py")])
+PARTS = sorted((EXAMPLES / "parts").glob("*.py"))
+EXTENDING = sorted((EXAMPLES / "extending").glob("my_*.py"))
 
 
 def names(path):
-    """Every name and attribute a file mentions, and every module it imports."""
-    found = set()
+    """Return every name and attribute in a file, and every module that it imports."""
+    used = set()
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Attribute):
-            found.add(node.attr)
+            used.add(node.attr)
         elif isinstance(node, ast.Name):
-            found.add(node.id)
+            used.add(node.id)
         elif isinstance(node, ast.ImportFrom):
-            found |= {node.module or "", *(alias.name for alias in node.names)}
+            used |= {node.module or "", *(alias.name for alias in node.names)}
         elif isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-    return found
+            used |= {alias.name for alias in node.names}
+    return used
 
 
-@pytest.mark.parametrize(
-    "path", sorted([*EXAMPLES.glob("*.py"), *EXAMPLES.glob("online/*.py")]), ids=lambda path: path.name
-)
+def run(folder, *command):
+    """Run Python in a folder and return its standard output."""
+    done = subprocess.run(
+        [sys.executable, *map(str, command)],
+        cwd=folder,
+        env={
+            **os.environ,
+            "TMPDIR": str(folder),
+            "RAY_TMPDIR": tempfile.gettempdir(),
+        },  # Ray's sockets need short paths
+        capture_output=True,
+        text=True,
+        timeout=400,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "Warning" not in done.stderr.replace("UserWarning: \x1b", "")  # Gymnasium's, about Meta-World's spaces
+    return done.stdout
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
 def test_examples_are_at_most_one_page(path):
     lines = path.read_text("utf-8").splitlines()
     longer = {"offline": 120, "rerun": 120, "suite": 155}
@@ -45,116 +73,93 @@ def test_examples_are_at_most_one_page(path):
     assert max(map(len, lines)) <= 120
 
 
-def test_train_bc_uses_no_trainer():
-    found = names(TRAIN_BC)
-    assert {"BCLoss", "PlanConditionedActor", "LanguageWorldExperienceReplay", "QAFTransform"} <= found
-    assert not any("Trainer" in name or "trainers" in name for name in found)
-    assert not any(name.startswith("lw_torchrl.") for name in found), "the public names are enough"
+def test_examples_use_the_parts_that_they_show():
+    train_bc = names(EXAMPLES / "train_bc.py")
+    assert {"BCLoss", "PlanConditionedActor", "LanguageWorldExperienceReplay", "QAFTransform"} <= train_bc
+    assert not [name for name in train_bc if re.search(r"[Tt]rainers?\b|^lw_torchrl\.", name)]
+    assert not [name for name in names(EXAMPLES / "any_environment.py") if "lw_torchrl.envs" in name]
+    assert not [name for name in names(EXAMPLES / "plain_pytorch.py") if re.search("[Rr]eplay|Trainer", name)]
+    assert {"ExpectileValueLoss", "AdvantageWeightedLoss", "SoftUpdate"} <= names(EXAMPLES / "offline_rl.py")
 
 
-def run(path, folder, *options):
-    done = subprocess.run(
-        [sys.executable, str(EXAMPLES / path), *map(str, options)],
-        cwd=folder,
-        env={**os.environ, "TMPDIR": str(folder), "RAY_TMPDIR": tempfile.gettempdir()},  # for sockets a short one
-        capture_output=True,
-        text=True,
-        timeout=240,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
-    assert "Warning" not in done.stderr
-    return done
+ONLINE = ["--task", "button-press-topdown", "--cloning-steps", 150, "--max-steps", 100, "--frames", 2_000]
+ONLINE += ["--learning-starts", 500, "--utd", 0.05, "--episodes", 2, "--out", "out"]
+SUCCESS = "button-press-topdown: success "
+POLICY = "out/button-press-topdown-seed0/policy.safetensors"
+# Options that make an example short; regular expressions that its output has; files that it leaves, if any.
+RUNS = {
+    "train_bc.py": (
+        ["--steps", 20, "--demonstrations", 1, "--episodes", 1],
+        ["step     0  loss", "^drawer-open ", "^window-open ", "^drawer-open: ", "^window-open: "],
+        [],
+    ),
+    "any_environment.py": (["--frames", 500], ["500 steps, the last episode's reward"], None),
+    "plain_pytorch.py": (
+        ["--steps", 500, "--demonstrations", 1, "--episodes", 1],
+        ["step   500  loss", "drawer-open"],
+        None,
+    ),
+    "fetch_few_shot.py": (
+        ["--demonstrations", 1, "--steps", 3, "--episodes", 1],
+        ["seed 0: fetch/pick-and-place"],
+        ["runs/fetch-few-shot/seed0/policy.safetensors"],
+    ),
+    "ppo.py": (
+        ["--updates", 2, "--rows", 4, "--horizon", 20, "--clone", 5],
+        ["update   1  reward", "window-open"],
+        None,
+    ),
+    "online/td3_with_demonstrations.py": ([*ONLINE, "--critic-warm-up", 10], ["step   2000/2000: ", SUCCESS], [POLICY]),
+    "online/sac_with_demonstrations.py": ([*ONLINE, "--critic-warm-up", 10], ["step   2000/2000: ", SUCCESS], [POLICY]),
+    "online/expert_iteration.py": (ONLINE, ["step   2000/2000: ", SUCCESS], [POLICY]),
+    "co_learning.py": (
+        ["--steps", 20, "--demonstrations", 1, "--episodes", 1],
+        ["the target's rows 50", "^window-open ", "^drawer-open ", "^door-open "],
+        [],
+    ),
+    "offline_rl.py": (["--steps", 3, "--episodes", 1, "--data", 6], ["^by advantage:", "^successes cloned:"], []),
+    "collect_on_ray.py": (["--workers", 2, "--batches", 4], ["batch 3: 200 steps"], None),
+}
 
 
-@pytest.mark.slow
-def test_other_environments_train(tmp_path):
-    pytest.importorskip("gymnasium_robotics")
-    done = run("any_environment.py", tmp_path, "--frames", 500)
-    assert "500 steps, the last episode's reward" in done.stdout
-    assert not any("lw_torchrl.envs" in name for name in names(EXAMPLES / "any_environment.py"))
-
-
-@pytest.mark.slow
-def test_plain_pytorch_trains_on_an_exported_dataset(tmp_path):
-    done = run("plain_pytorch.py", tmp_path, "--steps", 500, "--demonstrations", 1, "--episodes", 1)
-    assert "step   500  loss" in done.stdout
-    assert "drawer-open" in done.stdout
-    assert not any("replay" in name.lower() or "Trainer" in name for name in names(EXAMPLES / "plain_pytorch.py"))
-
-
-@pytest.mark.slow
-def test_fetch_learns_from_demonstrations(tmp_path):
-    pytest.importorskip("gymnasium_robotics")
-    done = run("fetch_few_shot.py", tmp_path, "--demonstrations", 1, "--steps", 3, "--episodes", 1)
-    assert "seed 0: fetch/pick-and-place" in done.stdout
-    assert (tmp_path / "runs/fetch-few-shot/seed0/policy.safetensors").is_file()
-
-
-@pytest.mark.slow
-def test_ppo_runs(tmp_path):
-    done = run("ppo.py", tmp_path, "--updates", 2, "--rows", 4, "--horizon", 20, "--clone", 5)
-    assert "update   1  reward" in done.stdout
-    assert "window-open" in done.stdout
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["td3_with_demonstrations", "sac_with_demonstrations", "expert_iteration"])
-def test_policy_trains_online(tmp_path, name):
-    """On an easy task, so that the few steps hold successes to learn from."""
-    task = ["--task", "button-press-topdown", "--cloning-steps", 150, "--max-steps", 100]
-    training = ["--frames", 2_000, "--learning-starts", 500, "--utd", 0.05, "--episodes", 2, "--out", "out"]
-    warm_up = [] if name == "expert_iteration" else ["--critic-warm-up", 10]
-    done = run(f"online/{name}.py", tmp_path, *task, *training, *warm_up)
-    assert "step   2000/2000: " in done.stdout
-    assert "button-press-topdown: success " in done.stdout
-    policy = lw.load_actor(tmp_path / "out" / "button-press-topdown-seed0" / "policy.safetensors")
-    assert policy.tasks == ("button-press-topdown",)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n == "train_bc.py" else pytest.mark.slow) for n in RUNS])
+def test_example_runs(name, tmp_path):
+    if name in ("any_environment.py", "fetch_few_shot.py"):
+        pytest.importorskip("gymnasium_robotics")
+    options, patterns, files = RUNS[name]
+    output = run(tmp_path, EXAMPLES / name, *options)
+    for pattern in patterns:
+        assert re.search(pattern, output, re.MULTILINE), pattern
+    for file in files or ():
+        assert lw.load_actor(tmp_path / file).tasks
+    if files == []:
+        assert not [path for path in tmp_path.iterdir() if not path.name.startswith("torchinductor")]
 
 
 @pytest.mark.slow
 def test_training_is_recorded(tmp_path):
     options = ["--steps", 20, "--demonstrations", 1, "--rollouts", 2, "--length", 30]
-    done = run("rerun_training.py", tmp_path, *options)
-    assert [line.split()[1] for line in done.stdout.splitlines() if line.startswith("step ")] == ["10", "20"]
+    output = run(tmp_path, EXAMPLES / "rerun_training.py", *options)
+    assert re.findall(r"^step +(\d+)", output, re.MULTILINE) == ["10", "20"]
     recording = RrdReader(tmp_path / "runs" / "rerun_training" / "training.rrd")
-    found = {chunk.entity_path for chunk in recording.stream()}
-    assert {"/metrics/loss/bc", "/metrics/success/mean", "/histograms/action", "/hparams"} <= found
-    assert {f"/{task}\\ after\\ {step}/action" for task in ("drawer-open", "window-open") for step in (10, 20)} <= found
-
-
-@pytest.mark.slow
-def test_co_learning_runs_on_custom_data(tmp_path):
-    done = run("co_learning.py", tmp_path, "--steps", 20, "--demonstrations", 1, "--episodes", 1)
-    assert "the target's rows 50" in done.stdout
-    for task in ("window-open", "drawer-open", "door-open"):
-        assert any(line.startswith(f"{task} ") for line in done.stdout.splitlines()), "the table"
-    left = {path.name for path in tmp_path.iterdir() if not path.name.startswith("torchinductor")}
-    assert not left, "it leaves nothing behind"
-
-
-@pytest.mark.slow
-def test_offline_rl_runs(tmp_path):
-    done = run("offline_rl.py", tmp_path, "--steps", 3, "--episodes", 1, "--data", 6)
-    lines = done.stdout.splitlines()
-    assert [line.split(":")[0] for line in lines[-2:]] == ["by advantage", "successes cloned"]
-    left = {path.name for path in tmp_path.iterdir() if not path.name.startswith("torchinductor")}
-    assert not left, "it leaves nothing behind"
-    assert {"ExpectileValueLoss", "AdvantageWeightedLoss", "SoftUpdate"} <= names(EXAMPLES / "offline_rl.py")
+    entities = {chunk.entity_path for chunk in recording.stream()}
+    assert {"/metrics/loss/bc", "/metrics/success/mean", "/histograms/action", "/hparams"} <= entities
+    tasks = ("drawer-open", "window-open")
+    assert {f"/{task}\\ after\\ {step}/action" for task in tasks for step in (10, 20)} <= entities
 
 
 @pytest.mark.slow
 def test_policy_is_exported(tmp_path):
     lw.save_actor(lw.PlanConditionedActor(lw.load_plans("MT10")), tmp_path / "policy.safetensors")
-    done = run("export_policy.py", tmp_path, "policy.safetensors", "policy.pt2")
-    assert done.stdout.count("at most 0.0e+00 away") == 3
+    output = run(tmp_path, EXAMPLES / "export_policy.py", "policy.safetensors", "policy.pt2")
+    assert output.count("at most 0.0e+00 away") == 3
     assert (tmp_path / "policy.pt2").is_file()
 
 
 @pytest.mark.slow
 def test_torchrls_trainer_runs(tmp_path):
-    done = run("torchrl_trainer.py", tmp_path, "--updates", 3, "--rows", 4, "--horizon", 25)
-    assert len(done.stdout.split("update:")[1].splitlines()[0].split()) == 3
+    output = run(tmp_path, EXAMPLES / "torchrl_trainer.py", "--updates", 3, "--rows", 4, "--horizon", 25)
+    assert len(output.split("update:")[1].splitlines()[0].split()) == 3
     logged = tmp_path / "runs" / "torchrl_trainer" / "ppo" / "scalars"
     for name in ("reward", "success", "loss_objective"):
         lines = (logged / f"{name}.csv").read_text("utf-8").splitlines()
@@ -162,32 +167,15 @@ def test_torchrls_trainer_runs(tmp_path):
     assert lw.load_actor(tmp_path / "runs" / "torchrl_trainer" / "policy.safetensors").distribution == "normal"
 
 
-@pytest.mark.slow
-def test_ray_collects_experience(tmp_path):
-    pytest.importorskip("ray")
-    done = run("collect_on_ray.py", tmp_path, "--workers", 2, "--batches", 4)
-    assert "batch 3: 200 steps" in done.stdout
-
-
-def test_train_bc_runs(tmp_path):
-    done = run("train_bc.py", tmp_path, "--steps", 20, "--demonstrations", 1, "--episodes", 1)
-    assert "step     0  loss" in done.stdout
-    for task in ("drawer-open", "window-open"):
-        assert any(line.startswith(f"{task} ") for line in done.stdout.splitlines()), "the table"
-        assert any(line.startswith(f"{task}: ") for line in done.stdout.splitlines()), "the skills"
-    left = {path.name for path in tmp_path.iterdir() if not path.name.startswith("torchinductor")}
-    assert not left, "it leaves nothing behind"
-
-
-def shown(path):
-    """What the cells of a notebook show: the kinds of their outputs, and their text."""
-    cells = json.loads(path.read_text("utf-8"))["cells"]
-    outputs = [output for cell in cells for output in cell.get("outputs", ())]
-    return [kind for output in outputs for kind in output.get("data", [output["output_type"]])], str(outputs)
+def outputs(notebook):
+    """Return the kinds of a notebook's outputs, and their text."""
+    cells = json.loads(notebook.read_text("utf-8"))["cells"]
+    shown = [output for cell in cells for output in cell.get("outputs", ())]
+    return [kind for output in shown for kind in output.get("data", [output["output_type"]])], str(shown)
 
 
 def test_tour_is_stored_with_its_outputs():
-    kinds, text = shown(TOUR)
+    kinds, text = outputs(TOUR)
     assert kinds.count("image/png") == 4
     assert "error" not in kinds
     assert "lw-torchrl view" in text
@@ -198,9 +186,95 @@ def test_tour_is_stored_with_its_outputs():
 @pytest.mark.slow
 def test_tour_runs_from_top_to_bottom(tmp_path):
     pytest.importorskip("nbclient")
-    script = EXAMPLES.parent / "docs" / "hooks" / "tour.py"
-    done = subprocess.run(
-        [sys.executable, str(script), "shown.ipynb"], cwd=tmp_path, capture_output=True, text=True, timeout=400
-    )
+    script = [sys.executable, str(ROOT / "docs" / "hooks" / "tour.py"), "shown.ipynb"]
+    done = subprocess.run(script, cwd=tmp_path, capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, done.stderr
-    assert shown(tmp_path / "shown.ipynb")[0] == shown(TOUR)[0]
+    assert outputs(tmp_path / "shown.ipynb")[0] == outputs(TOUR)[0]
+
+
+# ---- examples/parts: each program uses one part of the library
+
+PRINTS = {
+    "custom_decoder": "Linear(in_features=120, out_features=32",
+    "custom_skill_encoder": "torch.Size([1, 3, 16])",
+    "learned_evaluator": "['observation', 'task_id']",
+    "losses": "IQLLoss",
+    "plan_attention": "1.000  lower the gripper around the puck",
+    "qaf_transform": "False",
+    "rerun_logger": "swing",
+    "samplers": "TaskBalancedSampler 10 of 20 rows push",
+}
+
+
+def statements(path):
+    """Return the statements of a program, without its docstring."""
+    return ast.parse(path.read_text("utf-8")).body[1:]
+
+
+@pytest.mark.parametrize("path", PARTS, ids=lambda path: path.stem)
+def test_programs_have_at_most_15_lines_use_public_names_and_run(path, tmp_path):
+    lines = "\n".join(map(ast.unparse, statements(path))).splitlines()
+    written = [line for line in path.read_text("utf-8").splitlines()[1:] if line.strip()]
+    assert max(len(lines), len(written)) <= 15
+    assert {name for name in names(path) if name.startswith("lw_torchrl")} == {"lw_torchrl"}
+    assert PRINTS[path.stem] in run(tmp_path, path)
+    if path.stem == "custom_decoder":  # its policy is loaded in a new process
+        loads = [text for text in map(ast.unparse, statements(path)) if "save_actor(" not in text]
+        assert len(loads) == len(statements(path)) - 1
+        assert PRINTS[path.stem] in run(tmp_path, "-c", "\n".join(loads))
+
+
+# ---- examples/extending: docs/extending.md shows them
+
+TABLES = (METHODS, RELATIONS, SUITES, lw.PLAN_FORMATS)
+SAYS = {
+    "my_method.py": ("trained to step 3", "reach"),
+    "my_evaluator.py": ("trained to step 3", "window-open"),
+    "my_relation.py": ("reach.plan: 2 steps, valid", "is far from"),
+    "my_format.py": ("condition -> skill", "no step: Good luck!"),
+    "my_suite.py": ("ok   desk/hover", "trained to step 3"),
+}
+
+
+def commands(path):
+    """Return the command lines in an example's docstring."""
+    docstring = ast.get_docstring(ast.parse(path.read_text("utf-8")))
+    return [line for line in docstring.splitlines() if line.startswith("lw-torchrl ")]
+
+
+@pytest.fixture
+def tables():
+    before = [dict(table.data) for table in TABLES]
+    yield
+    for table, entries in zip(TABLES, before, strict=True):
+        table.data = entries
+    for path in EXTENDING:
+        sys.modules.pop(path.stem, None)
+
+
+@pytest.mark.parametrize("path", EXTENDING, ids=lambda path: path.stem)
+def test_page_shows_the_example_and_its_commands(path):
+    page = (ROOT / "docs" / "extending.md").read_text("utf-8")
+    code = path.read_text("utf-8").partition('"""\n\n')[2]
+    assert code in re.findall(r"```python\n(.*?)```", page, re.DOTALL), (
+        f"docs/extending.md must show {path.name} as it is"
+    )
+    assert "\n".join(commands(path)) in page
+    assert len(path.read_text("utf-8").splitlines()) <= 120
+
+
+@pytest.mark.parametrize("path", EXTENDING, ids=lambda path: path.stem)
+def test_commands_of_examples_run(path, tables, tmp_path, monkeypatch, capsys):
+    for file in path.parent.iterdir():
+        if file.is_file():
+            shutil.copy(file, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    for line in commands(path):
+        words = shlex.split(line)[1:]
+        for option, least in {"--steps": 3, "--episodes": 1}.items():
+            if option in words:
+                words[words.index(option) + 1] = str(least)
+        main([*words, *(["--batch-size", "20"] if words[0] == "train" else [])])
+    printed = capsys.readouterr()
+    for part in SAYS[path.name]:
+        assert part in printed.out + printed.err

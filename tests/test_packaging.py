@@ -1,7 +1,8 @@
-"""What is handed out: a source distribution that can be tested, a wheel with all its data, one version, and types."""
+"""Packages: the source distribution, the wheel with its data, versions of dependencies, and types."""
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -99,19 +100,15 @@ def test_wheel_works_outside_the_checkout(built, tmp_path):
 def test_every_dependency_has_a_tested_version():
     stated = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     extras = stated["optional-dependencies"]
-    needed = [*stated["dependencies"], *(one for name in ("text", "ray", "docs", "dev") for one in extras[name])]
-    pinned = {
-        line.split("==")[0].lower().replace("_", "-")
-        for line in (ROOT / "constraints.txt").read_text("utf-8").splitlines()
-        if "==" in line
-    }
-    names = {one.split(">")[0].split("[")[0].lower().replace("_", "-") for one in needed} - {"lw-torchrl"}
-    assert sorted(names - pinned) == []
+    needed = [*stated["dependencies"], *(line for name in ("text", "ray", "docs", "dev") for line in extras[name])]
+    pinned = re.findall(r"^(\S+)==", (ROOT / "constraints.txt").read_text("utf-8"), re.MULTILINE)
+    required, tested = ({re.split(r"[>\[]", line)[0].lower().replace("_", "-") for line in x} for x in (needed, pinned))
+    assert sorted(required - tested - {"lw-torchrl"}) == []
 
 
 def extras(text: str) -> set[str]:
-    """The extras that a text says to install."""
-    return {one for found in re.findall(r"lw_torchrl\[([a-z,-]+)\]|extra `?\[([a-z]+)\]", text) for one in found if one}
+    """Return the extras that a text tells the reader to install."""
+    return set(filter(None, itertools.chain(*re.findall(r"lw_torchrl\[([a-z,-]+)\]|extra `?\[([a-z]+)\]", text))))
 
 
 def test_extras_have_the_same_names_in_errors_and_pages():
@@ -119,16 +116,15 @@ def test_extras_have_the_same_names_in_errors_and_pages():
     readme = (ROOT / "README.md").read_text("utf-8")
     listed = re.findall(r"^\| `([a-z]+)` \|", readme, re.MULTILINE)
     assert sorted(listed) == sorted(set(stated) - {"dev"})
-    said = {path: extras(path.read_text("utf-8")) for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]}
-    said |= {path: extras(path.read_text("utf-8")) for path in (ROOT / "lw_torchrl").rglob("*.py")}
-    assert {name for path, names in said.items() if path.suffix == ".py" for name in names} >= {"fetch", "llm", "text"}
-    assert {path.name: sorted(names - set(stated)) for path, names in said.items() if names - set(stated)} == {}
+    paths = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *(ROOT / "lw_torchrl").rglob("*.py")]
+    named = {path: extras(path.read_text("utf-8")) for path in paths}
+    assert {"fetch", "llm", "text"} <= {name for path, names in named.items() if path.suffix == ".py" for name in names}
+    assert {path.name: sorted(names - set(stated)) for path, names in named.items() if names - set(stated)} == {}
 
 
 @pytest.mark.slow
 def test_mypy_finds_mistakes_outside_the_checkout(tmp_path):
-    """The package is found as it is installed, with ``make setup`` as a path. Overrides with names of their own, as the
-    docs show them, are no mistakes."""
+    """mypy reads the installed package. Overrides with other names of arguments, as in the docs, are not mistakes."""
     planted = {}
     for name in ("planted_errors.py", "planted_in_extensions.py"):
         lines = Path(shutil.copy(Path(__file__).with_name(name), tmp_path)).read_text("utf-8").splitlines()

@@ -72,7 +72,7 @@ class StackedBehavioralCloning(Training):
         options.setdefault("title", f"training {len(actors)} models")
         super().__init__(config, **options)
         self.actors = list(actors)
-        self.networks = [*actors]
+        self.module, self.networks = actors[0], [*actors]
         _check_actors(actors)
         if len({*map(id, replays)}) < len(replays) or len({id(one.sampler) for one in replays}) < len(replays):
             raise ValueError("replays must be different buffers, each with a sampler of its own")

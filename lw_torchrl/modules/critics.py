@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 
 from lw_torchrl._util.checks import Count, Natural, typed
-from lw_torchrl._util.keys import Keys, as_keys, check_apart, check_key, dispatched, read, write
+from lw_torchrl._util.keys import Keys, as_keys, check_apart, dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.parts import MLP, RenamedInputs, Width, encoding_keys, encoding_width, materialize
@@ -110,7 +110,6 @@ class QValue(Value):
     ) -> None:
         if quantiles > 1 and ensemble != 1:
             raise ValueError(f"ensemble must be 1 with quantiles, got {ensemble}: TQCLoss makes several critics itself")
-        check_key("action_key", action_key)
         self._outputs, self._also_read = quantiles, (action_key,)
         super().__init__(trunk, ensemble=ensemble, **options)
 

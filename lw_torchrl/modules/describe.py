@@ -12,7 +12,7 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 
-from lw_torchrl._util.checks import shown
+from lw_torchrl._util.checks import shown, typed
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import TASKS, Task
@@ -110,6 +110,7 @@ def _join(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
+@typed
 def from_description(
     description: Any, text_encoder: TextEncoder | None = None, parts: Sequence[type[nn.Module]] = ()
 ) -> Any:
@@ -132,8 +133,6 @@ def from_description(
 
 class _Decoder:
     def __init__(self, plans: list[Plans], text_encoder: TextEncoder | None, parts: Sequence[type[nn.Module]]) -> None:
-        if wrong := [part for part in parts if not (isinstance(part, type) and issubclass(part, nn.Module))]:
-            raise TypeError(f"parts must be classes of modules, got {shown(wrong[0])}")
         self.plans, self.text_encoder = plans, text_encoder
         self.custom = {f"{kind.__module__}:{kind.__qualname__}": kind for kind in parts}
         # A class that was saved by a script may now be in a module.

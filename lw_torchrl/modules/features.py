@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import add_random_module
 
-from lw_torchrl._util.checks import Scale, check_value, typed
+from lw_torchrl._util.checks import Scale, typed
 from lw_torchrl._util.devices import check_finite
 from lw_torchrl._util.keys import Keys, as_keys, check_apart, dispatched, read, write
 from lw_torchrl.language.layout import METAWORLD, Layout
@@ -40,10 +40,10 @@ class Features(TensorDictModuleBase):
 
     width: int
 
-    def __init__(self, noise: float, in_keys: Keys, out_keys: Keys | None = None) -> None:
+    @typed
+    def __init__(self, noise: Scale, in_keys: Keys, out_keys: Keys | None = None) -> None:
         super().__init__()
-        self.noise = check_value("noise", noise, Scale)
-        self.in_keys, self.out_keys = list(in_keys), as_keys("out_keys", out_keys, ("features",))
+        self.noise, self.in_keys, self.out_keys = noise, list(in_keys), as_keys("out_keys", out_keys, ("features",))
         check_apart(self.in_keys, self.out_keys)
 
     @property
@@ -99,7 +99,7 @@ class ObservationFeatures(Features):
     def __init__(
         self,
         kind: Kind = "differences",
-        noise: float = 0.0,
+        noise: Scale = 0.0,
         layout: Layout | None = None,
         *,
         in_keys: Keys | None = None,
@@ -238,7 +238,7 @@ def check_observation(observation: Tensor, layout: Layout) -> None:
 def check_rows(rows: Tensor) -> None:
     """Raise :class:`ValueError` unless there are rows to compute statistics from."""
     if not len(rows):
-        raise ValueError("rows to fit features to must be at least one, got 0")
+        raise ValueError("fit needs at least one of rows, got none")
 
 
 def relative(observation: Tensor, layout: Layout) -> Tensor:

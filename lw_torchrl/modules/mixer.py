@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from lw_torchrl._util.checks import Count, check_value, typed
+from lw_torchrl._util.checks import Count, Natural, typed
 from lw_torchrl._util.keys import Keys, dispatched, read, write
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.roles import role_vectors
@@ -36,8 +36,9 @@ class SkillEncoder(MLP):
         torch.Size([5, 32])
     """
 
-    def __init__(self, latent_size: int = 64, *, width: Width = 128, depth: int = 1) -> None:
-        super().__init__(check_value("latent_size", latent_size, Count), width=width, depth=depth)
+    @typed
+    def __init__(self, latent_size: Count = 64, *, width: Width = 128, depth: Natural = 1) -> None:
+        super().__init__(latent_size, width=width, depth=depth)
         self.config = {"latent_size": latent_size, "width": width, "depth": depth}
 
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Composite
 from torchrl.modules import MLP as TorchRLMLP
 
-from lw_torchrl._util.checks import Count, Natural, check_value
+from lw_torchrl._util.checks import Count
 from lw_torchrl._util.keys import Keys, any_arguments, as_keys, check_apart, last_name
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.language.plans import AnyPlans
@@ -33,9 +33,6 @@ class MLP(TorchRLMLP):
     """
 
     def __init__(self, out_features: int, *, width: Width = 256, depth: int = 3, layer_norm: bool = False) -> None:
-        check_value("depth", depth, Natural)
-        for cells in width if isinstance(width, Sequence) else [width]:  # beartype checks one item of a sequence only
-            check_value("width", cells, Count)
         widths = list(width) if isinstance(width, Sequence) else [width] * depth
         super().__init__(
             out_features=out_features,
@@ -141,7 +138,7 @@ def _reading(module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[A
 
 
 def _rename_parts(
-    module: nn.Module, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any], in_order: bool = False
+    module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any], in_order: bool = False
 ) -> None:
     """Replace a module's parts by copies that read renamed keys.
 

@@ -35,8 +35,8 @@ Pair = tuple[NamedObject, NamedObject]
 class _RelativePositions(Features):
     """Positions of objects relative to other objects, mixed by the attention over a plan's steps.
 
-    ``pairs`` gives for each step of a plan up to ``number`` P pairs: the object from which, and the object to which.
-    A step with fewer pairs has 0 there.
+    ``pairs`` returns for each step of a plan at most ``number`` = P pairs of objects, of which the position of the
+    second relative to the first is shown. A step with fewer pairs has zeros.
     """
 
     begin: Tensor
@@ -196,7 +196,6 @@ class RoleFeatures(_RelativePositions):
     acts: Tensor
     lifts: Tensor
     direction: Tensor
-    ahead_begin: Tensor
 
     @typed
     def __init__(
@@ -291,8 +290,8 @@ class RoleFeatures(_RelativePositions):
         positions = super().of_steps(observation, rows) + contact.unsqueeze(-2)
         lifts = (pick(self.lifts, rows) & ~pick(self.demonstrated, rows).unsqueeze(-1))[..., None, None]
         sideways, height = positions[..., :2], positions[..., 2:]
-        # More than 3 to 7 cm to the side of its target, the target is 15 cm higher; until the object is nearly that
-        # high, there is no way to the side.
+        # Until the object is over its target, within 3 to 7 cm, the target is 15 cm higher; until the object is nearly
+        # that high, it does not move sideways.
         distance = sideways.norm(dim=-1, keepdim=True)
         height = height + _LIFTED * ((distance - 0.03) / 0.04).clamp(0.0, 1.0) * lifts
         lifted = torch.where(lifts, ((0.06 - height) / 0.04).clamp(0.0, 1.0), 1.0)

@@ -18,7 +18,7 @@ from torch import nn
 from torchrl.data import Composite
 from torchrl.modules import IndependentNormal, TanhNormal
 
-from lw_torchrl._util.checks import check_choice, typed
+from lw_torchrl._util.checks import typed
 from lw_torchrl._util.keys import any_arguments, key_beside
 from lw_torchrl.modules.decoder import Decode, GaussianDecoder, MLPDecoder
 from lw_torchrl.modules.features import Features
@@ -97,7 +97,6 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
             TypeError: the actor's decoder is not an :class:`MLPDecoder`.
             ValueError: a Normal through tanh, of an actor that does not squash its actions.
         """
-        check_choice("distribution", distribution, DISTRIBUTIONS)
         old = getattr(actor.decoder, "network", None)
         if not isinstance(old, MLPDecoder):
             raise TypeError(

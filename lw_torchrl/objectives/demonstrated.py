@@ -15,7 +15,7 @@ from torchrl.data import Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss, TD3BCLoss
 
-from lw_torchrl._util.checks import Scale, shown, typed
+from lw_torchrl._util.checks import Scale, typed
 from lw_torchrl.objectives.offline import Reduction
 
 if TYPE_CHECKING:
@@ -44,9 +44,8 @@ class _ImitatesDemonstrations(_Loss):
         if spec is not None and not isinstance(spec, Composite) and len(spec.shape) > 1:
             got = f"shape {tuple(spec.shape)}; use env.action_spec_unbatched"
             raise ValueError(f"action_spec must have no batch dimension, got {got}")
-        critics = qvalue_network if isinstance(qvalue_network, list) else [qvalue_network]
-        if not critics or not all(isinstance(critic, TensorDictModuleBase) for critic in critics):
-            raise TypeError(f"qvalue_network must be a TensorDictModule, or a list, got {shown(qvalue_network)}")
+        if isinstance(qvalue_network, list) and not qvalue_network:
+            raise ValueError("qvalue_network must be at least one critic, got none")
         super().__init__(actor_network, qvalue_network, reduction=reduction, **self._fixed, **options)
         self.bc_weight = bc_weight
 

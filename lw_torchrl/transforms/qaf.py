@@ -54,7 +54,7 @@ class QAFTransform(KeepsEnvState):
     the environment's, as :class:`EnvState` does.
 
     Conditions are about metres, so put it before transforms that change the observation, such as a normaliser or
-    :class:`RandomYaw`. It refuses to stand behind one, except in the workers of a SerialEnv or ParallelEnv.
+    :class:`RandomYaw`. It raises an error behind one, except in the workers of a SerialEnv or ParallelEnv.
 
     Args:
         plans: a plan for each task that will be seen.

@@ -117,9 +117,9 @@ class RandomYaw(PlanAugmentation):
             in_keys=as_keys("in_keys", in_keys, _KEYS),
             out_keys=as_keys("out_keys", in_keys if out_keys is None else out_keys, _KEYS),
         )
-        for own, there in zip(self.in_keys, self.out_keys, strict=True):
-            if there != own:
-                check_apart(self.in_keys, [there])
+        for source, target in zip(self.in_keys, self.out_keys, strict=True):
+            if target != source:
+                check_apart(self.in_keys, [target])
         self.scale, self.tilt, self.has_plans = scale, tilt, plans is not None
         if plans is not None:
             plans = self._read_plans(plans)

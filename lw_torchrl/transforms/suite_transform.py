@@ -11,7 +11,7 @@ from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from lw_torchrl._util.checks import typed
-from lw_torchrl._util.keys import Keys, check_key, read
+from lw_torchrl._util.keys import Keys, read
 from lw_torchrl.language.tasks import Task, task_id
 
 
@@ -56,8 +56,6 @@ class SuiteTransform(Transform):
         act: Callable[[Tensor], Tensor] | None = None,
         in_keys: Keys = ("observation",),
     ) -> None:
-        for key in in_keys:
-            check_key("in_keys", key)
         inverse, written = ["action"] if act is not None else [], ["observation", "task_id"]
         super().__init__(in_keys=list(in_keys), out_keys=written, in_keys_inv=inverse, out_keys_inv=inverse)
         self.task, self.observe, self.act, self.layout = task, observe, act, task.layout

@@ -1,4 +1,4 @@
-"""Many plans in one simulation succeed as each does alone."""
+"""Plans that run in one simulation succeed as often as each does alone."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SHORT = {"episodes": 3, "seed": 1_000, "max_steps": 60, "progress": False}
 
 
 def without(plan, step):
-    pairs = [(str(one.condition), one.skill) for number, one in enumerate(plan.steps) if number != step]
+    pairs = [(str(other.condition), other.skill) for number, other in enumerate(plan.steps) if number != step]
     return lw.ConditionalPlan.from_pairs(plan.definition, pairs)
 
 
@@ -32,11 +32,11 @@ def test_success_of_each_plan_is_that_of_evaluate():
 
 
 def test_random_choices_depend_neither_on_rows_nor_on_other_plans():
-    seen = {}
+    reported = {}
     successes = evaluate_plans(MANY, num_envs=256, **SHORT)
     expected = [*successes[::-1], successes[0]]
-    assert evaluate_plans([*MANY[::-1], MANY[0]], num_envs=6, on_plan=seen.__setitem__, **SHORT) == expected
-    assert seen == dict(enumerate(expected))
+    assert evaluate_plans([*MANY[::-1], MANY[0]], num_envs=6, on_plan=reported.__setitem__, **SHORT) == expected
+    assert reported == dict(enumerate(expected))
     assert evaluate_plans(MANY[1:2], **SHORT) == successes[1:2]
 
 

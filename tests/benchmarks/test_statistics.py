@@ -1,4 +1,5 @@
-"""Statistics over seeds × tasks: against scipy, by hand, and intervals that hold the truth as often as they say."""
+"""Statistics over seeds × tasks: against scipy, by hand, and intervals that contain the truth as often as they
+claim."""
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ TWO = [mean_difference, probability_of_improvement]
 
 
 def rates(least_seeds=1, tasks=None):
-    """(seeds, tasks) in steps of a twentieth, as 20 episodes give: with many ties."""
+    """Rates (seeds, tasks) in steps of 1/20, as of 20 episodes, with many ties."""
     shapes = st.tuples(st.integers(least_seeds, 6), st.integers(1, 12) if tasks is None else tasks)
     return shapes.flatmap(lambda shape: arrays(np.int64, shape, elements=st.integers(0, 20))).map(lambda x: x / 20)
 
@@ -52,41 +53,43 @@ def test_probability_of_improvement_is_scipys(pair):
 @given(pairs(), st.sampled_from(TWO), st.randoms(use_true_random=False))
 def test_order_of_seeds_does_not_matter_and_intervals_stay_in_range(pair, function, random):
     x, y = pair
-    found = function(x, y)
+    estimate = function(x, y)
     again = function(x[random.sample(range(len(x)), len(x))], y)
-    assert again.value == pytest.approx(found.value)
+    assert again.value == pytest.approx(estimate.value)
     if min(len(x), len(y)) == 1:
-        assert found.low is found.high is None
+        assert estimate.low is estimate.high is None
     else:
         bottom = 0 if function is probability_of_improvement else -1
-        assert bottom <= found.low <= found.value + 1e-9
-        assert found.value - 1e-9 <= found.high <= 1
-        assert (again.low, again.high) == (pytest.approx(found.low), pytest.approx(found.high))
+        assert bottom <= estimate.low <= estimate.value + 1e-9
+        assert estimate.value - 1e-9 <= estimate.high <= 1
+        assert (again.low, again.high) == (pytest.approx(estimate.low), pytest.approx(estimate.high))
 
 
 @settings(deadline=None)
 @given(rates(least_seeds=2), st.sampled_from([0.5, 0.95]))
 def test_interval_of_a_mean_is_scipys_student_interval_over_seeds(x, confidence):
-    found, seeds = mean_rate(x, confidence=confidence), x.mean(1)
+    estimate, seeds = mean_rate(x, confidence=confidence), x.mean(1)
     error = seeds.std(ddof=1) / len(seeds) ** 0.5
     low, high = t.interval(confidence, len(seeds) - 1, seeds.mean(), error) if error else (seeds.mean(),) * 2
-    assert (found.low, found.high) == (pytest.approx(max(low, 0)), pytest.approx(min(high, 1)))
+    assert (estimate.low, estimate.high) == (pytest.approx(max(low, 0)), pytest.approx(min(high, 1)))
 
 
 @settings(deadline=None)
 @given(pairs())
 def test_interval_of_a_difference_is_that_of_scipys_welch_test(pair):
     seeds = [x.mean(1) for x in pair]
-    found = mean_difference(*pair)
+    estimate = mean_difference(*pair)
     if min(map(len, seeds)) > 1 and min(x.std() for x in seeds) > 1e-9:
         expected = ttest_ind(*seeds, equal_var=False).confidence_interval(0.95)
-        assert (found.low, found.high) == (pytest.approx(max(expected.low, -1)), pytest.approx(min(expected.high, 1)))
+        bounds = pytest.approx(max(expected.low, -1)), pytest.approx(min(expected.high, 1))
+        assert (estimate.low, estimate.high) == bounds
 
 
-def holds(function, truth, draw, repeats=400):
+def coverage(function, truth, draw, repeats=400):
+    """Return how often the interval contains the truth."""
     rng = np.random.default_rng(3)
-    found = [function(*draw(rng)) for _ in range(repeats)]
-    return np.mean([estimate.low <= truth <= estimate.high for estimate in found])
+    estimates = [function(*draw(rng)) for _ in range(repeats)]
+    return np.mean([estimate.low <= truth <= estimate.high for estimate in estimates])
 
 
 P = np.random.default_rng(0).random(20)
@@ -98,25 +101,24 @@ def test_intervals_contain_the_truth_in_95_of_100_cases(seeds):
     """Also with three seeds. 400 repeats make a standard error of 0.011."""
     x = lambda rng: rng.binomial(20, P, (seeds, 20)) / 20  # noqa: E731
     y = lambda rng: rng.binomial(20, Q, (seeds, 20)) / 20  # noqa: E731
-    assert holds(mean_rate, P.mean(), lambda rng: [x(rng)]) == pytest.approx(0.95, abs=0.03)
-    difference = holds(mean_difference, (P - Q).mean(), lambda rng: [x(rng), y(rng)])
+    assert coverage(mean_rate, P.mean(), lambda rng: [x(rng)]) == pytest.approx(0.95, abs=0.03)
+    difference = coverage(mean_difference, (P - Q).mean(), lambda rng: [x(rng), y(rng)])
     assert difference == pytest.approx(0.95, abs=0.03)
 
 
 def test_interval_of_the_probability_of_improvement_contains_the_truth():
     """X is uniform on [0.2, 1], Y on [0, 0.8]: Y is above X with probability 0.75² / 2."""
-    found = holds(
+    share = coverage(
         probability_of_improvement,
         1 - 0.75**2 / 2,
         lambda rng: [0.2 + 0.8 * rng.random((5, 5)), 0.8 * rng.random((5, 5))],
         repeats=300,
     )
-    assert found == pytest.approx(0.95, abs=0.04)
+    assert share == pytest.approx(0.95, abs=0.04)
 
 
 def test_interval_of_three_seeds():
-    found = mean_rate([[0.762], [0.767], [0.790]])
-    assert str(found) == "0.773 [0.736, 0.810]"
+    assert str(mean_rate([[0.762], [0.767], [0.790]])) == "0.773 [0.736, 0.810]"
 
 
 def test_tasks_solved_are_counted_at_the_threshold():
@@ -132,32 +134,23 @@ def test_estimate_is_text_and_json():
 
 
 @pytest.mark.parametrize(
-    ("given_rates", "error", "message"),
-    [
-        ([0.5, 0.6], ValueError, r"rates must have shape \(seeds, tasks\), both at least 1, got \(2,\)"),
-        (np.zeros((3, 0)), ValueError, r"rates must have shape .* got \(3, 0\)"),
-        ([[0.5, 1.5]], ValueError, r"rates must be rates in \[0, 1\], got 1.5"),
-        ([[0.5, float("nan")]], ValueError, r"rates must be rates in \[0, 1\], got nan"),
-        ([[0.5], [0.5, 0.6]], TypeError, "rates must be an array of numbers"),
-        ([["half"]], TypeError, "rates must be an array of numbers"),
-    ],
+    "wrong", [[0.5, 0.6], np.zeros((3, 0)), [[0.5, 1.5]], [[0.5, float("nan")]], [[0.5], [0.5, 0.6]], [["half"]]]
 )
 @pytest.mark.parametrize("function", [*ONE, count_solved])
-def test_wrong_rates_raise(function, given_rates, error, message):
-    with pytest.raises(error, match=message):
-        function(given_rates)
+def test_wrong_rates_raise(function, wrong):
+    with pytest.raises((TypeError, ValueError), match=r"^rates must "):
+        function(wrong)
 
 
 @pytest.mark.parametrize("function", TWO)
 def test_methods_need_the_same_tasks(function):
-    with pytest.raises(ValueError, match="y must have x's tasks, 2 columns, got 3"):
-        function([[0.5, 0.5]], [[0.5, 0.5, 0.5]])
-    with pytest.raises(ValueError, match=r"y must be rates in \[0, 1\], got -1.0"):
-        function([[0.5]], [[-1.0]])
+    for x, y in (([[0.5, 0.5]], [[0.5, 0.5, 0.5]]), ([[0.5]], [[-1.0]])):
+        with pytest.raises(ValueError, match=r"^y must "):
+            function(x, y)
 
 
 def test_wrong_threshold_or_confidence_raises():
-    with pytest.raises(ValueError, match=r"confidence must be in \(0, 1\), got 95"):
+    with pytest.raises(ValueError, match=r"^confidence must "):
         mean_rate([[0.5], [0.6]], confidence=95)
-    with pytest.raises(ValueError, match=r"threshold must be in \(0, 1\], got 80"):
+    with pytest.raises(ValueError, match=r"^threshold must "):
         count_solved([[0.5]], threshold=80)

@@ -1,4 +1,4 @@
-"""summarize: several seeds' results as headline numbers and a row per task."""
+"""summarize: results of several seeds as mean, interquartile mean, solved tasks and a row per task."""
 
 from __future__ import annotations
 
@@ -18,12 +18,9 @@ RATES = {"push": [0.5, 0.75], "reach": [1.0, 0.75], "sweep": [0.0, 0.0]}
 
 
 def make_result(hits, trials=4, **config):
-    """Task to how many of its episodes succeeded."""
-    episodes = [
-        EpisodeResult(task, k, k < count, 5 if k < count else None, None, None)
-        for task, count in hits.items()
-        for k in range(trials)
-    ]
+    """Make a result from the number of successes of each task."""
+    steps = [(task, k, 5 if k < count else None) for task, count in hits.items() for k in range(trials)]
+    episodes = [EpisodeResult(task, k, step is not None, step, None, None) for task, k, step in steps]
     settings = {"tasks": list(hits), "episodes_per_task": trials, "seed": 0, "noise_scale": 0.1, "max_steps": 500}
     return lw.EvaluationResult({**settings, **config}, tuple(episodes))
 
@@ -51,13 +48,11 @@ def test_numbers_are_those_computed_by_hand():
 
 def test_repeated_results_and_other_plans_raise():
     one, other = RESULTS.values()
-    with pytest.raises(ValueError, match="different training seeds, 0 and 2 are one evaluation"):
+    with pytest.raises(ValueError, match=r"^results .*0 and 2"):
         summarize([one, other, one])
-    with pytest.raises(ValueError, match="of the same plans; those of seeds 0 and 1 differ"):
+    with pytest.raises(ValueError, match=r"^results .*plans.*0 and 1"):
         summarize([replace(one, origin={"plans": "a"}), replace(other, origin={"plans": "b"})])
-    summarize([replace(one, origin={"plans": "a"}), other])  # not saved yet, so it does not say
-    with pytest.raises(TypeError, match=r"results\[1\] must be an EvaluationResult, got 'other'"):
-        summarize([one, "other"])
+    summarize([replace(one, origin={"plans": "a"}), other])  # unsaved results do not name their plans
 
 
 def test_one_seed_has_no_interval():
@@ -81,12 +76,13 @@ def test_one_seed_has_no_interval():
 @example({"0": [0.0, 1e-151]})
 def test_summary_is_json_and_consistent(rates):
     summary = summarize_rates(rates)
-    found = json.loads(json.dumps(summary.to_json(), allow_nan=False))
-    assert {task: row["rates"] for task, row in found["tasks"].items()} == rates
-    assert found["mean"]["value"] == pytest.approx(np.mean([row["mean"] for row in found["tasks"].values()]))
-    assert found["mean"]["value"] == pytest.approx(np.mean(list(found["by_seed"].values())))
-    assert all(row["min"] <= row["mean"] + 1e-9 <= row["max"] + 2e-9 for row in found["tasks"].values())
-    assert found["solved"] == sum(row["mean"] >= 0.8 - 1e-9 for row in found["tasks"].values())
+    document = json.loads(json.dumps(summary.to_json(), allow_nan=False))
+    rows = document["tasks"].values()
+    assert {task: row["rates"] for task, row in document["tasks"].items()} == rates
+    assert document["mean"]["value"] == pytest.approx(np.mean([row["mean"] for row in rows]))
+    assert document["mean"]["value"] == pytest.approx(np.mean(list(document["by_seed"].values())))
+    assert all(row["min"] <= row["mean"] + 1e-9 <= row["max"] + 2e-9 for row in rows)
+    assert document["solved"] == sum(row["mean"] >= 0.8 - 1e-9 for row in rows)
 
 
 def test_table():
@@ -100,35 +96,29 @@ def test_table():
 
 
 @pytest.mark.parametrize(
-    ("other", "message"),
+    ("hits", "options", "named"),
     [
-        (make_result({"push": 3, "reach": 3}), "results must be of the same tasks; seeds 3 and 7 do not share sweep"),
-        (
-            make_result({"push": 3, "reach": 3, "sweep": 0}, trials=5),
-            "results must share episodes_per_task, got 4 for seed 3 and 5 for seed 7",
-        ),
-        (
-            make_result({"push": 3, "reach": 3, "sweep": 0}, noise_scale=0.0),
-            "results must share noise_scale, got 0.1 for seed 3 and 0.0 for seed 7",
-        ),
+        ({"push": 3, "reach": 3}, {}, "sweep"),
+        ({"push": 3, "reach": 3, "sweep": 0}, {"trials": 5}, "episodes_per_task"),
+        ({"push": 3, "reach": 3, "sweep": 0}, {"noise_scale": 0.0}, "noise_scale"),
     ],
 )
-def test_results_that_cannot_be_averaged_raise(other, message):
-    with pytest.raises(ValueError, match=message):
-        summarize({3: RESULTS[3], 7: other})
+def test_results_that_cannot_be_averaged_raise(hits, options, named):
+    with pytest.raises(ValueError, match=f"^results must .*{named}"):
+        summarize({3: RESULTS[3], 7: make_result(hits, **options)})
 
 
 @pytest.mark.parametrize(
-    ("rates", "seeds", "message"),
+    ("argument", "rates", "seeds"),
     [
-        ({}, None, "rates must hold at least one task"),
-        ({"push": []}, None, "rates must hold at least one task, each with at least one rate"),
-        ({"push": [0.5], "reach": [0.5, 0.6]}, None, "got different numbers: {'push': 1, 'reach': 2}"),
-        ({"push": [1.5]}, None, r"rates must be rates in \[0, 1\], got 1.5"),
-        ({"push": [0.5, 0.6]}, [1], r"seeds must be 2 different names, got \('1',\)"),
-        ({"push": [0.5, 0.6]}, [1, "1"], r"seeds must be 2 different names, got \('1', '1'\)"),
+        ("rates", {}, None),
+        ("rates", {"push": []}, None),
+        ("rates", {"push": [0.5], "reach": [0.5, 0.6]}, None),
+        ("rates", {"push": [1.5]}, None),
+        ("seeds", {"push": [0.5, 0.6]}, [1]),
+        ("seeds", {"push": [0.5, 0.6]}, [1, "1"]),
     ],
 )
-def test_wrong_rates_raise(rates, seeds, message):
-    with pytest.raises(ValueError, match=message):
+def test_wrong_rates_raise(argument, rates, seeds):
+    with pytest.raises(ValueError, match=f"^{argument} must "):
         summarize_rates(rates, seeds=seeds)

@@ -1,4 +1,4 @@
-"""What test_devices.py runs in a process of its own: training and evaluation on a device that notes every wait."""
+"""Training and evaluation on a device that records every wait; test_devices.py runs these tests in another process."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def make_trainer(demos, device, actor="plan", sampler="balanced", turned=False, 
 
 
 def quiet_steps(trainer, number=3):
-    """The losses of the first steps, none of which but the first has waited."""
+    """Return the losses of the first steps, of which only the first may wait."""
     losses = [trainer.step()]
     WAITS.clear()
     COPIES.clear()
@@ -113,10 +113,10 @@ def test_step_waits_for_nothing_and_equals_the_cpus(demos, actor, sampler, turne
     assert trainer.device == PRETEND
     assert {p.device for p in trainer.actor.parameters()} == {PRETEND}
     losses = quiet_steps(trainer)
-    indices = 2 if sampler == "co-learning" else 1  # beside them, which rows are the target's
+    indices = 2 if sampler == "co-learning" else 1  # indices, and which rows are the target's
     assert len(COPIES) == 3 * indices, "one copy a batch"
     if turned or actor == "noisy plan":
-        return  # of other draws
+        return  # random numbers differ between devices
     cpu = make_trainer(demos, "cpu", actor, sampler)
     assert [loss.item() for loss in losses] == [cpu.step().item() for _ in losses]
     assert_same(weights(trainer), weights(cpu))
@@ -147,7 +147,7 @@ def test_rows_on_the_device_need_one_of_our_samplers(demos):
     rows = make_replay(demos, None)[:].select("observation", "task_id", "qaf", "qaf_plan", "action")
     mine = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows), device=PRETEND))
     mine.extend(rows)
-    with pytest.raises(ValueError, match="replay: a RandomSampler draws on pretend:0 with its own generator"):
+    with pytest.raises(ValueError, match=r"^replay: .*RandomSampler"):
         lw.BehavioralCloningTrainer(ACTORS["plan"](), mine, CONFIG, progress=False, device="pretend")
     mine = TensorDictReplayBuffer(storage=mine.storage, sampler=lw.TaskBalancedSampler())
     quiet_steps(lw.BehavioralCloningTrainer(ACTORS["plan"](), mine, CONFIG, progress=False, device="pretend"))
@@ -277,9 +277,9 @@ def test_evaluation_equals_the_cpus(kind):
     expected = lw.evaluate(actor, **options)
     WAITS.clear()
     found = lw.evaluate(actor, device="pretend", **options)
-    assert [wait for wait in WAITS if "episodes" in wait], "it was there"
-    assert {p.device for p in actor.parameters()} <= {PRETEND}, "and stays"
-    again = lw.evaluate(actor, **options)  # where it is
+    assert [wait for wait in WAITS if "episodes" in wait], "the actor was on the device"
+    assert {p.device for p in actor.parameters()} <= {PRETEND}, "the actor stays there"
+    again = lw.evaluate(actor, **options)  # on the device where the actor is
     for result in (found, again):
         assert result.success_once == expected.success_once
         for one, other in zip(result.episodes, expected.episodes, strict=True):
@@ -344,9 +344,9 @@ def test_device_names(demos):
 
     for name in ("auto", "pretend", "pretend:0", PRETEND):
         assert check_device("device", name) == PRETEND
-    with pytest.raises(ValueError, match="device must be one of 'cpu', 'pretend', 'pretend:0', 'auto' here, got 'pret"):
+    with pytest.raises(ValueError, match="device must be one of 'cpu', 'pretend', 'pretend:0', 'auto'"):
         check_device("device", "pretend:1")
-    with pytest.raises(ValueError, match="got 'cuda': this machine, or this build of PyTorch, has no CUDA"):
+    with pytest.raises(ValueError, match=r"device .*no CUDA"):
         make_trainer(demos, "cuda")
 
 
@@ -354,7 +354,7 @@ def test_device_names(demos):
     ("name", "condition"), [*((name, "plan") for name in LOSSES), ("SAC", "description"), ("IQL", "one-hot")]
 )
 def test_loss_made_on_the_device_equals_the_cpus(name, condition):
-    """With all its networks, their copies, targets and tables; its state comes back."""
+    """Networks, their copies, targets and tables are on the device; the state loads on the CPU."""
     here, actor, value = make_loss(name, condition)
     batch = ready(name, make_batch(), actor, value)
     there, _, _ = make_loss(name, condition, device=PRETEND)
@@ -383,9 +383,13 @@ def test_prefetched_rows_are_on_the_device(demos):
 
 
 @pytest.mark.parametrize("name", ["bc", "advantage", "value"])  # copies of critics are drawn where they are
-def test_losses_over_a_buffer_wait_for_nothing_and_equal_the_cpus(demos, name):
-    def trainer(device):
-        loss = offline.make_loss(name, noise=0.0, device=device)
+def test_losses_over_a_buffer_wait_for_nothing_and_equal_the_cpus(demos, name, monkeypatch):
+    originals = {part: getattr(offline, part) for part in ("make_actor", "make_value")}
+
+    def trainer(device):  # losses copy their networks, which must be on the device before
+        for part, make in originals.items():
+            monkeypatch.setattr(offline, part, lambda *args, make=make, **kw: make(*args, **kw).to(device))
+        loss = offline.make_loss(name, noise=0.0)
         return lw.OfflineTrainer(loss, offline.make_replay(demos, device=device), offline.CONFIG, progress=False)
 
     there, cpu = trainer("pretend"), trainer("cpu")

@@ -1,6 +1,6 @@
-"""A second device, of kind "pretend": its tensors compute on the CPU, and it notes whatever one would wait for.
+"""A device of kind "pretend", whose tensors compute on the CPU, and which records every wait that a GPU would cause.
 
-To be used in a process of its own: PyTorch knows one such device, for good.
+Use it in a separate process: PyTorch can register one such device, and never removes it.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ MODULE = Module()
 _setup_privateuseone_for_python_backend("pretend", MODULE)
 devices._ASSERTING.add("pretend")
 PRETEND = torch.device("pretend:0")
-WAITS: list[str] = []  # what made somebody wait, and where
-COPIES: list[torch.Size] = []  # what went over without waiting
+WAITS: list[str] = []  # operations that waited, and where in the package
+COPIES: list[torch.Size] = []  # shapes of copies to the device without waiting
 
 
 class PretendTensor(torch.Tensor):
-    """A tensor that says it is on the device, around one on the CPU."""
+    """A tensor that claims to be on the device, around one on the CPU."""
 
     @staticmethod
     def __new__(cls, raw):
@@ -75,7 +75,7 @@ def _here() -> str:
 
 
 def _note(func, flat, kwargs, there) -> None:
-    """Note what a GPU would make one wait for; raise where one would refuse."""
+    """Record what would wait for a GPU; raise for what a GPU would refuse."""
     packet = func.overloadpacket
     on = [one for one in flat if isinstance(one, PretendTensor)]
     off = [one for one in flat if isinstance(one, torch.Tensor) and not isinstance(one, PretendTensor) and one.dim()]
@@ -137,7 +137,7 @@ def _empty_strided(size, stride, *, dtype=None, layout=None, device=None, pin_me
 
 
 def _copy_from(source, here, non_blocking=False):
-    """What ``torch.tensor(..., device="pretend")`` calls."""
+    """Copy a tensor, for ``torch.tensor(..., device="pretend")``."""
     return _run(aten.copy_.default, (here, source, non_blocking), {})
 
 

@@ -1,4 +1,4 @@
-"""Devices: their names, a GPU where there is one, and one that notes every wait, in a process of its own."""
+"""Devices: names, a GPU if there is one, and a pretend device that records every wait, in another process."""
 
 from __future__ import annotations
 
@@ -23,16 +23,9 @@ needs_no_gpu = pytest.mark.skipif(torch.accelerator.is_available(), reason="need
 @pytest.mark.slow
 def test_pretend_device_is_never_waited_for():
     paths = [str(HERE), *(str(HERE.parent / room) for room in ("training", "objectives")), *sys.path]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(HERE / "on_a_pretend_device.py")]
     done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "pytest",
-            "-q",
-            "-p",
-            "no:cacheprovider",
-            str(HERE / "on_a_pretend_device.py"),
-        ],
+        command,
         cwd=HERE.parent.parent,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"},
         capture_output=True,
@@ -49,55 +42,35 @@ def test_cpu_is_available():
 
 
 @pytest.mark.parametrize(
-    ("given", "error", "said"),
-    [
-        ("cdua", ValueError, "device must be one of 'cpu', 'cuda', 'cuda:0', 'mps', 'auto', got 'cdua'; did you mean "),
-        ("cuda:x", ValueError, "device must be one of .*, got 'cuda:x'; did you mean 'cuda:0'"),
-        ("", ValueError, "device must be one of .*, got ''"),
-        (0, TypeError, "device must be a device's name, got 0"),
-    ],
+    ("wrong", "error"), [("cdua", ValueError), ("cuda:x", ValueError), ("", ValueError), (0, TypeError)]
 )
-def test_wrong_devices_raise(given, error, said):
-    with pytest.raises(error, match=said):
-        check_device("device", given)
+def test_wrong_devices_raise(wrong, error):
+    with pytest.raises(error, match=f"^device must be .*, got {wrong!r}"):
+        check_device("device", wrong)
 
 
 @needs_no_gpu
 def test_auto_is_the_cpu_without_a_gpu(demos, tmp_path):
     assert check_device("device", "auto") == CPU
     actor, replay = lw.PlanConditionedActor(PLANS), make_replay(demos)
-    for refused in (
+    for call in (
         lambda: make_replay(demos, "cuda"),
         lambda: lw.BehavioralCloningTrainer(actor, replay, device="cuda"),
         lambda: lw.evaluate(actor, tasks="reach", seed=0, device="cuda"),
     ):
-        with pytest.raises(
-            ValueError, match="device must be one of 'cpu', 'auto' here, got 'cuda': this machine, or this build"
-        ):
-            refused()
+        with pytest.raises(ValueError, match="device must be one of 'cpu', 'auto' here, got 'cuda': this machine"):
+            call()
 
 
 @needs_no_gpu
-@pytest.mark.parametrize(
-    ("command", "said"),
-    [
-        (
-            ["train", "DEMOS", "--out", "p.safetensors", "--device", "cuda"],
-            "device must be one of 'cpu', 'auto' here",
-        ),
-        (
-            ["train", "DEMOS", "--out", "p.safetensors", "--device", "gpu"],
-            "device must be one of 'cpu', 'cuda', 'cuda:0', 'mps', 'auto'",
-        ),
-    ],
-)
-def test_command_line_names_a_wrong_device(demos, tmp_path, monkeypatch, capsys, command, said):
+@pytest.mark.parametrize("device", ["cuda", "gpu"])
+def test_command_line_names_a_wrong_device_before_any_work(demos, tmp_path, monkeypatch, capsys, device):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as caught:
-        main([str(demos) if one == "DEMOS" else one for one in command])
+        main(["train", str(demos), "--out", "p.safetensors", "--device", device])
     assert caught.value.code == 2
-    assert said in capsys.readouterr().err
-    assert not list(tmp_path.iterdir()), "before any work"
+    assert f"device must be one of 'cpu', {'auto' if device == 'cuda' else 'cuda'!r}" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
@@ -122,7 +95,7 @@ def make_replay(demos, device=None):
 
 @needs_a_gpu
 def test_gpu_is_never_waited_for(demos, tmp_path):
-    """As on the pretend device, by CUDA's own word; what is drawn is the same, what is summed nearly so."""
+    """CUDA itself reports waits. Draws equal the CPU's, and sums nearly so."""
     config = lw.BehavioralCloningConfig(steps=8, batch_size=10)
     losses = {}
     for device in ("cpu", "cuda"):
@@ -140,7 +113,7 @@ def test_gpu_is_never_waited_for(demos, tmp_path):
         trainer.train()
     assert losses["cuda"] == pytest.approx(losses["cpu"], rel=1e-3)
     options = {"tasks": "reach", "episodes_per_task": 2, "seed": 1000, "max_steps": 20, "progress": False}
-    there = lw.evaluate(actor, record_actions=True, **options)
-    here = lw.evaluate(lw.load_actor(tmp_path / "cuda.safetensors"), record_actions=True, **options)
-    for one, other in zip(there.episodes, here.episodes, strict=True):
-        assert (one.actions - other.actions).abs().max() < 1e-2
+    on_gpu = lw.evaluate(actor, record_actions=True, **options)
+    on_cpu = lw.evaluate(lw.load_actor(tmp_path / "cuda.safetensors"), record_actions=True, **options)
+    for episode, other in zip(on_gpu.episodes, on_cpu.episodes, strict=True):
+        assert (episode.actions - other.actions).abs().max() < 1e-2

@@ -156,5 +156,4 @@ class TestActing:
             attribute=True,
             progress=False,
         )
-        if not result.mean_success:
-            assert [failure.cause for failure in result.failures] == ["query"]
+        assert [failure.cause for failure in result.failures] == ["query"]

@@ -82,7 +82,7 @@ def test_json_list_becomes_a_nested_key():
     ],
 )
 def test_writing_over_an_input_is_refused(make_one):
-    with pytest.raises(ValueError, match="out_keys must not be among in_keys"):
+    with pytest.raises(ValueError, match="out_keys"):
         make_one()
 
 

@@ -1,4 +1,4 @@
-"""A robot of another size, brought as a user would: joints for actions, and things that open, turn and slide."""
+"""A custom suite with another robot, whose actions move joints, and objects that open, turn and slide."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import pytest
 import torch
 from rerun.chunk import RrdReader
 from torchrl.envs import TransformedEnv, check_env_specs
-from torchrl.objectives import SoftUpdate, TD3Loss
 
 import lw_torchrl as lw
 from lw_torchrl.cli.main import main
@@ -60,20 +59,20 @@ def test_environment_follows_torchrls_rules(env):
 
 
 def test_first_59_numbers_are_the_kitchens():
-    theirs = KitchenEnv(tasks_to_complete=["microwave"])
-    ours = KitchenEngine([*BOTH, "kitchen/microwave"])
-    states = ours.reset([0, 1, 2], [5, 6, 7])
-    expected = theirs.reset(seed=7)[0]["observation"]
+    original = KitchenEnv(tasks_to_complete=["microwave"])
+    engine = KitchenEngine([*BOTH, "kitchen/microwave"])
+    states = engine.reset([0, 1, 2], [5, 6, 7])
+    expected = original.reset(seed=7)[0]["observation"]
     assert np.array_equal(states[2, :59], expected)
     draws = np.random.default_rng(0)
     for _ in range(3):
         action = draws.uniform(-1, 1, (3, 9))
-        step = ours.step(action, np.array([True, False, True]))
-        assert np.array_equal(step.observation[2, :59], theirs.step(action[2])[0]["observation"])
+        step = engine.step(action, np.array([True, False, True]))
+        assert np.array_equal(step.observation[2, :59], original.step(action[2])[0]["observation"])
         assert np.array_equal(step.observation[1], states[1])
     assert np.abs(states[0, KITCHEN.positions[-1]] - states[0, [78, 79, 80]]).max() > 0.1  # the door's goal is open
-    theirs.close()
-    ours.close()
+    original.close()
+    engine.close()
 
 
 def test_all_seven_objects_succeed_and_openings_are_right():
@@ -91,25 +90,25 @@ def test_all_seven_objects_succeed_and_openings_are_right():
     after = engine.step(still, every_row)
     assert after.success.all()
     assert after.reward.tolist() == [1.0] * len(rows)
-    opened = [[one == thing for one in JOINTED] for thing in OBS_ELEMENT_GOALS]
+    opened = [[jointed == thing for jointed in JOINTED] for thing in OBS_ELEMENT_GOALS]
     assert program(torch.from_numpy(after.observation), ids).tolist() == opened
     engine.close()
 
 
 def test_check_finds_nothing_wrong_but_an_opening_outside_its_range():
-    found = check_suite(SUITE)
-    assert all(one.right for one in found)
-    assert "opening of the microwave" in {one.what for one in found}
-    angle = tuple(replace(one, opening=3) if one.name == "microwave" else one for one in MICROWAVE.objects)
-    wrong = replace(SUITE, tasks={MICROWAVE.name: replace(MICROWAVE, objects=angle)}, plans=None)
-    assert [one.what for one in check_suite(wrong) if not one.right] == ["opening of the microwave"]
+    findings = check_suite(SUITE)
+    assert all(finding.right for finding in findings)
+    assert "opening of the microwave" in {finding.what for finding in findings}
+    objects = tuple(replace(thing, opening=3) if thing.name == "microwave" else thing for thing in MICROWAVE.objects)
+    wrong = replace(SUITE, tasks={MICROWAVE.name: replace(MICROWAVE, objects=objects)}, plans=None)
+    assert [finding.what for finding in check_suite(wrong) if not finding.right] == ["opening of the microwave"]
 
 
 def test_plans_about_openings_survive_every_format():
     plan = PLANS[MICROWAVE.name]
     for name in lw.PLAN_FORMATS:
-        found = lw.decode_plan(lw.encode_plan(plan, name), MICROWAVE, format=name)
-        assert [str(step.condition) for step in found.plan.steps] == [str(step.condition) for step in plan.steps]
+        decoded = lw.decode_plan(lw.encode_plan(plan, name), MICROWAVE, format=name).plan
+        assert [str(step.condition) for step in decoded.steps] == [str(step.condition) for step in plan.steps]
 
 
 def actors(features):
@@ -147,14 +146,14 @@ def test_evaluator_reads_an_objects_opening():
 def test_errors_where_a_displacement_is_needed():
     go = ScriptedSkill("go there", "microwave")
     plan = lw.ConditionalPlan.from_pairs(MICROWAVE, [("the microwave is closed", go.text)])
-    says = "an action of layout 'kitchen' has no displacement of the hand"
-    with pytest.raises(ValueError, match=f"scripted skills: {says}"):
+    missing = "layout 'kitchen' has no displacement"
+    with pytest.raises(ValueError, match=f"scripted skills: .*{missing}"):
         lw.ScriptedSkillActor(lw.Plans([plan]), skills={go.text: go})
-    with pytest.raises(ValueError, match=f"RandomYaw: {says}"):
+    with pytest.raises(ValueError, match=f"RandomYaw: .*{missing}"):
         lw.RandomYaw(0.3, plans=PLANS)
     plans = lw.canonical_plans(lw.load_plans("MT10"))
     trained = lw.PlanConditionedActor(plans, features=RoleFeatures(plans))
-    with pytest.raises(ValueError, match=f"TransferredActor: {says}"):
+    with pytest.raises(ValueError, match=f"TransferredActor: .*{missing}"):
         lw.modules.TransferredActor(trained, lw.canonical_plans(PLANS))
 
 
@@ -169,7 +168,6 @@ def demos(tmp_path_factory):
 
 @pytest.fixture
 def replay(demos):
-    """Of the demonstrations' own actions; 64 a batch."""
     return lw.LanguageWorldExperienceReplay(
         demos.root, label="executed", batch_size=64, transform=lw.QAFTransform(PLANS)
     )
@@ -188,63 +186,32 @@ def test_policy_learns_from_demonstrations_and_acts(demos, replay):
         assert lw.evaluate(actor, **run, progress=False).mean_success >= 0.9
 
 
-@pytest.mark.slow
-def test_torchrls_losses_train(replay):
-    actor = lw.PlanConditionedActor(PLANS, **small())
-    qvalue = lw.PlanConditionedQValue(PLANS, text_encoder=letters, width=32, depth=1)
-    loss = TD3Loss(actor, qvalue, bounds=(-1.0, 1.0))
-    loss.make_value_estimator(gamma=0.9)
-    targets, optimizer = SoftUpdate(loss, eps=0.99), torch.optim.AdamW(loss.parameters(), lr=1e-3)
-    before = {name: value.clone() for name, value in loss.named_parameters()}
-    for _ in range(2):
-        batch = replay.sample()
-        batch["next", "reward"] = batch["next", "success"].float()
-        found = loss(batch)
-        optimizer.zero_grad()
-        (found["loss_actor"] + found["loss_qvalue"]).backward()
-        optimizer.step()
-        targets.step()
-    assert all(value.isfinite().all() for value in loss.parameters())
-    moved = {name.partition(".")[0] for name, value in loss.named_parameters() if not torch.equal(value, before[name])}
-    assert {"actor_network_params", "qvalue_network_params"} <= moved
-
-
 def places_of_bodies(chunks, scene):
-    """The first place of each body that a recording's scene moves, by the end of its frame's name."""
-    found = {}
+    """Return the first position of each body that a recording moves, by the end of its frame's name."""
+    places = {}
     for batch in (chunk.to_record_batch() for chunk in chunks if chunk.entity_path == f"{scene}/bodies"):
         named, placed = (batch.column(f"Transform3D:{part}").to_pylist() for part in ("child_frame", "translation"))
         for name, place in zip(named, placed, strict=True):
-            found.setdefault(name[0].rpartition("/")[2], place[0])
-    return found
+            places.setdefault(name[0].rpartition("/")[2], place[0])
+    return places
 
 
 @pytest.mark.slow
 def test_recording_shows_the_kitchens_movements(tmp_path):
     actor = lw.PlanConditionedActor(PLANS, **small())
-    (one,) = run_recorded(actor, "kitchen/microwave", suite=SUITE, seed=7, max_steps=10)
+    (episode,) = run_recorded(actor, "kitchen/microwave", suite=SUITE, seed=7, max_steps=10)
     with lw.RerunLogger(tmp_path / "kitchen.rrd") as logger:
-        assert lw.log_rollout(logger, one.steps, PLANS, seed=7, suite=SUITE) == "kitchen/microwave-0"
+        assert lw.log_rollout(logger, episode.steps, PLANS, seed=7, suite=SUITE) == "kitchen/microwave-0"
     chunks = list(RrdReader(tmp_path / "kitchen.rrd").stream())
     scene = r"/kitchen\/microwave-0/scene"
-    there = {chunk.entity_path for chunk in chunks}
+    entities = {chunk.entity_path for chunk in chunks}
     bodies = places_of_bodies(chunks, scene)
     assert {"microdoorroot", "panda0_link7", "kettle"} <= bodies.keys()
-    assert {f"{scene}/objects/microwave", r"/kitchen\/microwave-0/plan"} <= there
-    assert f"{scene}/gripper" not in there  # a hand over a table, which stands for a robot that is not known
+    assert {f"{scene}/objects/microwave", r"/kitchen\/microwave-0/plan"} <= entities
+    assert f"{scene}/gripper" not in entities  # the drawing of an unknown robot
     x, y, z = bodies["kettle"]
     assert (round(x, 2), round(y, 2)) == (-0.27, 0.35)
     assert abs(z) < 0.02  # on the counter, which is our z = 0
-
-
-def test_random_behaviour_acts(tmp_path):
-    made = lw.collect_demonstrations(
-        "kitchen", suite=SUITE, policy="random", episodes_per_task=1, max_steps=4, redraw_failures=False,
-        root=tmp_path / "random", progress=False,
-    )  # fmt: skip
-    rows = lw.LanguageWorldExperienceReplay(made.root, label="executed")[:]
-    assert rows["action"].shape == (8, 9)
-    assert rows["action"].abs().amax(0).min() > 0
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """A custom suite works wherever Meta-World does: environment, data, training, files, evaluation, recordings."""
 
 import math
+import pickle
 from dataclasses import replace
 from functools import partial
 
@@ -14,7 +15,7 @@ from toy_suite import SKILLS, TASKS, TOY, ToyEngine, make_toy_suite
 
 import lw_torchrl as lw
 from lw_torchrl.language.layout import METAWORLD, Slot
-from lw_torchrl.language.skills import ScriptedSkill
+from lw_torchrl.language.skills import ScriptedSkill, load_skills
 from lw_torchrl.modules import (
     ActorEnsemble,
     Concat,
@@ -370,3 +371,15 @@ def test_losses_train_offline_with_the_layouts_statistics(make_loss, demos):
     trainer = lw.OfflineTrainer(loss, replay, lw.OfflineConfig(steps=2, batch_size=8), progress=False)
     trainer.train()
     assert all(map(math.isfinite, trainer.last.values()))
+
+
+@pytest.mark.parametrize("suite", ["metaworld", "fetch"])
+def test_suites_and_tables_are_pickled_and_read_only(suite):
+    suite = load_suite(suite)
+    copy = pickle.loads(pickle.dumps(suite))
+    assert (copy.tasks, copy.skills, copy.layout) == (suite.tasks, suite.skills, suite.layout)
+    assert copy.plans.fingerprint == suite.plans.fingerprint
+    for table in (lw.TASKS, load_skills(), suite.tasks, suite.skills):
+        assert pickle.loads(pickle.dumps(table)) == table
+        with pytest.raises(TypeError, match="does not support item assignment"):
+            table["new"] = table[min(table)]

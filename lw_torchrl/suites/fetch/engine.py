@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._util.checks import check_choice
+from lw_torchrl._util.checks import Count, check_choice, typed
 from lw_torchrl._util.rendering import naming_absent_renderer
 from lw_torchrl.suites.engine import BodyPoses, RowModel
 from lw_torchrl.suites.fetch import FETCH
@@ -175,10 +175,11 @@ class FetchEngine(ThreadedEngine):
     Source: Plappert et al., 'Multi-Goal Reinforcement Learning'; gymnasium-robotics 1.4.2.
     """
 
+    @typed
     def __init__(
-        self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: int | None = None
+        self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: Count | None = None
     ) -> None:
-        self._dense = check_choice("reward", reward, ("sparse", "dense")) == "dense"
+        self._dense = reward == "dense"
         tasks = [check_choice("task", task, _SCENES) for task in tasks]
         n = len(tasks)
         super().__init__([""] * n, FETCH, num_threads)  # shared models are only read, so rows need no grouping by model

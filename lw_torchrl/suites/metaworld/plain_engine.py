@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from lw_torchrl._util.checks import Count, typed
 from lw_torchrl._util.rendering import naming_absent_renderer
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import check_task
@@ -42,8 +43,9 @@ def make_metaworld_env(task: str, *, max_steps: int = 500) -> Any:
 class MetaWorldEngine(SeenRows):
     """An engine that runs Meta-World's own environments in a loop, in one thread: slow; the others' oracle."""
 
+    @typed
     def __init__(
-        self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: int | None = None
+        self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: Count | None = None
     ) -> None:
         self._dense = reward == "dense"
         # LanguageWorldEnv counts the steps; Meta-World's own limit must not come first.

@@ -14,7 +14,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._util.checks import Count, check_value
 from lw_torchrl.language.layout import Layout
 from lw_torchrl.suites.cameras import SeenRows
 from lw_torchrl.suites.engine import BodyPoses, EngineStep, RowModel, checked_step, seeds_of_rows
@@ -168,7 +167,7 @@ class ThreadedEngine(SeenRows):
     _rows: list[Any]  # each has ``seen`` and ``bodies``
 
     def __init__(self, keys: Sequence[str], layout: Layout, num_threads: int | None) -> None:
-        threads = check_value("num_threads", available_cores() if num_threads is None else num_threads, Count)
+        threads = num_threads or available_cores()
         self._groups, self._pool = split_into_groups(keys, threads), WorkerPool(threads)
         self._layout = layout
         self._goal = np.zeros((len(keys), 3))

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lw_torchrl._util.checks import check_choice
+from lw_torchrl._util.checks import Count, typed
 from lw_torchrl._util.reproducibility import version_changes
 from lw_torchrl.language.layout import METAWORLD
 from lw_torchrl.language.tasks import check_task
@@ -46,8 +46,9 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
         >>> engine.close()
     """
 
+    @typed
     def __init__(
-        self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: int | None = None
+        self, tasks: Sequence[str], *, reward: Literal["sparse", "dense"] = "sparse", num_threads: Count | None = None
     ) -> None:
         compared = task_programs.COMPARED_VERSIONS
         if changes := version_changes(compared, compared):
@@ -55,8 +56,7 @@ class VectorizedEngine(simulated_rows.ThreadedEngine):
                 f"engine: the vectorized engine was compared with other versions ({', '.join(changes)}); install "
                 "those, or use engine='metaworld', which runs any version"
             )
-        dense = check_choice("reward", reward, ("sparse", "dense")) == "dense"
-        tasks = [check_task(task) for task in tasks]
+        dense, tasks = reward == "dense", [check_task(task) for task in tasks]
         super().__init__([task_programs.model_path(task) for task in tasks], METAWORLD, num_threads)
         rewards = [reward_table()[task] if dense else None for task in tasks]
         rows: dict[int, simulated_rows.SimulatedRow] = {}
