@@ -16,6 +16,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Rates = Mapping[str, float | Sequence[float]]
+NEUTRAL = "#7a828b"  # legible on white and on black
+NEUTRAL_STYLE: dict[str, Any] = {
+    **dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "none"),
+    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), NEUTRAL),
+    **{"font.size": 13, "axes.titlesize": 14, "axes.labelsize": 13, "grid.color": NEUTRAL, "grid.alpha": 0.3},
+}
+"""Matplotlib settings for pictures that are shown in light and in dark mode."""
+METHOD_COLORS = {
+    "plan": "#3f8fd2", "generic plan": "#3aa99f", "task description": "#e8833a", "task number": "#5aa85a",
+    "scripted skills": "#a678c8", "baseline": "#8d97a3",
+}  # fmt: skip
+"""A method's colour, the same in every figure."""
+METHODS = {"pcbc": "plan", "dc": "task description", "one-hot": "task number", "scripted": "scripted skills"}
+"""Names of methods in experiments to their names in figures."""
 _DASHES = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)), (0, (3, 3)))
 
 
@@ -24,6 +38,52 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
     lines = [head, ["-" * width for width in widths], *rows]
     return "\n".join("| " + " | ".join(map(str.ljust, line, widths)) + " |" for line in lines)
+
+
+def draw_rates(axes: Axes, names: Sequence[str], rates: Sequence[Sequence[float] | None], colors: Sequence[str]) -> None:
+    """Draw a horizontal bar for each rate, with its interval and its number; the first name is at the top.
+
+    Args:
+        rates: for each name (mean, low, high) or (mean,), in [0, 1], or None to draw nothing.
+    """
+    for place, (rate, color) in enumerate(zip(rates, colors, strict=True)):
+        if rate is None:
+            axes.text(0.02, place, "not measured", va="center", fontsize=10, style="italic")
+            continue
+        mean, *ends = rate
+        axes.barh(place, mean, color=color, height=0.68, alpha=0.4)
+        if ends:
+            axes.plot(ends, [place, place], color=color, linewidth=3, solid_capstyle="butt")
+        axes.plot(mean, place, "o", color=color, markersize=9)
+        axes.text(1.05, place, f"{mean + 1e-9:.2f}", va="center", fontweight="bold")  # 0.835 is 0.84
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_xlim(0, 1.02)
+    axes.set_xticks([0, 0.25, 0.5, 0.75, 1.0], ["0", "", "0.5", "", "1"])
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(axis="x")
+    axes.set_axisbelow(True)
+
+
+def draw_points(axes: Axes, places: Sequence[str], methods: Mapping[str, Sequence[Sequence[float]]]) -> None:
+    """Draw each method's rates over ordered places: points with intervals, joined by a thin line.
+
+    Args:
+        methods: a name of :data:`METHOD_COLORS` to (mean, low, high) or (mean,) for each place.
+    """
+    for number, (name, rates) in enumerate(methods.items()):
+        x = np.arange(len(places)) + 0.12 * (number - (len(methods) - 1) / 2)
+        means = np.array([rate[0] for rate in rates])
+        ends = np.array([rate[1:] or (rate[0], rate[0]) for rate in rates]).T
+        look: dict[str, Any] = {"color": METHOD_COLORS[name], "capsize": 4, "markersize": 8, "linewidth": 1.5}
+        errors = np.abs(ends - means)
+        axes.errorbar(x, means, errors if errors.any() else None, marker="o", label=name, elinewidth=2.5, **look)
+    axes.set_xticks(range(len(places)), places)
+    axes.set_ylim(0, 1.03)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="y")
+    axes.set_axisbelow(True)
 
 
 def plot_sorted_tasks(
