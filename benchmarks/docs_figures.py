@@ -19,7 +19,7 @@ NUMBERS = Path(__file__).parent / "data" / "published_results.json"
 
 @dataclass(frozen=True)
 class Arguments:
-    """Draw the figures of README and docs: few-word titles, 95 % intervals, a transparent background."""
+    """Draw the figures of README and docs: with 95 % intervals, legible in light and in dark mode."""
 
     out: Path = Path("docs")
     """Folder for the pictures."""
@@ -32,7 +32,8 @@ def zero_shot(numbers: Any) -> Any:
     names, methods, rates = zip(*numbers["rows"], strict=True)
     draw_rates(axes, names, rates, [METHOD_COLORS[method] for method in methods])
     figure.suptitle("Success on 20 tasks that nobody demonstrated", fontsize=16, fontweight="bold")
-    figure.supxlabel("success; policies trained on 10 other tasks; lines: 95 % intervals, five training seeds", fontsize=13)
+    caption = "success; policies trained on 10 other tasks; lines: 95 % intervals, five training seeds"
+    figure.supxlabel(caption, fontsize=13)
     return figure
 
 

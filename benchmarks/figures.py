@@ -40,7 +40,9 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(map(str.ljust, line, widths)) + " |" for line in lines)
 
 
-def draw_rates(axes: Axes, names: Sequence[str], rates: Sequence[Sequence[float] | None], colors: Sequence[str]) -> None:
+def draw_rates(
+    axes: Axes, names: Sequence[str], rates: Sequence[Sequence[float] | None], colors: Sequence[str]
+) -> None:
     """Draw a horizontal bar for each rate, with its interval and its number; the first name is at the top.
 
     Args:

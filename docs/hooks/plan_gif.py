@@ -2,7 +2,7 @@
 
     python docs/hooks/plan_gif.py --out docs/plan.gif
 
-The frames come from the simulator, and a step is lit by the policy's attention weight. Rendering needs OpenGL (EGL or OSMesa).
+The frames come from the simulator, and a step is lit by the policy's attention weight. Rendering needs OpenGL.
 """
 
 from __future__ import annotations
