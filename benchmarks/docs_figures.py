@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import matplotlib
 import tyro
 
-from benchmarks.figures import METHOD_COLORS, NEUTRAL_STYLE, draw_points, draw_rates
+from benchmarks.figures import METHOD_COLORS, NEUTRAL_STYLE, draw_rates, plot_panels
 from lw_torchrl.evaluation.figures import new_figure, saved
 
 NUMBERS = Path(__file__).parent / "data" / "published_results.json"
@@ -39,24 +38,17 @@ def zero_shot(numbers: Any) -> Any:
 
 def demonstrations(numbers: Any) -> Any:
     """Success by the number of demonstrations of each demonstrated task."""
-    figure = new_figure(9.6, 4.2)
-    panels = figure.subplots(1, 2, sharey=True)
     places = [str(number) for number in numbers["numbers"]]
-    for axes, (title, methods) in zip(panels, numbers["panels"], strict=True):
-        draw_points(axes, places, {name: [[rate] for rate in rates] for name, rates in methods.items()})
-        axes.set_title(title)
-        axes.set_xlabel("demonstrations of each demonstrated task")
-    return _with_legend(figure, panels)
+    panels = [
+        (title, places, {name: [[rate] for rate in rates] for name, rates in methods.items()})
+        for title, methods in numbers["panels"]
+    ]
+    return plot_panels(panels, xlabel="demonstrations of each demonstrated task")
 
 
 def truth(numbers: Any) -> Any:
     """Success with late and with wrong answers to conditions."""
-    figure = new_figure(9.6, 4.2)
-    panels = figure.subplots(1, 2, sharey=True)
-    for axes, (title, places, methods) in zip(panels, numbers["panels"], strict=True):
-        draw_points(axes, places, methods)
-        axes.set_title(title)
-    return _with_legend(figure, panels)
+    return plot_panels(numbers["panels"])
 
 
 def offline(numbers: Any) -> Any:
@@ -69,12 +61,6 @@ def offline(numbers: Any) -> Any:
         draw_rates(axes, names, [row[column] for row in numbers["rows"]], colors)
         axes.set_title(title, fontsize=13)
     figure.supxlabel("success; lines: 95 % intervals over three seeds", fontsize=13)
-    return figure
-
-
-def _with_legend(figure: Any, panels: Sequence[Any]) -> Any:
-    panels[0].set_ylabel("success")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 

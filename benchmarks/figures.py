@@ -30,6 +30,7 @@ METHOD_COLORS = {
 }  # fmt: skip
 """A method's colour, the same in every figure."""
 METHODS = {"pcbc": "plan", "dc": "task description", "one-hot": "task number", "scripted": "scripted skills"}
+METHODS["PlanConditionedActor"] = "plan"
 """Names of methods in experiments to their names in figures."""
 _DASHES = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)), (0, (3, 3)))
 
@@ -69,24 +70,45 @@ def draw_rates(
     axes.set_axisbelow(True)
 
 
-def draw_points(axes: Axes, places: Sequence[str], methods: Mapping[str, Sequence[Sequence[float]]]) -> None:
+def draw_points(axes: Axes, places: Sequence[str], methods: Mapping[str, Sequence[Sequence[float] | None]]) -> None:
     """Draw each method's rates over ordered places: points with intervals, joined by a thin line.
 
     Args:
-        methods: a name of :data:`METHOD_COLORS` to (mean, low, high) or (mean,) for each place.
+        methods: a method to (mean, low, high) or (mean,) for each place, or None to draw nothing there.
     """
-    for number, (name, rates) in enumerate(methods.items()):
-        x = np.arange(len(places)) + 0.12 * (number - (len(methods) - 1) / 2)
-        means = np.array([rate[0] for rate in rates])
-        ends = np.array([rate[1:] or (rate[0], rate[0]) for rate in rates]).T
-        look: dict[str, Any] = {"color": METHOD_COLORS[name], "capsize": 4, "markersize": 8, "linewidth": 1.5}
-        errors = np.abs(ends - means)
-        axes.errorbar(x, means, errors if errors.any() else None, marker="o", label=name, elinewidth=2.5, **look)
+    looks = _look([*methods]).values()
+    for number, ((name, color), rates) in enumerate(zip(looks, methods.values(), strict=True)):
+        known = {place: rate for place, rate in enumerate(rates) if rate is not None}
+        x = np.array([*known]) + 0.12 * (number - (len(methods) - 1) / 2)
+        means = np.array([rate[0] for rate in known.values()])
+        errors = np.abs(np.array([rate[1:] or (rate[0], rate[0]) for rate in known.values()]).T - means)
+        look: dict[str, Any] = {"color": color, "capsize": 4, "markersize": 8, "linewidth": 1.5, "elinewidth": 2.5}
+        axes.errorbar(x, means, errors if errors.any() else None, marker="o", label=name, **look)
     axes.set_xticks(range(len(places)), places)
     axes.set_ylim(0, 1.03)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y")
     axes.set_axisbelow(True)
+
+
+Panel = tuple[str, Sequence[str], Mapping[str, Sequence[Sequence[float] | None]]]
+"""Title, places and rates, as :func:`draw_points` reads them."""
+
+
+def plot_panels(panels: Sequence[Panel], path: AnyPath | None = None, *, xlabel: str = "") -> Figure:
+    """Draw success over ordered places in panels side by side, with one legend below."""
+    check_image(path)
+    with rc_context(NEUTRAL_STYLE):
+        figure = new_figure(max(6.0, 4.8 * len(panels)), 4.2)
+        columns = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for axes, (title, places, methods) in zip(columns, panels, strict=True):
+            draw_points(axes, places, methods)
+            axes.set_title(title)
+            axes.set_xlabel(xlabel)
+        columns[0].set_ylabel("success")
+        handles, labels = columns[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+        return saved(figure, path)
 
 
 def plot_sorted_tasks(
