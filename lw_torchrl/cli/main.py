@@ -37,7 +37,7 @@ COMMANDS = {
     "plan repair": ("Language", "plan:Repair", "Ask a language model to repair the plans that fail"),
     "demo": ("Other", "demo:Demo", "Train, evaluate and record a policy on MT10 in a few minutes"),
     "check": ("Other", "language:Check", "Validate a file of plans, skills or tasks, or a suite"),
-    "info": ("Other", "data:Info", "Describe a policy file, a dataset or a recording"),
+    "info": ("Other", "data:Info", "Describe a file, or without one this installation"),
 }
 _MORE = """`lw-torchrl COMMAND --help` explains a command. Every command accepts --import MODULE, which first
 imports your Python module, for example one that registers a suite or a policy class
