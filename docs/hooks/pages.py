@@ -59,7 +59,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         if not full.startswith("docs/") and files.get_file_from_path(place(full)) is None:
             return text
         if text.endswith(".md") and (target_page := files.get_file_from_path(place(full))) is not None:
-            text = target_page.content_string.partition("\n")[0].removeprefix("# ")  # the title instead of the file name
+            text = target_page.content_string.partition("\n")[0].removeprefix("# ")  # not the file name
         return f"{mark}[{text}]({posixpath.relpath(place(full), posixpath.dirname(here) or '.')}{anchor})"
 
     return outside_code(markdown, lambda text: LINK.sub(moved, text))
