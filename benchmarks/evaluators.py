@@ -129,7 +129,7 @@ class Bench:
         states = lw.LanguageWorldExperienceReplay(roots, label="executed")
         labelled = lw.training.LabelledQueries(states, config)
         torch.manual_seed(self.seed)
-        evaluator = lw.StateQueryEvaluator(self.plans)
+        evaluator = lw.modules.StateQueryEvaluator(self.plans)
         file = self.folder / f"evaluator-{share:g}.safetensors"
         lw.training.QueryEvaluatorTrainer(evaluator, labelled, config, checkpoint=file).train()
         held_out = labelled if config == most else lw.training.LabelledQueries(states, most)

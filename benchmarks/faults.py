@@ -92,7 +92,7 @@ def lie(never: bool = False) -> Plant:
 
 
 def flipped(cast: Cast, step: int) -> None:
-    cast.evaluator = lw.CorruptQAF(cast.plans, flip=0.4, seed=step)
+    cast.evaluator = lw.transforms.CorruptQAF(cast.plans, flip=0.4, seed=step)
 
 
 def sensor(cast: Cast, step: int) -> None:

@@ -152,7 +152,7 @@ def compare_plans(
     """Decode recorded answers, and carry out all plans by scripted skills in one simulation.
 
     Args:
-        source: a folder or a .jsonl file, as for :class:`~lw_torchrl.FilePlanner`.
+        source: a folder or a .jsonl file, as for :class:`~lw_torchrl.planners.FilePlanner`.
         episodes, seed, choose, noise_scale, max_steps: as for :func:`~benchmarks.many_plans.evaluate_plans`.
         resume: a file for intermediate results, written every few seconds. Plans in it are not carried out again.
         progress: show progress bars.

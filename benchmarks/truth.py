@@ -49,8 +49,8 @@ class Cell(NamedTuple):
         if self.exact:
             return None
         if self.kind == "every":
-            return lw.CorruptQAF(plans, every=int(self.value))
-        return lw.CorruptQAF(plans, flip=self.value, seed=seed)
+            return lw.transforms.CorruptQAF(plans, every=int(self.value))
+        return lw.transforms.CorruptQAF(plans, flip=self.value, seed=seed)
 
 
 @dataclass(frozen=True)

@@ -85,7 +85,7 @@ def main() -> None:
         train(lw.objectives.AdvantageWeightedLoss(ours, beta=2.0), weighted, args.steps, 1e-3)
 
         print("a policy, by the episodes that succeeded")
-        successes = show(roots, plans, keep=lw.EpisodeFilter(success=True))
+        successes = show(roots, plans, keep=lw.data.EpisodeFilter(success=True))
         cloned = lw.PlanConditionedActor(plans)
         train(BCLoss(cloned, loss_function="l2"), successes, args.steps, 1e-3)
 

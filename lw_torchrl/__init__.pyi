@@ -10,7 +10,6 @@ from lw_torchrl import suites as suites
 from lw_torchrl import training as training
 from lw_torchrl import transforms as transforms
 from lw_torchrl.data import CoLearningSampler as CoLearningSampler
-from lw_torchrl.data import EpisodeFilter as EpisodeFilter
 from lw_torchrl.data import LanguageWorldExperienceReplay as LanguageWorldExperienceReplay
 from lw_torchrl.data import TaskBalancedSampler as TaskBalancedSampler
 from lw_torchrl.data import collect_demonstrations as collect_demonstrations
@@ -23,7 +22,6 @@ from lw_torchrl.evaluation import EvaluationResult as EvaluationResult
 from lw_torchrl.evaluation import attribute_failures as attribute_failures
 from lw_torchrl.evaluation import evaluate as evaluate
 from lw_torchrl.evaluation import from_pretrained as from_pretrained
-from lw_torchrl.evaluation import plot_success as plot_success
 from lw_torchrl.language.canonical import canonical_plan as canonical_plan
 from lw_torchrl.language.canonical import canonical_plans as canonical_plans
 from lw_torchrl.language.formats import PLAN_FORMATS as PLAN_FORMATS
@@ -45,16 +43,12 @@ from lw_torchrl.language.tasks import TASKS as TASKS
 from lw_torchrl.language.tasks import Task as Task
 from lw_torchrl.language.tasks import load_tasks as load_tasks
 from lw_torchrl.language.tasks import task_id as task_id
-from lw_torchrl.modules import DescriptorConditionedActor as DescriptorConditionedActor
 from lw_torchrl.modules import PlanConditionedActor as PlanConditionedActor
 from lw_torchrl.modules import PlanConditionedQValue as PlanConditionedQValue
 from lw_torchrl.modules import PlanConditionedValue as PlanConditionedValue
 from lw_torchrl.modules import QueryEvaluator as QueryEvaluator
 from lw_torchrl.modules import ScriptedSkillActor as ScriptedSkillActor
-from lw_torchrl.modules import StateQueryEvaluator as StateQueryEvaluator
-from lw_torchrl.planners import FilePlanner as FilePlanner
 from lw_torchrl.planners import OpenAIPlanner as OpenAIPlanner
-from lw_torchrl.planners import plan_prompt as plan_prompt
 from lw_torchrl.record import RerunLogger as RerunLogger
 from lw_torchrl.record import log_rollout as log_rollout
 from lw_torchrl.training import BehavioralCloningConfig as BehavioralCloningConfig
@@ -63,7 +57,6 @@ from lw_torchrl.training import OfflineConfig as OfflineConfig
 from lw_torchrl.training import OfflineTrainer as OfflineTrainer
 from lw_torchrl.training import load_actor as load_actor
 from lw_torchrl.training import save_actor as save_actor
-from lw_torchrl.transforms import CorruptQAF as CorruptQAF
 from lw_torchrl.transforms import QAFTransform as QAFTransform
 from lw_torchrl.transforms import RandomYaw as RandomYaw
 

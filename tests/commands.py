@@ -1,4 +1,4 @@
-"""Running the command line within a test."""
+"""Run the command line in a test."""
 
 import json
 import re
@@ -10,13 +10,13 @@ from lw_torchrl.cli.main import main
 
 
 def run(capsys, *args):
-    """What a command prints."""
+    """Run a command and return what it prints."""
     main([str(arg) for arg in args])
     return capsys.readouterr().out
 
 
 def fails(capsys, *args):
-    """The one line with which a command fails."""
+    """Run a command that fails and return its error message."""
     with pytest.raises(SystemExit) as caught:
         main([str(arg) for arg in args])
     assert caught.value.code == 2
@@ -27,8 +27,8 @@ def fails(capsys, *args):
 
 
 def document(capsys, command, *args):
-    """What a command prints with ``--json``, whose keys are those in the table of docs/cli.md."""
-    found = json.loads(run(capsys, *command.split(), *args, "--json"), parse_constant=pytest.fail)
+    """Run a command with ``--json`` and return the document, whose keys must be in the table of docs/cli.md."""
+    printed = json.loads(run(capsys, *command.split(), *args, "--json"), parse_constant=pytest.fail)
     name = " ".join(command.split()[:2]) if command.split()[0] in ("data", "plan") else command.split()[0]
     text = (Path(__file__).parent.parent / "docs" / "cli.md").read_text("utf-8")
     (cell,) = re.findall(rf"^\| `{name}`[^|]*\| (.*) \|$", text, re.MULTILINE)
@@ -37,8 +37,8 @@ def document(capsys, command, *args):
         key, _, names = part.partition(": ")
         if word := re.search(r"`(\w+)`", key):
             documented[word[1]] = re.findall(r"`(\w+)`", names)
-    for key, value in found.items():
+    for key, value in printed.items():
         assert key in documented, (command, key)
         for row in value if documented[key] and isinstance(value, list) else ():
             assert {*row} <= {*documented[key]}, (command, key)
-    return found
+    return printed

@@ -1,4 +1,4 @@
-"""What several test files need: Meta-World's own environments as the oracle, a plan for every task, MT50."""
+"""Fixtures of several test files: Meta-World's own environments as the oracle, a plan for every task, MT50."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from lw_torchrl._util import files as _files
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests come first, so that at the end no process is left alone with one of them."""
+    """Run files with slow tests first, so that parallel processes end at about the same time."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
 
 
 def pytest_collection_finish() -> None:
-    """The millions of objects of the libraries live to the end; a garbage collection need not look at them."""
+    """Exclude the millions of objects of the libraries from garbage collection."""
     gc.collect()
     gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
 def interruptible() -> None:
-    """Ctrl-C interrupts, also where a shell started the suite in the background, which ignores it."""
+    """Let Ctrl-C interrupt tests, also in processes that a shell started in the background."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
 def metaworld_env() -> Callable[[str], Any]:
-    """A task's own Meta-World environment, fresh, made without any of our code."""
+    """Make a new Meta-World environment of a task without our code."""
 
     def make(task: str) -> Any:
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE
@@ -52,21 +52,21 @@ def metaworld_env() -> Callable[[str], Any]:
 
 @pytest.fixture(scope="session")
 def plans() -> dict[str, lw.ConditionalPlan]:
-    """A plan for each of the 50 tasks: the shipped one, or else one to seven supported queries."""
+    """A plan for each of the 50 tasks: the shipped one, or one with one to seven supported queries."""
     shipped = lw.load_plans("MT10")
-    found = {}
+    plans = {}
     for number, task in enumerate(lw.MT50):
         queries = lw.supported_queries(task)
         steps = 1 + number % 7
-        found[task] = shipped.get(task) or lw.ConditionalPlan.from_pairs(
+        plans[task] = shipped.get(task) or lw.ConditionalPlan.from_pairs(
             task, [(queries[(k * 37 + number) % len(queries)], f"move {k}") for k in range(steps)]
         )
-    return found
+    return plans
 
 
 @pytest.fixture(scope="session", params=["vectorized", "metaworld"])
 def mt50(request: pytest.FixtureRequest) -> Iterator[lw.LanguageWorldEnv]:
-    """All 50 tasks, a row each, on each engine. Whoever takes it calls ``set_seed`` first."""
+    """All 50 tasks, one row each, on each engine. Tests call ``set_seed`` first."""
     env = lw.LanguageWorldEnv("MT50", seed=0, engine=request.param, reward="dense")
     yield env
     env.close(raise_if_closed=False)
@@ -74,7 +74,7 @@ def mt50(request: pytest.FixtureRequest) -> Iterator[lw.LanguageWorldEnv]:
 
 @pytest.fixture(scope="session")
 def forks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Forks]:
-    """Commands in processes of their own, forks of one that is started once."""
+    """Commands in separate processes, forked from one that is started once."""
     forks = Forks(tmp_path_factory.mktemp("forks"))
     yield forks
     forks.close()
@@ -82,7 +82,7 @@ def forks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Forks]:
 
 @pytest.fixture(scope="session")
 def python() -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Run a program text in an interpreter of its own."""
+    """Run a program in a new Python process."""
 
     def run(program: str, **environment: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
@@ -98,10 +98,10 @@ def python() -> Callable[..., subprocess.CompletedProcess[str]]:
 
 @pytest.fixture
 def in_time():
-    """The test fails, rather than waits, where a pipe is read that nobody writes to."""
+    """Let a test fail, instead of waiting, if it reads a pipe to which nothing is written."""
 
     def late(*_):
-        raise TimeoutError("it waits for a pipe")
+        raise TimeoutError("the test waits for a pipe")
 
     before = signal.signal(signal.SIGALRM, late)
     signal.alarm(20)
@@ -123,7 +123,7 @@ with files.locked(sys.argv[2], "place", folder=sys.argv[3] == "True"):
 
 @pytest.fixture
 def holding() -> Iterator[Callable[..., Callable[[], None]]]:
-    """A function that lets another process be at work in a place; it returns one that ends that."""
+    """A function that lets another process lock a path, and returns a function that ends the process."""
     processes = []
 
     def hold(place: Any, *, folder: bool = False) -> Callable[[], None]:

@@ -1,4 +1,4 @@
-"""A small OpenAI-compatible server on this machine, which answers with shipped plans, or fails in given ways."""
+"""A small OpenAI-compatible server on this machine, which answers with shipped plans or fails on purpose."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def shipped(body):
 
 @dataclass
 class Failure:
-    """A reply that is no chat completion, or one that is cut in half, or sent byte by byte."""
+    """A reply that is not a chat completion, or that is cut in half, or sent byte by byte."""
 
     status: int = 200
     body: object = ""  # a text, or an object that is sent as JSON
@@ -70,7 +70,7 @@ class FakeServer:
 
 @contextmanager
 def serving(server):
-    """Run a server; give its address."""
+    """Run a server and yield its address."""
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"

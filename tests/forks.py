@@ -1,7 +1,7 @@
-"""Commands of ``lw-torchrl`` in processes of their own that need not import anything first.
+"""Commands of ``lw-torchrl`` in separate processes that start at once.
 
-Each is a fork of one process that has imported the package and compiled the models of all tasks. What it does to files,
-and what a signal does to it, is what any process does; only the ten seconds of starting are left out.
+Each is a fork of one process that has imported the package and compiled the models of all tasks. Files and signals are
+those of any process; only the ten seconds of starting are saved.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ for line in sys.stdin:
 
 
 class Ended(NamedTuple):
-    """How a command ended: its exit status, minus the signal that killed it, and what it said."""
+    """The end of a command: its exit status, or minus the signal that killed it, and its output."""
 
     status: int
     out: str
@@ -59,10 +59,10 @@ class Ended(NamedTuple):
 
 
 class Forks:
-    """Runs one command at a time, in ``folder`` what it says."""
+    """Runs one command at a time and writes its output to ``folder``."""
 
     def __init__(self, folder: Path) -> None:
-        self.said = folder / "out", folder / "err"
+        self.outputs = folder / "out", folder / "err"
         self.parent = subprocess.Popen(
             [sys.executable, "-W", "ignore", "-c", PARENT],
             env=os.environ | {"OMP_NUM_THREADS": "1"},
@@ -70,7 +70,7 @@ class Forks:
             stdout=subprocess.PIPE,
             bufsize=0,
         )
-        self.child = self._number()  # none yet
+        self.child = self._number()  # 0: no child yet
 
     def _number(self) -> int:
         line = self.parent.stdout.readline()
@@ -78,31 +78,30 @@ class Forks:
         return int(line)
 
     def start(self, *arguments: object, before: str = "") -> None:
-        """Begin a command, after a program text."""
-        given = [str(one) for one in arguments], before, *map(str, self.said)
-        self.parent.stdin.write(json.dumps(given).encode() + b"\n")
+        """Start a command, after the program ``before``."""
+        job = [str(argument) for argument in arguments], before, *map(str, self.outputs)
+        self.parent.stdin.write(json.dumps(job).encode() + b"\n")
         self.child = self._number()
 
     def running(self, seconds: float = 0.0) -> bool:
-        """Whether it still runs after so many seconds; returns sooner if it ends."""
+        """Return whether the command still runs after some seconds; return earlier if it ends."""
         return not select.select([self.parent.stdout], [], [], seconds)[0]
 
     def send(self, number: signal.Signals) -> None:
-        """A signal to the command and whatever it has started."""
+        """Send a signal to the command and its children."""
         os.killpg(self.child, number)
 
     def end(self, seconds: float = 240.0) -> Ended:
-        """Wait until it ends."""
+        """Wait for the end of the command."""
         if self.running(seconds):
             self.send(signal.SIGKILL)
-            raise TimeoutError(f"it still ran after {seconds} s; it said {self.said[1].read_text()[-2000:]}")
-        return Ended(self._number(), *(path.read_text() for path in self.said))
+            raise TimeoutError(f"still running after {seconds} s: {self.outputs[1].read_text()[-2000:]}")
+        return Ended(self._number(), *(path.read_text() for path in self.outputs))
 
     def whole_and_killed(
         self, command: Callable[[Path], Sequence[object]], folder: Path, before: str = ""
     ) -> tuple[Path, Path]:
-        """Do a command undisturbed, and once more killed at five random moments before it comes to its end: where each
-        was told to put what it makes."""
+        """Run a command undisturbed, and again with five kills at random moments. Return both output folders."""
 
         def finish() -> None:
             ended = self.end()
@@ -125,7 +124,7 @@ class Forks:
         return whole, killed
 
     def close(self) -> None:
-        """Kill the process that forks: it may never see its input end, since other forks hold the pipe too."""
+        """Kill the parent, which may not see the end of its input, because forks hold the pipe too."""
         self.parent.kill()
         self.parent.wait()
         self.parent.stdin.close()

@@ -1,4 +1,4 @@
-"""Whether pictures can be taken here; what needs them is left out otherwise."""
+"""Whether this machine can render; tests of camera images are skipped otherwise."""
 
 from functools import cache
 
@@ -7,7 +7,7 @@ from lw_torchrl.suites.cameras import Cameras
 
 @cache
 def why_no_pictures():
-    """What is missing; nothing where pictures can be taken."""
+    """Return the reason why this machine cannot render, or ""."""
     try:
         Cameras().close()
     except ImportError as error:

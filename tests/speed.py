@@ -1,4 +1,4 @@
-"""Which cases of a test the fast suite runs."""
+"""Cases of a test that only the slow suite runs."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ import pytest
 
 
 def first_fast(values: Iterable[Any], fast: int = 1) -> list[Any]:
-    """The values of a parametrisation: the first are fast, the others are slow tests."""
-    return [one if n < fast else pytest.param(one, marks=pytest.mark.slow) for n, one in enumerate(values)]
+    """Mark all but the first values of a parametrisation as slow."""
+    return [value if n < fast else pytest.param(value, marks=pytest.mark.slow) for n, value in enumerate(values)]

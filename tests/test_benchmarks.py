@@ -176,7 +176,7 @@ def test_truth_reports_the_accuracy_that_an_evaluator_needs():
 
 
 def test_truth_needs_a_policy_that_reads_answers(tmp_path):
-    lw.save_actor(lw.DescriptorConditionedActor(["reach"]), tmp_path / "dc.safetensors")
+    lw.save_actor(lw.modules.DescriptorConditionedActor(["reach"]), tmp_path / "dc.safetensors")
     with pytest.raises(SystemExit, match=r"dc\.safetensors does not read qaf"):
         truth.main(truth.Arguments(policy=(tmp_path / "dc.safetensors",), out=tmp_path))
 

@@ -82,7 +82,7 @@ def test_numpy_numbers_arrive_as_python_numbers():
     assert (type(points), type(size), type(filled)) == (int, float, bool)
     config = lw.BehavioralCloningConfig(steps=np.int64(3), learning_rate=np.float32(0.5), normalize=np.bool_(True))
     assert json.loads(json.dumps(asdict(config)))["steps"] == 3
-    assert lw.EpisodeFilter(least_return=np.float16(0.5)).least_return == 0.5
+    assert lw.data.EpisodeFilter(least_return=np.float16(0.5)).least_return == 0.5
 
 
 def test_iterators_are_not_consumed_and_random_numbers_not_drawn():

@@ -1,5 +1,4 @@
-"""What a user adds from a file of their own, nothing of ours changed: a way of conditioning, an evaluator, a relation,
-a task, an engine. Together they are trained, saved, loaded, evaluated and recorded."""
+"""Extensions in a user's file: a method, an evaluator, a relation, a task and an engine, used together."""
 
 from __future__ import annotations
 
@@ -42,7 +41,7 @@ SKILLS = {
 
 
 class PointEngine:
-    """A hand without a body that moves by a centimetre at most, and a block."""
+    """A point that moves by at most a centimetre, and a block."""
 
     def __init__(self, rows, *, reward, num_threads):
         self.state = np.zeros((len(rows), 39))
@@ -64,7 +63,7 @@ class PointEngine:
 
 
 class LearnedTaskActor(TensorDictModuleBase):
-    """Conditioned on a learned vector of each task; any TensorDict module that writes ``action`` is an actor."""
+    """A policy with a learned vector for each task."""
 
     def __init__(self, tasks, size=8, width=32):
         super().__init__()
@@ -79,12 +78,12 @@ class LearnedTaskActor(TensorDictModuleBase):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict):
         rows = self.index.rows(tensordict["task_id"], "tasks unknown to this actor")
-        seen = self.features(tensordict["observation"])
-        return tensordict.set("action", self.net(torch.cat((self.vectors.weight[rows], seen), -1)))
+        features = self.features(tensordict["observation"])
+        return tensordict.set("action", self.net(torch.cat((self.vectors.weight[rows], features), -1)))
 
 
 class NearnessEvaluator(lw.QueryEvaluator):
-    """Learns at what distance the first condition ends and the second begins."""
+    """Learns the distance at which the first condition ends and the second begins."""
 
     def __init__(self, plans, sharpness=50.0):
         super().__init__(plans)
@@ -110,7 +109,7 @@ def plans(tmp_path, monkeypatch):
 
 @pytest.fixture
 def replay(plans):
-    """What the plan's scripts do in our engine."""
+    """Rows of the plan's scripted skills in the engine."""
     env = TransformedEnv(
         lw.LanguageWorldEnv(
             [plan.definition for plan in plans.values()], num_envs=8, engine=PointEngine, max_steps=STEPS
@@ -120,9 +119,9 @@ def replay(plans):
     rows = env.rollout(STEPS, lw.ScriptedSkillActor(plans, skills=SKILLS)).reshape(-1)
     env.close()
     assert rows["next", "success"].any()
-    found = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows)))
-    found.extend(rows.select("observation", "task_id", "qaf", "action"))
-    return found
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(len(rows)))
+    buffer.extend(rows.select("observation", "task_id", "qaf", "action"))
+    return buffer
 
 
 def trained(actor, replay, path):
@@ -132,7 +131,7 @@ def trained(actor, replay, path):
     return actor
 
 
-def made(kind, plans):
+def make(kind, plans):
     torch.manual_seed(0)
     if kind == "learned":
         return make_policy("learned", plans, width=32)
@@ -149,11 +148,11 @@ def small(plans):
 def test_extensions_are_trained_saved_loaded_evaluated_and_recorded(kind, plans, replay, tmp_path, monkeypatch):
     monkeypatch.setitem(METHODS, "learned", lambda plans, **options: LearnedTaskActor([*plans], **options))
     path = tmp_path / "policy.safetensors"
-    actor = trained(made(kind, plans), replay, path)
+    actor = trained(make(kind, plans), replay, path)
     loaded = lw.load_actor(path, text_encoder=letters)
-    for (name, ours), (other, found) in zip(actor.state_dict().items(), loaded.state_dict().items(), strict=True):
-        assert name == other
-        assert torch.equal(ours, found)
+    state = loaded.state_dict()
+    assert [*actor.state_dict()] == [*state]
+    assert all(torch.equal(value, state[name]) for name, value in actor.state_dict().items())
     definitions = [plan.definition for plan in plans.values()]
     run = dict(seed=1_000, engine=PointEngine, max_steps=STEPS)
     result = lw.evaluate(loaded, tasks=definitions, episodes_per_task=10, noise_scale=0.0, **run)
@@ -179,7 +178,7 @@ def test_custom_task_is_saved_with_its_policy(plans, tmp_path):
     assert loaded.plans.fingerprint == plans.fingerprint
     assert loaded.plans["touch-the-block"].definition.object_names == ("robot's gripper", "block")
     lw.save_actor(
-        lw.DescriptorConditionedActor([plan.definition for plan in plans.values()], text_encoder=letters),
+        lw.modules.DescriptorConditionedActor([plan.definition for plan in plans.values()], text_encoder=letters),
         tmp_path / "dc.safetensors",
     )
     assert lw.load_actor(tmp_path / "dc.safetensors", text_encoder=letters).tasks == ("touch-the-block",)

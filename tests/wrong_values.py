@@ -72,7 +72,7 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
     )
     actor = lw.PlanConditionedActor(plans)
     expert = lw.ExpertActor("reach")
-    evaluator = lw.StateQueryEvaluator(plans, width=8)
+    evaluator = lw.modules.StateQueryEvaluator(plans, width=8)
     images = lw.modules.ImageQueryEvaluator(plans, width=8)
     config = lw.training.QueryEvaluatorConfig(steps=1, batch_size=2, held_out_states=0.0, held_out_pairs=0.0)
     data = lw.training.LabelledQueries(replay, config)

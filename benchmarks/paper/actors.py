@@ -86,7 +86,7 @@ class Parts:
         return parts[0] if len(parts) == 1 else Concat(*parts)
 
     def _evaluator(self, plans: Plans) -> TensorDictModuleBase:
-        return lw.StateQueryEvaluator(plans, **(self.evaluator or {}))
+        return lw.modules.StateQueryEvaluator(plans, **(self.evaluator or {}))
 
     def transform(self, actor: TensorDictModuleBase) -> Compose:
         """Return the transforms of the buffer that trains the actor: conditions are answered, then rows augmented."""

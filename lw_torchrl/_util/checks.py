@@ -28,6 +28,7 @@ _CONF = BeartypeConf(
 )
 Count = Annotated[int, Is[lambda n: n >= 1]]
 Natural = Annotated[int, Is[lambda n: n >= 0]]
+Finite = Annotated[float, Is[lambda x: abs(x) <= _MOST]]
 Scale = Annotated[float, Is[lambda x: 0 <= x <= _MOST]]
 Positive = Annotated[float, Is[lambda x: 0 < x <= _MOST]]
 Probability = Annotated[float, Is[lambda p: 0 <= p <= 1]]
@@ -41,6 +42,7 @@ _WORDS: dict[Any, str] = {
     Callable: "a function",
     Count: "an integer of at least 1",
     Natural: "an integer of at least 0",
+    Finite: "a finite number",
     Scale: "a finite number of at least 0",
     Positive: "a finite number above 0",
     Probability: "a number from 0 to 1",
@@ -97,7 +99,9 @@ def _checked(function: Any, read_hints: Callable[[], dict[str, Any]]) -> Any:
 def check_value(argument: str, value: Any, hint: Any) -> Any:
     """Return ``value``, a NumPy number as Python's, if it matches a type hint; else raise :class:`ArgumentError`."""
     if not checker(hint)(value):
-        choices = [choice for part in _parts(hint) if get_origin(part) is Literal for choice in get_args(part)]
+        choices = [
+            choice for part in (hint, *get_args(hint)) if get_origin(part) is Literal for choice in get_args(part)
+        ]
         close = did_you_mean(value, map(str, choices)) if isinstance(value, str) else ""
         raise ArgumentError(f"{argument} must be {_words(hint)}, got {shown(value)}{close}")
     return _plain(value)
@@ -115,7 +119,8 @@ def checker(hint: Any) -> Callable[[Any], bool]:
     if kind in (Union, UnionType):
         alternatives = [checker(part) for part in parts]
         return lambda value: any(check(value) for check in alternatives)
-    if getattr(kind, "__module__", "") not in ("builtins", "collections.abc") or not issubclass(kind, Iterable):
+    is_container = getattr(kind, "__module__", "") in ("builtins", "collections.abc") and issubclass(kind, Iterable)
+    if not is_container or not (parts or kind is tuple):
         return lambda value: is_bearable(_plain(value), hint, conf=_CONF)
     items = [checker(part) for part in parts if part is not ...]
 
@@ -131,52 +136,46 @@ def checker(hint: Any) -> Callable[[Any], bool]:
     return check
 
 
-def _parts(hint: Any) -> tuple[Any, ...]:
-    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-
-
 def _words(hint: Any) -> str:
     """Describe a type hint in English."""
-    if len(parts := _parts(hint)) > 1:
+    kind, parts = get_origin(hint), get_args(hint)
+    if kind in (Union, UnionType):
         return " or ".join(map(_words, parts))
-    for known in (hint, get_origin(hint)):
-        if known in _WORDS:
-            return _WORDS[known]
-    if get_origin(hint) is Literal:
-        return " or ".join(map(repr, get_args(hint)))
-    if isinstance(hint, type) and get_origin(hint) is None:
-        return f"a {hint.__name__}"
-    if (kind := get_origin(hint)) in (None, Annotated):
-        return str(hint)
-    items = [re.sub("^an? ", "", _words(part)) for part in get_args(hint) if part is not ...]
+    if kind is Literal:
+        return " or ".join(map(repr, parts))
+    if words := _WORDS.get(hint) or _WORDS.get(kind):
+        return words
+    if kind in (None, Annotated):
+        return f"a {hint.__name__}" if isinstance(hint, type) else str(hint)
+    items = [re.sub("^an? ", "", _words(part)) for part in parts if part is not ...]
     return f"{kind.__name__}[{', '.join(items)}]"
 
 
-def check_choice(argument: str, given: Any, allowed: Iterable[str]) -> Any:
-    """Return ``given`` if it is one of ``allowed``; else raise :class:`ValueError` with the nearest name."""
+def check_choice(argument: str, value: Any, allowed: Iterable[str]) -> Any:
+    """Return ``value`` if it is one of ``allowed``; else raise :class:`ValueError` with the nearest name."""
     names = list(allowed)
-    if given not in names:
-        raise unknown_name(argument, given, names)
-    return given
+    if value not in names:
+        raise unknown_name(argument, value, names)
+    return value
 
 
-def unknown_name(argument: str, given: object, allowed: Iterable[str]) -> ValueError:
+def unknown_name(argument: str, value: object, allowed: Iterable[str]) -> ValueError:
     """Return the error for a name that is not in a set of names, with those of similar spelling."""
     names = list(allowed)
     listed = ", ".join(map(repr, names[:12])) + (", ..." if len(names) > 12 else "")
-    close = " or ".join(map(repr, nearest(given, names))) if isinstance(given, str) else ""
+    close = " or ".join(map(repr, nearest(value, names))) if isinstance(value, str) else ""
     hint = f"; did you mean {close}?" if close else ""
-    return ValueError(f"{argument} must be one of {listed}, got {shown(given)}{hint}")
+    return ValueError(f"{argument} must be one of {listed}, got {shown(value)}{hint}")
 
 
-def nearest(given: str, allowed: Iterable[str], *, n: int = 3) -> list[str]:
+def nearest(value: str, allowed: Iterable[str], *, n: int = 3) -> list[str]:
     """Return the ``n`` allowed names of most similar spelling, best first."""
-    return get_close_matches(given, list(allowed), n=n, cutoff=0.4)
+    return get_close_matches(value, list(allowed), n=n, cutoff=0.4)
 
 
-def did_you_mean(given: str, allowed: Iterable[str]) -> str:
+def did_you_mean(value: str, allowed: Iterable[str]) -> str:
     """Return the end of an error message that suggests an allowed name; "" if none is similar."""
-    return "".join(f"; did you mean {name!r}?" for name in nearest(given, allowed, n=1))
+    return "".join(f"; did you mean {name!r}?" for name in nearest(value, allowed, n=1))
 
 
 def missing_keys(present: Iterable[Any], *needed: str) -> ValueError:

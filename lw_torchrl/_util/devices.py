@@ -76,23 +76,23 @@ CPU = torch.device("cpu")
 BLOCK = 64  # rows on which networks run at once
 
 
-def check_device(argument: str, given: Any) -> torch.device:
-    """Return a device with its number. ``given`` is a :class:`torch.device`, a name that PyTorch knows, such as "cuda"
+def check_device(argument: str, value: Any) -> torch.device:
+    """Return a device with its number. ``value`` is a :class:`torch.device`, a name that PyTorch knows, such as "cuda"
     or "cuda:0", or "auto" for this machine's accelerator, or the CPU without one. Raise :class:`ValueError` for a
     device that does not exist or is not in this machine, and :class:`TypeError` for another object."""
-    if not isinstance(given, (str, torch.device)):
-        raise TypeError(f"{argument} must be a device's name, got {shown(given)}")
+    if not isinstance(value, (str, torch.device)):
+        raise TypeError(f"{argument} must be a device's name, got {shown(value)}")
     accelerator = torch.accelerator.current_accelerator(check_available=True)
     available = ["cpu"]
     if accelerator is not None:
         kind = accelerator.type
         available += [kind, *(f"{kind}:{number}" for number in range(torch.accelerator.device_count()))]
-    if given == "auto":
-        given = available[1] if len(available) > 1 else "cpu"
+    if value == "auto":
+        value = available[1] if len(available) > 1 else "cpu"
     try:
-        device = torch.device(given)
+        device = torch.device(value)
     except RuntimeError:
-        raise unknown_name(argument, given, _NAMES) from None
+        raise unknown_name(argument, value, _NAMES) from None
     if device.type == "cpu":
         return CPU
     if str(device) not in available:

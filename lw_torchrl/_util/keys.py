@@ -21,30 +21,30 @@ with naming_absent_renderer():  # rooms that use TorchRL import this module firs
 Keys = Sequence[NestedKey]
 
 
-def _key(given: Any) -> NestedKey | None:
+def _key(value: Any) -> NestedKey | None:
     """Return a key; None if it is not one. A list is a nested key too, since JSON has no tuples."""
-    given = tuple(given) if isinstance(given, list) else given
-    return unravel_key(given) if checker(NestedKey)(given) and given else None
+    value = tuple(value) if isinstance(value, list) else value
+    return unravel_key(value) if checker(NestedKey)(value) and value else None
 
 
-def as_keys(argument: str, given: Sequence[NestedKey] | None, default: Sequence[str]) -> list[NestedKey]:
+def as_keys(argument: str, value: Sequence[NestedKey] | None, default: Sequence[str]) -> list[NestedKey]:
     """Return keys that replace the default ones, in their order; None means the default ones.
 
     Raises :class:`ValueError` for another number of keys, a repeated key, or an object that is not a key.
     """
-    if given is None:
+    if value is None:
         return list(default)
-    is_list = isinstance(given, Sequence) and not isinstance(given, str)
-    keys = [key for item in given if (key := _key(item)) is not None] if is_list else []
-    if not is_list or len({*keys}) != len(default) or len(given) != len(default):
-        raise ValueError(f"{argument} must be {len(default)} different keys, for {', '.join(default)}; got {given!r}")
+    is_list = isinstance(value, Sequence) and not isinstance(value, str)
+    keys = [key for item in value if (key := _key(item)) is not None] if is_list else []
+    if not is_list or len({*keys}) != len(default) or len(value) != len(default):
+        raise ValueError(f"{argument} must be {len(default)} different keys, for {', '.join(default)}; got {value!r}")
     return keys
 
 
-def check_key(argument: str, given: Any) -> None:
-    """Raise :class:`TypeError` unless ``given`` is a key of a tensordict."""
-    if isinstance(given, list) or _key(given) is None:
-        raise TypeError(f"{argument} must be a key (a string or a tuple of strings), got {given!r}")
+def check_key(argument: str, value: Any) -> None:
+    """Raise :class:`TypeError` unless ``value`` is a key of a tensordict."""
+    if isinstance(value, list) or _key(value) is None:
+        raise TypeError(f"{argument} must be a key (a string or a tuple of strings), got {value!r}")
 
 
 def check_apart(in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> None:

@@ -1,4 +1,4 @@
-"""What results depend on: the random numbers of an episode, and the versions of packages."""
+"""Reproducibility: the random numbers of an episode, and the versions of packages that results depend on."""
 
 import warnings
 from collections.abc import Iterable, Mapping
@@ -31,15 +31,18 @@ def episode_generator(purpose: str, task: str | Task, seed: int, episode: int) -
 
 def package_versions() -> dict[str, str]:
     """Return the versions of the packages that results depend on, by name; ours is that of the running code."""
-    others = sorted({*SIMULATORS, *LIBRARIES} - {"lw_torchrl"})
-    return {"lw_torchrl": __version__, **{name: version(name) for name in others}}
+    return {name: _installed(name) for name in ("lw_torchrl", *sorted({*SIMULATORS, *LIBRARIES} - {"lw_torchrl"}))}
+
+
+def _installed(name: str) -> str:
+    return __version__ if name == "lw_torchrl" else version(name)
 
 
 def version_changes(recorded: Any, names: Iterable[str]) -> list[str]:
     """Return the packages whose installed version is not the recorded one: "mujoco 3.2.0, now 3.3.0"."""
-    before, now = recorded if isinstance(recorded, Mapping) else {}, package_versions()
-    pairs = [(name, before.get(name), now[name]) for name in names]
-    return [f"{name} {shown(was)[1:-1]}, now {is_}" for name, was, is_ in pairs if isinstance(was, str) and was != is_]
+    before = recorded if isinstance(recorded, Mapping) else {}
+    pairs = [(name, before[name], _installed(name)) for name in names if isinstance(before.get(name), str)]
+    return [f"{name} {shown(was)[1:-1]}, now {now}" for name, was, now in pairs if was != now]
 
 
 def warn_of_other_versions(path: object, recorded: Any, names: Iterable[str] = LIBRARIES) -> None:

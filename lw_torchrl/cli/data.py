@@ -174,11 +174,11 @@ def _summary(label: str, episodes: list[_Episode]) -> dict[str, Any]:
 
 
 def _check(output: Output, parts: list[Demonstrations]) -> None:
-    from lw_torchrl.data.dataset import whole_episodes
+    from lw_torchrl.data.dataset import damaged_episodes
 
     damaged = []
     for part in parts:
-        if number := len(part.episodes) - len(whole_episodes(part, progress=True)):
+        if number := len(damaged_episodes(part, part.episodes, progress=True)):
             damaged.append({"folder": part.root, "episodes": number})
             fault = f"{number} of {counted(len(part.episodes), 'episode')} differ from their checksums"
             output.fault = f"{str(part.root)!r} is damaged: {fault}; delete the folder and collect it again"

@@ -174,7 +174,7 @@ class Evaluate:
         for name, file in (("checkpoint", policy_file(self.policy)), ("evaluator", Path(rollout.evaluator or ""))):
             origin[name] = file if file.is_file() else None
         result.save(out / "results.json", **origin)
-        lw.plot_success(result, out / "success.png", title=f"{self.policy}, {self.episodes} episodes a task")
+        lw.evaluation.plot_success(result, out / "success.png", title=f"{self.policy}, {self.episodes} episodes a task")
         if use is not None:
             write_json(out / "plan_use.json", {task: counts.to_json() for task, counts in use.tasks().items()})
         if rollout.attribute:

@@ -198,7 +198,7 @@ def read_evaluator(name: str, plans: Plans, text_encoder: str | None = None) -> 
     encoder = read_encoder(text_encoder)
     if Path(name).exists() or not (":" in name or name == "StateQueryEvaluator"):
         return lw.training.load_evaluator(name, plans, text_encoder=encoder)
-    evaluator: Any = import_object("--evaluator", name) if ":" in name else lw.StateQueryEvaluator
+    evaluator: Any = import_object("--evaluator", name) if ":" in name else lw.modules.StateQueryEvaluator
     if isinstance(evaluator, lw.QueryEvaluator):
         return evaluator.with_plans(plans)
     if not (isinstance(evaluator, type) and issubclass(evaluator, lw.QueryEvaluator)):

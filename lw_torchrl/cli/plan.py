@@ -135,8 +135,8 @@ class Repair(_Model):
     """Run a language model's plans with scripted skills, report failures to the model, and ask it again.
 
     The report names the step where the robot got stuck, conditions that never held, distances that stayed too large,
-    and text that could not be parsed. The answers of round k are kept in OUT/NAME-roundk. If it is stopped, the same
-    command resumes it.
+    and text that could not be parsed. The answers of round k are kept in OUT/NAME-roundk. Answers of `plan generate`
+    with the same options are used again. If it is stopped, the same command resumes it.
 
     Example: lw-torchrl plan repair MT10 --model llama3.1 --base-url http://127.0.0.1:11434/v1 --rounds 3
     """
@@ -153,7 +153,7 @@ class Repair(_Model):
         from lw_torchrl.planners.repairing import repair_plans
 
         options.use_one_thread()
-        first = planner.plans(tasks, format=self.format, attempts=self.attempts, out=self.out, recorded=True)
+        first = planner.plans(tasks, format=self.format, attempts=self.attempts, out=self.out)
         how: dict[str, Any] = {"rounds": self.rounds, "enough": self.enough, "episodes": self.episodes}
         repairs = repair_plans(planner, first, tasks=known, out=self.out, seed=self.episode_seed, **how)
         rows = []

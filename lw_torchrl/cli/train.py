@@ -293,7 +293,7 @@ class TrainEvaluator:
             own = lw.Plans({task: plans[task] for task in tasks})
             evaluator = lw.modules.ImageQueryEvaluator(own, hidden=self.width, depth=self.depth, **pictures)
         else:
-            evaluator = lw.StateQueryEvaluator(plans, width=self.width, depth=self.depth)
+            evaluator = lw.modules.StateQueryEvaluator(plans, width=self.width, depth=self.depth)
         replay = self._replay(tasks)
         if self.cameras:
             for root in self.data or [self.out / "data" / name for name in self.behaviours]:

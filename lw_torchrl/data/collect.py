@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing, nullcontext
 from numbers import Real
 from pathlib import Path
@@ -28,20 +28,9 @@ from lw_torchrl._util.progress import Progress
 from lw_torchrl._util.reproducibility import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import dataset
 from lw_torchrl.data.collection_policy import Behaviour, SegmentActor, behaviour_of, segment_plans
-from lw_torchrl.data.dataset import (
-    COLUMNS,
-    TRAJECTORY,
-    CollectConfig,
-    DatasetError,
-    Demonstrations,
-    describe_episode,
-    verify,
-    write_metadata,
-    write_rows,
-)
+from lw_torchrl.data.dataset import COLUMNS, TRAJECTORY, CollectConfig, DatasetError, Demonstrations
 from lw_torchrl.envs.episodes import policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
-from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.parts import evaluating
 from lw_torchrl.modules.policy import plans_of, tasks_of, transform_of
@@ -145,8 +134,7 @@ def suite_expert(suite: Suite, tasks: Sequence[str]) -> Any:
         return suite.make_expert(tasks)
     if suite.plans is None or suite.skills is None:
         raise ValueError(f"policy='expert': suite {suite.name!r} has no plans with scripted skills; give a policy")
-    suite.plans.require(tasks)
-    return ScriptedSkillActor(Plans([suite.plans[task] for task in tasks]), skills=suite.skills)
+    return ScriptedSkillActor(segment_plans(tasks, suite), skills=suite.skills)
 
 
 def run_missing_episodes(
@@ -157,6 +145,7 @@ def run_missing_episodes(
     missing = sum(map(len, wanted.values()))
     if not missing:
         return kept
+    # The dense reward is recorded; the sparse one follows from success.
     base = LanguageWorldEnv(
         config.tasks,
         suite=suite,
@@ -226,26 +215,17 @@ def _assemble(
     root: Path, config: CollectConfig, versions: dict[str, str], files: EpisodeFiles, kept: dict[str, list[int]]
 ) -> None:
     """Join the episodes' files to a dataset."""
-    listed = [(task, episode) for task in config.tasks for episode in kept[task]]
-    infos: list[dataset.EpisodeInfo] = []
-
-    def episodes() -> Iterator[TensorDictBase]:
-        for number, (task, episode) in enumerate(listed):
-            rows = files.get(task, episode)
-            rows.set(TRAJECTORY, torch.full(rows.batch_size, number))
-            start = infos[-1].start + infos[-1].length if infos else 0
-            infos.append(describe_episode(task, episode, start, rows))
-            yield rows
-
+    episodes = ((task, episode, files.get(task, episode)) for task in config.tasks for episode in kept[task])
     building = files.folder / "rows"
+    # The folder of the rows gets its name when it is complete, and the metadata, written last, finish the dataset.
     for old in (building, root / dataset.DATA):
         shutil.rmtree(old, ignore_errors=True)
-    write_rows(building, episodes(), config.layout)
+    infos = dataset.write_rows(building, episodes, config.layout)
     os.replace(building, root / dataset.DATA)
     flush(root)
     attempts = {task: max(kept[task]) + 1 for task in config.tasks}
     task_ids = {task: task_id(task) for task in config.tasks}
-    write_metadata(Demonstrations(root, config, versions, task_ids, tuple(infos), attempts))
+    dataset.write_metadata(Demonstrations(root, config, versions, task_ids, infos, attempts))
 
 
 def _finished(root: Path, config: CollectConfig) -> Demonstrations | None:
@@ -254,7 +234,7 @@ def _finished(root: Path, config: CollectConfig) -> Demonstrations | None:
         return None
     demonstrations = dataset.read_metadata(root)
     _check_same(demonstrations.config, config, root)
-    verify(demonstrations, demonstrations.episodes)
+    dataset.verify(demonstrations, demonstrations.episodes)
     return demonstrations
 
 

@@ -60,9 +60,6 @@ class Behaviour:
             raise ValueError(f"behaviour: name must be a printable label, got {shown(self.name)}")
         if self.shortest > self.longest:
             raise ValueError(f"behaviour: longest must be at least shortest, {self.shortest}, got {self.longest}")
-        for name, value in asdict(self).items():
-            if isinstance(value, np.generic):  # JSON needs Python's numbers
-                object.__setattr__(self, name, value.item())
 
     @property
     def acts(self) -> Behaviour:
@@ -71,11 +68,6 @@ class Behaviour:
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
-
-    @classmethod
-    def from_json(cls, described: Mapping[str, Any]) -> Behaviour:
-        """Return the behaviour that :meth:`to_json` described."""
-        return cls(**described)
 
 
 EXPERT: Behaviour = Behaviour("expert", "expert")

@@ -30,10 +30,11 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from lw_torchrl._util.checks import Count, Scale, check_value, typed_fields
+from lw_torchrl._util.checks import Count, Scale, typed_fields
 from lw_torchrl._util.files import AnyPath, flush, read_json, write_json
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data.collection_policy import EXPERT, NOISY, Behaviour, check_own_label
+from lw_torchrl.envs.episodes import first_success
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.tasks import resolve_tasks
 
@@ -56,7 +57,7 @@ class CollectConfig:
     tasks: tuple[str, ...]
     episodes_per_task: Count
     seed: int
-    noise_scale: tuple[float, ...] = (0.0,)
+    noise_scale: tuple[Scale, ...] = (0.0,)
     noise_hold: Count = 1
     gripper_noise_factor: Scale = 0.2
     redraw_failures: bool = False
@@ -74,11 +75,10 @@ class CollectConfig:
             tasks = tuple(sorted(self.tasks))
             if not tasks or not all(task.startswith(f"{self.layout.name}/") for task in tasks):
                 raise ValueError(f"tasks must be named '{self.layout.name}/...', got {short(self.tasks)}")
-        # beartype looks at only one item of a tuple.
-        noise_scale = tuple(check_value("noise_scale", scale, Scale) for scale in self.noise_scale)
-        numbers = {name: value.item() for name, value in vars(self).items() if isinstance(value, np.generic)}
-        for name, value in {"tasks": tasks, "noise_scale": noise_scale, **numbers}.items():
-            object.__setattr__(self, name, value)
+        # JSON needs Python's numbers.
+        noise_scale = tuple(scale.item() if isinstance(scale, np.generic) else scale for scale in self.noise_scale)
+        object.__setattr__(self, "tasks", tasks)
+        object.__setattr__(self, "noise_scale", noise_scale)
 
     def to_json(self) -> dict[str, Any]:
         """Return the configuration as JSON, without ``policy`` for the expert and ``layout`` for Meta-World's."""
@@ -93,9 +93,10 @@ class CollectConfig:
     def from_json(cls, config: Mapping[str, Any]) -> CollectConfig:
         """Return the configuration that :meth:`to_json` described."""
         options = {**config, "tasks": tuple(config["tasks"]), "noise_scale": tuple(config["noise_scale"])}
-        for key, parse in (("policy", Behaviour.from_json), ("layout", Layout.from_json)):
-            if key in options:
-                options[key] = parse(options[key])
+        if "policy" in options:
+            options["policy"] = Behaviour(**options["policy"])
+        if "layout" in options:
+            options["layout"] = Layout.from_json(options["layout"])
         return cls(**options)
 
     @property
@@ -249,22 +250,28 @@ def _meta(rows: int, layout: Layout = METAWORLD) -> dict[str, dict[str, Any]]:
     return {folder: entries | about for folder, entries in folders.items()}
 
 
-def write_rows(folder: Path, episodes: Iterable[TensorDictBase], layout: Layout) -> None:
-    """Write episodes one after another, and flush them to the disk; an :class:`OSError` leaves some of them there."""
-    rows = 0
+def write_rows(
+    folder: Path, episodes: Iterable[tuple[str, int, TensorDictBase]], layout: Layout
+) -> tuple[EpisodeInfo, ...]:
+    """Write episodes (task, index, rows) one after another, flush them to the disk, and return their descriptions."""
+    infos: list[EpisodeInfo] = []
+    start = 0
     for name in _meta(0):
         (folder / name).mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         files = {key: stack.enter_context(_path(folder, key).open("wb")) for key in COLUMNS}
-        for steps in episodes:
-            rows += len(steps)
+        for number, (task, episode, rows) in enumerate(episodes):
+            rows.set(TRAJECTORY, torch.full(rows.batch_size, number))
+            infos.append(describe_episode(task, episode, start, rows))
+            start += len(rows)
             for key, file in files.items():
-                file.write(steps.get(key).contiguous().numpy().data)
-    for name, entries in _meta(rows, layout).items():
+                file.write(rows.get(key).contiguous().numpy().data)
+    for name, entries in _meta(start, layout).items():
         (folder / name / "meta.json").write_text(json.dumps(entries, separators=(",", ":")), encoding="utf-8")
-    for path in sorted(folder.rglob("*"), reverse=True):
+    for path in sorted(folder.rglob("*"), reverse=True):  # files before their folders
         flush(path)
     flush(folder)
+    return tuple(infos)
 
 
 def describe_episode(task: str, episode: int, start: int, rows: TensorDictBase) -> EpisodeInfo:
@@ -272,8 +279,7 @@ def describe_episode(task: str, episode: int, start: int, rows: TensorDictBase) 
     checksum = 0
     for key in COLUMNS:
         checksum = crc32(rows.get(key).contiguous().numpy().data, checksum)
-    successes = rows.get(("next", "success")).flatten().nonzero().flatten()
-    first = int(successes[0]) + 1 if len(successes) else None
+    first = first_success(rows.get(("next", "success")))
     return EpisodeInfo(task, episode, start, len(rows), first is not None, first, checksum)
 
 
@@ -315,31 +321,30 @@ def load_rows(demonstrations: Demonstrations) -> TensorDict:
 _VERIFIED: dict[Path, tuple[list[Any], set[EpisodeInfo]]] = {}
 
 
-def whole_episodes(demonstrations: Demonstrations, *, progress: bool) -> list[EpisodeInfo]:
-    """Return the episodes whose rows match their checksums."""
-    rows, whole = load_rows(demonstrations), []
-    with Progress("checking", len(demonstrations.episodes), "episode", show=progress) as bar:
-        for info in demonstrations.episodes:
-            if _is_whole(info, rows):
-                whole.append(info)
+def damaged_episodes(
+    demonstrations: Demonstrations, episodes: Sequence[EpisodeInfo], *, progress: bool = False
+) -> list[EpisodeInfo]:
+    """Return the episodes whose rows differ from their checksums."""
+    rows, damaged_ones = load_rows(demonstrations), []
+    with Progress("checking", len(episodes), "episode", show=progress) as bar:
+        for info in episodes:
+            steps = rows[info.start : info.start + info.length]
+            if describe_episode(info.task, info.episode, info.start, steps) != info:
+                damaged_ones.append(info)
             bar.update()
-    return whole
-
-
-def _is_whole(info: EpisodeInfo, rows: TensorDictBase) -> bool:
-    return describe_episode(info.task, info.episode, info.start, rows[info.start : info.start + info.length]) == info
+    return damaged_ones
 
 
 def verify(demonstrations: Demonstrations, episodes: Sequence[EpisodeInfo]) -> None:
     """Raise DatasetError unless episodes match their checksums; each is compared once while the files do not change."""
-    rows, root = load_rows(demonstrations), demonstrations.root.resolve()
+    load_rows(demonstrations)  # raises if a file is missing
+    root = demonstrations.root.resolve()
     states = [path.stat() for path in (root / METADATA, *(_path(root / DATA, key) for key in COLUMNS))]
     files = [(state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns) for state in states]
     files_before, known = _VERIFIED.get(root, (files, set()))
     if files != files_before:
         known = set()
-    for info in episodes:
-        if info not in known and not _is_whole(info, rows):
-            episode = f"episode {info.episode} of {info.task!r}"
-            raise damaged(f"the rows in {str(root)!r} are damaged: {episode} differs from its checksum")
+    if broken := damaged_episodes(demonstrations, [info for info in episodes if info not in known]):
+        episode = f"episode {broken[0].episode} of {broken[0].task!r}"
+        raise damaged(f"the rows in {str(root)!r} are damaged: {episode} differs from its checksum")
     _VERIFIED[root] = (files, known | set(episodes))

@@ -2,40 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDict
 
-from lw_torchrl._util.checks import Count, Natural, Probability, check_value, typed, unknown_name
+from lw_torchrl._util.checks import Count, Natural, Probability, typed, unknown_name
 from lw_torchrl._util.devices import check_device, finite
 from lw_torchrl._util.files import AnyPath
-from lw_torchrl.data.dataset import (
-    DATASET,
-    DONE,
-    REWARD,
-    TRAJECTORY,
-    DatasetError,
-    Demonstrations,
-    load_rows,
-    read_metadata,
-    verify,
-)
+from lw_torchrl.data.dataset import DATASET, DONE, REWARD, TRAJECTORY, DatasetError, Demonstrations, load_rows
 from lw_torchrl.data.rewards import REWARDS, STEPS, RewardName, n_step_returns
-from lw_torchrl.data.selection import (
-    EpisodeChoice,
-    EpisodeFilter,
-    Label,
-    check_behaviours,
-    check_label,
-    choose_episodes,
-    kept_rows,
-    returns_of,
-)
+from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, Label, kept_rows, select
 
 _FLAGS = ("done", "terminated", "truncated")
 ROLLOUT: tuple[NestedKey, ...] = (
@@ -58,6 +36,7 @@ def _read_part(
     else:
         taken, other = ("expert_action", "unclipped_action")[:: 1 if label == "expert" else -1]
         rows = rows.exclude("next", "action", other).rename_key_(taken, "action")
+    # One NaN would spoil the weights of a policy, and the loss shows it only a step later.
     if not finite(rows.get("action")):
         raise DatasetError(f"root: {str(whole.root)!r} holds an action that is NaN or infinite, for label={label!r}")
     if chosen.episodes == whole.episodes and after is None:
@@ -86,17 +65,7 @@ def _choose_keys(rows: TensorDict, keys: Keys) -> TensorDict:
     return rows.select(*chosen)
 
 
-@dataclass(frozen=True)
-class Loaded:
-    """Rows (R,), and the description of each folder with the episodes that are shown."""
-
-    rows: TensorDict
-    parts: tuple[Demonstrations, ...]
-    behaviours: tuple[str, ...]  # the labels of the collecting policies, sorted
-    is_joined: bool  # folders are joined or episodes chosen
-
-
-def _check_options(
+def check_options(
     label: Label, after_success: int | None, terminate_on_success: bool, n_steps: int, gamma: float | None, keys: Any
 ) -> None:
     """Raise :class:`ValueError` for options that exclude or need each other."""
@@ -110,65 +79,30 @@ def _check_options(
         raise ValueError("terminate_on_success ends episodes at success; leave out after_success")
 
 
-def _folders_and_choices(
-    root: AnyPath | Iterable[AnyPath], episodes: EpisodeChoice | Sequence[EpisodeChoice]
-) -> tuple[list[AnyPath], list[Any]]:
-    """Return the folders, and the choice of episodes in each."""
-    if isinstance(root, (str, os.PathLike)):
-        return [root], [episodes]
-    folders = [check_value("root", folder, AnyPath) for folder in root]
-    is_repeated = episodes is None and len({Path(folder).resolve() for folder in folders}) < len(folders)
-    if not folders or is_repeated:
-        raise ValueError(f"root must be a folder, or a list that names each folder once, got {folders}")
-    if episodes is None:
-        return folders, [None] * len(folders)
-    if not isinstance(episodes, Sequence) or len(episodes) != len(folders):
-        raise ValueError(f"episodes must be a list of {len(folders)} choices, one for each folder, got {episodes!r}")
-    return folders, list(episodes)
+def labels_of(datasets: Sequence[Demonstrations]) -> tuple[str, ...]:
+    """Return the labels of the collecting policies, sorted."""
+    return tuple(sorted({dataset.config.behaviour for dataset in datasets}))
 
 
-def load(
-    root: AnyPath | Iterable[AnyPath],
-    *,
-    episodes: EpisodeChoice | Sequence[EpisodeChoice],
-    keep: EpisodeFilter | None,
+def read_rows(
+    datasets: Sequence[Demonstrations],
+    parts: Sequence[Demonstrations],
     label: Label,
     reward: RewardName,
-    after_success: int | None,
-    terminate_on_success: bool,
+    after: int | None,
+    terminate: bool,
     n_steps: int,
     gamma: float | None,
     keys: Keys | None,
     device: str | torch.device | None,
-    check: bool,
-) -> Loaded:
-    """Load rows with their descriptions; see :func:`load_demonstrations`, which checks the arguments' types."""
-    _check_options(label, after_success, terminate_on_success, n_steps, gamma, keys)
-    is_list = not isinstance(root, (str, os.PathLike))
-    folders, choices = _folders_and_choices(root, episodes)
-    whole = [read_metadata(folder) for folder in folders]
-    check_label(label, whole)
-    check_behaviours(whole)
-    parts = [
-        choose_episodes(dataset, choice, f"episodes[{number}]" if is_list else "episodes")
-        for number, (dataset, choice) in enumerate(zip(whole, choices, strict=True))
-    ]
-    for dataset, chosen in zip(whole, parts, strict=True) if check else ():
-        verify(dataset, chosen.episodes)
-    sizes = [(part.config.layout.size, part.config.layout.action_size) for part in parts]
-    if len(set(sizes)) > 1:
-        raise ValueError(f"root: the folders must have rows of one layout, got observation and action sizes {sizes}")
-    after = 0 if terminate_on_success else after_success
-    if keep is not None:
-        returns = [returns_of(dataset, chosen, reward, after) for dataset, chosen in zip(whole, parts, strict=True)]
-        parts = keep.choose(parts, returns)
-    behaviours = tuple(sorted({part.config.behaviour for part in whole}))
-    rows_of_parts, trajectories = [], 0
-    for number, (dataset, chosen) in enumerate(zip(whole, parts, strict=True)):
-        rows = _read_part(dataset, chosen, label, reward, after, terminate_on_success)
-        rows.set("behaviour", torch.full(rows.batch_size, behaviours.index(dataset.config.behaviour)))
+) -> TensorDict:
+    """Read the rows of the selected episodes of datasets; see :func:`load_demonstrations`."""
+    labels, rows_of_parts, trajectories = labels_of(datasets), [], 0
+    for number, (dataset, part) in enumerate(zip(datasets, parts, strict=True)):
+        rows = _read_part(dataset, part, label, reward, after, terminate)
+        rows.set("behaviour", torch.full(rows.batch_size, labels.index(dataset.config.behaviour)))
         rows.set("is_demonstration", torch.ones(rows.batch_size, dtype=torch.bool))
-        if len(whole) > 1:
+        if len(datasets) > 1:
             rows.set(TRAJECTORY, rows.get(TRAJECTORY) + trajectories)
             rows.set(DATASET, torch.full(rows.batch_size, number))
         # n-step returns need columns that the choice may leave out.
@@ -179,9 +113,7 @@ def load(
         assert gamma is not None
         rows = n_step_returns(rows, n_steps, gamma)
         rows = rows if keys is None else _choose_keys(rows, keys if keys != "rollout" else (*ROLLOUT, STEPS))
-    if device is not None:
-        rows = rows.to(check_device("device", device))
-    return Loaded(rows, tuple(parts), behaviours, is_list or episodes is not None or keep is not None)
+    return rows if device is None else rows.to(check_device("device", device))
 
 
 @typed
@@ -248,5 +180,7 @@ def load_demonstrations(
 
     Source: the datasets of ``torchrl.data.datasets``, which keep their rows in memory-mapped tensordicts.
     """
-    options = {name: value for name, value in locals().items() if name != "root"}
-    return load(root, **options).rows
+    check_options(label, after_success, terminate_on_success, n_steps, gamma, keys)
+    after = 0 if terminate_on_success else after_success
+    datasets, parts = select(root, episodes, keep, label, reward, after, check)
+    return read_rows(datasets, parts, label, reward, after, terminate_on_success, n_steps, gamma, keys, device)

@@ -23,15 +23,8 @@ from lw_torchrl._util.checks import Count, typed
 from lw_torchrl._util.files import AnyPath, replacing
 from lw_torchrl._util.progress import Progress
 from lw_torchrl._util.rendering import check_cameras
-from lw_torchrl.data.dataset import (
-    TRAJECTORY,
-    DatasetError,
-    Demonstrations,
-    EpisodeInfo,
-    load_rows,
-    read_metadata,
-    verify,
-)
+from lw_torchrl.data import dataset
+from lw_torchrl.data.dataset import TRAJECTORY, DatasetError, Demonstrations, EpisodeInfo
 from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.transforms.camera import CameraTransform
@@ -110,25 +103,27 @@ def add_pictures(
         torch.Size([8, 64, 64, 3])
     """
     pictures = Pictures(check_cameras(cameras, height, width), height, width, every)
-    dataset = read_metadata(root)
-    verify(dataset, dataset.episodes)
-    rows = load_rows(dataset)
-    missing = [episode for episode in dataset.episodes if not pictures.file(dataset.root, episode).is_file()]
+    demonstrations = dataset.read_metadata(root)
+    dataset.verify(demonstrations, demonstrations.episodes)
+    rows = dataset.load_rows(demonstrations)
+    missing = [
+        episode for episode in demonstrations.episodes if not pictures.file(demonstrations.root, episode).is_file()
+    ]
     with Progress("rendering", sum(map(pictures.count, missing)), "picture", show=progress) as bar:
-        for task in dataset.config.tasks:
+        for task in demonstrations.config.tasks:
             episodes = [episode for episode in missing if episode.task == task]
             for start in range(0, len(episodes), _TOGETHER):
                 group = episodes[start : start + _TOGETHER]
-                for episode, images in zip(group, _render(dataset, rows, group, pictures), strict=True):
-                    _write(pictures.file(dataset.root, episode), images)
+                for episode, images in zip(group, _render(demonstrations, rows, group, pictures), strict=True):
+                    _write(pictures.file(demonstrations.root, episode), images)
                     bar.update(len(images))
 
 
 def _render(
-    dataset: Demonstrations, rows: TensorDictBase, episodes: Sequence[EpisodeInfo], pictures: Pictures
+    demonstrations: Demonstrations, rows: TensorDictBase, episodes: Sequence[EpisodeInfo], pictures: Pictures
 ) -> list[list[np.ndarray[Any, Any]]]:
     """Run some episodes of one task again together, and return the pictures of each."""
-    task, seed, steps = episodes[0].task, dataset.config.seed, dataset.config.max_steps
+    task, seed, steps = episodes[0].task, demonstrations.config.seed, demonstrations.config.max_steps
     base = LanguageWorldEnv(task, num_envs=len(episodes), seed=seed, max_steps=steps)
     camera = CameraTransform(pictures.cameras, height=pictures.height, width=pictures.width, every=pictures.every)
     images: list[list[np.ndarray[Any, Any]]] = [[] for _ in episodes]
@@ -140,10 +135,10 @@ def _render(
             active = step < lengths
             stored = rows[starts + torch.minimum(torch.tensor(step), lengths - 1)]
             if not torch.equal(state.get("observation")[active], stored.get("observation")[active]):
-                versions = ", ".join(f"{name} {version}" for name, version in dataset.versions.items())
+                versions = ", ".join(f"{name} {version}" for name, version in demonstrations.versions.items())
                 raise DatasetError(
-                    f"root: episodes of {task!r} in {str(dataset.root)!r} differ from step {step} on when they are run "
-                    f"again; they were collected with {versions}"
+                    f"root: episodes of {task!r} in {str(demonstrations.root)!r} differ from step {step} on when they "
+                    f"run again; they were collected with {versions}"
                 )
             if step % pictures.every == 0:
                 for place in active.nonzero().flatten().tolist():

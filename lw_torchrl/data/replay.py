@@ -23,10 +23,10 @@ from lw_torchrl._util.devices import CPU, finite
 from lw_torchrl._util.files import AnyPath, reading
 from lw_torchrl._util.tensor_files import pop_state, read_tensors, write_tensors
 from lw_torchrl.data.dataset import DATA, read_metadata, verify
-from lw_torchrl.data.loading import load
+from lw_torchrl.data.loading import check_options, labels_of, read_rows
 from lw_torchrl.data.rewards import RewardName
 from lw_torchrl.data.samplers import to_device_of
-from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, JoinedDemonstrations, Label
+from lw_torchrl.data.selection import EpisodeChoice, EpisodeFilter, JoinedDemonstrations, Label, select
 
 _FILE = "buffer.safetensors"
 
@@ -145,22 +145,21 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         _check_transform(transform)
         if (prefetch := kwargs.get("prefetch") or 0) > 1:
             raise ValueError(f"prefetch must be 0 or 1, got {prefetch}: several threads draw in no fixed order")
-        root = root if isinstance(root, (str, os.PathLike)) else list(root)
-        loaded = load(
-            root, episodes=episodes, keep=keep, label=label, reward=reward, after_success=after_success,
-            terminate_on_success=terminate_on_success, n_steps=n_steps, gamma=gamma, keys=keys, device=device,
-            check=check,
-        )  # fmt: skip
-        self.parts, self.behaviours = loaded.parts, loaded.behaviours
-        self.demonstrations = JoinedDemonstrations(loaded.parts) if loaded.is_joined else loaded.parts[0]
-        self.roots = tuple(part.root for part in loaded.parts)
+        check_options(label, after_success, terminate_on_success, n_steps, gamma, keys)
+        is_single = isinstance(root, (str, os.PathLike)) and episodes is None and keep is None
+        after = 0 if terminate_on_success else after_success
+        datasets, parts = select(root, episodes, keep, label, reward, after, check)
+        loaded = read_rows(datasets, parts, label, reward, after, terminate_on_success, n_steps, gamma, keys, device)
+        self.parts, self.behaviours = tuple(parts), labels_of(datasets)
+        self.demonstrations = parts[0] if is_single else JoinedDemonstrations(self.parts)
+        self.roots = tuple(part.root for part in parts)
         self.root = self.roots[0]
         self.label, self.reward, self.terminate_on_success = label, reward, terminate_on_success
         self.n_steps, self.gamma, self.columns = n_steps, gamma, dict[str, str]()
         self._plain = keys is not None
-        rows = [[[e.task, e.episode, e.start, e.length, e.checksum] for e in part.episodes] for part in loaded.parts]
-        shown = json.dumps([rows, after_success, terminate_on_success])
-        storage = DatasetStorage(loaded.rows, sha256(shown.encode()).hexdigest())
+        rows = [[[e.task, e.episode, e.start, e.length, e.checksum] for e in part.episodes] for part in parts]
+        shown = json.dumps([rows, after_success, terminate_on_success])  # identifies the rows in saved states
+        storage = DatasetStorage(loaded, sha256(shown.encode()).hexdigest())
         kwargs |= {"sampler": sampler, "batch_size": batch_size, "transform": transform}
         super().__init__(storage=storage, writer=ImmutableDatasetWriter(), **kwargs)
 
@@ -174,6 +173,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
     def set_sampler(self, sampler: Sampler) -> Sampler:
         """Use another sampler, which draws from the buffer's generator; in a worker, call ``set_rng`` after it."""
         before = super().set_sampler(sampler)
+        # In a DataLoader's workers the generators are equal copies, so all workers would draw the same rows.
         if get_worker_info() is None:
             self.set_rng(self._rng)
         return before

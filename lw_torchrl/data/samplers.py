@@ -134,7 +134,7 @@ class GroupSampler(Sampler):
         if not same.any(1).all():
             return False
         label, moved = same.int().argmax(1), torch.zeros(length, dtype=torch.bool)
-        moved[rows] = True
+        moved[rows] = True  # they leave the pass that they were in
         passes, cursors = [], []
         orders = self._order.split(self._size.tolist())
         for group, (order, cursor) in enumerate(zip(orders, self._cursor.tolist(), strict=True)):
@@ -250,19 +250,15 @@ class GroupSampler(Sampler):
     def state_dict(self) -> dict[str, Any]:
         """Return the rows in the order of their passes, each pass's position, and rows written since the last batch."""
         none = torch.empty(0, dtype=torch.int64)
-        # Without the keys of the groups, rows that were written since force all rows to be grouped again.
-        begun = self._length > 0 and not (self._written and self._known is None)
-        order, size, cursor = (self._order, self._size, self._cursor) if begun else (none, none, none)
-        return {
-            "order": order.clone(),
-            "size": size.clone(),
-            "cursor": cursor.clone(),
-            "credit": self._credit.clone() if begun else none,
-            "known": self._known.clone() if begun and self._known is not None else none,
-            "written": torch.cat(self._written) if begun and self._written else none,
-            "length": torch.tensor(self._length if begun else 0),
-            "ran_out": torch.tensor(self.ran_out),
-        }
+        if self._length == 0 or (self._written and self._known is None):  # the next sample groups all rows again
+            passes = [none] * 6
+        else:
+            known = none if self._known is None else self._known
+            written = torch.cat(self._written) if self._written else none
+            passes = [self._order, self._size, self._cursor, self._credit, known, written]
+        length = self._length if len(passes[0]) else 0
+        values = [*(value.clone() for value in passes), torch.tensor(length), torch.tensor(self.ran_out)]
+        return dict(zip(_STATE, values, strict=True))
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state; ValueError if it is not a sampler's, or at the next sample if it belongs to other rows."""
@@ -352,8 +348,8 @@ class CoLearningSampler(GroupSampler):
     """Draw half of every minibatch from a target task's demonstrations, half in equal numbers from the base tasks.
 
     It works in any :class:`torchrl.data.ReplayBuffer`. Target and base tasks are drawn without replacement, each in its
-    own passes. An epoch, at whose end ``ran_out`` is true, is the pass that takes the most batches. The sampler draws
-    from the replay buffer's generator; a restored state continues with the same batches.
+    own passes. ``ran_out`` is true at the end of an epoch, which is the pass that takes the most batches. The sampler
+    draws from the replay buffer's generator; a restored state continues with the same batches.
 
     If the rows have a column ``dataset``, as :func:`load_demonstrations` writes for several folders, the target's rows
     come from the last dataset that has any; the target's rows in other datasets are left out. A batch holds the

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from lw_torchrl._util.checks import Count, Probability, check_value, shown, typed_fields, unknown_name
-from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo, load_rows
+from lw_torchrl._util.files import AnyPath
+from lw_torchrl.data.dataset import CollectConfig, Demonstrations, EpisodeInfo, load_rows, read_metadata, verify
 from lw_torchrl.data.rewards import REWARDS, RewardName, episode_returns
 
 
@@ -103,7 +106,7 @@ def choose_episodes(dataset: Demonstrations, choice: EpisodeChoice, argument: st
         if task not in existing:
             raise unknown_name(f"{argument}: task", task, existing)
         of_task, place = existing[task], f"{argument}[{task!r}]"
-        if isinstance(wanted, Sequence) and not isinstance(wanted, str):
+        if isinstance(wanted, Sequence):
             numbers = list(wanted)
         elif check_value(place, wanted, Count) > len(of_task):
             raise ValueError(f"{place}: the dataset has {len(of_task)} episodes of {task!r}, got {wanted}")
@@ -133,6 +136,71 @@ def returns_of(whole: Demonstrations, chosen: Demonstrations, reward: RewardName
     rows, (kept, lengths) = load_rows(whole).get("next"), kept_rows(chosen.episodes, after)
     kind = REWARDS[reward]
     return episode_returns(kind.of(rows.get(f"reward_{kind.source}")[kept], rows.get("success")[kept]), lengths)
+
+
+def check_label(label: str, parts: Sequence[Demonstrations]) -> None:
+    """Raise :class:`ValueError` if the label needs an expert's actions and another policy acted."""
+    others = sorted({part.config.behaviour for part in parts if part.config.policy.kind != "expert"})
+    if others and label != "executed":
+        needs = f"label={label!r} needs an expert's actions, but this dataset was collected by {', '.join(others)!r}"
+        raise ValueError(f"{needs}; use label='executed'")
+
+
+def check_behaviours(parts: Sequence[Demonstrations]) -> None:
+    """Raise :class:`ValueError` if two behaviours have the same label."""
+    first: dict[str, Demonstrations] = {}
+    for part in parts:
+        before = first.setdefault(part.config.behaviour, part)
+        if before.config.policy.acts != part.config.policy.acts:
+            folders = f"{str(before.root)!r} and {str(part.root)!r}"
+            raise ValueError(f"root: {part.config.behaviour!r} names different behaviours in {folders}")
+
+
+def _folders_and_choices(
+    root: AnyPath | Iterable[AnyPath], episodes: EpisodeChoice | Sequence[EpisodeChoice]
+) -> tuple[list[AnyPath], list[Any]]:
+    """Return the folders, and the choice of episodes in each."""
+    if isinstance(root, (str, os.PathLike)):
+        return [root], [episodes]
+    folders = list(root)
+    is_repeated = episodes is None and len({Path(folder).resolve() for folder in folders}) < len(folders)
+    if not folders or is_repeated:
+        raise ValueError(f"root must be a folder, or a list that names each folder once, got {folders}")
+    if episodes is None:
+        return folders, [None] * len(folders)
+    if not isinstance(episodes, Sequence) or len(episodes) != len(folders):
+        raise ValueError(f"episodes must be a list of {len(folders)} choices, one for each folder, got {episodes!r}")
+    return folders, list(episodes)
+
+
+def select(
+    root: AnyPath | Iterable[AnyPath],
+    episodes: EpisodeChoice | Sequence[EpisodeChoice],
+    keep: EpisodeFilter | None,
+    label: Label,
+    reward: RewardName,
+    after: int | None,
+    check: bool,
+) -> tuple[list[Demonstrations], list[Demonstrations]]:
+    """Return the descriptions of datasets, and the same with only the selected episodes; see load_demonstrations."""
+    folders, choices = _folders_and_choices(root, episodes)
+    datasets = [read_metadata(folder) for folder in folders]
+    check_label(label, datasets)
+    check_behaviours(datasets)
+    sizes = {(dataset.config.layout.size, dataset.config.layout.action_size) for dataset in datasets}
+    if len(sizes) > 1:
+        raise ValueError(f"root: the folders must have rows of one layout, got observation and action sizes {sizes}")
+    is_single = isinstance(root, (str, os.PathLike))
+    parts = [
+        choose_episodes(dataset, choice, "episodes" if is_single else f"episodes[{number}]")
+        for number, (dataset, choice) in enumerate(zip(datasets, choices, strict=True))
+    ]
+    for dataset, part in zip(datasets, parts, strict=True) if check else ():
+        verify(dataset, part.episodes)
+    if keep is not None:
+        returns = [returns_of(dataset, part, reward, after) for dataset, part in zip(datasets, parts, strict=True)]
+        parts = keep.choose(parts, returns)
+    return datasets, parts
 
 
 @dataclass(frozen=True)
@@ -170,21 +238,3 @@ class JoinedDemonstrations:
             for episode in part.episodes:
                 chosen[-1].setdefault(episode.task, []).append(episode.episode)
         return JoinedConfig(tuple(part.config for part in self.parts), tuple(chosen))
-
-
-def check_label(label: str, parts: Sequence[Demonstrations]) -> None:
-    """Raise :class:`ValueError` if the label needs an expert's actions and another policy acted."""
-    others = sorted({part.config.behaviour for part in parts if part.config.policy.kind != "expert"})
-    if others and label != "executed":
-        needs = f"label={label!r} needs an expert's actions, but this dataset was collected by {', '.join(others)!r}"
-        raise ValueError(f"{needs}; use label='executed'")
-
-
-def check_behaviours(parts: Sequence[Demonstrations]) -> None:
-    """Raise :class:`ValueError` if two behaviours have the same label."""
-    first: dict[str, Demonstrations] = {}
-    for part in parts:
-        before = first.setdefault(part.config.behaviour, part)
-        if before.config.policy.acts != part.config.policy.acts:
-            folders = f"{str(before.root)!r} and {str(part.root)!r}"
-            raise ValueError(f"root: {part.config.behaviour!r} names different behaviours in {folders}")

@@ -16,6 +16,12 @@ from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.envs.seeding import action_noise
 
 
+def first_success(success: Tensor) -> int | None:
+    """Return the first successful step of (T, 1) bool, from 1; None without success."""
+    successes = success.flatten().nonzero().flatten()
+    return int(successes[0]) + 1 if len(successes) else None
+
+
 class FinishedEpisode(NamedTuple):
     """A finished episode: its task's name, its index, and the recorded keys of its steps, batch (T,)."""
 
@@ -26,8 +32,7 @@ class FinishedEpisode(NamedTuple):
     @property
     def first_success(self) -> int | None:
         """The first successful step, from 1; None without success. It needs ("next", "success") in the steps."""
-        successes = self.steps.get(("next", "success")).flatten().nonzero().flatten()
-        return int(successes[0]) + 1 if len(successes) else None
+        return first_success(self.steps.get(("next", "success")))
 
 
 def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[[TensorDictBase], TensorDictBase]:

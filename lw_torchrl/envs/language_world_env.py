@@ -67,7 +67,9 @@ class LanguageWorldEnv(EnvBase):
         suite: the :class:`~lw_torchrl.suites.Suite` of the tasks, or its name; None for the suite that their names
             begin with, as in "fetch/push", and Meta-World for names without one.
         engine: None for the suite's; for Meta-World "vectorized", the default, or "metaworld", its own environments in
-            a loop, slower with the same numbers; or a callable ``(row_tasks, *, reward, num_threads) -> Engine``.
+            a loop, slower with the same numbers; another name of :data:`~lw_torchrl.suites.metaworld.ENGINES`; or a
+            callable ``(row_tasks, *, reward, num_threads) -> Engine``. For versions of Meta-World or MuJoCo that the
+            vectorized engine does not reproduce, the default is "metaworld", with a warning.
         num_threads: threads of the simulation, by default the cores that this process may use. It never changes a
             result.
         reward: "sparse", the success as 0 and 1, or "dense", Meta-World's own.
@@ -83,8 +85,8 @@ class LanguageWorldEnv(EnvBase):
         RuntimeError: a step of a row that has ended; a reset or step in a process that was forked later.
         TypeError: it is pickled or copied; pass the function that makes it.
         ValueError: the step of a custom engine does not return an EngineStep.
-        ImportError: a rendering library named by MUJOCO_GL is missing, or the vectorized engine does not know the
-            installed version of Meta-World or MuJoCo.
+        ImportError: a rendering library named by MUJOCO_GL is missing, or ``engine="vectorized"`` does not reproduce
+            the installed version of Meta-World or MuJoCo.
 
     Example:
         >>> env = LanguageWorldEnv(["reach", "push"], num_envs=4, seed=0)
@@ -106,7 +108,7 @@ class LanguageWorldEnv(EnvBase):
         num_envs: Count | None = None,
         seed: int = 0,
         suite: str | Suite | None = None,
-        engine: Literal["vectorized", "metaworld"] | Callable[..., Engine] | None = None,
+        engine: str | Callable[..., Engine] | None = None,
         num_threads: Count | None = None,
         reward: Literal["sparse", "dense"] = "sparse",
         max_steps: Count | None = None,
@@ -122,12 +124,11 @@ class LanguageWorldEnv(EnvBase):
         named = self.suite.named_tasks(tasks)
         self.tasks, self.layout = tuple(named), one_layout(named.values())
         n = len(self.tasks)
-        num_envs = n if num_envs is None else int(num_envs)
+        num_envs = n if num_envs is None else num_envs
         if num_envs < n:
             raise ValueError(f"num_envs must be at least {n}, the number of tasks, got {num_envs}")
-        self.max_steps = self.suite.max_steps if max_steps is None else int(max_steps)
-        self.frame_skip = int(frame_skip)
-        self.strict, self.terminate_on_success = strict, terminate_on_success
+        self.max_steps = self.suite.max_steps if max_steps is None else max_steps
+        self.frame_skip, self.strict, self.terminate_on_success = frame_skip, strict, terminate_on_success
         if batch_size is not None and num_envs != 1:
             raise ValueError(f"batch_size=() is only for a single environment, num_envs is {num_envs}")
         self.row_tasks = tuple(self.tasks[i % n] for i in range(num_envs))
@@ -135,7 +136,7 @@ class LanguageWorldEnv(EnvBase):
         if not 0 <= self.worker[0] < self.worker[1]:
             raise ValueError(f"worker must be (w, W) with 0 <= w < W, got {worker}")
         self._process = os.getpid()
-        self._counter = EpisodeCounter([named[t] for t in self.row_tasks], int(seed), self.worker)
+        self._counter = EpisodeCounter([named[t] for t in self.row_tasks], seed, self.worker)
         super().__init__(device=check_device("device", device), batch_size=(num_envs,) if batch_size is None else ())
         self._rows = RowStates(self.row_tasks, self.layout)
         index = ... if batch_size is None else 0
@@ -194,6 +195,7 @@ class LanguageWorldEnv(EnvBase):
         raise TypeError("a LanguageWorldEnv can be neither pickled nor copied: pass a function that makes it")
 
     def _check_process(self) -> None:
+        # The simulator's threads and its OpenGL context do not survive a fork: a child would hang.
         if os.getpid() != self._process:
             raise RuntimeError(
                 "this process was forked after the environment was made: make the environment in this process (give "

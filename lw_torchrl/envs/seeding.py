@@ -50,13 +50,14 @@ class EpisodeCounter:
         self.seed = seed
         self.resets = np.zeros(len(tasks), dtype=np.int64)
         rows = np.arange(len(tasks))
+        # The r-th of a task's R rows in worker w of W runs the episodes w·R + r, then every (W·R)-th after it.
         self._rank, copies = rows // n, np.bincount(rows % n)[rows % n]
         self._first, self._stride = worker[0] * copies + self._rank, worker[1] * copies
 
     def start_again(self, seed: int | None) -> None:
         """Begin at the first episode, of another seed if one is given."""
         if seed is not None:
-            self.seed = int(seed)
+            self.seed = seed
         self.resets[:] = 0
 
     def next(self, rows: Rows) -> Episodes:

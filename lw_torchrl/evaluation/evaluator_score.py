@@ -26,35 +26,36 @@ _ROWS = 256
 class PartScore:
     """Counts of answers to one held-out part of :class:`LabelledQueries`, by predicate, negated or not."""
 
-    right: dict[str, tuple[int, int]]  # correct answers where the clause is false, and where it is true
-    asked: dict[str, tuple[int, int]]  # all answers, likewise
+    correct: dict[str, tuple[int, int]]  # correct answers where the clause is false, and where it is true
+    total: dict[str, tuple[int, int]]  # all answers where the clause is false, and where it is true
 
     @property
     def answers(self) -> int:
         """The number of answers."""
-        return sum(map(sum, self.asked.values()))
+        return sum(map(sum, self.total.values()))
 
     def accuracy(self, predicate: str | None = None) -> float:
         """Return the fraction of correct answers, for one predicate or all."""
-        names = self.asked if predicate is None else [predicate]
-        return sum(sum(self.right[name]) for name in names) / sum(sum(self.asked[name]) for name in names)
+        names = self.total if predicate is None else [predicate]
+        return sum(sum(self.correct[name]) for name in names) / sum(sum(self.total[name]) for name in names)
 
     def balanced_accuracy(self, predicate: str | None = None) -> float:
         """Return the mean of the accuracies where the predicate is false and where it is true, as far as both occur."""
-        names = self.asked if predicate is None else [predicate]
-        counts = [[sum(table[name][truth] for name in names) for table in (self.right, self.asked)] for truth in (0, 1)]
-        rates = [right / asked for right, asked in counts if asked]
+        names = self.total if predicate is None else [predicate]
+        tables = self.correct, self.total
+        counts = [[sum(table[name][truth] for name in names) for table in tables] for truth in (0, 1)]
+        rates = [correct / total for correct, total in counts if total]
         return sum(rates) / len(rates)
 
     @property
     def worst(self) -> list[str]:
         """The predicates, sorted by balanced accuracy, lowest first."""
-        return sorted(self.asked, key=lambda name: (self.balanced_accuracy(name), name))
+        return sorted(self.total, key=lambda name: (self.balanced_accuracy(name), name))
 
     def to_json(self) -> dict[str, Any]:
         """Return the rates and counts as JSON."""
         predicates = {
-            name: self._rates(name) | {"false_and_true": list(self.asked[name]), "right": list(self.right[name])}
+            name: self._rates(name) | {"false_and_true": list(self.total[name]), "right": list(self.correct[name])}
             for name in self.worst
         }
         return {"answers": self.answers, **self._rates(), "predicates": predicates}
@@ -75,7 +76,7 @@ class EvaluatorScore:
         lines = [f"{'':36}{'answers':>10}{'accuracy':>10}{'balanced':>10}"]
         for part, score in self.parts.items():
             rows: list[tuple[str, int, str | None]] = [(PARTS[part], score.answers, None)]
-            rows += [(f"  {name}", sum(score.asked[name]), name) for name in score.worst[:most]]
+            rows += [(f"  {name}", sum(score.total[name]), name) for name in score.worst[:most]]
             for title, answers, name in rows:
                 rates = f"{score.accuracy(name):10.4f}{score.balanced_accuracy(name):10.4f}"
                 lines.append(f"{title:36}{answers:10}{rates}")
@@ -99,7 +100,7 @@ def score_evaluator(evaluator: ClauseEvaluator, data: LabelledQueries) -> Evalua
         ...     _ = lw.collect_demonstrations("push", episodes_per_task=2, root=root + "/demos", max_steps=40)
         ...     replay = lw.LanguageWorldExperienceReplay(root + "/demos", label="executed")
         ...     data = lw.training.LabelledQueries(replay, lw.training.QueryEvaluatorConfig())
-        >>> untrained = lw.StateQueryEvaluator(lw.load_plans("MT10"))
+        >>> untrained = lw.modules.StateQueryEvaluator(lw.load_plans("MT10"))
         >>> list(score_evaluator(untrained, data).parts)
         ['states', 'queries']
     """
@@ -114,7 +115,7 @@ def _score(evaluator: ClauseEvaluator, part: list[TaskQueries]) -> PartScore:
     with torch.no_grad(), evaluating(evaluator):
         for queries in part:
             logits, truth = clause_logits(evaluator, queries)
-            for table, counted in ((score.asked, torch.ones_like(truth)), (score.right, (logits > 0) == truth)):
+            for table, counted in ((score.total, torch.ones_like(truth)), (score.correct, (logits > 0) == truth)):
                 numbers = torch.stack([counted & ~truth, counted & truth], dim=-1).sum(0).tolist()
                 for clause, (false, true) in zip(queries.clauses, numbers, strict=True):
                     before = table.get(clause.predicate, (0, 0))

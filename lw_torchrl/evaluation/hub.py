@@ -16,7 +16,7 @@ from lw_torchrl.evaluation.result import EvaluationResult, wilson_interval
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.training.checkpoint import demonstrated_tasks, load_actor, policy_file, read_description
 
-_SHOWN = {
+_SHOWN = {  # the entries of a policy's metadata that a card shows
     *("loss", "reward"),
     *("episodes_per_task", "seed", "noise_scale", "noise_hold", "redraw_failures", "max_steps", "behaviour"),
     *("steps", "batch_size", "learning_rate", "optimizer", "schedule"),

@@ -72,7 +72,7 @@ def evaluate(
         device: the actor's device, to which it is moved: "cpu", "cuda", "cuda:1", "mps" or "auto"; None leaves it where
             it is. The environment and its queries are always on the CPU.
         evaluator: a module, function or transform in front of the actor that answers the conditions, such as
-            :class:`~lw_torchrl.CorruptQAF`; None for exact answers at every step.
+            :class:`~lw_torchrl.transforms.CorruptQAF`; None for exact answers at every step.
         attribute: find the causes of failed episodes, see :func:`attribute_failures`: ``.failures`` of the result.
         reference: trusted plans for the same tasks, with which failed episodes are re-run.
 
@@ -142,6 +142,7 @@ def evaluate(
     config |= {"stop_at_success": stop_at_success, "reward": reward}
     failures = None
     if attribute and answered is not None:
+        # Episodes finish in an order that depends on the number of environments.
         failed.sort(key=lambda episode: episode[:2])
         parts: dict[str, Any] = {"actor": actor, "reference": reference, "evaluator": evaluator}
         failures = tuple(attribute_failures(failed, answered, **parts, **env_options, **run))

@@ -142,11 +142,11 @@ def actor_plans(actor: Any, plans: AnyPlans | None) -> Plans | None:
     own = plans_of(actor)
     if plans is None:
         return own
-    given = as_plans(plans)
-    if own is not None and (different := given.differences(own)):
+    answered = as_plans(plans)
+    if own is not None and (different := answered.differences(own)):
         how = "pass plans=None, or evaluate actor.with_plans(plans)"
         raise ValueError(f"plans differ from the actor's own for {', '.join(different)}; {how}")
-    return own or given
+    return own or answered
 
 
 def suite_tasks(

@@ -159,6 +159,7 @@ def fallback_plan(task: str | Task) -> ConditionalPlan:
         return ConditionalPlan(task.name, steps, task)
     names = whole_objects(task)
     goal = next((name for name in names if is_goal(task, name)), None)
+    # Without an object and without a named goal, the first place is the target.
     near, target = _gripper_is("near", goal or names[0]), GOAL if goal else names[0]
     approach = _step(_negated(near), StepRole("reach", GRIPPER, target, "reach"))
     return ConditionalPlan(task.name, (approach, _step(near, StepRole("hold", GRIPPER, target, "reach"))), task)
@@ -287,6 +288,7 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
         both = Query(tuple(clause for query in conditions for clause in query.clauses))
         return _step(both, StepRole(verb, GRIPPER, point, manner, way, confidence=0.0))
 
+    # A pull is completed as a grasp, which also holds what the fingers cannot hook.
     if motion.manner in ("grasp", "pull"):
         held = object_of(task, point)
         if motion.verb == "pull":
@@ -332,6 +334,7 @@ def _confidence(task: Task, steps: Sequence[PlanStep]) -> float:
     motion = motion_of(roles)
     if motion is None:
         return 0.0
+    # These have no typical states: reaching touches nothing, and each side has its own approach.
     if motion.manner == "reach" or _has_sides(roles):
         return 1.0
     manner = "pull" if motion.verb == "pull" else motion.manner

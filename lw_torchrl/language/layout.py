@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, Literal
 
-from lw_torchrl._util.checks import Count, Natural, Positive, check_value, shown, typed_fields
+from lw_torchrl._util.checks import Count, Natural, Positive, shown, typed_fields
 from lw_torchrl._util.registry import ReadOnlyDict
 
 
@@ -77,8 +77,6 @@ class Layout:
                 raise ValueError(f"{name} of {layout} must be within {self.action_size} numbers, got {index}")
         if self.displacement is not None and self.gripper in range(self.displacement, self.displacement + 3):
             raise ValueError(f"gripper of {layout} must not be an index of the displacement, got {self.gripper}")
-        for relation, threshold in self.thresholds.items():
-            check_value(f"thresholds of {layout}: {relation!r}", threshold, float)
         object.__setattr__(self, "thresholds", ReadOnlyDict(dict(self.thresholds)))
         for name in ("present", "positions", "all_positions", "parts"):
             getattr(self, name)  # computed here: torch.compile cannot trace the lock of a cached_property
@@ -112,11 +110,7 @@ class Layout:
         return slice(0, 0) if self.gripper is None else slice(self.gripper, self.gripper + 1)
 
     def displaced(self, user: str) -> slice:
-        """Return the hand's displacement among the numbers of an action.
-
-        Raises:
-            ValueError: the layout has none; the message names the ``user`` that needs it.
-        """
+        """Return the hand's displacement in an action; raise :class:`ValueError` for the ``user`` if there is none."""
         if self.displacement is None:
             lacks = f"an action of layout {self.name!r} has no displacement of the hand, which it needs"
             raise ValueError(f"{user}: {lacks}")

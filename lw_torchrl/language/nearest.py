@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from rapidfuzz import fuzz, process
 
-from lw_torchrl._util.checks import check_choice, check_value, typed
+from lw_torchrl._util.checks import check_choice, typed
 from lw_torchrl.language.objects import WORDS
 from lw_torchrl.language.queries import Clause, Query, QueryError, base_clauses, check_length, read_query
 from lw_torchrl.language.relations import PREDICATES
@@ -159,8 +159,6 @@ def nearest_skill(
     table = shipped if skills is None else skills
     if not isinstance(table, Mapping):
         table = {check_choice("skills", name, shipped): shipped[name] for name in table}
-    for skill in table.values():
-        check_value("skills", skill, ScriptedSkill)
     allowed = tuple(name for name, skill in table.items() if task is None or skill.suits(task))
     if not allowed:
         raise SkillError(f"no scripted skill suits task {task!r}")

@@ -6,11 +6,9 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import Annotated, Any
+from typing import Any
 
-from beartype.vale import Is
-
-from lw_torchrl._util.checks import Natural, check_choice, shown, typed_fields
+from lw_torchrl._util.checks import Finite, Natural, check_choice, shown, typed_fields
 from lw_torchrl._util.files import read_toml
 from lw_torchrl.language.layout import METAWORLD, Layout, places
 
@@ -20,8 +18,7 @@ WORDS: Mapping[str, Any] = read_toml(files("lw_torchrl.language") / "data" / "wo
 GRIPPER = "robot's gripper"
 GOAL = "target location"
 """The goal, which every observation has, whatever a task calls it."""
-Metres = Annotated[float, Is[lambda x: abs(x) < 1e9]]
-Coordinate = int | Metres
+Coordinate = int | Finite
 """An int is an index into the observation, a float a fixed number of metres."""
 TypedPosition = tuple[tuple[bool, Coordinate], ...]
 
@@ -35,10 +32,7 @@ def typed_position(position: Sequence[Coordinate]) -> TypedPosition:
 
 
 def coordinate_indices(position: Sequence[Coordinate], constants: list[float], size: int) -> list[int]:
-    """Return the index of each coordinate in the ``size`` numbers of an observation followed by ``constants``.
-
-    Fixed coordinates that are missing from ``constants`` are appended to it.
-    """
+    """Return the index of each coordinate in an observation (of ``size``) followed by ``constants``, which grow."""
     fixed = dict.fromkeys(c for c in position if not isinstance(c, int))
     constants += [c for c in fixed if c not in constants]
     return [c if isinstance(c, int) else size + constants.index(c) for c in position]
@@ -51,7 +45,7 @@ class NamedObject:
 
     name: str  # "drawer handle": lower-case words without an article
     position: tuple[Coordinate, Coordinate, Coordinate]  # x, y and z
-    offset: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)  # added to the position of an object: a point on it
+    offset: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # metres, added to the position of an object: a point on it
     ours: bool = False  # whether it is a point that we named, which the published object list lacks
     opening: Natural | None = None  # index of its opening, from 0 (closed) to 1 (open); None if it cannot open
 

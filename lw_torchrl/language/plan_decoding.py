@@ -97,6 +97,7 @@ def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> 
     text = without_thoughts(text, notes)
     if len(text) > _LONGEST:
         notes.append(Note(text.count("\n", 0, _LONGEST) + 1, f"the rest of {len(text)} characters is not read"))
+    # Models sometimes answer in another format, so the other readers are tried too.
     reading, section = _read(text[:_LONGEST], owner, read)
     if further := section.clauses[MOST_STEPS:]:
         reading.note(further[0].line, f"the plan has more than {MOST_STEPS} steps; {len(further)} are left out")
@@ -223,6 +224,7 @@ def without_thoughts(text: str, notes: list[Note]) -> str:
     A closing tag without an opening one ends a thought that began before the text, if the tag ends its line and is not
     in a comment. An opening tag in a comment or a string is ignored. gpt-oss's tags always count. JSON has no thoughts.
     """
+    # comment and quotes: whether the current line is inside a comment, and its quotes so far.
     spans, opened, at, comment, quotes = list[tuple[int, int]](), None, 0, False, 0
     for tag in _TAG.finditer("" if _IS_JSON.match(text) else text):
         *lines, before = text[at : tag.start()].split("\n")

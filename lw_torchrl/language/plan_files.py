@@ -208,10 +208,7 @@ def _read_pairs(path: Path, tasks: Tasks) -> Plans:
 
 @typed
 def save_plans(plans: AnyPlans, folder: AnyPath) -> list[Path]:
-    """Write each plan to ``folder``/<task>.plan, with "__" for a slash, and return the paths.
-
-    A file is replaced whole or not at all.
-    """
+    """Write each plan to ``folder``/<task>.plan, with "__" for a slash, whole or not at all; return the paths."""
     texts = {Path(folder) / f"{task.replace('/', '__')}.plan": str(plan) for task, plan in as_plans(plans).items()}
     Path(folder).mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():

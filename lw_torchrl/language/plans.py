@@ -10,7 +10,7 @@ from functools import cached_property, lru_cache
 from hashlib import sha256
 from typing import Any
 
-from lw_torchrl._util.checks import Probability, check_value, shown, typed, typed_fields
+from lw_torchrl._util.checks import Probability, shown, typed, typed_fields
 from lw_torchrl.language.layout import METAWORLD, Layout
 from lw_torchrl.language.queries import Query, check_query, read_query
 from lw_torchrl.language.relations import comparisons
@@ -104,7 +104,6 @@ class ConditionalPlan:
             raise PlanError(f"definition of {plan} is of another task, {task.name!r}")
         steps = []
         for number, step in enumerate(self.steps, 1):
-            check_value(f"step {number} of {plan}", step, PlanStep)
             try:
                 condition, skill = check_query(step.condition, task), canonical_skill(step.skill, task)
                 goal = None if step.goal is None else check_query(step.goal, task)
@@ -112,6 +111,7 @@ class ConditionalPlan:
                     role_object(task, name)
             except ValueError as error:
                 raise PlanError(f"step {number} of {plan}: {error}") from error
+            # A usual goal is stored as None, so that plans with and without it are equal.
             goal = None if goal == usual_goal(skill, task) else goal
             steps.append(replace(step, condition=condition, skill=skill, goal=goal))
         object.__setattr__(self, "definition", task)
@@ -180,10 +180,6 @@ class Plans(Mapping[str, ConditionalPlan]):
     @typed
     def __init__(self, plans: Mapping[str, ConditionalPlan] | Iterable[ConditionalPlan]) -> None:
         listed = list(plans.values() if isinstance(plans, Mapping) else plans)
-        for plan in listed:
-            if not isinstance(plan, ConditionalPlan):
-                hint = "ConditionalPlan.from_pairs makes one; QueryProgram accepts queries"
-                raise TypeError(f"plans must hold ConditionalPlan, got {shown(plan)}; {hint}")
         for name, plan in plans.items() if isinstance(plans, Mapping) else ():
             if name != plan.task:
                 raise PlanError(f"plans[{name!r}] is a plan for another task, {plan.task!r}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import permutations
 
@@ -19,7 +19,6 @@ from lw_torchrl.language.tasks import Task, get_task
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
 _MOST_CLAUSES = 64  # the tables have room for as many in every step
-_MOST_COMPARED = 8  # objects whose queries are compared with a wrong text, a limit to the time of an error
 
 
 @dataclass(frozen=True)
@@ -115,22 +114,11 @@ class _ClauseParser:
             return QueryError("not a query")
         word = f"{_cut(self.words[self.at], 40)!r} (word {self.at + 1})" if self.at < len(self.words) else "its end"
         context = " ".join(self.words[max(0, self.at - 8) : self.at + 8])
-        close = process.extractOne((self.inferred + context)[:300], self.comparable(), scorer=fuzz.ratio)
+        close = process.extractOne((self.inferred + context)[:300], supported_queries(self.task), scorer=fuzz.ratio)
         return QueryError(
             f"query {_cut(self.text)!r} of task {self.task.name!r}: at {word} in {_cut(context, 60)!r}, "
             f"expected {expected}. The nearest query is {close[0]!r}; supported_queries({self.task.name!r}) lists all."
         )
-
-    def comparable(self) -> tuple[str, ...]:
-        """Return the queries to compare with: in a task with many objects, those of the most similar objects."""
-        names = self.task.object_names
-        if len(names) <= _MOST_COMPARED:
-            return supported_queries(self.task)
-        text = (self.inferred + " ".join(self.words))[:300]
-        similar = process.extract(text, names[1:], scorer=fuzz.partial_ratio, limit=_MOST_COMPARED - 1)
-        kept = {GRIPPER, *(name for name, _, _ in similar)}
-        objects = tuple(named for named in self.task.objects if named.name in kept)
-        return supported_queries(replace(self.task, objects=objects))
 
     def take(self, phrase: str) -> bool:
         """Consume a phrase if it comes next; return whether it did."""

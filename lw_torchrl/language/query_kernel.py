@@ -36,6 +36,7 @@ def answer(
                 row = nearest
         if row < 0:
             return False
+        # Unsigned throughout: Numba turns a mix of int64 and uint64 into float64.
         t = np.uint64(row)
         facts = np.uint64(0)
         for a in range(ends[t, 0], ends[t, 1]):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, reduce
+from numbers import Real
 
 import numpy as np
 import torch
@@ -119,7 +120,7 @@ class QueryProgram(nn.Module):
         Returns:
             (..., S) float32 logits on the observation's device, of size 1e-6 to 1e4; padding is -1e4.
         """
-        if not 1e-6 <= check_value("temperature", temperature, float) <= 1e6:
+        if not isinstance(temperature, Real) or not 1e-6 <= temperature <= 1e6:  # torch.compile can trace this
             raise ValueError(f"temperature must be between 1e-6 and 1e6, got {temperature!r}")
         truth = self(observation.detach(), task_id)
         state = observation if observation.dtype in _COMPILED else observation.float()

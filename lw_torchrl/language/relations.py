@@ -8,11 +8,10 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Any, Literal
 
-from lw_torchrl._util.checks import Positive, shown, typed_fields
+from lw_torchrl._util.checks import Finite, Positive, shown, typed_fields
 from lw_torchrl._util.files import read_toml
 from lw_torchrl._util.registry import Registry
 from lw_torchrl.language.layout import Layout
-from lw_torchrl.language.objects import Metres
 
 
 @typed_fields
@@ -22,9 +21,9 @@ class Comparison:
 
     axes: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]  # the axes of d that count
     sense: Literal["<", ">", "<="]
-    threshold: Metres
+    threshold: Finite  # metres, or a fraction of an opening
     length: bool = True  # compare the Euclidean length over the axes; False for the signed coordinate of one axis
-    raise_z: Metres = 0.0  # added to dz first
+    raise_z: Finite = 0.0  # metres, added to dz first
     temperature: Positive = 0.01  # of the soft truth: metres (or a fraction of an opening) for one logit
 
     def __post_init__(self) -> None:

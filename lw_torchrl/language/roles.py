@@ -48,10 +48,7 @@ _SYNONYMS = {word: verb for verb, words in _WORDS["synonyms"].items() for word i
 
 
 def simplify(text: str) -> str:
-    """Rewrite a text with marked objects in known words.
-
-    "carefully hover over <mug>" becomes "move <robot's gripper> over <mug>".
-    """
+    """Rewrite a text with marked objects: "hover over <mug>" becomes "move <robot's gripper> over <mug>"."""
     if len(text) > _LONGEST:
         return text
     for pattern, simple in _REWRITINGS:

@@ -9,14 +9,12 @@ from functools import cache, lru_cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from beartype.vale import Is
-
-from lw_torchrl._util.checks import Scale, check_choice, did_you_mean, shown, typed, typed_fields
+from lw_torchrl._util.checks import Finite, Scale, check_choice, did_you_mean, shown, typed, typed_fields
 from lw_torchrl._util.files import AnyPath, read_toml
 from lw_torchrl._util.registry import ReadOnlyDict
-from lw_torchrl.language.objects import GRIPPER, WORDS, Metres
+from lw_torchrl.language.objects import GRIPPER, WORDS
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task
 
 
@@ -42,11 +40,15 @@ class ScriptedSkill:
     text: str
     target: str
     moved: str = GRIPPER  # what moves to the target: the robot's gripper, or an object that it holds or pushes
-    offset: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)  # added to the target: x to the right, y away, z up
+    offset: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # metres, added to the target: x right, y away, z up
     gain: tuple[Scale, Scale, Scale] = (10.0, 10.0, 10.0)  # action per metre along each axis; 0 leaves an axis alone
-    gripper: Annotated[float, Is[lambda effort: -1 <= effort <= 1]] = 0.0  # effort; -1 opens, 1 closes
+    gripper: float = 0.0  # effort from -1, which opens, to 1, which closes
     goal: str = ""  # the state that it steers to, as a query; "" if no query expresses it
     variants: Mapping[str, ScriptedSkill] = field(default_factory=dict, hash=False, repr=False)  # by task name
+
+    def __post_init__(self) -> None:
+        if not -1 <= self.gripper <= 1:
+            raise SkillError(f"gripper must be an effort from -1 to 1, got {self.gripper}")
 
     def for_task(self, task: str | Task) -> ScriptedSkill:
         """Return the task's variant of the skill; raise :class:`SkillError` if the task lacks one of its objects."""

@@ -76,6 +76,7 @@ def parse_steps(plan: ConditionalPlan) -> tuple[ParsedStep | None, ...]:
     return parsed
 
 
+# "it" right after the verb; elsewhere ("close around it") the object is clear from the condition.
 _IT = re.compile(r"^(\w+) (?:it|them|her|him)\b")
 _NO_MOTION = {"approach", "beside", "descend", "close", "open"}
 
@@ -175,6 +176,7 @@ class _StepParser:
         if is_goal(self.task, noun) and not self.by_hand and self.verb not in _VERBS["go"]:
             at_goal = self.near is None or is_goal(self.task, self.near)
             noun = self.first if at_goal else object_of(self.task, str(self.near))
+        # "open the gripper around the mug" descends; it does not let go.
         opens = self.verb in _VERBS["open"] and GRIPPER in self.text and not self.words & {"around", "onto", "on"}
         if opens or self.verb == "release":
             return ParsedStep("open", GRIPPER, noun)
@@ -200,6 +202,7 @@ class _StepParser:
             if holds:
                 return ParsedStep("carry", self.first, target)
             return ParsedStep("hold" if self.verb in _VERBS["hold"] else "reach", GRIPPER, target)
+        # The order matters: the first rule that applies wins.
         above = bool(self.words & _PLACES["above"])
         if self.grasping and self.facts.closed and self.facts.at and (above or "to" in self.words):
             elsewhere = self.near is None or not same_object(self.task, target, self.near)
@@ -225,6 +228,7 @@ class _StepParser:
         direction: Direction | None = self.direction
         if direction == "down" and (self.grasping or self.verb not in ("push", "press")):
             direction = None
+        # A plan that grasps moves the held object; any other pushes or pulls with the gripper.
         if self.grasping:
             if target is not None:
                 return ParsedStep("carry" if carries or self.words & _PLACES["above"] else "move", moved, target)

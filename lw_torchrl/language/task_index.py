@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from lw_torchrl._util.devices import asserted, plain, readable, waits
 from lw_torchrl.language.plans import Plans
-from lw_torchrl.language.plans import as_plans as as_plans
 from lw_torchrl.language.tasks import MT50
 
 _Kind = tuple[torch.device, torch.dtype, bool]
@@ -29,14 +28,7 @@ def pick(table: Tensor, rows: Tensor) -> Tensor:
 
 
 class TaskIndex:
-    """The rows of tasks in a table, in the order of their ids.
-
-    Args:
-        task_ids: task name to id, as :attr:`Plans.task_ids`.
-
-    Raises:
-        ValueError: two tasks have the same id.
-    """
+    """The rows of tasks in a table, in the order of their ids; ``task_ids`` is as :attr:`Plans.task_ids`."""
 
     def __init__(self, task_ids: Mapping[str, int]) -> None:
         names: dict[int, str] = {}

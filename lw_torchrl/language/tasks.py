@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lw_torchrl._util.checks import check_choice, check_value, did_you_mean, shown, typed, typed_fields, unknown_name
+from lw_torchrl._util.checks import check_choice, did_you_mean, shown, typed, typed_fields, unknown_name
 from lw_torchrl._util.files import AnyPath, read_toml
 from lw_torchrl._util.registry import ReadOnlyDict
 from lw_torchrl.language.layout import METAWORLD, Layout, places
@@ -49,8 +49,7 @@ class Task:
         what, size = f"objects of task {self.name!r}", self.layout.size
         if len(self.objects) > _MOST_OBJECTS:
             raise ValueError(f"{what} must be at most {_MOST_OBJECTS}, the gripper included, got {len(self.objects)}")
-        for named in self.objects:  # all of them: the annotation's check looks at one
-            check_value("objects", named, NamedObject)
+        for named in self.objects:
             for index in (*named.position, named.opening):
                 if isinstance(index, int) and not 0 <= index < size:
                     raise ValueError(f"position of {named.name!r}: obs[{index}] is not among obs[0] to obs[{size - 1}]")

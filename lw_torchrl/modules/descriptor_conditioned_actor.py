@@ -115,7 +115,7 @@ class DescriptorConditionedActor(ConditionedActor):
 
     Example:
         >>> import lw_torchrl as lw
-        >>> lw.DescriptorConditionedActor("MT10")(lw.LanguageWorldEnv("reach").reset())["action"].shape
+        >>> lw.modules.DescriptorConditionedActor("MT10")(lw.LanguageWorldEnv("reach").reset())["action"].shape
         torch.Size([1, 4])
 
     Source: paper section 'Conditional Plan Experiments'.

@@ -74,7 +74,7 @@ class ActorEnsemble(_Wrapper):
 
     Example:
         >>> import lw_torchrl as lw
-        >>> actor = lw.modules.ActorEnsemble([lw.DescriptorConditionedActor("MT10") for _ in range(4)])
+        >>> actor = lw.modules.ActorEnsemble([lw.modules.DescriptorConditionedActor("MT10") for _ in range(4)])
         >>> actor(lw.LanguageWorldEnv("reach").reset())["action"].shape
         torch.Size([1, 4])
 
@@ -123,7 +123,7 @@ class DecidedGripper(_ActionWrapper):
 
     Example:
         >>> import lw_torchrl as lw
-        >>> actor = lw.modules.DecidedGripper(lw.DescriptorConditionedActor("MT10")).eval()
+        >>> actor = lw.modules.DecidedGripper(lw.modules.DescriptorConditionedActor("MT10")).eval()
         >>> actor(lw.LanguageWorldEnv("reach").reset())["action"][0, 3].abs().item()
         1.0
     """
@@ -175,7 +175,7 @@ class DemonstratedActor(_Wrapper):
         >>> import lw_torchrl as lw
         >>> plans = lw.canonical_plans(lw.load_plans("MT50"))
         >>> others = lw.PlanConditionedActor(plans, features=lw.modules.RoleFeatures(plans))
-        >>> actor = lw.modules.DemonstratedActor(lw.DescriptorConditionedActor("MT10"), others)
+        >>> actor = lw.modules.DemonstratedActor(lw.modules.DescriptorConditionedActor("MT10"), others)
         >>> state = lw.modules.transform_of(actor)(lw.LanguageWorldEnv(["reach", "hammer"]).reset())
         >>> actor(state)["action"].shape
         torch.Size([2, 4])

@@ -197,7 +197,7 @@ class AdvantageWeightedLoss(LossModule):
     Example:
         >>> import lw_torchrl as lw, torch
         >>> from tensordict import TensorDict
-        >>> loss = lw.objectives.AdvantageWeightedLoss(lw.DescriptorConditionedActor("MT10"), beta=3.0)
+        >>> loss = lw.objectives.AdvantageWeightedLoss(lw.modules.DescriptorConditionedActor("MT10"), beta=3.0)
         >>> reach = torch.full((5,), lw.task_id("reach"))
         >>> batch = TensorDict(observation=torch.rand(5, 39), task_id=reach, action=torch.rand(5, 4))
         >>> batch["advantage"] = torch.randn(5, 1)

@@ -148,24 +148,15 @@ def write_answer(folder: AnyPath, model: str, answer: Answer) -> Path:
     return path
 
 
-def write_settings(folder: Path, settings: Mapping[str, Any], *, reading: bool = False) -> None:
-    """Write the settings that determine a model's answers to ``folder/settings.json``, unless they are there.
-
-    Raises:
-        ValueError: the folder has answers with other settings; with ``reading``, of another model.
-    """
+def write_settings(folder: Path, settings: dict[str, Any]) -> None:
+    """Write ``folder/settings.json``; raise :class:`ValueError` if the folder holds answers with other settings."""
     file = folder / "settings.json"
-    before = read_json(file, "out: the settings") if file.is_file() else {}
-    if before == settings:
-        return
-    if any(path for name, format in PLAN_FORMATS.items() for path in folder.glob(f"{name}/*.{format.extension}")):
-        if reading and before.get("model", settings["model"]) == settings["model"]:
-            return
-        difference = ", ".join(differences(before, settings)) if before else "it has no settings.json to compare with"
+    before = read_json(file, "out: the settings") if file.is_file() else settings
+    if before != settings:
+        difference = ", ".join(differences(before, settings))
         advice = "use these settings again, or give the new answers another name (--name) or out"
         raise ValueError(f"out: {str(folder)!r} holds answers of other settings: {difference}; {advice}")
-    if not reading:
-        write_json(file, dict(settings))
+    write_json(file, settings)
 
 
 def recorded_answers(source: AnyPath) -> dict[str, dict[_Place, str | Path]]:

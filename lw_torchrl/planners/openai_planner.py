@@ -17,7 +17,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from lw_torchrl._util.checks import Count, Natural, Positive, Scale, check_choice, check_value, counted, shown, typed
-from lw_torchrl._util.files import AnyPath, parse_json, read_json, read_text, write_json
+from lw_torchrl._util.files import AnyPath, parse_json, read_json, write_json
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.language.formats import PLAN_FORMATS
 from lw_torchrl.language.plans import AnyPlans, as_plans
@@ -29,7 +29,6 @@ from lw_torchrl.planners.answer_files import (
     PlannerError,
     Reply,
     Tokens,
-    answer_path,
     folder_name,
     read_reply,
     write_answer,
@@ -154,7 +153,6 @@ class OpenAIPlanner:
         format: str = "chain_py",
         attempts: int = 1,
         out: AnyPath | None = None,
-        recorded: bool = False,
         progress: bool = True,
     ) -> Answers:
         """Ask for plans, several at a time.
@@ -162,7 +160,6 @@ class OpenAIPlanner:
         Args:
             tasks, format, attempts, out: see :meth:`Planner.plans`. The JSON of a constrained model is written next to
                 its answer, and the settings to ``out/<name>/settings.json``.
-            recorded: read the answers that are in ``out``, and ask only for the others.
             progress: show a progress bar.
 
         Raises:
@@ -174,7 +171,7 @@ class OpenAIPlanner:
         count = check_value("attempts", attempts, Count)
         each = [(task, attempt) for task in named_tasks(tasks).values() for attempt in range(count)]
         questions = [Question(task, attempt, self.request(task, format, attempt)) for task, attempt in each]
-        return self._answers(questions, format, self.name, out, progress, recorded)
+        return self._answers(questions, format, self.name, out, progress)
 
     def revise(
         self,
@@ -211,33 +208,18 @@ class OpenAIPlanner:
         return self._answers(questions, format, name, out, progress)
 
     def _answers(
-        self,
-        questions: list[Question],
-        format: str,
-        name: str,
-        out: AnyPath | None,
-        progress: bool,
-        recorded: bool = False,
+        self, questions: list[Question], format: str, name: str, out: AnyPath | None, progress: bool
     ) -> Answers:
-        """Answer questions from ``out`` if they are ``recorded``, else from the cache, else from the server."""
+        """Answer questions from the cache, else from the server."""
         answers: list[Answer] = []
         missing: list[Question] = []
-        written = 0
         for question in questions:
-            reply = self._cached(question.request)
-            answer = None if reply is None else self._read(reply, question, format)
-            path = answer_path(out or "", name, format, question.task.name, question.attempt)
-            if recorded and out is not None and path.is_file():
-                written += 1
-                text = read_text(path, ValueError)
-                if answer is None or answer.text != text:
-                    answer = read_reply(Reply(text), question.task, format, question.attempt, self.skills)
-            if answer is None:
+            if (reply := self._cached(question.request)) is None:
                 missing.append(question)
             else:
-                answers.append(replace(answer, cached=True))
+                answers.append(replace(self._read(reply, question, format), cached=True))
         if out is not None:
-            write_settings(Path(out) / folder_name(name), self.settings(), reading=written == len(questions))
+            write_settings(Path(out) / folder_name(name), self.settings())
             for answer in answers:
                 write_answer(out, name, answer)
         errors: list[PlannerError] = []
@@ -363,7 +345,7 @@ class _ChatClient:
 
     def _complete(self, request: Mapping[str, Any]) -> tuple[bytes, frozenset[str]]:
         """Return the body of a reply, and the fallbacks with which the server accepted the request."""
-        while True:
+        while True:  # at most once for each fallback, since a refusal of an active fallback is raised
             fallbacks = self._fallbacks
             try:
                 fields = _request_fields(self.model, request, fallbacks)
@@ -379,26 +361,30 @@ class _ChatClient:
         """Return the cause of a client's error, with a remedy, and whether it is fatal."""
         tried = f"asked {counted(int(error.request.headers.get('x-stainless-retry-count', 0)) + 1, 'time')}"
         status, message = getattr(error, "status_code", None), _excerpt(self._without_key(_error_text(error)))
+        fatal = True
         if any(isinstance(cause, self._openai.APITimeoutError) for cause in (error, error.__cause__)):
-            limit = f"no whole answer within {self._timeout:g} s, {tried}"
-            return f"{limit}. Give a longer timeout, or a lower concurrency", False
-        if status is None:
-            cause = _excerpt(self._without_key(str(error.__cause__ or error))) or type(error.__cause__).__name__
+            cause, fatal = f"no whole answer within {self._timeout:g} s, {tried}", False
+            advice = "Give a longer timeout, or a lower concurrency"
+        elif status is None:
+            reason = _excerpt(self._without_key(str(error.__cause__ or error))) or type(error.__cause__).__name__
+            cause = f"the connection failed or broke off, {tried}: {reason}"
             advice = "Check that the server runs, and that base_url is its address"
-            return f"the connection failed or broke off, {tried}: {cause}. {advice}", True
-        if status in (401, 403):
-            known = f"the key in {_KEY} is not accepted" if self._key else f"the server needs a key, in {_KEY}"
-            return f"{known} ({message}). Give the key of this server", True
-        if status == 404:
-            return f"no such model or address ({message}). `GET {self.address}/models` lists its models", True
-        if status == 429:
-            return f"too many requests, {tried} ({message}). Continue later, or with a lower concurrency", True
-        if status >= 500:
-            return f"the server failed, {tried} ({message}). Its log may say why; ask again", False
-        if re.search(r"context|too long|max_tokens|maximum.{0,20}length", message, re.IGNORECASE):
+        elif status in (401, 403):
+            cause = f"the key in {_KEY} is not accepted" if self._key else f"the server needs a key, in {_KEY}"
+            advice = "Give the key of this server"
+        elif status == 404:
+            cause, advice = "no such model or address", f"`GET {self.address}/models` lists its models"
+        elif status == 429:
+            cause, advice = f"too many requests, {tried}", "Continue later, or with a lower concurrency"
+        elif status >= 500:
+            cause, advice, fatal = f"the server failed, {tried}", "Its log may say why; ask again", False
+        elif re.search(r"context|too long|max_tokens|maximum.{0,20}length", message, re.IGNORECASE):
+            cause, fatal = "the question does not fit", False
             advice = "Give fewer max_tokens, a shorter format (basic_py), or the server a longer context"
-            return f"the question does not fit ({message}). {advice}", False
-        return f"the request is refused ({message}). Leave out the options that the server does not know", False
+        else:
+            cause, fatal = "the request is refused", False
+            advice = "Leave out the options that the server does not know"
+        return f"{cause}{f' ({message})' if status else ''}. {advice}", fatal
 
     def _without_key(self, text: Any) -> Any:
         """Replace copies of the key in a text or in bytes; a shorter key, such as "none", may be an ordinary word."""

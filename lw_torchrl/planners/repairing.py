@@ -129,11 +129,6 @@ class Repair:
     answers: tuple[Answer, ...]
     checks: tuple[PlanCheck, ...]
 
-    @property
-    def best(self) -> int:
-        """The round with the most successful plan, the earliest if several are equal; 0 is the first answer."""
-        return max(range(len(self.checks)), key=lambda round: self.checks[round].success)
-
 
 def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
     """Write the report to a model on how its plan performed. Of the answer's ``notes``, only truncation is reported.

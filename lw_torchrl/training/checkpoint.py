@@ -1,4 +1,4 @@
-"""Files of policies, query evaluators and trainings: one .safetensors file each, with a description as JSON."""
+"""Files of policies, query evaluators and training states: one .safetensors file each, with a description as JSON."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def save_evaluator(evaluator: QueryEvaluator, path: AnyPath, **about: Any) -> No
     Example:
         >>> import lw_torchrl as lw, os, tempfile
         >>> path = os.path.join(tempfile.mkdtemp(), "evaluator.safetensors")
-        >>> lw.training.save_evaluator(lw.StateQueryEvaluator(lw.load_plans("MT10"), width=8), path)
+        >>> lw.training.save_evaluator(lw.modules.StateQueryEvaluator(lw.load_plans("MT10"), width=8), path)
         >>> lw.training.load_evaluator(path, lw.load_plans("MT50")).config["width"]
         8
     """
@@ -293,12 +293,12 @@ class CheckpointFiles:
         return status.st_ino, status.st_size, status.st_mtime_ns
 
     def write(
-        self, description: Mapping[str, Any], device: torch.device, tensors: Any, state: Any, part: nn.Module
+        self, description: Mapping[str, Any], device: torch.device, tensors: Any, state: Any, part: nn.Module | None
     ) -> None:
         """Write ``tensors`` and ``state``, then the policy or evaluator ``part``. Earlier files are replaced whole."""
         _write(self.state, "training", {**description, "device": device.type}, tensors, state)
         self._known = self._version()
-        if self.part is not None:
+        if self.part is not None and part is not None:
             _write(self.checkpoint, self.part, description, contents_of(part))
 
     def exist(self) -> bool:

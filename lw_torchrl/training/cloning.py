@@ -153,7 +153,7 @@ class BehavioralCloningTrainer(Training):
         self.loss = bc_loss(actor, config.loss_function)
         self.optimizer = make_optimizer([(self.loss.parameters(), config.learning_rate)], config, self.device)
         self.minibatches = [Minibatches(replay, config.batch_size, config.seed)]
-        if self.resume():
+        if self.resume():  # the checkpoint holds the statistics of the features
             return
         if config.normalize and statistics_of(actor):
             fit_normalization(actor, replay)

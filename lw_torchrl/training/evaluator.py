@@ -35,6 +35,7 @@ class _StateQueries:
     def __init__(self, evaluator: ClauseEvaluator, tasks: list[TaskQueries]) -> None:
         self.observation = torch.cat([task.observation for task in tasks])
         self.clauses = evaluator.code([(task.task, clause) for task in tasks for clause in task.clauses])
+        # A group is a predicate and a truth; it lists its pairs of a row and a clause, as int32 to save memory.
         predicate = 2 * self.clauses.predicate.to(torch.uint8)
         groups: dict[int, list[Tensor]] = {}
         row = first = 0
@@ -53,6 +54,7 @@ class _StateQueries:
 
     def sample(self, size: int) -> TensorDictBase:
         """Draw ``observation`` (B, 39) float32, ``clauses`` (B, 1) and their ``truth`` (B, 1) float32."""
+        # The groups take turns from a random one on, so that a batch smaller than their number favours none.
         group = (torch.arange(size) + torch.randint(len(self.sizes), ())) % len(self.sizes)
         place = (torch.rand(size, dtype=torch.float64) * self.sizes[group]).long()
         row, clause = self.pairs[self.starts[group] + place].long().unbind(-1)
@@ -176,7 +178,7 @@ class QueryEvaluatorTrainer(Training):
         >>> replay = lw.LanguageWorldExperienceReplay(root, label="executed")
         >>> config = lw.training.QueryEvaluatorConfig(steps=200, batch_size=64, held_out_pairs=0.0)
         >>> data = lw.training.LabelledQueries(replay, config)
-        >>> lw.training.QueryEvaluatorTrainer(lw.StateQueryEvaluator(plans), data, config).train() < 0.65
+        >>> lw.training.QueryEvaluatorTrainer(lw.modules.StateQueryEvaluator(plans), data, config).train() < 0.65
         True
 
         From pictures:

@@ -129,7 +129,7 @@ class LabelledQueries:
         shipped = find_suite(getattr(replay, "tasks", ())).tasks
         known = {task_id(task.name): task for task in (shipped.values() if tasks is None else tasks)}
         rows = replay[:]
-        if config.every > 1:
+        if config.every > 1:  # counted from each episode's first row, where its first picture is
             _, lengths = torch.unique_consecutive(rows.get(("collector", "traj_ids")), return_counts=True)
             first = (lengths.cumsum(0) - lengths).repeat_interleave(lengths)
             rows = rows[(torch.arange(len(rows)) - first) % config.every == 0]
@@ -147,6 +147,7 @@ class LabelledQueries:
         self.parts: dict[str, list[TaskQueries]] = {"training": [], "states": [], "queries": [], "tasks": []}
         for task in present:
             own, most = ids == task_id(task.name), config.states_per_task
+            # A negated clause has the opposite answer, so it would add nothing to learn.
             clauses = [clause for clause in base_clauses(task, tuple(PREDICATES)) if not clause.negated]
             train = _at_most(most, (own & ~held_out).nonzero().flatten(), generator)
             test = _at_most(most, (own & held_out).nonzero().flatten(), generator)
@@ -198,7 +199,7 @@ def _check_pictures(rows: TensorDictBase, layout: Layout) -> None:
     same_episode = rows.get(("collector", "traj_ids"))[1:] == rows.get(("collector", "traj_ids"))[:-1]
     for row in (moved & same_episode).nonzero().flatten().tolist():
         if torch.equal(pixels[row], pixels[row + 1]):
-            raise ValueError("every must be the number of steps between pictures: one stays while the hand moves")
+            raise ValueError("every must be the number of steps between pictures: a picture stays while the hand moves")
 
 
 def _draw_tasks(held_out: int | tuple[str, ...], names: Sequence[str], generator: torch.Generator) -> tuple[str, ...]:

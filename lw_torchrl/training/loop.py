@@ -307,7 +307,8 @@ class Training:
         except ValueError as error:
             raise ValueError(f"{error} after step {self.steps}: the learning rate is too high") from error
         if self._files is not None:
-            self._files.write(self.description, self.device, self.contents(), self.state_dict(), self.saved)
+            part = self.saved if self.part else None
+            self._files.write(self.description, self.device, self.contents(), self.state_dict(), part)
 
     def resume(self) -> bool:
         """Resume from the checkpoint and return True, if there is one."""

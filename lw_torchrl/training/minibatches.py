@@ -40,6 +40,7 @@ class Minibatches:
     @contextmanager
     def drawing(self, device: torch.device) -> Iterator[None]:
         """Seed PyTorch's generators for a step within the block, and count the step."""
+        # A large prime keeps the seeds of trainings with neighbouring seeds apart.
         with seeded(device, (self.seed * 1_000_003 + self.step) % 2**63):
             self.step += 1
             yield

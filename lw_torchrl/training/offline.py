@@ -216,7 +216,7 @@ def networks_of(loss: LossModule) -> list[nn.Module]:
 def check_loss(loss: Any, replay: TensorDictReplayBuffer) -> None:
     """Raise unless a loss can be trained on a buffer. A loss without a value estimator gets TorchRL's default one."""
     if not isinstance(loss, LossModule):
-        hint = "compile one by loss.compile()"
+        hint = "to compile a loss, call loss.compile()"
         if loss is None:
             hint = "make_value_estimator of TorchRL's losses returns None, so call it on a line of its own"
         raise TypeError(f"loss must be a LossModule, got {type(loss).__name__}; {hint}")

@@ -168,7 +168,7 @@ class CorruptQAF(EpisodeTransform):
     Example:
         >>> import lw_torchrl as lw
         >>> plans = lw.load_plans("MT10")
-        >>> actor, noisy = lw.ScriptedSkillActor(plans), lw.CorruptQAF(plans, every=2, flip=0.05)
+        >>> actor, noisy = lw.ScriptedSkillActor(plans), lw.transforms.CorruptQAF(plans, every=2, flip=0.05)
         >>> lw.evaluate(actor, tasks="reach", episodes_per_task=2, seed=1_000, evaluator=noisy).success_once
         {'reach': 1.0}
 

@@ -39,7 +39,7 @@ def replay(tmp_path_factory):
 
 def test_report_has_the_calibration_of_every_answer(replay, tmp_path):
     data = lw.training.LabelledQueries(replay, lw.training.QueryEvaluatorConfig(held_out_tasks=("reach",)))
-    evaluator = lw.StateQueryEvaluator(PLANS, width=16, depth=1)
+    evaluator = lw.modules.StateQueryEvaluator(PLANS, width=16, depth=1)
     bins = reliability(evaluator, data)
     for part, counts in bins.items():
         assert counts[:, 0].sum() == sum(asked.truth.numel() for asked in data.parts[part])

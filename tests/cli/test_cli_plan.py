@@ -10,11 +10,11 @@ import lw_torchrl as lw
 
 
 def test_prompt_equals_that_of_plan_prompt(capsys):
-    assert run(capsys, "plan", "prompt", "drawer-open", "--format", "chain_py") == lw.plan_prompt(
+    assert run(capsys, "plan", "prompt", "drawer-open", "--format", "chain_py") == lw.planners.plan_prompt(
         "drawer-open", "chain_py"
     )
     printed = run(capsys, "plan", "prompt", "push", "--format", "goal_md", "--vocabulary", "--plans", "MT50")
-    assert printed == lw.plan_prompt("push", "goal_md", vocabulary=True, plans=lw.load_plans("MT50"))
+    assert printed == lw.planners.plan_prompt("push", "goal_md", vocabulary=True, plans=lw.load_plans("MT50"))
 
 
 def test_read_shows_how_each_step_was_parsed(capsys, tmp_path):
@@ -161,23 +161,15 @@ def test_repair_asks_again_and_shows_the_success_of_each_round(capsys, tmp_path)
 
 @pytest.mark.usefixtures("_no_key")
 def test_repair_reuses_the_answers_of_generate(capsys, tmp_path):
-    """Answers with any --seed of generate are reused; only missing answers are requested."""
     server = FakeServer(lambda body: completion(f"I cannot, for the {len(server.requests)}th time."))
     where = ("--out", tmp_path / "plans", "--cache", tmp_path / "kept", "--model", "m")
-    options = ("--episodes", 1, "--rounds", 1, *where)
     with serving(server) as address:
-        run(capsys, "plan", "generate", "reach", "--seed", 7, "--base-url", address, *where)
-        first = tmp_path / "plans/m/chain_py/reach-0.py"
-        text = first.read_text()
-        printed = run(capsys, "plan", "repair", "reach", "--base-url", address, *options)
+        run(capsys, "plan", "generate", "reach", "--base-url", address, "--seed", 7, *where)
+        text = (tmp_path / "plans/m/chain_py/reach-0.py").read_text()
+        repair = ("plan", "repair", "reach", "--base-url", address, "--episodes", 1, "--rounds", 1, *where)
+        printed = run(capsys, *repair, "--seed", 7)
         assert len(server.requests) == 2
-        assert [message["content"] for message in server.requests[1]["messages"]][2] == text
-        assert first.read_text() == text
+        assert server.requests[1]["messages"][2]["content"] == text
         assert "1 first answer, 0 requested now" in printed
         assert printed.endswith(f"written to {tmp_path / 'plans/m'}, {tmp_path / 'plans/m-round1'}\n")
-        more = ("plan", "repair", "reach", "--base-url", address, "--attempts", 2, *options)
-        assert "seed (7, now None)" in fails(capsys, *more)
-        run(capsys, *more, "--seed", 7, "--name", "other")
-        assert [body.get("seed") for body in server.requests[:3]] == [7, None, 8]
-        assert sorted(body["seed"] for body in server.requests[3:]) == [7, 8]
-        assert first.read_text() == text
+        assert "seed (7, now None)" in fails(capsys, *repair)

@@ -66,7 +66,7 @@ def test_train_logs_and_fine_tunes(capsys, tmp_path, demos, policy):
 def test_the_baseline_is_trained_and_evaluated(capsys, demos, tmp_path):
     path = tmp_path / "baseline.safetensors"
     run(capsys, "train", demos, "--out", path, "--method", "dc", *TINY)
-    assert isinstance(lw.load_actor(path), lw.DescriptorConditionedActor)
+    assert isinstance(lw.load_actor(path), lw.modules.DescriptorConditionedActor)
     assert [row["task"] for row in document(capsys, "evaluate", path, *SHORT)["tasks"]] == ["push", "reach"]
     assert "attribute" in fails(capsys, "evaluate", path, "--attribute", *SHORT)
 

@@ -75,7 +75,7 @@ def test_custom_policies_and_evaluators_are_recorded(capsys, tmp_path, monkeypat
     assert "reach, episode 0, policy: success at step " in printed
     assert tabs(tmp_path / "runs" / "recordings" / "reach-policy.rrd") == ["reach-0"]
     torch.manual_seed(0)
-    lw.training.save_evaluator(lw.StateQueryEvaluator(lw.load_plans("MT10"), width=8), "evaluator.safetensors")
+    lw.training.save_evaluator(lw.modules.StateQueryEvaluator(lw.load_plans("MT10"), width=8), "evaluator.safetensors")
     reach = lw.Plans({"reach": lw.load_plans("MT10")["reach"]})
     lw.save_actor(lw.PlanConditionedActor(reach, decoder=lw.modules.MLPDecoder(width=8)), "mine.safetensors")
     for policy in ("scripted", "mine.safetensors"):

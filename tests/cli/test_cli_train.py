@@ -46,7 +46,7 @@ def trained(demos, tmp_path_factory):
     actor = lw.PlanConditionedActor(plans, decoder=lw.modules.MLPDecoder(width=8, depth=1))
     config = lw.BehavioralCloningConfig(steps=5, batch_size=8)
     lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=path / "policy.safetensors", progress=False).train()
-    lw.training.save_evaluator(lw.StateQueryEvaluator(plans, width=8), path / "evaluator.safetensors")
+    lw.training.save_evaluator(lw.modules.StateQueryEvaluator(plans, width=8), path / "evaluator.safetensors")
     return path
 
 
@@ -116,7 +116,7 @@ def test_a_new_evaluator_is_trained_with_the_policy(capsys, demos, tmp_path):
     args = "train", demos, "--out", out, "--evaluator", "StateQueryEvaluator", "--qaf-anchor", 1, *SMALL, *NET
     assert document(capsys, *args)["steps"] == 4
     actor = lw.load_actor(out)
-    assert isinstance(actor[0], lw.StateQueryEvaluator)
+    assert isinstance(actor[0], lw.modules.StateQueryEvaluator)
     assert actor[0].answers == "soft"
     assert "qaf" not in actor.in_keys
 
@@ -140,7 +140,7 @@ def test_missing_files_and_unsuitable_policies_are_errors(capsys, demos, trained
     out = ["--out", tmp_path / "x.safetensors", *SMALL]
     for option in ("--evaluator", "--begin"):
         assert "none.safetensors" in fails(capsys, "train", demos, *out, option, tmp_path / "none.safetensors")
-    lw.save_actor(lw.DescriptorConditionedActor(["reach"]), tmp_path / "dc.safetensors")
+    lw.save_actor(lw.modules.DescriptorConditionedActor(["reach"]), tmp_path / "dc.safetensors")
     file = ["--evaluator", trained / "evaluator.safetensors"]
     error = fails(capsys, "train", demos, *out, "--begin", tmp_path / "dc.safetensors", *file)
     assert "--evaluator requires a policy that reads qaf" in error

@@ -76,7 +76,7 @@ def trained(kind="plan", seed=0, squash=True, **options):
     options["decoder"] = lw.modules.MLPDecoder(width=8, depth=1, squash=squash)
     if kind == "plan":
         return lw.PlanConditionedActor(PLANS, **options)
-    return lw.DescriptorConditionedActor(("push", "reach"), **options)
+    return lw.modules.DescriptorConditionedActor(("push", "reach"), **options)
 
 
 def same_rows(left, right):
@@ -104,7 +104,7 @@ def random_dataset(root: Path, lengths: Sequence[Sequence[int]], seed: int = 0) 
         values[odd] = draws.choice(ODD, odd.sum())
         return torch.from_numpy(values)
 
-    infos, parts = [], []
+    parts = []
     for task, of_task in zip(tasks, lengths, strict=True):
         for episode, steps in enumerate(of_task):
             states, ends = numbers(steps + 1, 39), torch.zeros(steps, 1, dtype=torch.bool)
@@ -116,15 +116,13 @@ def random_dataset(root: Path, lengths: Sequence[Sequence[int]], seed: int = 0) 
             number = torch.full((steps,), task_id(task))
             rows.update({"observation": states[:-1], "task_id": number, "episode": torch.full_like(number, episode)})
             rows.set("action", rows.get("action").clamp(-1, 1)).set(("next", "observation"), states[1:])
-            rows.set(("next", "task_id"), number).set(("collector", "traj_ids"), torch.full_like(number, len(infos)))
+            rows.set(("next", "task_id"), number)
             rows.set(("next", "reward_sparse"), success.float()).set(("next", "success"), success)
             rows.set(("next", "done"), ends).set(("next", "truncated"), ends).set(("next", "terminated"), ends & False)
-            start = infos[-1].start + infos[-1].length if infos else 0
-            infos.append(describe_episode(task, episode, start, rows))
-            parts.append(rows)
+            parts.append((task, episode, rows))
     config = CollectConfig(tasks, len(lengths[0]), seed, max_steps=max(map(max, lengths)))
-    write_rows(root / DATA, parts, config.layout)
+    infos = write_rows(root / DATA, parts, config.layout)
     numbers_of = {task: task_id(task) for task in tasks}
     attempts = dict.fromkeys(tasks, len(lengths[0]))
-    write_metadata(Demonstrations(root, config, package_versions(), numbers_of, tuple(infos), attempts))
+    write_metadata(Demonstrations(root, config, package_versions(), numbers_of, infos, attempts))
     return read_metadata(root)

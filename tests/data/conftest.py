@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-
 import pytest
 from collecting import collect
 
@@ -25,9 +23,3 @@ def other_dataset(tmp_path_factory):
 @pytest.fixture(scope="session")
 def rows(dataset):
     return load_rows(dataset)
-
-
-@pytest.fixture
-def damaged_root(dataset, tmp_path):
-    """A copy of the dataset to damage."""
-    return shutil.copytree(dataset.root, tmp_path / "demos")

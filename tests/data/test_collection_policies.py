@@ -285,13 +285,6 @@ def test_only_the_same_policy_resumes_an_interrupted_collection(tmp_path, monkey
     assert tree(collect(root, policy=actor, behaviour="tiny").root) == tree(whole.root)
 
 
-def nan(policy):
-    with torch.no_grad():
-        for parameter in policy.parameters():
-            parameter.fill_(torch.nan)
-    return policy
-
-
 class Odd(TensorDictModuleBase):
     """A policy with a wrong action."""
 
@@ -303,6 +296,8 @@ class Odd(TensorDictModuleBase):
     def forward(self, tensordict):
         dtype = torch.float64 if self.wrong == "dtype" else torch.float32
         action = tensordict["observation"][..., : 3 if self.wrong == "shape" else 4].to(dtype)
+        if self.wrong == "value":
+            action = action * torch.nan
         return tensordict.set(self.out_keys[0], action)
 
 
@@ -321,7 +316,7 @@ RANDOM = lw.ScriptedSkillActor(PLANS, "random")
         (lambda state: state, {}, ValueError, "must write 'action'"),
         (lambda state: state, dict(behaviour=None), ValueError, "behaviour must name the policy"),
         (trained("description"), dict(tasks=("push", "drawer-open")), ValueError, "tasks must be .* drawer-open"),
-        (nan(trained()), {}, ValueError, "NaN"),
+        (Odd("value"), {}, ValueError, "NaN"),
         (Odd("key"), {}, ValueError, "must write 'action'"),
         (lambda state: state["observation"], {}, TypeError, "policy must return the TensorDict"),
         (Odd("dtype"), {}, ValueError, "must be float32"),

@@ -23,6 +23,12 @@ from lw_torchrl.data.dataset import COLUMNS, FORMAT, FORMAT_VERSION, MappedColum
 ALL = [(task, episode) for task in TASKS for episode in range(EPISODES)]
 
 
+@pytest.fixture
+def root(dataset, tmp_path):
+    """A copy of the dataset to damage."""
+    return shutil.copytree(dataset.root, tmp_path / "demos")
+
+
 def check_error(root, message):
     """Check that opening raises an error that names the folder, and that no file changes."""
     before = tree(root)
@@ -58,17 +64,17 @@ def test_a_missing_folder_is_named(tmp_path):
         LanguageWorldExperienceReplay(tmp_path / "nowhere")
 
 
-def test_unfinished_and_other_folders_are_errors(damaged_root):
-    (damaged_root / "metadata.json").unlink()
-    check_error(damaged_root, "is not a dataset")
-    (damaged_root / ".partial").mkdir()
-    check_error(damaged_root, "unfinished")
+def test_unfinished_and_other_folders_are_errors(root):
+    (root / "metadata.json").unlink()
+    check_error(root, "is not a dataset")
+    (root / ".partial").mkdir()
+    check_error(root, "unfinished")
 
 
 @pytest.mark.parametrize(("format", "number"), [(FORMAT, FORMAT_VERSION + 1), ("minari", FORMAT_VERSION)])
-def test_another_format_or_version_is_an_error(damaged_root, format, number):
-    edit(damaged_root, lambda metadata: metadata.update(format=format, version=number))
-    check_error(damaged_root, f"format {format!r} version {number}.*reads {FORMAT!r} version {FORMAT_VERSION}")
+def test_another_format_or_version_is_an_error(root, format, number):
+    edit(root, lambda metadata: metadata.update(format=format, version=number))
+    check_error(root, f"format {format!r} version {number}.*reads {FORMAT!r} version {FORMAT_VERSION}")
 
 
 @pytest.mark.parametrize(
@@ -81,24 +87,24 @@ def test_another_format_or_version_is_an_error(damaged_root, format, number):
         lambda metadata: metadata["episodes"]["length"].__setitem__(0, STEPS - 1),
     ],
 )
-def test_damaged_metadata_are_an_error(damaged_root, change):
-    edit(damaged_root, change)
-    check_error(damaged_root, "metadata.json' are damaged .*; delete the folder")
+def test_damaged_metadata_are_an_error(root, change):
+    edit(root, change)
+    check_error(root, "metadata.json' are damaged .*; delete the folder")
 
 
 @pytest.mark.parametrize("damage", ["missing", "truncated", "longer", "empty"])
-def test_a_column_of_another_size_is_an_error(damaged_root, damage):
-    path = damaged_root / "data" / "next" / "observation.memmap"
+def test_a_column_of_another_size_is_an_error(root, damage):
+    path = root / "data" / "next" / "observation.memmap"
     content = path.read_bytes()
     path.unlink()
     if damage != "missing":
         path.write_bytes({"truncated": content[:-8], "longer": content + bytes(8), "empty": b""}[damage])
-    check_error(damaged_root, "the rows in .* are damaged")
+    check_error(root, "the rows in .* are damaged")
 
 
 @pytest.mark.parametrize("name", ["/".join(key) for key in COLUMNS])
-def test_every_changed_bit_of_a_column_is_found(damaged_root, name):
-    path, draws = damaged_root / "data" / f"{name}.memmap", np.random.default_rng(sum(name.encode()))
+def test_every_changed_bit_of_a_column_is_found(root, name):
+    path, draws = root / "data" / f"{name}.memmap", np.random.default_rng(sum(name.encode()))
     content = path.read_bytes()
     for at in {0, len(content) - 1, *draws.integers(len(content), size=4).tolist()}:
         changed = bytearray(content)
@@ -106,59 +112,59 @@ def test_every_changed_bit_of_a_column_is_found(damaged_root, name):
         path.write_bytes(changed)
         task, episode = ALL[at // (len(content) // len(ALL))]
         with pytest.raises(DatasetError, match=f"episode {episode} of {task!r} differs from its checksum"):
-            LanguageWorldExperienceReplay(damaged_root, label="executed", n_steps=2, gamma=0.9)
+            LanguageWorldExperienceReplay(root, label="executed", n_steps=2, gamma=0.9)
     with pytest.raises(DatasetError, match="differs from its checksum"):
-        collect(damaged_root)
-    assert len(LanguageWorldExperienceReplay(damaged_root, check=False)) == len(ALL) * STEPS
+        collect(root)
+    assert len(LanguageWorldExperienceReplay(root, check=False)) == len(ALL) * STEPS
     path.write_bytes(content)
-    LanguageWorldExperienceReplay(damaged_root).verify()
+    LanguageWorldExperienceReplay(root).verify()
 
 
-def test_only_the_selected_episodes_are_checked(damaged_root):
-    path = damaged_root / "data" / "action.memmap"
+def test_only_the_selected_episodes_are_checked(root):
+    path = root / "data" / "action.memmap"
     path.write_bytes(b"\1\2\3\4" + path.read_bytes()[4:])
-    LanguageWorldExperienceReplay(damaged_root, episodes={"push": [1, 2], "reach": 1}).verify()
+    LanguageWorldExperienceReplay(root, episodes={"push": [1, 2], "reach": 1}).verify()
     with pytest.raises(DatasetError, match="0 of 'push'"):
-        LanguageWorldExperienceReplay([damaged_root], episodes=[{"push": 1}])
+        LanguageWorldExperienceReplay([root], episodes=[{"push": 1}])
 
 
-def test_checksums_are_compared_once_while_the_files_do_not_change(damaged_root, monkeypatch):
-    checked, real = [], module._is_whole
-    monkeypatch.setattr(module, "_is_whole", lambda info, rows: checked.append(info.episode) or real(info, rows))
+def test_checksums_are_compared_once_while_the_files_do_not_change(root, monkeypatch):
+    checked, describe = [], module.describe_episode
+    monkeypatch.setattr(module, "describe_episode", lambda *args: checked.append(args[1]) or describe(*args))
     for _ in range(3):
-        LanguageWorldExperienceReplay(damaged_root, label="executed").verify()
+        LanguageWorldExperienceReplay(root, label="executed").verify()
     assert len(checked) == len(ALL)
-    os.utime(damaged_root / "data" / "action.memmap", ns=(0, 0))
-    LanguageWorldExperienceReplay(damaged_root, episodes={"push": [1]})
+    os.utime(root / "data" / "action.memmap", ns=(0, 0))
+    LanguageWorldExperienceReplay(root, episodes={"push": [1]})
     assert len(checked) == len(ALL) + 1
 
 
-def test_a_state_is_not_restored_over_damaged_rows(damaged_root, tmp_path):
-    LanguageWorldExperienceReplay(damaged_root, batch_size=8).dumps(tmp_path / "saved")
-    path = damaged_root / "data" / "action.memmap"
+def test_a_state_is_not_restored_over_damaged_rows(root, tmp_path):
+    LanguageWorldExperienceReplay(root, batch_size=8).dumps(tmp_path / "saved")
+    path = root / "data" / "action.memmap"
     path.write_bytes(b"\1\2\3\4" + path.read_bytes()[4:])
     with pytest.raises(DatasetError, match="differs from its checksum"):
-        LanguageWorldExperienceReplay(damaged_root, check=False).load_state_dict({})
+        LanguageWorldExperienceReplay(root, check=False).load_state_dict({})
 
 
-def test_a_pickle_among_the_rows_is_never_executed(damaged_root, tmp_path):
+def test_a_pickle_among_the_rows_is_never_executed(root, tmp_path):
     marker = tmp_path / "executed"
-    rows = TensorDict.load_memmap(damaged_root / "data").clone()
+    rows = TensorDict.load_memmap(root / "data").clone()
     rows["note"] = NonTensorData(Evil(marker), batch_size=rows.batch_size)
-    shutil.rmtree(damaged_root / "data")
-    rows.memmap(damaged_root / "data")
-    assert list((damaged_root / "data").rglob("*.pickle")), "the test needs a pickle"
-    assert "note" not in LanguageWorldExperienceReplay(damaged_root)[:]
+    shutil.rmtree(root / "data")
+    rows.memmap(root / "data")
+    assert list((root / "data").rglob("*.pickle")), "the test needs a pickle"
+    assert "note" not in LanguageWorldExperienceReplay(root)[:]
     assert not marker.exists()
-    TensorDict.load_memmap(damaged_root / "data", allow_pickle=True)["note"]
+    TensorDict.load_memmap(root / "data", allow_pickle=True)["note"]
     assert marker.exists(), "the pickle would have been executed"
 
 
-def test_an_action_that_is_not_finite_is_an_error(damaged_root):
-    path = damaged_root / "data" / "expert_action.memmap"
+def test_an_action_that_is_not_finite_is_an_error(root):
+    path = root / "data" / "expert_action.memmap"
     path.write_bytes(np.full(path.stat().st_size // 4, np.nan, dtype=np.float32).tobytes())
     with pytest.raises(DatasetError, match="action that is NaN or infinite"):
-        LanguageWorldExperienceReplay(damaged_root, check=False)
+        LanguageWorldExperienceReplay(root, check=False)
 
 
 # ---- the rows of a buffer are read-only

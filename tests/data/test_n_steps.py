@@ -79,11 +79,11 @@ def test_torchrls_flags_would_bootstrap_from_the_end():
     """Show why done and terminated follow the observation, and why TorchRL's transform is an error."""
     rows = make_rows([4])
     rows["next", "terminated"][-1], rows["next", "truncated"][-1] = True, False
-    theirs = MultiStep(0.9, 3)(rows.unsqueeze(0))[0]
-    assert torch.equal(theirs["next", "observation"][1], rows["next", "observation"][3])
-    assert not theirs["next", "terminated"][1]
-    ours = n_step_returns(rows, 3, 0.9)
-    assert ours["next", "terminated"].flatten().tolist() == [False, True, True, True]
+    torchrls_rows = MultiStep(0.9, 3)(rows.unsqueeze(0))[0]
+    assert torch.equal(torchrls_rows["next", "observation"][1], rows["next", "observation"][3])
+    assert not torchrls_rows["next", "terminated"][1]
+    ahead = n_step_returns(rows, 3, 0.9)
+    assert ahead["next", "terminated"].flatten().tolist() == [False, True, True, True]
 
 
 def test_a_value_estimator_discounts_by_the_steps():

@@ -70,8 +70,7 @@ def oracle(parts, returns, success, least_return, best, behaviours, else_best):
             kept.append((episode.task, -total, rows, place, number))
     chosen = set()
     for task in TASKS:
-        of_task = sorted(row for row in kept if row[0] == task)
-        share = best
+        of_task, share = sorted(row for row in kept if row[0] == task), best
         if not of_task:
             if else_best is None:
                 return None
@@ -100,15 +99,6 @@ def test_filters_keep_what_the_oracle_keeps(described, options):
     assert [part.config for part in left] == [part.config for part in parts]
     for place, (part, before) in enumerate(zip(left, parts, strict=True)):
         assert part.episodes == tuple(e for n, e in enumerate(before.episodes) if (place, n) in expected)
-
-
-def test_at_equal_returns_the_shorter_and_then_the_earlier_episode_is_best():
-    config = CollectConfig(("reach",), 4, 0)
-    episodes = tuple(EpisodeInfo("reach", n, 0, 9, True, 1, 0) for n in range(4))
-    part = Demonstrations(Path(), config, {}, {}, episodes, {})
-    returns = torch.tensor([[1.0, 9], [2.0, 9], [2.0, 5], [1.0, 9]], dtype=torch.float64)
-    kept = [EpisodeFilter(best=b).choose([part], [returns])[0].episodes for b in (0.25, 0.5, 0.75, 1.0)]
-    assert [[e.episode for e in episodes] for episodes in kept] == [[2], [1, 2], [0, 1, 2], [0, 1, 2, 3]]
 
 
 @pytest.fixture(scope="module")

@@ -182,8 +182,8 @@ def test_a_buffer_that_grows_is_grouped_again():
     replay.extend(more.set("row", more["row"] + 8))
     batch = replay.sample(6)
     assert batch["task_id"].bincount(minlength=21)[[3, 5, 20]].tolist() == [2, 2, 2]
-    seen = {row for _ in range(10) for row in replay.sample(6)["row"].tolist()}
-    assert seen == set(range(14))
+    drawn_rows = {row for _ in range(10) for row in replay.sample(6)["row"].tolist()}
+    assert drawn_rows == set(range(14))
 
 
 def test_an_emptied_buffer_can_be_filled_again():

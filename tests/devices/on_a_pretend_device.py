@@ -27,7 +27,7 @@ ACTORS = {
     "one-hot": lambda: make_descriptor_actor(condition="one-hot", noise=0.0),
     "stochastic": lambda: make_actor(noise=0.0).stochastic("normal"),
     "evaluator": lambda: TensorDictSequential(
-        seeded(lw.StateQueryEvaluator, PLANS, width=8, depth=1), make_actor(noise=0.0)
+        seeded(lw.modules.StateQueryEvaluator, PLANS, width=8, depth=1), make_actor(noise=0.0)
     ),
 }
 SAMPLERS = {
@@ -404,7 +404,9 @@ def test_losses_over_a_buffer_wait_for_nothing_and_equal_the_cpus(demos, name, m
 
 def test_environment_is_on_its_device():
     def parts():
-        return Compose(lw.QAFTransform(PLANS), lw.CorruptQAF(PLANS, every=2, delay=1, flip=0.3), FallbackTurns())
+        return Compose(
+            lw.QAFTransform(PLANS), lw.transforms.CorruptQAF(PLANS, every=2, delay=1, flip=0.3), FallbackTurns()
+        )
 
     options = {"num_envs": 2, "max_steps": 4}
     moved = TransformedEnv(lw.LanguageWorldEnv(["push", "reach"], **options), parts()).to(PRETEND)

@@ -161,13 +161,6 @@ def test_a_custom_task_runs_with_others(tasks):
     env.close()
 
 
-def test_a_single_custom_task():
-    env = lw.LanguageWorldEnv(STACK, engine=FakeEngine)
-    assert env.tasks == ("stack-cups",)
-    assert env.observation_spec["task_id"].is_in(env.reset()["task_id"])
-    env.close()
-
-
 def test_episodes_of_a_custom_task_have_noise():
     env = lw.LanguageWorldEnv([STACK, "push"], seed=4, max_steps=5, engine=FakeEngine)
     episodes = run_episodes(

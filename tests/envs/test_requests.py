@@ -45,13 +45,6 @@ def test_resets_in_a_loop_start_the_next_episodes(any_env):
     assert seen == [[0, 0, 0, 1, 1, 1], [2, 2, 2, 3, 3, 3], [4, 4, 4, 5, 5, 5]]
 
 
-def test_a_partial_reset_starts_the_next_episode(any_env):
-    any_env.set_seed(3)
-    state = any_env.reset()
-    state = any_env.reset(state.clone().set("_reset", ~others(1)))
-    assert state["episode"].tolist() == [0, 2, 0, 1, 1, 1]
-
-
 def test_a_rollout_from_a_state_starts_the_next_episodes(any_env):
     any_env.set_seed(3)
     last = any_env.rollout(STEPS)[:, -1]["next"]
@@ -134,11 +127,6 @@ def test_a_wrong_episode_is_an_error(any_env, episode):
         any_env.reset(episode=episode)
     assert any_env.reset()["episode"].tolist() == [2, 2, 2, 3, 3, 3], "the error must not count as a reset"
     assert state["episode"].tolist() == [0, 0, 0, 1, 1, 1]
-
-
-def test_a_misspelt_argument_is_an_error(any_env):
-    with pytest.raises(TypeError, match="episodes"):
-        any_env.reset(episodes=3)
 
 
 @pytest.mark.parametrize("mask", [torch.tensor([1, 0]), torch.tensor([1.0, 0.0]), torch.ones(2, 2, dtype=torch.bool)])

@@ -44,13 +44,6 @@ def test_another_process_draws_the_same_numbers(python):
     assert python(program, PYTHONHASHSEED="1").stdout.strip() == here
 
 
-def test_episodes_have_different_seeds():
-    triples = [(task, seed, episode) for task in lw.MT50 for seed in range(-3, 20) for episode in range(20)]
-    seeds = [episode_seed(*triple) for triple in triples]
-    assert len(set(seeds)) == len(triples)
-    assert all(0 <= seed < 2**63 for seed in seeds)
-
-
 @given(TRIPLES, TRIPLES)
 @settings(max_examples=100, deadline=None)
 def test_different_triples_have_different_seeds_and_noise(left, right):

@@ -12,7 +12,7 @@ from speed import first_fast
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, EnvBase, EnvCreator, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import Compose, EnvBase, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
 import lw_torchrl as lw
 
@@ -150,15 +150,6 @@ def test_a_collector_of_a_plain_environment_saves_no_state():
     first.shutdown()
 
 
-def test_an_env_creator_uses_no_episode():
-    plain = make_transformed()
-    expected = plain.reset()["episode"]
-    plain.close()
-    env = EnvCreator(make_transformed)()
-    assert torch.equal(env.reset()["episode"], expected)
-    env.close()
-
-
 @pytest.mark.parametrize(("tasks", "num_envs"), [(TASKS, 4), (["push", "sweep"], 3)])
 def test_a_state_of_other_rows_is_an_error(tasks, num_envs):
     env, foreign = make_env(), lw.LanguageWorldEnv(tasks, num_envs=num_envs, num_threads=1)
@@ -196,14 +187,6 @@ def test_a_transform_of_a_buffer_has_no_environments_state():
     with pytest.raises(ValueError, match="lacks an environment's episodes"):
         env.transform[0].load_state_dict(state)
     env.close()
-
-
-def test_the_state_of_a_closed_batch_warns():
-    env = MAKERS["outside"]()
-    env.reset()
-    env.close()
-    with pytest.warns(UserWarning, match="this SerialEnv is not running"):
-        env.state_dict()
 
 
 @pytest.mark.parametrize("copier", [copy.copy, copy.deepcopy, pickle.dumps], ids=lambda f: f.__name__)

@@ -37,13 +37,6 @@ def test_partial_resets_change_only_their_rows(any_env):
     assert state["done"].flatten().tolist() == (~mask).tolist(), "rows that were reset count their own steps"
 
 
-def test_an_empty_reset_mask_changes_nothing(env):
-    env.set_seed(0)
-    state = env.rand_step(env.reset())["next"]
-    again = env.reset(state.clone().set("_reset", torch.zeros(ROWS, dtype=torch.bool)))
-    assert same(state.exclude("reward"), again)
-
-
 @pytest.mark.parametrize("shape", [(ROWS,), (ROWS, 1)], ids=str)
 def test_rows_outside_a_step_mask_do_not_move(any_env, shape):
     """Rows that pause, even with NaN actions, run as rows that do not."""
@@ -216,18 +209,6 @@ def test_writes_to_a_state_do_not_change_the_environment(env):
     assert same(kept.select(*STATE), resting)
 
 
-def test_a_rollout_equals_its_steps(any_env):
-    any_env.set_seed(9)
-    torch.manual_seed(0)
-    rollout = any_env.rollout(STEPS)
-    any_env.set_seed(9)
-    state = any_env.reset()
-    for step in range(STEPS):
-        assert torch.equal(state["observation"], rollout["observation"][:, step])
-        state = advance(any_env, state, rollout["action"][:, step])
-        assert same(state, rollout["next"][:, step])
-
-
 @pytest.mark.parametrize("transformed", [False, True])
 def test_a_collector_collects_the_same_as_a_rollout(plans, transformed):
     base = lw.LanguageWorldEnv(FEW, num_envs=ROWS, seed=9, max_steps=STEPS)
@@ -244,21 +225,6 @@ def test_a_collector_collects_the_same_as_a_rollout(plans, transformed):
     assert batches["next", "done"].sum() == ROWS
     assert batches["collector", "traj_ids"].unique().numel() == 2 * ROWS
     assert base.is_closed, "the collector must close its environment"
-
-
-def test_a_collector_gives_whole_episodes():
-    env = lw.LanguageWorldEnv(FEW, num_envs=ROWS, seed=9, max_steps=STEPS)
-    collector = Collector(
-        env, row_policy(), frames_per_batch=2 * ROWS, total_frames=24 * ROWS, trajs_per_batch=4, traj_format="cat"
-    )
-    batches = list(collector)
-    collector.shutdown()
-    assert len(batches) == 3
-    for batch in batches:
-        assert batch.batch_size == (4 * STEPS,)
-        assert batch["next", "done"].nonzero()[:, 0].tolist() == [STEPS * k - 1 for k in range(1, 5)]
-    pairs = [(b["task_id"][k].item(), b["episode"][k].item()) for b in batches for k in range(0, 48, STEPS)]
-    assert sorted(pairs) == sorted((lw.task_id(task), episode) for task in FEW for episode in range(4))
 
 
 def row_policy():

@@ -130,7 +130,7 @@ MAKERS = {
 @pytest.mark.parametrize("name", MAKERS)
 @pytest.mark.parametrize(
     "policy",
-    [lw.PlanConditionedActor, lw.ScriptedSkillActor, lambda plans: lw.DescriptorConditionedActor(tuple(plans))],
+    [lw.PlanConditionedActor, lw.ScriptedSkillActor, lambda plans: lw.modules.DescriptorConditionedActor(tuple(plans))],
     ids=["plan", "scripted", "description"],
 )
 @pytest.mark.slow

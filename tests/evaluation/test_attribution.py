@@ -275,7 +275,7 @@ def test_a_policy_that_cannot_follow_the_reference_causes_a_warning():
         def forward(self, tensordict):
             return self.actor(tensordict)
 
-    with pytest.warns(UserWarning, match="the policy cannot carry it out"):
+    with pytest.warns(UserWarning, match="the policy cannot follow it"):
         [failure] = evaluated(Fixed(), reference=REFERENCE, max_steps=20).failures
     assert "plan" not in failure.counterfactuals
 

@@ -42,7 +42,9 @@ def test_the_shipped_policy_succeeds():
 
 def test_a_file_with_the_shipped_policys_name_takes_precedence(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    lw.save_actor(lw.DescriptorConditionedActor("reach", decoder=lw.modules.MLPDecoder(width=8)), tmp_path / SHIPPED)
+    lw.save_actor(
+        lw.modules.DescriptorConditionedActor("reach", decoder=lw.modules.MLPDecoder(width=8)), tmp_path / SHIPPED
+    )
     assert lw.load_actor(SHIPPED).tasks == ("reach",)
     with pytest.raises(FileNotFoundError, match="did you mean the shipped policy 'few-shot-mt50'"):
         lw.load_actor("few-shot-mt5")
@@ -74,7 +76,7 @@ def test_the_shipped_policys_card_has_its_own_result_and_citation():
 
 def test_a_policy_without_metadata_has_a_card(result, tmp_path):
     path = tmp_path / "a: [b] 'c.safetensors"
-    member = lw.DescriptorConditionedActor("reach", decoder=lw.modules.MLPDecoder(width=8))
+    member = lw.modules.DescriptorConditionedActor("reach", decoder=lw.modules.MLPDecoder(width=8))
     lw.save_actor(lw.modules.ActorEnsemble([member, member]), path)
     card = policy_card(path)
     assert "Not measured." in str(card)

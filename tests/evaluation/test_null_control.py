@@ -101,7 +101,9 @@ def test_the_wrong_part_of_the_action_is_found(task, done, cause):
 
 def test_a_failure_of_a_policy_without_plans_has_no_step():
     torch.manual_seed(0)
-    actor = lw.DescriptorConditionedActor(TASK, condition="one-hot", decoder=lw.modules.MLPDecoder(width=8, depth=1))
+    actor = lw.modules.DescriptorConditionedActor(
+        TASK, condition="one-hot", decoder=lw.modules.MLPDecoder(width=8, depth=1)
+    )
     result = lw.evaluate(
         actor, tasks=TASK, plans=PLANS, episodes_per_task=1, stop_at_success=True, attribute=True, **RUN
     )

@@ -315,9 +315,8 @@ def test_a_file_that_is_not_a_result_is_refused(tmp_path, name):
 
 
 def test_the_recorded_version_is_that_of_the_running_code(monkeypatch):
-    monkeypatch.setattr(
-        "lw_torchrl._util.reproducibility.version", lambda name: "0.0.1"
-    )  # as an old editable install says
+    # An old editable install reports the version that it was installed with.
+    monkeypatch.setattr("lw_torchrl._util.reproducibility.version", lambda name: "0.0.1")
     versions = package_versions()
     assert versions["lw_torchrl"] == lw_torchrl.__version__
     assert versions["torch"] == "0.0.1"

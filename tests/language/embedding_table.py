@@ -1,4 +1,4 @@
-"""The shipped vectors: ``python tests/language/embedding_table.py`` writes them anew, where a shipped text changed."""
+"""Write the shipped text vectors again after a shipped text changed: ``python tests/language/embedding_table.py``."""
 
 from pathlib import Path
 

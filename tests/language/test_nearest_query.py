@@ -1,6 +1,5 @@
-"""nearest_query: any text becomes a query of the task, and one that is a query stays as it is."""
+"""nearest_query: any text matches a query of the task, and a query matches itself."""
 
-import dataclasses
 import statistics
 import time
 
@@ -9,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lw_torchrl.language import nearest
-from lw_torchrl.language.nearest import QueryMatch, nearest_query
+from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
 from lw_torchrl.language.tasks import MT50
 
@@ -50,7 +49,7 @@ def test_any_text_has_a_nearest_query(text, task):
 
 @settings(max_examples=80, deadline=None)
 @given(st.data(), tasks)
-def test_a_text_that_is_a_query_is_found_as_it_is(data, task):
+def test_a_query_matches_itself(data, task):
     picked = data.draw(st.lists(st.sampled_from(supported_queries(task)), min_size=1, max_size=3))
     match = nearest_query(" and ".join(picked), task)
     assert str(match.query) == " and ".join(picked)
@@ -58,15 +57,9 @@ def test_a_text_that_is_a_query_is_found_as_it_is(data, task):
     assert [str(part.query) for part in match.parts] == picked
 
 
-def test_a_query_that_is_answered_and_not_listed_keeps_its_meaning():
-    match = nearest_query("puck around gripper", "push")
-    assert (str(match.query), match.score) == ("the puck is around the robot's gripper", 1.0)
-    assert str(nearest_query("Isn't the gripper open?", "push").query) == "the robot's gripper is not open"
-
-
 @settings(max_examples=80, deadline=None)
 @given(st.data(), tasks)
-def test_one_wrong_letter_is_forgiven(data, task):
+def test_a_misspelt_query_matches_the_query_that_is_meant(data, task):
     meant = data.draw(st.sampled_from([text for text in supported_queries(task) if " above " in text]))
     text = meant.replace("above", data.draw(st.sampled_from(["abov", "abbove", "aboove", "abve"])))
     match = nearest_query(text, task)
@@ -90,7 +83,7 @@ def test_one_wrong_letter_is_forgiven(data, task):
          "the puck is near the robot's gripper and the puck is above the target location"),
     ],
 )  # fmt: skip
-def test_what_people_write(text, task, expected):
+def test_free_form_conditions(text, task, expected):
     match = nearest_query(text, task)
     assert str(match.query) == expected
     assert 0.5 < match.score < 1.0
@@ -109,24 +102,21 @@ def test_what_people_write(text, task, expected):
         ("no, the gripper is not not hovering above the puck", True),
     ],
 )
-def test_a_negation_stays_one(text, negated, by):
+def test_a_negation_matches_a_negation(text, negated, by):
     query = nearest_query(text, "push", by=by).query
     assert [(clause.predicate, clause.negated) for clause in query.clauses] == [("above", negated)]
 
 
-def test_parts_say_what_was_taken_for_what():
+def test_each_part_has_its_match():
     match = nearest_query("the gripper is open and  not abov the puck", "push")
     assert [part.text for part in match.parts] == ["the gripper is open", "not abov the puck"]
     assert str(match.parts[0].query) == "the robot's gripper is open"
     assert match.parts[0].score == 1.0
     assert str(match.parts[1].query) == "the robot's gripper is not above the puck"
     assert 0.5 < match.parts[1].score < 1.0
-    assert isinstance(match, QueryMatch)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        match.score = 1.0
 
 
-def test_by_embedding_finds_the_meaning_and_encodes_a_tasks_list_once(monkeypatch):
+def test_an_embedding_matches_the_meaning_and_a_task_s_queries_are_encoded_once(monkeypatch):
     sizes = []
     encode = nearest.sentence_vectors
     monkeypatch.setattr(nearest, "sentence_vectors", lambda texts: sizes.append(len(texts)) or encode(texts))
@@ -134,8 +124,8 @@ def test_by_embedding_finds_the_meaning_and_encodes_a_tasks_list_once(monkeypatc
     match = nearest_query("Has the gripper arrived at the reach target?", "reach", by="embedding")
     assert str(match.query) == "the robot's gripper is near the reach target"
     assert 0.3 < match.score < 1.0
-    for said in ("the goal was reached", "", "\ud800", "and", "the gripper is open and where it should be"):
-        again = nearest_query(said, "reach", by="embedding")
+    for text in ("the goal was reached", "", "\ud800", "and", "the gripper is open and where it should be"):
+        again = nearest_query(text, "reach", by="embedding")
         assert parse_query(str(again.query), "reach") == again.query
         assert 0.0 <= again.score <= 1.0
     assert sum(size > 1 for size in sizes) == 1
@@ -146,14 +136,7 @@ def test_a_query_needs_no_text_model(monkeypatch):
     assert nearest_query("gripper open", "push", by="embedding").score == 1.0
 
 
-def test_a_wrong_way_or_task_names_the_nearest():
-    with pytest.raises(ValueError, match="did you mean 'edit'"):
-        nearest_query("gripper open", "push", by="edits")
-    with pytest.raises(ValueError, match="'push'"):
-        nearest_query("gripper open", "psuh")
-
-
-def test_a_tasks_whole_list_is_searched_within_two_milliseconds():
+def test_a_search_of_all_queries_takes_less_than_two_milliseconds():
     longest = max(MT50, key=lambda task: len(supported_queries(task)))
     text = "the gripper touches the puck"
     nearest_query(text, longest)
@@ -168,7 +151,7 @@ def test_a_tasks_whole_list_is_searched_within_two_milliseconds():
 @pytest.mark.parametrize(
     "text", ["x" * 200_000, "and " * 50_000, "the gripper is open and " * 63 + "moon " * 40_000, "not " * 50_000]
 )
-def test_a_very_long_text_is_answered_soon(text):
+def test_a_very_long_text_is_matched_in_time(text):
     started = time.perf_counter()
     nearest_query(text, "stick-pull")
     assert time.perf_counter() - started < 5.0

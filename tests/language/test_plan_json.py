@@ -1,4 +1,4 @@
-"""Plans as JSON with the tasks they speak of, and their fingerprint."""
+"""Plans as JSON with their tasks, and their fingerprint."""
 
 import json
 import random
@@ -29,17 +29,17 @@ def moved(shift):
     return Task("push", "Push it.", (*TASKS["push"].objects, edge))
 
 
-def test_what_counts_and_what_does_not():
+def test_the_fingerprint_depends_on_queries_skills_and_objects():
     plans = of()
     reasons = [replace(step, reason="why") for step in plans["push"].steps]
     words = Task("push", "Other words.", TASKS["push"].objects)
     same = [
         of(),
-        Plans([ConditionalPlan("push", reasons)]),
+        Plans([ConditionalPlan("push", tuple(reasons))]),
         of(words),
         of(pairs=[("gripper near puck", "wait"), PUSH[1]]),
     ]
-    assert {one.fingerprint for one in same} == {plans.fingerprint}
+    assert {each.fingerprint for each in same} == {plans.fingerprint}
     assert len(plans.fingerprint) == 32
     int(plans.fingerprint, 16)
     reach = ConditionalPlan.from_pairs("reach", PUSH[1:])
@@ -55,16 +55,16 @@ def test_what_counts_and_what_does_not():
         Plans({"push": plans["push"], "reach": reach}),
         Plans({"push": plans["push"], "reach": sweep}),
     ]
-    assert len({one.fingerprint for one in [plans, *other]}) == len(other) + 1
+    assert len({each.fingerprint for each in [plans, *other]}) == len(other) + 1
 
 
-def test_the_meaning_of_the_relations_used_counts():
+def test_the_fingerprint_depends_on_the_meaning_of_the_used_relations():
     before, reach = of().fingerprint, of("reach", PUSH[1:]).fingerprint
     near = RELATIONS["near"]
     RELATIONS["near"] = (Comparison("xyz", "<", 0.05),)
     try:
         assert of().fingerprint != before
-        assert of("reach", PUSH[1:]).fingerprint == reach  # does not speak of it
+        assert of("reach", PUSH[1:]).fingerprint == reach  # it does not use "near"
     finally:
         RELATIONS["near"] = near
     assert of().fingerprint == before
@@ -77,7 +77,7 @@ def test_the_fingerprint_is_the_same_in_every_process(python):
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**31))
-def test_plans_come_back_with_their_tasks_and_answer_alike(seed):
+def test_plans_from_json_have_the_same_tasks_and_answers(seed):
     rng = random.Random(seed)
     tasks = [
         *rng.sample(list(TASKS.values()), 3),
@@ -89,12 +89,12 @@ def test_plans_come_back_with_their_tasks_and_answer_alike(seed):
         pairs = [(q, rng.choice(["wait", "place the gripper"])) for q in rng.choices(lw.supported_queries(task), k=3)]
         listed.append(ConditionalPlan.from_pairs(task, pairs[: rng.randint(1, 3)]))
     plans = Plans(listed)
-    told = json.loads(json.dumps(plans.to_json(), allow_nan=False))
-    found = Plans.from_json(told)
+    rows = json.loads(json.dumps(plans.to_json(), allow_nan=False))
+    found = Plans.from_json(rows)
     assert found == plans
     assert [plan.definition for plan in found.values()] == [plan.definition for plan in plans.values()]
     assert found.fingerprint == plans.fingerprint
-    assert ["task" in entry for entry in told.values()] == [p.definition != TASKS.get(p.task) for p in plans.values()]
+    assert ["task" in row for row in rows.values()] == [p.definition != TASKS.get(p.task) for p in plans.values()]
     ids = torch.tensor([lw.task_id(task) for task in plans])
     states = torch.rand(len(ids), 39)
     assert torch.equal(plan_program(found)(states, ids), plan_program(plans)(states, ids))
@@ -104,7 +104,7 @@ GOOD = Plans([ConditionalPlan.from_pairs(moved(0.1), PUSH)]).to_json()
 
 
 @pytest.mark.parametrize(
-    ("found", "says"),
+    ("rows", "message"),
     [
         ({"pusch": {"plan": "def pusch(robot):"}}, "did you mean 'push'"),
         ({"../push": {"plan": "", "task": GOOD["push"]["task"]}}, "lower-case words"),
@@ -112,14 +112,14 @@ GOOD = Plans([ConditionalPlan.from_pairs(moved(0.1), PUSH)]).to_json()
         ({"push": {"plan": str(MT10_PLANS["reach"])}}, "'reach' is not a task"),
         ({"push": {"plan": "def push(robot):\n  if check('\ud800'):"}}, "line 2"),
         ({"push": {"plan": "x" * 10**5}}, "line 1"),
-        ({"push": {"plan": "x" * 10**6}}, "at most 262144 characters, got 1000000"),
+        ({"push": {"plan": "x" * 10**6}}, "262144 characters"),
         ({3: {"plan": ""}}, "plan of 3"),
         ({("push",): {"plan": ""}}, "plan of"),
     ],
 )
-def test_json_of_no_plan_says_what_is_wrong(found, says):
-    with pytest.raises(PlanError, match=says) as caught:
-        Plans.from_json(found)
+def test_faulty_json_is_refused(rows, message):
+    with pytest.raises(PlanError, match=message) as caught:
+        Plans.from_json(rows)
     assert len(str(caught.value)) < 1000
 
 

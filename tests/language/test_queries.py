@@ -1,6 +1,5 @@
-"""The query language: every spelling, the published list, and errors that say where and what else."""
+"""The query language: every spelling, the published list, and errors that point at a word and name the nearest."""
 
-import re
 import time
 
 import language_world as oracle
@@ -8,7 +7,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from lw_torchrl.language import queries
 from lw_torchrl.language.nearest import nearest_query
 from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.language.queries import ARTICLES, Clause, Query, QueryError, check_query, parse_query, supported_queries
@@ -71,8 +69,8 @@ def without_articles(text):
 
 @settings(deadline=None)
 @given(task_queries())
-def test_the_canonical_spelling_parses_to_the_same_query(given):
-    task, query = given
+def test_the_canonical_spelling_parses_to_the_same_query(drawn):
+    task, query = drawn
     assert parse_query(str(query), task) == query
     assert str(parse_query(str(query), task)) == str(query)
     assert parse_query(str(query), TASKS[task]) == query
@@ -80,8 +78,8 @@ def test_the_canonical_spelling_parses_to_the_same_query(given):
 
 @settings(max_examples=120, deadline=None)
 @given(spelled())
-def test_every_spelling_parses_to_the_same_query(given):
-    task, query, text = given
+def test_every_spelling_parses_to_the_same_query(drawn):
+    task, query, text = drawn
     assert parse_query(text, task) == query
 
 
@@ -120,7 +118,7 @@ def test_the_supported_queries_are_the_published_ones(task):
         assert without_articles(str(parse_query(text, task))) == without_articles(text)
 
 
-def test_around_is_listed_with_the_gripper_first_alone_but_answered_either_way():
+def test_around_is_listed_only_with_the_gripper_first_but_parsed_either_way():
     assert "the robot's gripper is around the puck" in supported_queries("push")
     assert "the puck is around the robot's gripper" not in supported_queries("push")
     assert str(parse_query("puck around gripper", "push")) == "the puck is around the robot's gripper"
@@ -129,19 +127,6 @@ def test_around_is_listed_with_the_gripper_first_alone_but_answered_either_way()
     assert str(parse_query("the gripper isn't touching the table", "push")) == (
         "the robot's gripper is not touching the table"
     )
-
-
-@pytest.mark.parametrize(
-    "text", ["the gripper is open and around the drawer", "the gripper is closed and around the drawer"]
-)
-def test_the_papers_drawer_that_is_no_object_names_the_drawer_handle(text):
-    # drawer-open names a drawer handle; the paper's last two rows say "the drawer".
-    with pytest.raises(QueryError) as caught:
-        parse_query(text, "drawer-open")
-    message = str(caught.value)
-    assert "'the drawer handle'" in message
-    assert any(f"nearest query is {listed!r}" in message for listed in supported_queries("drawer-open"))
-    assert "around the drawer handle" in message
 
 
 VOCABULARY = sorted({
@@ -198,7 +183,7 @@ def test_any_text_is_a_query_or_a_query_error(text, task):
     ],
     ids=["letters", "articles", "ands", "parentheses", "clauses", "negations", "spaces", "marks"],
 )
-def test_a_very_long_text_fails_soon(text):
+def test_a_very_long_text_fails_in_time(text):
     started = time.perf_counter()
     with pytest.raises(QueryError):
         parse_query(text, "stick-pull")
@@ -214,22 +199,6 @@ def test_a_query_has_at_most_64_clauses():
         nearest_query("grip open" + " and no above stick" * 64, "stick-pull")
 
 
-LISTED = queries.base_clauses
-
-
-def test_an_error_of_a_task_with_many_objects_compares_few_queries(monkeypatch):
-    compared = []
-    monkeypatch.setattr(queries, "base_clauses", lambda task, _: compared.append(task.objects) or LISTED(task, _))
-    names = [f"{one} {other}" for one in ("left", "right", "red") for other in ("cup", "lid", "box", "jar", "pan")]
-    named = [GRIPPER, *names]
-    task = Task("mine", "Mine.", tuple(NamedObject(name, (4, 5, 6)) for name in named))
-    with pytest.raises(QueryError, match="nearest query is 'the red jar is above the left pan'"):
-        parse_query("the red jar is abofe the left pan", task)
-    with pytest.raises(QueryError, match="nearest query is 'the right lid is near the red cup'"):
-        parse_query("the right lit is near the red cup", task)
-    assert [len(objects) for objects in compared] == [8, 8]
-
-
 GRIPPER_ABOVE = "the robot's gripper is above the puck"
 PUCK_NEAR = "the puck is near the robot's gripper"
 
@@ -237,7 +206,7 @@ PUCK_NEAR = "the puck is near the robot's gripper"
 @pytest.mark.parametrize(
     ("text", "task", "at", "expected", "near"),
     [
-        ("the gripper is abov the puck", "push", "'abov'", "'above'", GRIPPER_ABOVE),
+        ("the gripper is abov the puck", "push", "'abov' (word 4)", "'above'", GRIPPER_ABOVE),
         ("the gripper is above the duck", "push", "'duck'", "'the puck'", GRIPPER_ABOVE),
         ("the duck is near the gripper", "push", "'duck'", "'the puck'", PUCK_NEAR),
         ("the puck is open", "push", "'open'", "only the gripper", None),
@@ -255,33 +224,23 @@ PUCK_NEAR = "the puck is near the robot's gripper"
         ("", "push", "its end", "a condition", None),
         ("the gripper is holding the puck", "push", "'holding'", "'around'", None),
         ("the gripper is above the puck", "drawer-open", "'puck'", "'the drawer handle'", None),
+        ("the the gripper is open", "push", "'the' (word 2)", "'the puck'", None),
+        ("the gripper is open and the puck is is near the gripper", "push", "'is' (word 4)", "'near'", None),
+        # drawer-open names a drawer handle; the paper's last two rows say "the drawer".
+        ("gripper is open and around the drawer", "drawer-open", "'drawer'", "'the drawer handle'",
+         "the robot's gripper is around the drawer handle"),
     ],
 )  # fmt: skip
 def test_an_error_points_at_the_word_and_names_the_nearest(text, task, at, expected, near):
     with pytest.raises(QueryError) as caught:
         parse_query(text, task)
     message = str(caught.value)
-    assert isinstance(caught.value, ValueError)
-    assert f"at {at} in" in message or re.search(rf"at {re.escape(at)} \(word \d+\) in", message)
+    assert f"at {at}" in message
     assert expected in message
     assert repr(text) in message
     assert repr(task) in message
     if near is not None:
         assert f"nearest query is {near!r}" in message
-
-
-@pytest.mark.parametrize(
-    ("text", "word"),
-    [
-        ("the gripper is abov the puck", 4),
-        ("the the gripper is open", 2),
-        ("gripper is near the puck the puck", 6),
-        ("the gripper is open and the puck is is near the gripper", 4),
-    ],
-)
-def test_an_error_says_which_word_of_its_clause(text, word):
-    with pytest.raises(QueryError, match=rf"\(word {word}\) in"):
-        parse_query(text, "push")
 
 
 def test_the_nearest_query_of_a_clause_without_subject_is_about_the_one_before():
@@ -317,13 +276,6 @@ def test_a_query_is_checked_against_its_task():
             check_query(wrong, "push")
 
 
-def test_queries_can_be_compared_hashed_and_not_changed():
-    query = parse_query("the gripper is open", "reach")
-    assert {query, parse_query("Gripper open?", "push")} == {query}
-    with pytest.raises(AttributeError):
-        query.clauses = ()
-
-
 words = st.sampled_from(
     ["a", "an", "isn't", "open", "near", "above", "gripper", "robot", "touching", "box", "lid", "x-1"]
 )
@@ -332,7 +284,7 @@ own_names = st.lists(words, min_size=1, max_size=3).map(" ".join)
 
 @settings(max_examples=80, deadline=None)
 @given(data=st.data(), names=st.lists(own_names.filter(lambda n: n != GRIPPER), min_size=1, max_size=4, unique=True))
-def test_the_objects_of_a_task_of_ones_own_may_have_any_allowed_name(data, names):
+def test_the_objects_of_a_custom_task_may_have_any_allowed_name(data, names):
     named = (NamedObject(GRIPPER, (0, 1, 2)), *(NamedObject(name, (4, 5, 6)) for name in names))
     task = Task("mine", "Mine.", named)
     query = Query(tuple(data.draw(st.lists(clauses(task), min_size=1, max_size=3))))

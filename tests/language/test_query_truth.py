@@ -78,7 +78,7 @@ OTHERS = [pytest.param(task, marks=pytest.mark.slow) for task in MT50 if task !=
 def test_the_truth_is_the_oracles_on_random_states(task):
     states = random_states(task)
     expected = agree(task, states, slice(DIRECT))
-    # The states must tell: each query is true in some and false in others.
+    # Each query is true in some of the states and false in others.
     published = oracle.enumerate_base_queries(task)
     constant = [published[i] for i in np.flatnonzero(expected.all(0) | ~expected.any(0))]
     assert not constant
@@ -101,7 +101,7 @@ def test_every_pair_of_clauses_is_the_and_of_its_clauses():
     np.testing.assert_array_equal(found, np.stack([expected[:, a] & expected[:, b] for a, b in pairs], 1))
 
 
-def test_queries_that_are_answered_and_not_listed():
+def test_queries_that_are_parsed_but_not_listed():
     # Touching for any object, around either way, the negations of open and closed.
     task = "pick-place-wall"
     states = random_states(task, seed=2)
@@ -134,7 +134,7 @@ def test_queries_that_are_answered_and_not_listed():
         ("gripper not near puck", {"hand": [0.04, 0.0, 0.0]}, True),
     ],
 )
-def test_at_the_threshold_itself_float32_answers_as_published(query, at, expected):
+def test_on_the_threshold_float32_answers_as_published(query, at, expected):
     state = observation(**at)
     assert QueryProgram({"push": [query]})(state, torch.tensor(task_id("push"))).tolist() == [expected]
     text = str(parse_query(query, "push"))

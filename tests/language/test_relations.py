@@ -1,22 +1,24 @@
-"""What the 13 relations mean, against the published formulas written out in plain Python."""
+"""The meaning of relations: the 13 published formulas, custom relations, and points that we named."""
 
 import math
 import re
 from pathlib import Path
 
+import language_world as oracle
 import numpy as np
 import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from states import comparison_holds, relation_holds
+from states import comparison_holds, random_states, relation_holds
 
 from lw_torchrl.language.nearest import nearest_query
+from lw_torchrl.language.objects import GRIPPER, NamedObject
 from lw_torchrl.language.plans import ConditionalPlan
 from lw_torchrl.language.queries import QueryError, parse_query, supported_queries
 from lw_torchrl.language.query_program import QueryProgram
 from lw_torchrl.language.relations import PREDICATES, PUBLISHED, RELATIONS, TOUCHING, UNARY, Comparison
-from lw_torchrl.language.tasks import task_id
+from lw_torchrl.language.tasks import MT50, TASKS, Task, task_id
 
 # Every relation as (value, sense, threshold) on d = first - second in metres, from the published semantics.
 FORMULAS = {
@@ -69,7 +71,7 @@ def test_a_relation_is_its_formula(relation, second, displacement):
 @pytest.mark.parametrize("pair", [("left of", "right of"), ("behind", "in front of"), ("above", "below")])
 @settings(deadline=None)
 @given(second=positions, displacement=displacements, dtype=st.sampled_from([torch.float32, torch.float64]))
-def test_opposites_swap_and_never_hold_together(pair, second, displacement, dtype):
+def test_opposites_swap_and_are_never_both_true(pair, second, displacement, dtype):
     first = moved(second, displacement)
     for one, other in (pair, pair[::-1]):
         forth = holds(one, first, second, dtype)
@@ -93,14 +95,7 @@ def test_the_unary_predicates_compare_one_number(name, inside, outside):
             assert comparison_holds(comparison, torch.tensor([9.0, -9.0, value])).item() is expected
 
 
-@settings(deadline=None)
-@given(opening=st.floats(0, 1, width=32))
-def test_open_and_closed_are_complements(opening):
-    at = torch.tensor([0.0, 0.0, opening])
-    assert comparison_holds(UNARY["open"][0], at).item() is not comparison_holds(UNARY["closed"][0], at).item()
-
-
-def test_the_senses_differ_at_the_threshold_itself():
+def test_senses_differ_on_the_threshold():
     at = torch.tensor([0.5, 0.0, 0.0])
     found = {
         sense: comparison_holds(Comparison("x", sense, 0.5, length=False), at).item() for sense in ("<", ">", "<=")
@@ -115,7 +110,7 @@ def written(part, opening):
     return f"{value} {part.sense} {part.threshold:g}{raised}"
 
 
-def test_the_page_on_queries_says_every_threshold():
+def test_the_page_on_queries_has_every_threshold():
     page = (Path(__file__).parents[2] / "docs" / "queries.md").read_text("utf-8")
     table = page[page.index("| predicate | holds where |") :].split("\n\n")[0]
     rows = dict(re.findall(r"^\| ([a-z ]+) \| ([^|]+) \|$", table, re.MULTILINE))
@@ -161,7 +156,7 @@ def own():
 
 
 @pytest.mark.parametrize("name", OWN)
-def test_a_relation_of_ones_own_is_compiled_with_all_its_comparisons(own, name):
+def test_a_custom_relation_is_compiled_with_all_its_comparisons(own, name):
     first = torch.randn(400, 3, generator=torch.Generator().manual_seed(0)) * 0.1
     states = torch.zeros(400, 39)
     states[:, 0:3] = first
@@ -178,7 +173,7 @@ def test_a_relation_of_ones_own_is_compiled_with_all_its_comparisons(own, name):
     assert torch.equal(relation_holds(name, first, torch.zeros(3)), expected)
 
 
-def test_whatever_is_made_of_the_relations_sees_what_is_added_and_taken_away():
+def test_a_custom_relation_is_listed_parsed_and_matched_until_it_is_removed():
     before = supported_queries("push")
     text = "the robot's gripper is beside the puck"
     assert text not in before
@@ -205,21 +200,90 @@ def test_whatever_is_made_of_the_relations_sees_what_is_added_and_taken_away():
 
 
 @pytest.mark.parametrize(
-    ("name", "parts", "says"),
+    ("name", "parts", "message"),
     [
         ("Beside", OWN["beside"], "lower-case words"),
-        ("", OWN["beside"], "lower-case words"),
         (" beside", OWN["beside"], "lower-case words"),
         (3, OWN["beside"], "lower-case words"),
         ("open", OWN["beside"], "own meaning"),
         ("not near", OWN["beside"], "own meaning"),
-        ("near and dear to", OWN["beside"], "'and' has its own meaning"),
+        ("near and dear to", OWN["beside"], "'and'"),
         ("beside", (), "at least one"),
         ("beside", OWN["beside"][0], "tuple of Comparison"),
         ("beside", ("xy < 0.1",), "tuple of Comparison"),
     ],
 )
-def test_a_relation_that_no_query_could_have_is_refused(name, parts, says):
-    with pytest.raises(ValueError, match=says):
+def test_a_faulty_relation_is_refused(name, parts, message):
+    with pytest.raises(ValueError, match=message):
         RELATIONS[name] = parts
     assert tuple(RELATIONS) == PUBLISHED
+
+
+# ---- points
+
+metres = st.floats(-0.2, 0.2)
+
+
+def with_points(name, offset=(0.03, -0.1, 0.02)):
+    """Return the published task with two points: one on its last object, one at a fixed place."""
+    task = TASKS[name].published
+    beside = NamedObject("place beside it", task.objects[-1].position, offset, ours=True)
+    fixed = NamedObject("fixed place", (0.1, 0.7, 0.15), ours=True)
+    return Task(name, task.description, (*task.objects, beside, fixed))
+
+
+def states_of(name, n=100):
+    return torch.from_numpy(random_states(name, seed=21, n=n)).double(), torch.full((n,), task_id(name))
+
+
+@pytest.mark.parametrize("name", MT50)
+def test_published_only_lists_no_points(name):
+    task, published = with_points(name), supported_queries(TASKS[name], published_only=True)
+    assert supported_queries(task, published_only=True) == published
+    assert supported_queries(task.published) == published
+    assert len(published) == len(oracle.enumerate_base_queries(name))
+    everything = supported_queries(task)
+    assert set(published) < set(everything)
+    assert [text for text in everything if "place" not in text] == list(published)
+    for text in ("the robot's gripper is near the fixed place", "the fixed place is not above the place beside it"):
+        assert text in everything
+    assert "the fixed place is touching the table" not in everything
+    assert all(str(parse_query(text, task)) == text for text in everything)
+
+
+def test_points_do_not_change_the_truth_of_published_queries():
+    for name in MT50:
+        states, ids = states_of(name)
+        published = list(supported_queries(name, published_only=True))
+        alone = QueryProgram({TASKS[name].published: published})(states, ids)
+        extended = QueryProgram({with_points(name): [*published, "gripper near fixed place"]})(states, ids)
+        assert torch.equal(alone, extended[:, :-1]), name
+        assert torch.equal(alone, QueryProgram({name: published})(states, ids)), name
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.sampled_from(MT50), st.tuples(metres, metres, metres), st.sampled_from(sorted(RELATIONS)))
+def test_queries_use_the_position_of_a_point(name, offset, relation):
+    task = with_points(name, offset)
+    states, ids = states_of(name)
+    at = task.positions(states)
+    based = at[task.objects[-3].name] + torch.tensor(offset, dtype=torch.float64)
+    torch.testing.assert_close(at["place beside it"], based, rtol=0, atol=0)
+    assert at["fixed place"].tolist() == [[0.1, 0.7, 0.15]] * 100
+    pairs = [(GRIPPER, "place beside it"), ("place beside it", GRIPPER), ("fixed place", "place beside it")]
+    answer = QueryProgram({task: [f"the {a} is {relation} the {b}" for a, b in pairs]})(states, ids)
+    for (first, second), found in zip(pairs, answer.unbind(1), strict=True):
+        # Within rounding of a threshold either answer is right.
+        expected = relation_holds(relation, at[first], at[second])
+        moved = [relation_holds(relation, at[first] + x, at[second]) for x in (-1e-9, 1e-9)]
+        sure = (moved[0] == expected) & (moved[1] == expected)
+        assert torch.equal(found[sure], expected[sure])
+
+
+def test_touching_the_table_includes_the_offset():
+    low = NamedObject("low place", (4, 5, 6), (0.0, 0.0, -0.05), ours=True)
+    task = Task("push", "Push it.", (*TASKS["push"].published.objects, low))
+    state = torch.zeros(39)
+    state[6] = 0.06
+    answer = QueryProgram({task: ["puck touching the table", "low place touching the table"]})
+    assert answer(state, torch.tensor(task_id("push"))).tolist() == [False, True]

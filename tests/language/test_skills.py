@@ -1,13 +1,16 @@
-"""The scripted skills: the shipped table, files of one's own, and the nearest to a text."""
+"""Scripted skills: the shipped table, custom files, the nearest to a text, and the batched controller."""
 
+import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 import lw_torchrl as lw
 from lw_torchrl.language.nearest import nearest_skill
 from lw_torchrl.language.objects import GRIPPER
-from lw_torchrl.language.skills import SkillError, load_skills, skills_for
+from lw_torchrl.language.skill_program import SkillProgram
+from lw_torchrl.language.skills import ScriptedSkill, SkillError, load_skills, skills_for
 
 
 def written(tmp_path, text):
@@ -29,7 +32,7 @@ def test_shipped_skills_are_plain_english_and_each_suits_a_task():
             assert skill.for_task(task).text.startswith(text.split()[0])
 
 
-def test_no_shipped_skill_is_idle():
+def test_every_shipped_skill_is_used():
     used = set(lw.load_plans("MT50").skills)
     assert set(load_skills()) == used
 
@@ -41,35 +44,40 @@ def test_a_variant_changes_only_what_it_says():
     assert (here.gain, here.gripper, here.target) == (there.gain, there.gripper, there.target)
 
 
-def test_a_file_of_ones_own_joins_and_replaces(tmp_path):
+def test_a_custom_file_adds_and_replaces_skills(tmp_path):
     path = written(
         tmp_path,
         '["wave the gripper"]\ntarget = "robot\'s gripper"\noffset = [0.1, 0, 0]\ngain = [1, 0, 0]\n'
-        '["place the gripper above the puck"]\ntarget = "puck"\ngripper = -0.5\n',
+        '["place the gripper above the puck"]\ntarget = "puck"\ngripper = -0.5\ngoal = "the gripper is open"\n',
     )
     skills = load_skills(path)
     assert skills["wave the gripper"].gain == (1, 0, 0)
     assert skills["wave the gripper"].target == GRIPPER
-    assert skills["place the gripper above the puck"].gripper == -0.5
+    replaced = skills["place the gripper above the puck"]
+    assert (replaced.gripper, replaced.goal) == (-0.5, "the gripper is open")
     assert load_skills()["place the gripper above the puck"].gripper == -1.0
     assert len(skills) == len(load_skills()) + 1
+
+
+PUSH = '["push it"]\ntarget = "puck"\n'
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("[a", "skills.toml"),
-        ('["push it"]\ngripper = 1.0\n', "'push it' must name a target"),
-        ('["push it"]\ntarget = "puck"\ngriper = 1.0\n', "did you mean 'gripper'"),
-        ('["push it"]\ntarget = "puck"\ngripper = 2.0\n', r"gripper of skill 'push it' must lie in \[-1, 1\], got 2.0"),
-        ('["push it"]\ntarget = "puck"\noffset = [0, 1]\n', "offset of skill 'push it' must be three numbers"),
-        ('["push it"]\ntarget = "puck"\ngain = -1\n', "gain of skill 'push it' must not be negative"),
-        ('["push it"]\ntarget = "puck"\ngain = "much"\n', "gain of skill 'push it' must be three numbers"),
-        ('["push it"]\ntarget = "puck"\noffset = [0, 0, inf]\n', "offset of skill 'push it' must be three numbers"),
+        ('["push it"]\ngripper = 1.0\n', "'push it': target"),
+        (PUSH + "griper = 1.0", "did you mean 'gripper'"),
+        (PUSH + "gripper = 2.0", "'push it': gripper .* 2.0"),
+        (PUSH + "offset = [0, 1]", "'push it': offset"),
+        (PUSH + "offset = [0, 0, inf]", "'push it': offset"),
+        (PUSH + "gain = -1", "'push it': gain"),
+        (PUSH + 'gain = "much"', "'push it': gain"),
+        (PUSH + "goal = 3", "'push it': goal"),
+        (PUSH + "for = 3", "'push it': for"),
         ('["push it".for.pusch]\ntarget = "puck"\n', "did you mean 'push'"),
-        ('"push it" = 3\n', "skill 'push it' must be a table, got 3"),
-        ('["push it"]\ntarget = "puck"\nfor = 3\n', "for of skill 'push it' must map"),
-        ('["push it"]\ntarget = 3\n', "target of skill 'push it' must be the name of an object"),
+        ('"push it" = 3\n', "'push it': .*table, got 3"),
+        ('["push it"]\ntarget = 3\n', "'push it': target"),
     ],
 )
 def test_a_faulty_file_is_refused(tmp_path, text, message):
@@ -104,16 +112,79 @@ def test_any_text_has_a_nearest_skill_that_the_task_can_use(text, task):
     assert 0.0 <= score <= 1.0
 
 
-def test_nearest_skill_wants_words():
-    with pytest.raises(TypeError, match=r"text must be a string, got 3 \(int\)"):
-        nearest_skill(3)
-    with pytest.raises(SkillError, match="no scripted skill suits task 'push'"):
+def test_no_skill_suits_the_task():
+    with pytest.raises(SkillError, match="'push'"):
         nearest_skill("push", "push", {})
 
 
 def test_a_task_can_use_the_skills_of_its_shipped_plan():
-    """Also those whose texts say "front" or "hole", which are things of other tasks."""
+    # Also those with "front" or "hole" in their texts, which are objects of other tasks.
     for name, plan in lw.load_plans("MT50").items():
         assert {step.skill for step in plan.steps} <= set(skills_for(lw.TASKS[name])), name
     assert "place the gripper above the wrench" not in skills_for(lw.TASKS["push"])
     assert "lower the puck into the hole" not in skills_for(lw.TASKS["push"])
+
+
+# ---- SkillProgram
+
+PLANS = lw.load_plans("MT50")
+PROGRAM = SkillProgram({task: [step.skill for step in plan.steps] for task, plan in PLANS.items()})
+
+
+def by_hand(skill, task, observation):
+    """Return the action of one skill in one state, by its definition."""
+    scripted = lw.load_skills()[skill].for_task(task)
+    places = {name: p.double().numpy() for name, p in lw.TASKS[task].positions(observation.double()).items()}
+    error = places[scripted.target] + np.array(scripted.offset) - places[scripted.moved]
+    return [*np.clip(np.array(scripted.gain) * error, -1, 1), scripted.gripper]
+
+
+@given(st.lists(st.sampled_from(lw.MT50), min_size=1, max_size=12), st.integers(0, 2**31))
+def test_every_skill_of_every_row_is_the_formula(tasks, seed):
+    generator = torch.Generator().manual_seed(seed)
+    observation = torch.rand(len(tasks), 39, generator=generator, dtype=torch.float64) - 0.3
+    actions = PROGRAM(observation, torch.tensor([lw.task_id(task) for task in tasks]))
+    assert actions.shape == (len(tasks), PLANS.num_steps, 4)
+    for row, task in enumerate(tasks):
+        for s, step in enumerate(PLANS[task].steps):
+            assert actions[row, s].tolist() == pytest.approx(by_hand(step.skill, task, observation[row]), abs=1e-12)
+        assert not actions[row, len(PLANS[task].steps) :].any()
+
+
+def test_any_leading_shape_and_precision():
+    observation, ids = torch.rand(2, 3, 39), torch.randint(50, (2, 3))
+    whole = PROGRAM(observation, ids)
+    assert whole.shape == (2, 3, PLANS.num_steps, 4)
+    assert whole.dtype == torch.float32
+    assert torch.equal(PROGRAM(observation[0, 1], ids[0, 1]), whole[0, 1])
+
+
+def test_an_object_moved_and_an_axis_left_alone():
+    carry = ScriptedSkill("carry", "target location", moved="puck", gain=(10.0, 0.0, 100.0), gripper=1.0)
+    observation = torch.zeros(1, 39)
+    observation[0, 4:7] = torch.tensor([0.1, 0.5, 0.0])
+    observation[0, 36:39] = torch.tensor([0.13, 0.9, 0.2])
+    action = SkillProgram({"push": [carry]})(observation, torch.tensor([lw.task_id("push")]))
+    assert action[0, 0].tolist() == pytest.approx([0.3, 0.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("skills", "message"),
+    [
+        ({"push": ["place the griper above the puck"]}, "did you mean 'place the gripper above the puck'"),
+        ({"reach": ["place the gripper above the puck"]}, "'puck', which task 'reach' lacks"),
+        ({"rech": ["place the gripper above the puck"]}, "did you mean 'reach'"),
+        ({}, "skills"),
+        ({"push": []}, r"skills\['push'\]"),
+    ],
+)
+def test_a_program_of_faulty_skills_is_refused(skills, message):
+    with pytest.raises(ValueError, match=message):
+        SkillProgram(skills)
+
+
+@pytest.mark.parametrize(("size", "task", "message"), [(39, 0, "assembly"), (39, 50, "50"), (38, 37, "observation")])
+def test_a_wrong_batch_is_refused(size, task, message):
+    program = SkillProgram({"push": ["place the gripper above the puck"]})
+    with pytest.raises(ValueError, match=message):
+        program(torch.zeros(1, size), torch.tensor([task]))

@@ -1,6 +1,7 @@
-"""The 50 tasks against the published package, and the ways to name them."""
+"""The 50 tasks against the published package; names, ids, files of tasks; a custom task from its plan to an action."""
 
 import json
+from importlib.resources import files
 from inspect import signature
 from pydoc import render_doc
 
@@ -8,13 +9,13 @@ import language_world as oracle
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
 import lw_torchrl as lw
 from lw_torchrl.language.nearest import nearest_query
-from lw_torchrl.language.objects import GRIPPER, NamedObject
+from lw_torchrl.language.objects import GRIPPER, NamedObject, read_objects, write_objects
 from lw_torchrl.language.plan_files import parse_plan
-from lw_torchrl.language.queries import parse_query, supported_queries
-from lw_torchrl.language.query_program import QueryProgram
+from lw_torchrl.language.skills import SkillError
 from lw_torchrl.language.tasks import (
     MT10,
     MT50,
@@ -28,20 +29,17 @@ from lw_torchrl.language.tasks import (
     task_id,
 )
 
+HAND = NamedObject(GRIPPER, (0, 1, 2))
+
 
 def read(position, observation):
     return np.array([float(observation[c]) if isinstance(c, int) else c for c in position])
 
 
 def test_the_names_are_the_published_ones_in_sorted_order():
-    assert len(TASKS) == 50
-    assert list(TASKS) == sorted(oracle.MT50_ENV_NAMES)
-    assert list(MT50) == list(TASKS)
+    assert list(MT50) == list(TASKS) == sorted(oracle.MT50_ENV_NAMES)
     assert list(MT10) == sorted(oracle.MT10_ENV_NAMES)
     assert all(task.name == name for name, task in TASKS.items())
-
-
-def test_the_table_cannot_be_changed():
     with pytest.raises(TypeError):
         TASKS["reach"] = TASKS["push"]
 
@@ -52,11 +50,9 @@ def test_the_task_id_is_the_rank_of_the_name():
     assert task_id("button-press") < task_id("button-press-topdown")
 
 
-def test_descriptions_are_distinct_sentences_of_our_own():
+def test_descriptions_are_different_sentences_and_not_the_published_ones():
     descriptions = [task.description for task in TASKS.values()]
-    assert len(set(descriptions)) == 50
     assert len({text.casefold().strip(".") for text in descriptions}) == 50
-    assert TASKS["door-lock"].description != TASKS["door-unlock"].description
     published = {text.casefold() for text in oracle.TASK_DESCRIPTIONS.values()}
     for text in descriptions:
         assert text[0].isupper()
@@ -68,13 +64,13 @@ def test_descriptions_are_distinct_sentences_of_our_own():
 @pytest.mark.parametrize("name", MT50)
 def test_objects_are_the_published_ones(name):
     relations = [query.split(" is near ") for query in oracle.enumerate_base_queries(name) if " is near " in query]
-    named = {side.removeprefix("the ") for sides in relations for side in sides}
+    names = {side.removeprefix("the ") for sides in relations for side in sides}
     published = TASKS[name].published
-    assert set(published.object_names) == named
+    assert set(published.object_names) == names
     assert published.object_names[0] == GRIPPER
-    assert len(published.objects) == len(named)
-    assert all(thing.offset == (0.0, 0.0, 0.0) for thing in published.objects)
-    assert TASKS[name].objects[: len(named)] == published.objects, "points of ours come after"
+    assert len(published.objects) == len(names)
+    assert all(named.offset == (0.0, 0.0, 0.0) for named in published.objects)
+    assert TASKS[name].objects[: len(names)] == published.objects, "our points come last"
 
 
 @pytest.mark.parametrize("name", MT50)
@@ -88,7 +84,7 @@ def test_positions_are_read_where_the_published_package_reads_them(name):
 
 @pytest.mark.parametrize("name", MT50)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_positions_of_a_whole_batch(name, dtype):
+def test_positions_of_a_batch(name, dtype):
     observation = torch.rand(2, 3, 39, generator=torch.Generator().manual_seed(0)).to(dtype)
     positions = TASKS[name].positions(observation)
     assert tuple(positions) == TASKS[name].object_names
@@ -102,7 +98,7 @@ def test_positions_of_a_whole_batch(name, dtype):
 
 
 def test_positions_that_are_not_plain_slices():
-    # The facts in words, so that a change on both sides of the test above is seen too.
+    # The numbers themselves, so that a change on both sides of the test above is seen too.
     assert TASKS["peg-insert-side"].object("hole").position == (-0.35, 37, 0.16)
     assert TASKS["stick-pull"].object("thermos").position == (11, 12, 13)
     assert TASKS["button-press-wall"].object("wall").position == (0.1, 0.6, 0.0)
@@ -113,25 +109,26 @@ def test_positions_that_are_not_plain_slices():
     assert all(isinstance(c, float) for c in TASKS["button-press-wall"].object("wall").position)
 
 
+# ---- names and ids
+
+
 @pytest.mark.parametrize(
-    ("given", "expected"),
+    ("names", "expected"),
     [
         ("MT10", MT10),
         ("MT50", MT50),
         ("pick-place", ("pick-place",)),
         (["push", "door-open"], ("door-open", "push")),
-        (("reach",), ("reach",)),
         ({"push": 1, "assembly": 2}, ("assembly", "push")),
         ((name for name in ["window-open", "basketball"]), ("basketball", "window-open")),
-        (reversed(MT50), MT50),
     ],
 )
-def test_resolve_tasks_takes_a_set_a_name_or_names(given, expected):
-    assert resolve_tasks(given) == expected
+def test_resolve_tasks_accepts_a_set_a_name_or_names(names, expected):
+    assert resolve_tasks(names) == expected
 
 
 @pytest.mark.parametrize(
-    ("given", "error", "says"),
+    ("names", "error", "words"),
     [
         ("pick-plaec", ValueError, ["'pick-plaec'", "did you mean", "'pick-place'"]),
         ("MT5", ValueError, ["'MT5'", "'MT50'"]),
@@ -139,15 +136,14 @@ def test_resolve_tasks_takes_a_set_a_name_or_names(given, expected):
         (["reach", "drawer-opne"], ValueError, ["'drawer-opne'", "'drawer-open'"]),
         (["MT10"], ValueError, ["'MT10'"]),
         (["push", "reach", "push"], ValueError, ["once", "push"]),
-        ([], ValueError, ["at least one task", "empty"]),
-        (3, TypeError, ["tasks", "3"]),
+        ([], ValueError, ["at least one task"]),
         ([None], TypeError, ["None"]),
     ],
 )
-def test_resolve_tasks_names_what_is_wrong(given, error, says):
+def test_resolve_tasks_names_the_fault(names, error, words):
     with pytest.raises(error) as caught:
-        resolve_tasks(given)
-    assert all(word in str(caught.value) for word in says), str(caught.value)
+        resolve_tasks(names)
+    assert all(word in str(caught.value) for word in words), str(caught.value)
 
 
 @pytest.mark.parametrize("function", [check_task, get_task])
@@ -157,27 +153,34 @@ def test_an_unknown_task_is_a_value_error(function, name):
         function(name)
 
 
-OWN = {"stack-blocks": 650718257, "reahc": 893438262, "reach-v3": 94884373, "x": 950319221}
-
-
-@pytest.mark.parametrize(("name", "number"), OWN.items())
-def test_any_other_name_has_an_id_of_its_own_that_never_changes(name, number):
+@pytest.mark.parametrize(
+    ("name", "number"), [("stack-blocks", 650718257), ("reahc", 893438262), ("reach-v3", 94884373), ("x", 950319221)]
+)
+def test_the_id_of_any_other_name_never_changes(name, number):
     assert task_id(name) == number
-    assert 50 <= number < 2**31
 
 
 @pytest.mark.parametrize("name", ["", "Reach", " reach", "reach_v3", "reach-", "-", "../reach", "3d", "reach\n", "ré"])
-def test_a_name_that_no_task_may_have(name):
-    for function in (task_id, lambda given: Task(given, "Do it.", (NamedObject(GRIPPER, (0, 1, 2)),))):
-        with pytest.raises(ValueError, match="lower-case words joined by hyphens"):
+def test_a_wrong_task_name_is_refused(name):
+    for function in (task_id, lambda name: Task(name, "Do it.", (HAND,))):
+        with pytest.raises(ValueError, match="lower-case words"):
             function(name)
 
 
 def test_a_suite_s_name_may_have_a_hyphen():
-    task = Task("my-desk/hover-low", "Do it.", (NamedObject(GRIPPER, (0, 1, 2)),))
+    task = Task("my-desk/hover-low", "Do it.", (HAND,))
     plan = lw.ConditionalPlan.from_pairs(task, [("the gripper is open", "wait at the gripper")])
     assert "def my_desk__hover_low(robot):" in str(plan)
     assert parse_plan(str(plan), tasks={task.name: task}).task == "my-desk/hover-low"
+
+
+@pytest.mark.parametrize("function", [lw.load_plans, lw.load_skills, lw.decode_plan, lw.planners.plan_prompt])
+def test_help_begins_with_a_short_signature(function):
+    assert "lw.TASKS, the 50 tasks from assembly to window-open" in render_doc(function)
+    assert len(str(signature(function))) < 500
+
+
+# ---- custom tasks
 
 
 def test_an_unknown_object_names_the_nearest():
@@ -185,28 +188,20 @@ def test_an_unknown_object_names_the_nearest():
         TASKS["drawer-open"].object("drawer handel")
 
 
-def test_a_task_of_ones_own_is_returned_as_it_is():
-    mine = Task("stacking", "Stack them.", (NamedObject(GRIPPER, (0, 1, 2)), NamedObject("block", (4, 5, 6))))
-    assert get_task(mine) is mine
-    assert mine.object_names == (GRIPPER, "block")
-
-
-@pytest.mark.parametrize(
-    "name", ["", "Puck", "the puck", "puck and peg", "what is it", "not puck", "puck  peg", " puck"]
-)
-def test_an_object_name_that_queries_could_not_hold_is_refused(name):
+@pytest.mark.parametrize("name", ["", "Puck", "the puck", "puck and peg", "what is it", "not puck", "a  peg", " puck"])
+def test_an_object_name_that_queries_cannot_contain_is_refused(name):
     with pytest.raises(ValueError, match="name"):
         NamedObject(name, (4, 5, 6))
 
 
-@pytest.mark.parametrize("position", [(4, 5), (4, 5, 39), (-1, 0, 1), ()])
+@pytest.mark.parametrize("position", [(4, 5, 39), (-1, 0, 1)])
 def test_a_position_outside_the_observation_is_refused(position):
-    with pytest.raises(ValueError, match="puck"):
-        Task("mine", "Mine.", (NamedObject(GRIPPER, (0, 1, 2)), NamedObject("puck", position)))
+    with pytest.raises(ValueError, match="position of 'puck'"):
+        Task("mine", "Mine.", (HAND, NamedObject("puck", position)))
 
 
 @pytest.mark.parametrize("names", [[], ["puck"], ["puck", GRIPPER], [GRIPPER, "puck", "puck"], [GRIPPER, GRIPPER]])
-def test_a_task_needs_the_gripper_first_and_different_names(names):
+def test_a_task_has_the_gripper_first_and_different_names(names):
     with pytest.raises(ValueError, match="objects of task 'mine'"):
         Task("mine", "Mine.", tuple(NamedObject(name, (4, 5, 6)) for name in names))
 
@@ -216,7 +211,7 @@ def test_a_task_has_at_most_64_objects():
     task = Task.from_json("mine", {"description": "Mine.", "objects": objects})
     assert len(task.object_names) == 64
     assert str(nearest_query("cup 61 is abof cup 2", task).parts[0].query) == "the cup 61 is above the cup 2"
-    with pytest.raises(TaskError, match="objects of task 'mine' must be at most 64, the gripper included, got 65"):
+    with pytest.raises(TaskError, match=r"objects of task 'mine' .*64"):
         Task.from_json("mine", {"description": "Mine.", "objects": objects | {"lid": "obs[4:7]"}})
 
 
@@ -229,7 +224,7 @@ def load(tmp_path, text):
     return load_tasks(path)
 
 
-def test_tasks_of_ones_own_replace_ours_of_the_same_name(tmp_path):
+def test_a_file_replaces_tasks_of_the_same_name(tmp_path):
     mine = load(
         tmp_path,
         PUSH
@@ -245,38 +240,36 @@ points."gripper tip" = {object = "robot's gripper", offset = [0.0, 0.0, -0.04]}
     assert all(mine[name] is TASKS[name] for name in MT50 if name != "push")
     push = mine["push"]
     assert push.description == "Push the disc."
-    assert push.object_names == (GRIPPER, "disc", "goal", "disc edge", "corner", "shadow", "gripper tip")
     assert push.published.object_names == (GRIPPER, "disc", "goal")
-    assert push.object("goal") == NamedObject("goal", (0.1, 37, 0.0))
-    assert push.object("disc edge") == NamedObject("disc edge", (4, 5, 6), (0.03, 0, 0), ours=True)
-    assert push.object("corner") == NamedObject("corner", (0.4, 0.9, 0.0), ours=True)
-    assert push.object("shadow") == NamedObject("shadow", (4, 5, 0.0), ours=True)
-    assert push.object("gripper tip").position == (0, 1, 2)
+    assert push.objects[2:] == (
+        NamedObject("goal", (0.1, 37, 0.0)),
+        NamedObject("disc edge", (4, 5, 6), (0.03, 0, 0), ours=True),
+        NamedObject("corner", (0.4, 0.9, 0.0), ours=True),
+        NamedObject("shadow", (4, 5, 0.0), ours=True),
+        NamedObject("gripper tip", (0, 1, 2), (0.0, 0.0, -0.04), ours=True),
+    )
     with pytest.raises(TypeError):
         mine["push"] = push
-    assert TASKS["push"].object_names != push.object_names
 
 
-def test_a_task_of_ones_own_is_taken_wherever_a_task_is_asked_for(tmp_path):
+def test_a_custom_task_is_accepted_wherever_a_task_is(tmp_path):
     push = load(tmp_path, PUSH)["push"]
-    assert str(parse_query("gripper above the disc", push)) == "the robot's gripper is above the disc"
-    assert "the disc is touching the table" in supported_queries(push)
+    assert get_task(push) is push
+    assert str(lw.parse_query("gripper above the disc", push)) == "the robot's gripper is above the disc"
+    assert "the disc is touching the table" in lw.supported_queries(push)
     assert str(nearest_query("gripper abov the disk", push).query) == "the robot's gripper is above the disc"
-    program = QueryProgram({push: ["gripper near disc", "disc touching the table"]})
+    program = lw.QueryProgram({push: ["gripper near disc", "disc touching the table"]})
     state, ids = torch.zeros(39), torch.tensor(task_id("push"))
     assert program(state, ids).tolist() == [True, True]
     assert (program.logits(state, ids) > 0).tolist() == [True, True]
 
 
-STACK = PUSH + '[stack-blocks]\ndescription = "Stack them."\nobjects.block = "obs[4:7]"\nobjects.tower = "obs[11:14]"\n'
-
-
-def test_tasks_that_the_simulator_does_not_have(tmp_path):
-    mine = load(tmp_path, STACK)
+def test_a_file_adds_tasks_that_the_simulator_lacks(tmp_path):
+    added = '[stack-blocks]\ndescription = "Stack them."\nobjects.block = "obs[4:7]"\nobjects.tower = "obs[11:14]"\n'
+    mine = load(tmp_path, PUSH + added)
     assert list(mine) == sorted([*TASKS, "stack-blocks"])
     assert mine["stack-blocks"].object_names == (GRIPPER, "block", "tower")
     assert resolve_tasks(["stack-blocks", "push"], tasks=mine) == ("push", "stack-blocks")
-    assert resolve_tasks("stack-blocks", tasks=mine) == ("stack-blocks",)
     assert resolve_tasks("MT50", tasks=mine) == MT50
     with pytest.raises(ValueError, match="did you mean 'stack-blocks'"):
         resolve_tasks(["stack-block"], tasks=mine)
@@ -290,60 +283,62 @@ def test_a_task_is_the_same_read_from_its_json(name):
     assert Task.from_json(name, row) == TASKS[name]
 
 
-def test_a_task_that_is_no_row_of_the_table():
-    beside = NamedObject("edge", (4, 5, 6), (0.1, 0.0, 0.0), ours=True)
-    with pytest.raises(TaskError, match="cannot be written"):
-        Task("mine", "Mine.", (NamedObject(GRIPPER, (0, 1, 2)), beside)).to_json()
-    with pytest.raises(TaskError, match="cannot be written"):
-        Task("mine", "Mine.", (NamedObject(GRIPPER, (4, 5, 6)),)).to_json()
-
-
-def test_our_own_table_is_such_a_file():
-    from importlib.resources import files
-
+def test_the_shipped_table_is_a_file_of_tasks():
     assert load_tasks(files("lw_torchrl.language") / "data" / "tasks.toml") == TASKS
 
 
+def test_a_task_that_a_row_cannot_hold_is_refused():
+    edge = NamedObject("edge", (4, 5, 6), (0.1, 0.0, 0.0), ours=True)
+    for objects in ((HAND, edge), (NamedObject(GRIPPER, (4, 5, 6)),)):
+        with pytest.raises(TaskError, match="mine"):
+            Task("mine", "Mine.", objects).to_json()
+
+
+def test_a_point_on_an_object_at_fixed_coordinates_is_written_as_a_point_on_that():
+    # Index 1 and 1.0 metres are equal numbers, but different places.
+    puck, wall = NamedObject("puck", (0, 1, 2)), NamedObject("wall", (0.0, 1, 2))
+    side = NamedObject("wall side", (0.0, 1, 2), offset=(0.1, 0.0, 0.0), ours=True)
+    written = write_objects((HAND, puck, wall, side))
+    assert written["points"]["wall side"]["object"] == "wall"
+    assert read_objects(written)[1:] == (puck, wall, side)
+
+
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "words"),
     [
-        ("[push", ["']'", "end of document"]),
-        ('[psuh]\ndescription = "Push."', ["'psuh'", "must name its objects", "did you mean 'push'"]),
-        (PUSH.replace("[push]", '["Push it"]'), ["'Push it'", "lower-case words joined by hyphens"]),
+        ("[push", ["end of document"]),
+        ('[psuh]\ndescription = "Push."', ["'psuh'", "objects", "did you mean 'push'"]),
+        (PUSH.replace("[push]", '["Push it"]'), ["'Push it'", "lower-case words"]),
         ("push = 3", ["'push'", "table", "3"]),
         (PUSH + 'object.puck = "obs[4:7]"', ["'push'", "'object'", "did you mean 'objects'"]),
-        (PUSH + 'point.puck = "obs[4:7]"', ["'push'", "'point'", "'points'"]),
         (PUSH.replace("description", "desciption"), ["'desciption'", "'description'"]),
-        ('[push]\nobjects.disc = "obs[4:7]"', ["'push'", "description must be a sentence"]),
-        ("[push]\ndescription = 3", ["'push'", "description must be a sentence", "3"]),
+        ('[push]\nobjects.disc = "obs[4:7]"', ["'push'", "description"]),
+        ("[push]\ndescription = 3", ["'push'", "description", "3"]),
         (PUSH.replace("obs[4:7]", "obs[4:8]"), ["'push'", "'disc'", "'obs[4:8]'", "'obs[4:7]'"]),
-        (PUSH.replace("obs[4:7]", "obs[37:40]"), ["'push'", "'disc'", "obs[39]", "0 to 38"]),
+        (PUSH.replace("obs[4:7]", "obs[37:40]"), ["'push'", "'disc'", "obs[39]"]),
         (PUSH.replace("obs[4:7]", "state[4:7]"), ["'push'", "'disc'", "'obs[4:7]'"]),
         (PUSH.replace('"obs[4:7]"', "[0.1, 0.2]"), ["'push'", "'disc'", "[0.1, 0.2]"]),
         (PUSH.replace('"obs[4:7]"', "[0.1, nan, 0.2]"), ["'push'", "'disc'", "nan"]),
         (PUSH.replace('"obs[4:7]"', f"[0.1, {10**400}, 0.2]"), ["'push'", "'disc'"]),
         (PUSH.replace(".disc", '."The Disc"'), ["'push'", "'The Disc'", "lower-case"]),
-        (PUSH.replace(".disc", '."robot\'s gripper"'), ["'push'", "robot's gripper", "every task has"]),
-        ('[push]\ndescription = "Push."\nobjects = ["disc"]', ["'push'", "objects must be a table", "disc"]),
-        (PUSH + "points = 3", ["'push'", "points must be a table", "3"]),
+        (PUSH.replace(".disc", '."robot\'s gripper"'), ["'push'", "robot's gripper"]),
+        ('[push]\ndescription = "Push."\nobjects = ["disc"]', ["'push'", "objects", "disc"]),
+        (PUSH + "points = 3", ["'push'", "points", "3"]),
         (PUSH + "points.edge = {object = 'disk', offset = [0, 0, 0]}", ["'edge'", "'disk'", "did you mean 'disc'"]),
-        (PUSH + "points.edge = {object = 'disc'}", ["'edge'", "object and offset"]),
+        (PUSH + "points.edge = {object = 'disc'}", ["'edge'", "offset"]),
         (PUSH + "points.edge = {objekt = 'disc', offset = [0, 0, 0]}", ["'edge'", "'objekt'", "did you mean 'object'"]),
-        (PUSH + "points.edge = {object = 'disc', offset = [0, 0]}", ["'edge'", "three numbers", "[0, 0]"]),
+        (PUSH + "points.edge = {object = 'disc', offset = [0, 0]}", ["'edge'", "offset"]),
         (PUSH + "points.edge = {object = ['disc'], offset = [0, 0, 0]}", ["'edge'", "['disc']"]),
         (PUSH + "points.edge = 'obs[4]'", ["'edge'", "'obs[4:7]'"]),
         (PUSH + "points.disc = [0, 0, 0]", ["'push'", "different names", "'disc'"]),
-        (PUSH + "points.disc = ", ["Invalid value"]),
         (PUSH + "points.disc = " + "[" * 5000, ["mine.toml"]),
         (PUSH + "points.disc = " + "9" * 5000, ["4300 digits"]),
     ],
 )
-def test_a_file_of_tasks_says_what_is_wrong_and_where(tmp_path, text, says):
+def test_a_faulty_file_of_tasks_names_the_fault_and_its_place(tmp_path, text, words):
     with pytest.raises(TaskError) as caught:
         load(tmp_path, text)
-    message = str(caught.value)
-    assert isinstance(caught.value, ValueError)
-    assert all(word in message for word in ["mine.toml", *says]), message
+    assert all(word in str(caught.value) for word in ["mine.toml", *words]), str(caught.value)
 
 
 def test_a_missing_or_unreadable_file_of_tasks(tmp_path):
@@ -354,8 +349,76 @@ def test_a_missing_or_unreadable_file_of_tasks(tmp_path):
         load_tasks(tmp_path / "latin.toml")
 
 
-@pytest.mark.parametrize("function", [lw.load_plans, lw.load_skills, lw.decode_plan, lw.plan_prompt])
-def test_help_begins_with_a_short_signature(function):
-    said = render_doc(function)
-    assert "lw.TASKS, the 50 tasks from assembly to window-open" in said
-    assert len(str(signature(function))) < 500
+# ---- a 51st task, from its plan to an action
+
+
+@pytest.fixture
+def stacking(tmp_path):
+    (tmp_path / "tasks.toml").write_text("""
+[stack-blocks]
+description = "Put the block on the tower."
+objects.block = "obs[4:7]"
+objects.tower = "obs[11:14]"
+points."tower top" = { object = "tower", offset = [0.0, 0.0, 0.1] }
+""")
+    (tmp_path / "stack-blocks.plan").write_text("""def stack_blocks(robot):
+    if check("the gripper is not near the block"):
+        robot.place("the gripper around the block")
+    if check("the block is not above the tower top"):
+        robot.move("the block above the tower top")
+""")
+    (tmp_path / "skills.toml").write_text("""
+["place the gripper around the block"]
+target = "block"
+["move the block above the tower top"]
+target = "tower top"
+moved = "block"
+for.stack-blocks.gripper = 1.0
+""")
+    tasks = lw.load_tasks(tmp_path / "tasks.toml")
+    own = lw.load_plans(tmp_path / "stack-blocks.plan", tasks=tasks)["stack-blocks"]
+    return tasks, {"stack-blocks": own, "push": lw.load_plans("MT10")["push"]}
+
+
+def states(plans):
+    observation = torch.rand(4, 39, generator=torch.Generator().manual_seed(0)) * 0.1
+    observation[0, 0:3] = observation[0, 4:7]  # the gripper at the block
+    ids = torch.tensor([lw.task_id(task) for task in ("stack-blocks", "push", "stack-blocks", "push")])
+    return lw.QAFTransform(plans)(TensorDict({"observation": observation, "task_id": ids}, [4]))
+
+
+def test_plans_queries_and_actors_of_a_51st_task(stacking):
+    tasks, plans = stacking
+    assert plans["stack-blocks"].definition is tasks["stack-blocks"]
+    assert lw.load_plans("MT50", tasks=tasks).keys() == set(lw.MT50)
+    batch = states(plans)
+    assert not batch["qaf"][0, 0]  # near
+    assert batch["qaf"][2, 0] == (batch["observation"][2, :3] - batch["observation"][2, 4:7]).norm().ge(0.04)
+    alone = lw.QueryProgram({"push": [step.condition for step in plans["push"].steps]})
+    assert torch.equal(batch["qaf"][1], alone(batch["observation"][1], batch["task_id"][1]))
+    actor = lw.PlanConditionedActor(plans, text_encoder=lambda texts: torch.eye(len(texts), 8))
+    assert actor(batch.clone())["skill_weights"][0, 2:].tolist() == [0.0] * (batch["qaf"].shape[-1] - 2)
+    without = actor.with_plans({"push": plans["push"]}).eval()
+    with pytest.raises(ValueError, match=rf"without a plan.*{lw.task_id('stack-blocks')} \(none of the 50\)"):
+        without(batch.clone())
+
+
+def test_scripted_skills_of_a_51st_task(stacking, tmp_path):
+    tasks, plans = stacking
+    own = {"stack-blocks": plans["stack-blocks"]}
+    batch = states(plans)[[0, 2]]
+    batch["qaf"] = batch["qaf"][:, :2]
+    skills = lw.load_skills(tmp_path / "skills.toml", tasks=tasks)
+    action = lw.ScriptedSkillActor(own, skills=skills)(batch)["action"]
+    error = batch["observation"][0, 11:14] + torch.tensor([0.0, 0.0, 0.1]) - batch["observation"][0, 4:7]
+    torch.testing.assert_close(action[0], torch.cat([(10 * error).clamp(-1, 1), torch.ones(1)]))
+    with pytest.raises(SkillError, match="stack-blocks"):
+        lw.load_skills(tmp_path / "skills.toml")
+
+
+def test_a_plan_without_a_definition_is_for_one_of_the_50():
+    steps = lw.load_plans("MT10")["push"].steps
+    with pytest.raises(ValueError, match="did you mean 'push'"):
+        lw.ConditionalPlan("pushh", steps)
+    task = lw.Task("pushh", "Push.", lw.TASKS["push"].objects)
+    assert lw.ConditionalPlan("pushh", steps, task).definition is task

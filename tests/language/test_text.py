@@ -1,4 +1,4 @@
-"""Text vectors: the shipped table is the real encoder's, and a new text says what it needs."""
+"""Text vectors: the shipped table holds the real encoder's, and other texts need the extra."""
 
 from __future__ import annotations
 
@@ -43,13 +43,8 @@ def encoded():
     return texts, text.sentence_encoder(texts)
 
 
-def test_every_description_and_skill_is_shipped():
-    assert set(shipped_texts()) == {*DESCRIPTIONS, *SKILLS}
-    assert text._shipped().keys() >= set(shipped_texts())
-
-
-def test_the_table_holds_nothing_that_is_not_used():
-    assert text._shipped().keys() <= set(shipped_texts())
+def test_every_description_and_skill_is_shipped_and_nothing_else():
+    assert text._shipped().keys() == set(shipped_texts()) == {*DESCRIPTIONS, *SKILLS}
 
 
 def test_shipped_texts_need_no_text_model(without_extra):
@@ -58,12 +53,12 @@ def test_shipped_texts_need_no_text_model(without_extra):
     assert vectors.dtype == torch.float32
 
 
-def test_the_table_is_the_real_sentence_encoders(encoded):
+def test_the_table_holds_the_real_sentence_encoder_s_vectors(encoded):
     texts, expected = encoded
     torch.testing.assert_close(text.encode_texts(texts), expected, atol=2e-3, rtol=0)
 
 
-def test_vectors_have_length_one_and_tell_the_texts_apart():
+def test_vectors_have_length_one_and_differ():
     vectors = text.encode_texts([*DESCRIPTIONS, *SKILLS])
     torch.testing.assert_close(vectors.norm(dim=-1), torch.ones(len(vectors)), atol=2e-3, rtol=0)
     alike = vectors @ vectors.T - 2 * torch.eye(len(vectors))
@@ -77,7 +72,7 @@ def test_the_order_and_repetitions_of_the_texts_are_kept():
     assert torch.equal(text.encode_texts([two, one, two]), torch.stack([b, a, b]))
 
 
-def test_a_new_text_is_encoded_beside_shipped_ones(encoded):
+def test_new_and_shipped_texts_are_encoded_together(encoded):
     found = text.encode_texts([SKILLS[0], NEW, SKILLS[1], NEW])
     assert found.shape == (4, text.TEXT_DIMENSION)
     assert torch.equal(found[1], found[3])
@@ -87,12 +82,12 @@ def test_a_new_text_is_encoded_beside_shipped_ones(encoded):
     assert near[0] @ near[1] > near[0] @ near[2]
 
 
-def test_a_new_text_without_the_extra_says_what_to_install(without_extra):
-    with pytest.raises(ImportError, match=r"juggle three drawers.*pip install 'lw_torchrl\[text\]'"):
+def test_missing_extra_error_names_the_extra(without_extra):
+    with pytest.raises(ImportError, match=r"juggle three drawers.*lw_torchrl\[text\]"):
         text.encode_texts([SKILLS[0], NEW])
 
 
-def test_writing_the_table_gives_what_is_shipped(tmp_path, encoded, monkeypatch):
+def test_writing_the_table_gives_the_shipped_one(tmp_path, encoded, monkeypatch):
     path = tmp_path / "embeddings.npz"
     texts, vectors = encoded
     monkeypatch.setattr("lw_torchrl.language.text.sentence_encoder", lambda listed: vectors)

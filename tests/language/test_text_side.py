@@ -1,4 +1,4 @@
-"""The text side of the language is plain Python and NumPy."""
+"""Tasks, queries and plans need no torch."""
 
 import subprocess
 import sys

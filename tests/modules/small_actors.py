@@ -32,7 +32,7 @@ def make_actor(plans=PLANS, seed=0, **options):
 def make_descriptor(tasks="MT10", seed=0, **options):
     torch.manual_seed(seed)
     small = {"task_encoder": m.SkillEncoder(6, width=12), "decoder": small_decoder()}
-    return lw.DescriptorConditionedActor(tasks, **{**small, **options}).eval()
+    return lw.modules.DescriptorConditionedActor(tasks, **{**small, **options}).eval()
 
 
 def make_role_actor(plans=CANONICAL, seed=0, **options):
@@ -58,7 +58,7 @@ ACTORS = {
     "description": make_descriptor,
     "one-hot": lambda: make_descriptor(condition="one-hot"),
     "scripted": lambda: lw.ScriptedSkillActor(PLANS),
-    "evaluator": lambda: TensorDictSequential(lw.StateQueryEvaluator(PLANS, width=8), make_actor()),
+    "evaluator": lambda: TensorDictSequential(lw.modules.StateQueryEvaluator(PLANS, width=8), make_actor()),
     "ensemble": lambda: m.ActorEnsemble([make_actor(seed=seed) for seed in range(2)]),
     "decided": lambda: m.DecidedGripper(make_actor()),
     "demonstrated": lambda: m.DemonstratedActor(make_descriptor(["push", "reach"]), make_role_actor()),

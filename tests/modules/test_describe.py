@@ -20,7 +20,7 @@ MODULES = ACTORS | {
     "raw features": lambda: m.ObservationFeatures("raw", 0.2, in_keys=[("robot", "state")]),
     "concatenated features": lambda: m.Concat(m.ObservationFeatures(), m.RoleFeatures(CANONICAL, 0.1), out_keys=["x"]),
     "value": lambda: lw.PlanConditionedValue(PLANS, width=8),
-    "evaluator": lambda: lw.StateQueryEvaluator(PLANS, width=8, answers="hard"),
+    "evaluator": lambda: lw.modules.StateQueryEvaluator(PLANS, width=8, answers="hard"),
     "transferred": lambda: m.TransferredActor(
         make_actor(CANONICAL, features=m.RoleFeatures(CANONICAL)), CANONICAL, speed=2.0
     ),

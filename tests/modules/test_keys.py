@@ -99,7 +99,7 @@ MODULES = ACTORS | {
     "quantiles": lambda: QValue(plan_trunk(PLANS), quantiles=5, **SMALL),
     "attention": lambda: PlanAttention(PLANS),
     "focus features": lambda: m.FocusFeatures(PLANS),
-    "answers": lambda: lw.StateQueryEvaluator(PLANS, width=8),
+    "answers": lambda: lw.modules.StateQueryEvaluator(PLANS, width=8),
 }
 each_module = pytest.mark.parametrize("name", MODULES)
 

@@ -57,14 +57,14 @@ def test_parts_with_different_plans_are_refused():
     actor = lw.PlanConditionedActor(PLANS)
     with pytest.raises(ValueError, match="attention and mixer"):
         actor.mixer = SkillMixer(REVERSED)
-    policy = TensorDictSequential(lw.StateQueryEvaluator(REVERSED), lw.PlanConditionedActor(PLANS))
+    policy = TensorDictSequential(lw.modules.StateQueryEvaluator(REVERSED), lw.PlanConditionedActor(PLANS))
     with pytest.raises(ValueError, match="qaf answers other plans"):
         policy(observation=torch.zeros(2, 39), task_id=IDS)
 
 
 def test_evaluator_replaces_the_answers_of_an_environment_with_other_plans():
     canonical = lw.canonical_plans(PLANS)
-    policy = TensorDictSequential(lw.StateQueryEvaluator(canonical), lw.PlanConditionedActor(canonical))
+    policy = TensorDictSequential(lw.modules.StateQueryEvaluator(canonical), lw.PlanConditionedActor(canonical))
     rows = lw.QAFTransform(PLANS)(lw.LanguageWorldEnv(["push", "reach"]).reset())
     assert policy(rows)["action"].shape == (2, 4)
 
@@ -77,7 +77,7 @@ def test_transform_writes_a_renamed_turn():
 
 
 def test_renamed_keys_of_an_ensemble_skip_what_a_member_writes_itself():
-    member = TensorDictSequential(lw.StateQueryEvaluator(PLANS), lw.PlanConditionedActor(PLANS))
+    member = TensorDictSequential(lw.modules.StateQueryEvaluator(PLANS), lw.PlanConditionedActor(PLANS))
     ensemble = ActorEnsemble([member, lw.PlanConditionedActor(PLANS)])
     names = {"qaf": "truth"}
     ensemble.in_keys = [names.get(key, key) for key in ensemble.in_keys]

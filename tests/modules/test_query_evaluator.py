@@ -83,7 +83,7 @@ def test_constructor_without_answers_is_always_soft():
     assert (evaluator.answers, evaluator.config) == ("soft", {"width": 5})
     with pytest.raises(TypeError, match="answers"):
         evaluator.answers = "hard"
-    evaluator = lw.StateQueryEvaluator(PLANS, width=8)
+    evaluator = lw.modules.StateQueryEvaluator(PLANS, width=8)
     evaluator.answers = "hard"
     assert evaluator.with_plans(OTHER).answers == evaluator.config["answers"] == "hard"
     with pytest.raises(ValueError, match="answers"):
@@ -139,7 +139,7 @@ def test_double_precision_and_vmap_over_rows():
 
 def make(plans=PLANS, seed=0, **options):
     torch.manual_seed(seed)
-    return lw.StateQueryEvaluator(plans, width=8, depth=1, **options)
+    return lw.modules.StateQueryEvaluator(plans, width=8, depth=1, **options)
 
 
 def make_policy(**options):

@@ -75,7 +75,7 @@ def make_actor(condition, distribution=None, noise=0.05, **options):
     if condition == "plan":
         actor = lw.PlanConditionedActor(PLANS, **parts)
     else:
-        actor = lw.DescriptorConditionedActor("MT10", condition=condition, **parts)
+        actor = lw.modules.DescriptorConditionedActor("MT10", condition=condition, **parts)
     return actor if distribution is None else actor.stochastic(distribution)
 
 

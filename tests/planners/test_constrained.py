@@ -1,4 +1,4 @@
-"""The JSON Schema of plans: shipped plans satisfy it, what satisfies it is a plan that runs, servers may ignore it."""
+"""The JSON Schema of plans: shipped plans satisfy it, JSON that satisfies it is a plan, servers may ignore it."""
 
 import json
 
@@ -31,7 +31,7 @@ def parts(schema):
 
 
 @pytest.mark.parametrize("format", FORMATS)
-def test_servers_know_every_word_of_the_schema(format):
+def test_the_schema_uses_only_keywords_that_servers_support(format):
     for task in lw.MT50 if PLAN_FORMATS[format].style.goals else lw.MT10:
         schema = plan_schema(task, format)
         jsonschema.Draft202012Validator.check_schema(schema)
@@ -113,7 +113,7 @@ ANSWERS = st.tuples(st.sampled_from(lw.MT50), st.sampled_from(FORMATS), st.boole
 
 @settings(max_examples=40, deadline=None)
 @given(ANSWERS)
-def test_what_satisfies_the_schema_is_a_plan_that_runs(drawn):
+def test_json_that_satisfies_the_schema_is_a_plan_that_runs(drawn):
     (task, format, free), value, cut = drawn
     text = json.dumps(value)[:cut]
     answer = read_reply(Reply(text), lw.TASKS[task], format, schema=plan_schema(task, format, free_skills=free))
@@ -137,7 +137,7 @@ ANY_JSON = st.recursive(
 
 @settings(max_examples=40, deadline=None)
 @given(ANSWERS, ANY_JSON, st.randoms(use_true_random=False))
-def test_answers_are_validated_as_json_schema_says(drawn, other, random):
+def test_validation_agrees_with_json_schema(drawn, other, random):
     (task, format, free), value, _ = drawn
     schema = plan_schema(task, format, free_skills=free)
     assert passes(value, schema)
@@ -152,7 +152,7 @@ def test_answers_are_validated_as_json_schema_says(drawn, other, random):
 
 @settings(max_examples=60, deadline=None)
 @given(ANY_JSON, st.text(max_size=10), st.none() | st.integers(0, 60))
-def test_any_other_text_is_a_plan_or_a_reason(value, before, cut):
+def test_any_json_is_a_plan_or_a_reason(value, before, cut):
     text = (before + json.dumps({"steps": value}))[:cut]
     answer = read_reply(Reply(text), lw.TASKS["push"], "basic_py", schema=PUSH)
     assert (answer.decoded.plan is None) == bool(answer.decoded.reason)

@@ -26,7 +26,7 @@ def folder(tmp_path):
 
 
 def test_answers_of_a_folder(folder, tmp_path):
-    planner = lw.FilePlanner(folder, "two/2")
+    planner = lw.planners.FilePlanner(folder, "two/2")
     assert isinstance(planner, lw.planners.Planner)
     assert planner.name == "two_2"
     assert planner.recorded == tuple(("chain_md", task, k) for task in ("drawer-open", "push") for k in (0, 1, 12))
@@ -35,25 +35,28 @@ def test_answers_of_a_folder(folder, tmp_path):
         ("drawer-open", 0, True), ("drawer-open", 1, True), ("push", 0, True), ("push", 1, True),
     ]  # fmt: skip
     assert [answer.decoded.plan for answer in answers] == [None, PLANS["drawer-open"], None, PLANS["push"]]
-    assert lw.FilePlanner(tmp_path / "copy").plans("push", format="chain_md", attempts=2)[1].text == answers[3].text
+    assert (
+        lw.planners.FilePlanner(tmp_path / "copy").plans("push", format="chain_md", attempts=2)[1].text
+        == answers[3].text
+    )
 
 
 def test_missing_answers(folder, tmp_path):
-    planner = lw.FilePlanner(folder, "one")
+    planner = lw.planners.FilePlanner(folder, "one")
     missing = "no answer of 'one' is recorded for push in chain_md, attempt 2.*: 0, 1, 12"
     with pytest.raises(lw.planners.PlannerError, match=missing):
         planner.plans("push", format="chain_md", attempts=3)
     with pytest.raises(lw.planners.PlannerError, match=r"reach in chain_md, attempt 0.*none"):
         planner.plans("reach", format="chain_md")
     with pytest.raises(ValueError, match="has answers of one, two_2"):
-        lw.FilePlanner(folder)
+        lw.planners.FilePlanner(folder)
     with pytest.raises(ValueError, match="model must be one of 'one', 'two_2', got 'tow'"):
-        lw.FilePlanner(folder, "tow")
+        lw.planners.FilePlanner(folder, "tow")
     with pytest.raises(FileNotFoundError, match="nowhere"):
-        lw.FilePlanner(tmp_path / "nowhere")
+        lw.planners.FilePlanner(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match="holds no answers"):
-        lw.FilePlanner(tmp_path / "empty")
+        lw.planners.FilePlanner(tmp_path / "empty")
 
 
 ROW = {"llm": "PaLM 2", "format": "basic_py", "task": "push", "attempt": 0, "completion": "x", "more": 1}
@@ -63,7 +66,7 @@ def test_lines_of_json(tmp_path):
     text = lw.encode_plan(PLANS["push"], "basic_py")
     rows = [{**ROW, "completion": text}, {**ROW, "attempt": 1}, {**ROW, "llm": "GPT"}]
     (tmp_path / "answers.jsonl").write_text("\n".join(json.dumps(row) for row in rows) + "\n\n")
-    planner = lw.FilePlanner(tmp_path / "answers.jsonl", "PaLM 2")
+    planner = lw.planners.FilePlanner(tmp_path / "answers.jsonl", "PaLM 2")
     assert planner.recorded == (("basic_py", "push", 0), ("basic_py", "push", 1))
     assert planner.plans("push", format="basic_py")[0].decoded.plan == PLANS["push"]
 
@@ -81,7 +84,7 @@ def test_lines_of_json(tmp_path):
 def test_broken_lines(tmp_path, line, message):
     (tmp_path / "answers.jsonl").write_text(json.dumps(ROW) + "\n" + line)
     with pytest.raises(ValueError, match=message):
-        lw.FilePlanner(tmp_path / "answers.jsonl")
+        lw.planners.FilePlanner(tmp_path / "answers.jsonl")
 
 
 @pytest.mark.parametrize("name", ["..", "/", "", "a/../b", "x" * 500, "ä ö", ".hidden", "con:stream?*"])

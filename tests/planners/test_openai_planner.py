@@ -1,4 +1,4 @@
-"""OpenAIPlanner: answers become plans, failures become clear errors, and no answer is lost."""
+"""OpenAIPlanner: answers become plans, failures become clear errors, and answers are kept."""
 
 import json
 import socket
@@ -11,7 +11,8 @@ import pytest
 from fake_server import PLANS, Failure, FakeServer, asked_for, completion, error, shipped
 
 import lw_torchrl as lw
-from lw_torchrl.planners import PlannerError, Tokens, openai_planner
+from lw_torchrl.planners import PlannerError, Tokens
+from lw_torchrl.planners.openai_planner import REPLY_LIMIT
 
 KEY = "sk-a-secret-of-the-tests"
 
@@ -38,7 +39,7 @@ def test_the_request(ask):
     }  # fmt: skip
     assert second["seed"] == 6
     system, user = first["messages"]
-    assert user == {"role": "user", "content": lw.plan_prompt("push", "chain_py")}
+    assert user == {"role": "user", "content": lw.planners.plan_prompt("push", "chain_py")}
     assert "`push` alone" in system["content"]
     plain = FakeServer()
     ask(plain, "push")
@@ -57,7 +58,7 @@ def test_cached_answers_are_not_requested_again(ask):
     assert again[0].tokens == first[0].tokens
 
 
-def test_everything_that_determines_an_answer_is_in_the_cache_s_key():
+def test_the_cache_key_has_everything_that_determines_an_answer():
     def path(task="push", format="chain_py", attempt=0, **options):
         planner = lw.OpenAIPlanner("m", **{"base_url": "http://127.0.0.1:1/v1", **options})
         return planner.cache_path(planner.request(lw.TASKS[task], format, attempt))
@@ -71,7 +72,7 @@ def test_everything_that_determines_an_answer_is_in_the_cache_s_key():
     assert path(concurrency=9, retries=1, timeout=2.0, name="other") == path()
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"answer": {"text": 3}}', "\x00" * 99], ids=range(5))
+@pytest.mark.parametrize("content", ["", "{", '{"answer": {"text": 3}}'], ids=range(3))
 def test_a_damaged_cached_answer_is_requested_again(ask, tmp_path, content):
     ask(FakeServer(), ["push", "reach"])
     file = min((tmp_path / "kept").rglob("*.json"))
@@ -84,52 +85,40 @@ def test_a_damaged_cached_answer_is_requested_again(ask, tmp_path, content):
 
 
 FAILURES = {
-    "429": (error(429, "slow down"), "too many requests, asked 2 times", "lower concurrency"),
-    "429 for long": (error(429, "no", **{"retry-after-ms": "9e9"}), "too many requests, asked 1 time", "Continue"),
-    "500": (error(500, "my fault"), "the server failed, asked 2 times .*my fault", "log"),
-    "500, without a message": (Failure(500, "<p>oops</p>", {"retry-after-ms": "1"}), "failed.*oops", "log"),
-    "429 in 200": (Failure(200, {"error": {"message": "slow down", "code": 429}}), "too many requests", "Continue"),
-    "401": (error(401, "no"), "needs a key, in OPENAI_API_KEY", "Give the key"),
-    "404": (error(404, "no model a/model"), "no such model or address", "/v1/models"),
-    "400": (error(400, "unknown field"), "refused .*unknown field", "Leave out"),
-    "400, plain": (Failure(400, "no top_k"), "refused .*no top_k", "Leave out"),
-    "context": (error(400, "maximum context length is 2048"), "does not fit", "max_tokens"),
-    "cut body": (Failure(200, completion("x" * 99), cut=True), "broke off, asked 2", "server runs"),
-    "cut JSON": (Failure(200, '{"choices": ['), "cut off or is not JSON", "Ask again"),
-    "HTML": (Failure(200, "<style>a{}</style><body>Welcome</body>"), "not a chat completion: Welcome", "ends in /v1"),
-    "other JSON": (Failure(200, {"hello": 1}), "not a chat completion", "ends in /v1"),
-    "no choices": (Failure(200, {"choices": []}), "not a chat completion", "ends in /v1"),
-    "a slow reply": (Failure(200, completion("x"), drip=1.0), "answer within 0.4 s, asked 2 times", "longer"),
-    "a dripping reply": (
-        Failure(200, completion("x"), drip=0.1),
-        "answer within 0.4 s, asked 1 time",
-        "longer",
-    ),
-    "a large reply": (
-        Failure(200, completion("x" * openai_planner.REPLY_LIMIT)),
-        "larger than 4 MiB",
-        "fewer max_tokens",
-    ),
+    "429": (error(429, "slow down"), "too many requests, asked 2 times"),
+    "429 for long": (error(429, "no", **{"retry-after-ms": "9e9"}), "too many requests, asked 1 time"),
+    "500": (error(500, "my fault"), "server failed, asked 2 times .*my fault"),
+    "500, without a message": (Failure(500, "<p>oops</p>", {"retry-after-ms": "1"}), "failed.*oops"),
+    "429 in 200": (Failure(200, {"error": {"message": "slow down", "code": 429}}), "too many requests"),
+    "401": (error(401, "no"), "key, in OPENAI_API_KEY"),
+    "404": (error(404, "no model a/model"), "no such model .*/v1/models"),
+    "400": (error(400, "unknown field"), "refused .*unknown field"),
+    "400, plain": (Failure(400, "no top_k"), "refused .*no top_k"),
+    "context": (error(400, "maximum context length is 2048"), "does not fit .*max_tokens"),
+    "cut body": (Failure(200, completion("x" * 99), cut=True), "broke off, asked 2"),
+    "cut JSON": (Failure(200, '{"choices": ['), "cut off or is not JSON"),
+    "HTML": (Failure(200, "<style>a{}</style><body>Welcome</body>"), "not a chat completion: Welcome"),
+    "other JSON": (Failure(200, {"hello": 1}), "not a chat completion"),
+    "no choices": (Failure(200, {"choices": []}), "not a chat completion"),
+    "a slow reply": (Failure(200, completion("x"), drip=1.0), "answer within 0.4 s, asked 2 times"),
+    "a dripping reply": (Failure(200, completion("x"), drip=0.1), "answer within 0.4 s, asked 1 time"),
+    "a large reply": (Failure(200, completion("x" * REPLY_LIMIT)), "larger than 4 MiB"),
 }
 
 
 @pytest.mark.parametrize("name", FAILURES)
 def test_a_failure_is_a_clear_error_and_the_other_answers_are_kept(ask, name):
-    failure, cause, advice = FAILURES[name]
+    failure, cause = FAILURES[name]
     bad, slow = lw.MT10[4], "answer within" in cause
     server = FakeServer(lambda body: failure if asked_for(body) == bad else shipped(body))
     began = time.monotonic()
-    with pytest.raises(PlannerError, match=cause) as caught:
+    with pytest.raises(PlannerError, match=rf"^'a/model' at http://127.0.0.1.*{bad}, attempt 0: .*{cause}") as caught:
         ask(server, concurrency=1, timeout=0.4 if slow else 20.0)
     assert time.monotonic() - began < 10
-    message = str(caught.value)
-    assert message.startswith("'a/model' at http://127.0.0.1")
-    assert f"{bad}, attempt 0: " in message
-    assert advice in message
-    assert message.isprintable()
-    assert len(message) < 1000
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 1000
     kept = 4 if caught.value.fatal else 9
-    assert f"{kept} of 10 answers are kept" in message
+    assert f"{kept} of 10 answers are kept" in str(caught.value)
     working = FakeServer()
     assert len(ask(working, concurrency=1)) == 10
     assert len(working.requests) == 10 - kept
@@ -146,7 +135,7 @@ def test_a_failure_is_a_clear_error_and_the_other_answers_are_kept(ask, name):
     ids=range(4),
 )
 @pytest.mark.parametrize("constrain", [False, True])
-def test_passing_failures_are_retried(ask, failure, constrain):
+def test_temporary_failures_are_retried(ask, failure, constrain):
     server = FakeServer(failures=[failure])
     format = "basic_py" if constrain else "chain_py"
     assert ask(server, "push", constrain=constrain, format=format)[0].decoded.plan == PLANS["push"]
@@ -168,7 +157,7 @@ def test_a_refused_connection(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_fatal_failure_ends_the_questions(ask):
+def test_no_question_is_asked_after_a_fatal_failure(ask):
     server = FakeServer(lambda body: error(401, "no"))
     with pytest.raises(PlannerError):
         ask(server, "MT50", concurrency=2, retries=0)
@@ -214,7 +203,7 @@ def test_a_missing_or_broken_key(tmp_path, monkeypatch):
         assert "9876" not in str(caught.value)
 
 
-def test_an_address_is_shown_without_secrets():
+def test_a_printed_address_has_no_secrets():
     planner = lw.OpenAIPlanner("m", base_url="http://me:secret@127.0.0.1:8000/v1/?token=secret")
     assert planner.address == "http://127.0.0.1:8000/v1"
     assert "secret" not in repr(planner) + json.dumps(planner.request(lw.TASKS["push"], "chain_py"))
@@ -245,7 +234,7 @@ def test_answers_without_a_plan(ask, tmp_path, body, note):
     assert note is None or any(note in other for other in answer.notes)
     (again,) = ask(FakeServer(), "push")
     assert (again.cached, again.text, again.notes) == (True, answer.text, answer.notes)
-    (read,) = lw.FilePlanner(tmp_path / "out").plans("push")
+    (read,) = lw.planners.FilePlanner(tmp_path / "out").plans("push")
     assert read.text == answer.text
 
 
@@ -279,10 +268,10 @@ def test_servers_that_refuse_max_tokens_and_system_messages(ask):
     server = FakeServer(respond)
     assert all(answer.decoded.plan for answer in ask(server, concurrency=1))
     assert len(server.requests) == 12
-    assert server.requests[-1]["messages"][0]["content"].endswith(lw.plan_prompt(lw.MT10[-1], "chain_py"))
+    assert server.requests[-1]["messages"][0]["content"].endswith(lw.planners.plan_prompt(lw.MT10[-1], "chain_py"))
 
 
-def test_your_own_task(ask, tmp_path):
+def test_a_custom_task(ask, tmp_path):
     (tmp_path / "tasks.toml").write_text('[stack]\ndescription = "Stack it."\nobjects.brick = "obs[4:7]"\n')
     stack = lw.load_tasks(tmp_path / "tasks.toml")["stack"]
     server = FakeServer(lambda body: completion('def stack(robot):\n if check("gripper open"):\n  robot.take("brick")'))

@@ -92,7 +92,6 @@ def test_a_plan_is_repaired(planner, tmp_path):
         again = repair_plans(model, first, episodes=2, progress=False)
     push, reach = repairs
     assert [check.success for check in push.checks] == [0.0, 1.0]
-    assert push.best == 1
     assert len(reach.answers) == 1, "the only step of its plan is its first"
     assert len(server.requests) == 3, "the second time, all answers are cached"
     assert [repair.answers[-1].text for repair in again] == [repair.answers[-1].text for repair in repairs]
@@ -100,7 +99,7 @@ def test_a_plan_is_repaired(planner, tmp_path):
     assert (answer["role"], answer["content"], facts["role"]) == ("assistant", first[0].raw, "user")
     assert "succeeded in 0% of episodes" in facts["content"]
     assert "stuck in step 1" in facts["content"]
-    assert lw.FilePlanner(tmp_path / "plans", "m-round1").recorded == (("chain_py", "push", 0),)
+    assert lw.planners.FilePlanner(tmp_path / "plans", "m-round1").recorded == (("chain_py", "push", 0),)
 
 
 def test_rounds_limit_the_requests(planner):
@@ -109,11 +108,10 @@ def test_rounds_limit_the_requests(planner):
         model = planner(address)
         (repair,) = repair_plans(model, model.plans("push", progress=False), rounds=2, episodes=1, progress=False)
     assert len(repair.answers) == 3
-    assert repair.best == 0
     assert "no plan was found" in server.requests[-1]["messages"][-1]["content"]
 
 
-def test_the_model_is_told_that_its_json_was_cut_off(planner):
+def test_the_report_says_that_the_json_was_cut_off(planner):
     whole = write_structured(PLANS["push"], PLAN_FORMATS["chain_py"].style)
     server = FakeServer(lambda body: completion(whole[: whole.index('"skill"', 900)], "length"))
     with serving(server) as address:
@@ -130,7 +128,7 @@ def test_answers_and_facts_must_agree(planner):
     with serving(FakeServer()) as address:
         model = planner(address)
         answers = [*model.plans("push", progress=False), *model.plans("push", format="basic_py", progress=False)]
-        with pytest.raises(ValueError, match="of one format, each with its facts, got 2 answers of basic_py, chain_py"):
+        with pytest.raises(ValueError, match=r"answers .*basic_py, chain_py"):
             model.revise(answers, ["a", "b"])
-        with pytest.raises(ValueError, match="got 1 answer of chain_py and 2 facts"):
+        with pytest.raises(ValueError, match=r"answers .*2 facts"):
             model.revise(answers[:1], ["a", "b"])

@@ -1,4 +1,4 @@
-"""A suite of one's own, of another size: gymnasium-robotics' FrankaKitchen, whose nine actions turn joints."""
+"""A custom suite of another size: gymnasium-robotics' FrankaKitchen, whose nine actions move joints."""
 
 from functools import cache
 
@@ -55,7 +55,7 @@ def built() -> KitchenEnv:
 
 
 class KitchenEngine(SeenRows):
-    """Rows of FrankaKitchen-v1, each with a task and a state of its own; they share the compiled model."""
+    """Rows of FrankaKitchen-v1, each with its task and state; they share the compiled model."""
 
     def __init__(self, row_tasks, *, reward="sparse", num_threads=None):
         self._rows = []
@@ -103,7 +103,7 @@ class KitchenEngine(SeenRows):
 
 
 def goal_of(env: KitchenEnv) -> np.ndarray:
-    """Where the task's thing is once its joint is at the goal."""
+    """Return the position of the task's object when its joint is at the goal."""
     data, ((thing, goal),) = mujoco.MjData(env.model), env.goal.items()
     data.qpos[:] = env.robot_env.init_qpos
     data.qpos[OBS_ELEMENT_INDICES[thing]] = goal
@@ -112,7 +112,7 @@ def goal_of(env: KitchenEnv) -> np.ndarray:
 
 
 class Pusher(TensorDictModuleBase):
-    """Slide the cabinet open: the hand goes beside the handle, then to the right, by the arm's Jacobian."""
+    """Slides the cabinet open: the hand moves beside the handle, then right, by the arm's Jacobian."""
 
     row_by_row = True
     in_keys, out_keys = ("observation",), ("action",)

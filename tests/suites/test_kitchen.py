@@ -119,7 +119,7 @@ def actors(features):
             plans, **small() | {"features": Concat(ObservationFeatures("opening", layout=KITCHEN), RoleFeatures(plans))}
         )
     else:
-        yield lw.DescriptorConditionedActor([MICROWAVE, CABINET], **small(features, "task_encoder"))
+        yield lw.modules.DescriptorConditionedActor([MICROWAVE, CABINET], **small(features, "task_encoder"))
 
 
 @pytest.mark.parametrize("features", ["raw", "differences", "relative", "opening", "both"])
@@ -135,7 +135,7 @@ def test_actors_write_nine_numbers(features, env, tmp_path):
 
 
 def test_evaluator_reads_an_objects_opening():
-    evaluator = lw.StateQueryEvaluator(PLANS, width=8)
+    evaluator = lw.modules.StateQueryEvaluator(PLANS, width=8)
     state = torch.zeros(2, 93)
     state[1, DOOR] = 1.0
     ids = torch.full((2,), lw.task_id(MICROWAVE.name))

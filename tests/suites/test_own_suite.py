@@ -160,7 +160,7 @@ def test_failures_are_attributed_with_the_suites_skills():
 
 
 def test_evaluators_and_critics_read_the_layout(demos):
-    evaluator = lw.StateQueryEvaluator(SUITE.plans, width=8)
+    evaluator = lw.modules.StateQueryEvaluator(SUITE.plans, width=8)
     actor = TensorDictSequential(evaluator, lw.PlanConditionedActor(SUITE.plans, **small()))
     env = lw.LanguageWorldEnv("toy", suite=SUITE)
     state = actor(env.reset())
@@ -189,7 +189,7 @@ def test_policies_that_cannot_transfer_raise():
     with pytest.raises(ValueError, match="'differences' of layout 'metaworld' do not transfer to 'toy'"):
         TransferredActor(lw.PlanConditionedActor(lw.load_plans("MT10")), SUITE.plans)
     with pytest.raises(TypeError, match="plans"):
-        TransferredActor(lw.DescriptorConditionedActor("MT10"), SUITE.plans)
+        TransferredActor(lw.modules.DescriptorConditionedActor("MT10"), SUITE.plans)
 
 
 def test_transferred_policy_is_saved(tmp_path):

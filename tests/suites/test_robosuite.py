@@ -34,9 +34,9 @@ def suite(example):
 
 
 def test_check_finds_nothing_wrong(suite):
-    """Of one task: the others have the same arm, gripper and frame."""
+    """One task is enough: the others have the same arm, gripper and frame."""
     lift = replace(suite, tasks={"robosuite/lift": suite.tasks["robosuite/lift"]}, plans=None)
-    assert [one for one in check_suite(lift) if not one.right] == []
+    assert [finding for finding in check_suite(lift) if not finding.right] == []
 
 
 def test_seed_determines_an_episode(suite):
@@ -53,8 +53,8 @@ def test_seed_determines_an_episode(suite):
         np.testing.assert_array_equal(engine.step(action, np.array([True, True])).observation[[1, 0]], state)
     alone = engine.step(action, np.array([True, False]))
     np.testing.assert_array_equal(alone.observation[1], walk[-1][0])
-    spoilt = engine.step(np.full_like(action, np.nan), np.array([False, True]))
-    assert spoilt.fault.tolist() == [False, True]
+    unstable = engine.step(np.full_like(action, np.nan), np.array([False, True]))
+    assert unstable.fault.tolist() == [False, True]
     engine.close()
 
 

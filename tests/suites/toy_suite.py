@@ -1,4 +1,4 @@
-"""A suite of one's own, in NumPy: three blocks, no step before, actions of 7 numbers of which 4 count."""
+"""A custom suite in NumPy: three blocks, no numbers of the previous step, actions of 7 numbers, of which 4 count."""
 
 from __future__ import annotations
 

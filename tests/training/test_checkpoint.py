@@ -28,7 +28,7 @@ PLANS = lw.load_plans("MT10")
 
 
 def small(plans=PLANS, **options):
-    """A small actor; the same for :class:`lw.DescriptorConditionedActor`'s tasks."""
+    """A small actor; the same for :class:`lw.modules.DescriptorConditionedActor`'s tasks."""
     parts = {"skill_encoder": SkillEncoder(4, width=8), "decoder": MLPDecoder(width=16, depth=1)}
     return lw.PlanConditionedActor(plans, **{**parts, **options})
 
@@ -115,7 +115,7 @@ def test_custom_plans_are_stored_and_the_text_encoder_is_passed_again(path):
 
 CUSTOM_TEXTS = {
     "a plan": lambda: small(own_plans()),
-    "a description": lambda: lw.DescriptorConditionedActor(
+    "a description": lambda: lw.modules.DescriptorConditionedActor(
         [replace(lw.TASKS["reach"], description="Bring the hand over to the red spot.")]
     ),
     "an ensemble": lambda: ActorEnsemble([small(own_plans()), small(own_plans())]),
@@ -265,7 +265,7 @@ def test_files_of_another_kind_are_refused(saved, tmp_path, path):
     save_file({"weight": torch.ones(2)}, path)
     assert_refused(path, "not written by lw_torchrl")
     assert_refused(saved[0].with_name("policy.training.safetensors"), "must be a policy .*'lw_torchrl.training'")
-    save_evaluator(lw.StateQueryEvaluator(PLANS, width=8), path)
+    save_evaluator(lw.modules.StateQueryEvaluator(PLANS, width=8), path)
     assert_refused(path, "must be a policy .*'lw_torchrl.evaluator'")
 
 

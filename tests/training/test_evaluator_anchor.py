@@ -14,7 +14,7 @@ import lw_torchrl as lw
 
 def make_trainer(demos, weight, steps=12, path=None, stop_at=None):
     torch.manual_seed(0)
-    evaluator = lw.StateQueryEvaluator(PLANS, width=16, depth=1)
+    evaluator = lw.modules.StateQueryEvaluator(PLANS, width=16, depth=1)
     actor = TensorDictSequential(evaluator, make_actor())
     replay = lw.LanguageWorldExperienceReplay(demos, sampler=lw.TaskBalancedSampler())
     config = replace(CONFIG, qaf_anchor=weight, steps=steps)

@@ -34,7 +34,7 @@ def replay(tmp_path_factory):
 
 def make(seed=0, **options):
     torch.manual_seed(seed)
-    return lw.StateQueryEvaluator(PLANS, **{"width": 16, "depth": 1, **options})
+    return lw.modules.StateQueryEvaluator(PLANS, **{"width": 16, "depth": 1, **options})
 
 
 def make_trainer(replay, path=None, *, config=SMALL, **options):
@@ -126,8 +126,8 @@ def test_a_score_counts_every_answer_once(replay, tmp_path):
     score = score_evaluator(make(), data)
     part, states = data.parts["states"], score.parts["states"]
     assert states.answers == sum(queries.truth.numel() for queries in part)
-    assert sum(true for _, true in states.asked.values()) == int(sum(queries.truth.sum() for queries in part))
-    assert states.balanced_accuracy(states.worst[0]) == min(map(states.balanced_accuracy, states.asked))
+    assert sum(true for _, true in states.total.values()) == int(sum(queries.truth.sum() for queries in part))
+    assert states.balanced_accuracy(states.worst[0]) == min(map(states.balanced_accuracy, states.total))
     score.save(tmp_path / "score.json")
     assert json.loads((tmp_path / "score.json").read_text())["parts"]["states"]["accuracy"] == states.accuracy()
     assert "held-out queries" in score.table()

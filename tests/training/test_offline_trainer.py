@@ -193,19 +193,6 @@ def test_cqls_first_actor_loss_is_not_added_to_the_other_one(demos):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["value", "td3-bc"])
-def test_the_rows_statistics_reach_networks_and_their_targets(demos, name):
-    trainer = make_trainer(demos, name)
-    tensors = tensors_of(trainer.loss)
-    means = {key: tensor for key, tensor in tensors.items() if key.endswith("features.mean")}
-    assert any(key.startswith("target_") for key in means)
-    assert all(tensor.abs().sum() > 0 for tensor in means.values())
-    untouched = make_trainer(demos, name, config=replace(CONFIG, normalize=False))
-    assert all(
-        tensor.abs().sum() == 0 for key, tensor in tensors_of(untouched.loss).items() if key.endswith("features.mean")
-    )
-
-
 def test_a_trained_policy_keeps_its_statistics(demos):
     actor = make_actor(0.0)
 

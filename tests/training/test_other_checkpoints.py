@@ -144,7 +144,7 @@ def offline(demos, path):
 def evaluator(demos, path):
     data = lw.training.LabelledQueries(lw.LanguageWorldExperienceReplay(demos, label="executed"), EVALUATOR)
     torch.manual_seed(0)
-    network = lw.StateQueryEvaluator(PLANS, width=8, depth=1)
+    network = lw.modules.StateQueryEvaluator(PLANS, width=8, depth=1)
     return lw.training.QueryEvaluatorTrainer(network, data, EVALUATOR, checkpoint=path, progress=False)
 
 

@@ -26,7 +26,7 @@ OPEN = CONDITIONS[0]
 def both(env: EnvBase, **options) -> TransformedEnv:
     """Return the environment with exact answers and corrupted ones."""
     exact, corrupted = lw.QAFTransform(PLANS, out_keys=["exact"]), lw.QAFTransform(PLANS)
-    return TransformedEnv(env, Compose(exact, corrupted, lw.CorruptQAF(PLANS, **options)))
+    return TransformedEnv(env, Compose(exact, corrupted, lw.transforms.CorruptQAF(PLANS, **options)))
 
 
 def draws(purpose: str, task: str, seed: int, episode: int, step: int, width: int) -> Tensor:
@@ -84,7 +84,7 @@ def test_soft_answers_are_corrupted_alike(options):
 
     module = TensorDictModule(lambda qaf: 0.25 + 0.5 * qaf.float(), in_keys=["qaf"], out_keys=["qaf"])
     soft = Evaluate(module=module, observation_spec_transform=to_float)
-    parts = lw.QAFTransform(PLANS), soft, lw.CorruptQAF(PLANS, **options)
+    parts = lw.QAFTransform(PLANS), soft, lw.transforms.CorruptQAF(PLANS, **options)
     env = TransformedEnv(RandomStates(ROWS), Compose(*parts))
     check_env_specs(env)
     env, plain = (
@@ -156,7 +156,7 @@ def test_errors_do_not_depend_on_the_number_of_environments_and_workers():
         return lw.LanguageWorldEnv(names, num_envs=rows, seed=1, max_steps=6, num_threads=1, worker=worker)
 
     def corrupted(env: EnvBase) -> TransformedEnv:
-        return TransformedEnv(env, Compose(lw.QAFTransform(PLANS), lw.CorruptQAF(PLANS, **options)))
+        return TransformedEnv(env, Compose(lw.QAFTransform(PLANS), lw.transforms.CorruptQAF(PLANS, **options)))
 
     envs = [
         corrupted(make(2)),
@@ -211,7 +211,7 @@ def test_resumed_environment_continues_with_the_same_errors():
 
 def test_loaded_state_requires_a_reset():
     """Also in an environment that does not require one itself."""
-    env = TransformedEnv(RandomStates(2), Compose(lw.QAFTransform(PLANS), lw.CorruptQAF(PLANS, delay=1)))
+    env = TransformedEnv(RandomStates(2), Compose(lw.QAFTransform(PLANS), lw.transforms.CorruptQAF(PLANS, delay=1)))
     state = env.reset()
     env.load_state_dict(env.state_dict())
     with pytest.raises(RuntimeError, match="reset the environment"):
@@ -222,7 +222,7 @@ def test_loaded_state_requires_a_reset():
 def test_evaluation_does_not_depend_on_num_envs_or_other_tasks(kind):
     plans = lw.load_plans("MT10")
     actor = lw.ScriptedSkillActor(plans) if kind == "scripted" else lw.PlanConditionedActor(plans)
-    corrupted = lw.CorruptQAF(plans, flip=0.2, delay=1)
+    corrupted = lw.transforms.CorruptQAF(plans, flip=0.2, delay=1)
 
     def answers(**options) -> dict[tuple[str, int], Tensor]:
         seen = []
@@ -240,7 +240,7 @@ def test_evaluation_does_not_depend_on_num_envs_or_other_tasks(kind):
 
 
 def test_with_plans_keeps_the_options():
-    corrupted = lw.CorruptQAF(PLANS, flip=0.1, delay=2, seed=4)
+    corrupted = lw.transforms.CorruptQAF(PLANS, flip=0.1, delay=2, seed=4)
     other = corrupted.with_plans(lw.Plans([PLANS["reach"]]))
     assert (other.flip, other.delay, other.seed) == (0.1, 2, 4)
 
@@ -249,29 +249,33 @@ def test_with_plans_keeps_the_options():
 
 
 def test_missing_qaf_is_refused():
-    env = TransformedEnv(RandomStates(2), lw.CorruptQAF(PLANS))
+    env = TransformedEnv(RandomStates(2), lw.transforms.CorruptQAF(PLANS))
     with pytest.raises(ValueError, match="without qaf"):
         env.reset()
     with pytest.raises(ValueError, match="without qaf"):
         _ = env.observation_spec
-    before = TransformedEnv(RandomStates(2), Compose(lw.CorruptQAF(PLANS), lw.QAFTransform(PLANS)))
+    before = TransformedEnv(RandomStates(2), Compose(lw.transforms.CorruptQAF(PLANS), lw.QAFTransform(PLANS)))
     with pytest.raises(ValueError, match="without qaf"):
         before.reset()
 
 
 def test_answers_of_other_plans_are_refused():
     turned = lw.Plans([lw.ConditionalPlan("reach", PLANS["reach"].steps[::-1]), PLANS["push"]])
-    env = TransformedEnv(RandomStates(2), Compose(lw.QAFTransform(turned), lw.CorruptQAF(PLANS)))
+    env = TransformedEnv(RandomStates(2), Compose(lw.QAFTransform(turned), lw.transforms.CorruptQAF(PLANS)))
     with pytest.raises(ValueError, match="qaf answers other plans"):
         env.reset()
-    narrow = TransformedEnv(RandomStates(1), Compose(lw.QAFTransform(PLANS), lw.CorruptQAF({"push": PLANS["push"]})))
+    narrow = TransformedEnv(
+        RandomStates(1), Compose(lw.QAFTransform(PLANS), lw.transforms.CorruptQAF({"push": PLANS["push"]}))
+    )
     with pytest.raises(ValueError, match="qaf"):
         narrow.reset()
 
 
 def test_a_replay_buffer_is_refused():
     rows = TransformedEnv(RandomStates(2), lw.QAFTransform(PLANS)).rollout(3).flatten()
-    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(6), transform=lw.CorruptQAF(PLANS), batch_size=6)
+    replay = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(6), transform=lw.transforms.CorruptQAF(PLANS), batch_size=6
+    )
     replay.extend(rows)
     with pytest.raises(ValueError, match="replay buffer"):
         replay.sample()
@@ -287,7 +291,7 @@ def test_failure_by_wrong_answers_is_attributed_to_queries():
         episodes_per_task=1,
         seed=7,
         max_steps=150,
-        evaluator=lw.CorruptQAF(plans, flip=1.0),
+        evaluator=lw.transforms.CorruptQAF(plans, flip=1.0),
         attribute=True,
         reference=reference,
     )

@@ -72,7 +72,7 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
         steps = arrow.slice(in_file[0][0], in_file[-1][1] - in_file[0][0])
         pq.write_table(steps, path, compression="zstd", use_dictionary=False)
         bar.update(len(steps))
-    place = np.unique(place, return_inverse=True)[1]
+    place = np.unique(place, return_inverse=True)[1]  # a long episode may skip a number
     episodes: dict[str, Any] = {
         "episode_index": np.arange(len(lengths)),
         "tasks": [[table.descriptions[task]] for task in table.tasks],
@@ -166,13 +166,9 @@ def _pixel_format(pictures: Pictures) -> str:
 def _video_feature(pictures: Pictures, fps: int) -> dict[str, Any]:
     """Return a video's entry in LeRobot's info.json."""
     height, width, _ = pictures.shape
-    info: dict[str, Any] = {
-        "video.height": height,
-        "video.width": width,
-        "video.channels": 3,
-        "video.is_depth_map": False,
-    }
-    info |= {"video.codec": "h264", "video.pix_fmt": _pixel_format(pictures), "video.fps": fps, "has_audio": False}
+    info: dict[str, Any] = {"video.height": height, "video.width": width, "video.channels": 3, "video.fps": fps}
+    info |= {"video.codec": "h264", "video.pix_fmt": _pixel_format(pictures)}
+    info |= {"video.is_depth_map": False, "has_audio": False}
     return {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": info}
 
 

@@ -31,6 +31,7 @@ def _episode(group: Any) -> dict[str, Array]:
     columns: dict[str, Array] = {}
 
     def add(path: str, item: Any) -> None:
+        # Only known columns are loaded: images may be larger than the memory.
         name = path.replace("/", ".")
         if name in KNOWN and getattr(item, "dtype", np.dtype("O")).kind in "biuf" and item.ndim:
             columns[name] = item[()]

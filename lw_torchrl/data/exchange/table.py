@@ -19,17 +19,7 @@ from lw_torchrl._util.files import replacing_folder
 from lw_torchrl._util.progress import Progress
 from lw_torchrl.data import dataset
 from lw_torchrl.data.collection_policy import Behaviour
-from lw_torchrl.data.dataset import (
-    TRAJECTORY,
-    CollectConfig,
-    DatasetError,
-    Demonstrations,
-    EpisodeInfo,
-    describe_episode,
-    load_rows,
-    verify,
-    write_rows,
-)
+from lw_torchrl.data.dataset import CollectConfig, DatasetError, Demonstrations, EpisodeInfo
 from lw_torchrl.language.plans import Plans
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.suites.suite import Suite
@@ -114,8 +104,8 @@ class Table:
 
 def table_of(demonstrations: Demonstrations, metadata: Mapping[str, Any], suite: Suite, plans: Plans | None) -> Table:
     """Return a dataset's rows, compared with their checksums, and the truth of its tasks' conditions."""
-    verify(demonstrations, demonstrations.episodes)
-    rows, tasks = load_rows(demonstrations), demonstrations.config.tasks
+    dataset.verify(demonstrations, demonstrations.episodes)
+    rows, tasks = dataset.load_rows(demonstrations), demonstrations.config.tasks
     columns: dict[str, Array] = {name: np.asarray(rows.get(key)) for name, key in KEYS.items()}
     columns |= {name: column[:, 0] for name, column in columns.items() if name not in WIDE}
     planned = {name: plans[name] for name in tasks if plans is not None and name in plans}
@@ -159,11 +149,10 @@ def write_dataset(
 ) -> Demonstrations:
     """Write rows, an episode for each span, as the described dataset, atomically. Rows of an export must match the
     checksums in the description."""
-    infos: list[EpisodeInfo] = []
 
-    def episodes() -> Iterator[TensorDict]:
+    def episodes() -> Iterator[tuple[str, int, TensorDict]]:
         with Progress("importing", sum(end - start for start, end in spans), "row") as bar:
-            for number, (info, (start, end)) in enumerate(zip(description.episodes, spans, strict=True)):
+            for info, (start, end) in zip(description.episodes, spans, strict=True):
                 rows = TensorDict({}, [end - start])
                 for name, key in KEYS.items():
                     part = torch.from_numpy(np.array(columns[name][start:end], order="C"))
@@ -171,17 +160,14 @@ def write_dataset(
                 task = torch.full((end - start,), description.task_ids[info.task])
                 rows.set("task_id", task).set(("next", "task_id"), task)
                 rows.set("episode", torch.full_like(task, info.episode))
-                rows.set(TRAJECTORY, torch.full_like(task, number))
-                first = infos[-1].start + infos[-1].length if infos else 0
-                infos.append(describe_episode(info.task, info.episode, first, rows))
-                yield rows
+                yield info.task, info.episode, rows
                 bar.update(end - start)
 
     with replacing_folder(out) as folder:
-        write_rows(folder / dataset.DATA, episodes(), description.config.layout)
-        if exported_as and tuple(infos) != description.episodes:
+        infos = dataset.write_rows(folder / dataset.DATA, episodes(), description.config.layout)
+        if exported_as and infos != description.episodes:
             raise ExchangeError(f"source: {str(exported_as)!r} is damaged: its rows differ from their checksums")
-        dataset.write_metadata(replace(description, root=folder, episodes=tuple(infos)))
+        dataset.write_metadata(replace(description, root=folder, episodes=infos))
     return dataset.read_metadata(out)
 
 

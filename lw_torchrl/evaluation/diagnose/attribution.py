@@ -121,8 +121,8 @@ def attribute_failures(
     names = sorted({task for task, _, _ in failed})
     own_suite = find_suite(names, suite)
     table = (own_suite.skills or load_skills()) if skills is None else skills
-    given = {} if reference is None else as_plans(reference, "reference")
-    trusted = {task: plan for task, plan in given.items() if task in names}
+    all_trusted = {} if reference is None else as_plans(reference, "reference")
+    trusted = {task: plan for task, plan in all_trusted.items() if task in names}
     seen = [states_of(task, k, steps, answered, _answers(steps, actor)) for task, k, steps in failed]
     scripts, trusted_scripts = Scripts(answered, table), Scripts(Plans(trusted), table) if trusted else None
     explained = [(states, explain(states, scripts, trusted_scripts)) for states in seen]
@@ -219,6 +219,7 @@ def _by_counterfactuals(
     counting = [name for name in tried.mending(seen) if not (same and name == "plan")]
     decision = decide(counting, shares, share)
     cause, also, mended = decision.cause, decision.also, tried.mended(decision.by, which)
+    # If the motion is wrong only in one step, the skill of that step is to blame.
     only = tried.step_of_motion(seen) if cause == "actuation" else None
     cause = cause if only is None else "skill"
     if mended is not None:
@@ -226,7 +227,7 @@ def _by_counterfactuals(
         if cause == "actuation" and tried_here.get("skill") and "skill" not in counting:
             record["scripted_step"] = tried.step[which]
     elif explanation.cause == "query" and "query" not in tried_here and not (same and tried_here.get("plan")):
-        cause = "query"
+        cause = "query"  # wrong answers are a fact, even where they could not be replaced
     step: int | None
     finding: Finding | None
     step, at, finding = explanation.blames.get(cause, explanation.blames["undecided"])

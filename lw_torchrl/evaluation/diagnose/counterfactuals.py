@@ -66,12 +66,16 @@ class Rerun:
         """Return the episodes, each up to its first success, with ``longer`` times the time limit."""
         listed = {task: [k for _, k in group] for task, group in groupby(sorted(which), itemgetter(0))}
         episodes: dict[EpisodeId, FinishedEpisode] = {}
+
+        def keep(episode: FinishedEpisode) -> None:
+            episodes[episode.task, episode.episode] = episode
+
         rollout(
             f"again with {label}",
             actor,
             {task: self.tasks[task] for task in listed},
             listed,
-            lambda episode: episodes.__setitem__(episode[:2], episode),
+            keep,
             plans=plans,
             evaluator=evaluator,
             num_envs=None if self.num_envs is None else max(len(listed), self.num_envs),
@@ -93,14 +97,14 @@ class NullControl(NamedTuple):
 
     episodes: Mapping[EpisodeId, FinishedEpisode]
     misled: Mapping[EpisodeId, Misled]  # episodes in which the policy was shown a wrong state
-    differs: Mapping[EpisodeId, Difference]  # the first difference of episodes that went another way
+    differs: Mapping[EpisodeId, Difference]  # the first difference of episodes that did not repeat exactly
 
     def succeeds(self, which: EpisodeId) -> bool:
         return self.episodes[which].first_success is not None
 
     def share(self, task: str) -> float:
         """Return the share of a task's failed episodes that succeed in the re-run."""
-        succeeded = [one.first_success is not None for (of, _), one in self.episodes.items() if of == task]
+        succeeded = [episode.first_success is not None for (of, _), episode in self.episodes.items() if of == task]
         return sum(succeeded) / len(succeeded)
 
 
@@ -121,7 +125,7 @@ def null_control(
         if (first := difference(steps, again)) is not None:
             differs[which] = first
     numbers = {(task_id(task), k): (task, k) for task, k in failed}
-    return NullControl(episodes, {numbers[one]: misled for one, misled in seen.misled.items()}, differs)
+    return NullControl(episodes, {numbers[which]: misled for which, misled in seen.misled.items()}, differs)
 
 
 def difference(steps: TensorDictBase, again: TensorDictBase) -> Difference | None:
@@ -164,17 +168,19 @@ class Counterfactuals:
         try:
             other = with_plans(actor, canonical_like(reference, plans_of(actor)))
             reference = plans_of(other) or reference  # a policy may complete its plans
-            theirs = evaluator.with_plans(reference) if hasattr(evaluator, "with_plans") else evaluator
-            self.other, self.other_evaluator, self.reference = other, theirs, reference
+            other_evaluator = evaluator.with_plans(reference) if hasattr(evaluator, "with_plans") else evaluator
+            self.other, self.other_evaluator, self.reference = other, other_evaluator, reference
         except (AttributeError, ImportError, RuntimeError, TypeError, ValueError) as error:
-            why = f"{type(error).__name__}: {error}"
-            warnings.warn(f"reference: the policy cannot carry it out, so no plan is replaced ({why})", stacklevel=4)
+            reason = f"{type(error).__name__}: {error}"
+            warnings.warn(f"reference: the policy cannot follow it, so no plan is replaced ({reason})", stacklevel=4)
 
     def run(self, seen: Sequence[EpisodeStates], same: Collection[EpisodeId] = ()) -> None:
-        """Run the replacements; ``same`` are the episodes in which plan and reference request the same actions."""
-        seen = [one for one in seen if not self.null.succeeds(one.which)]
-        every = [one.which for one in seen]
-        # Each replacement is tried only where it can decide something that those before it did not.
+        """Run the replacements; ``same`` are the episodes in which plan and reference request the same actions.
+
+        Each replacement is tried only on the episodes in which it can still decide the cause.
+        """
+        seen = [states for states in seen if not self.null.succeeds(states.which)]
+        every = [states.which for states in seen]
         misled = [which for which in every if which in self.null.misled]
         is_sensor = isinstance(self.evaluator, Transform) and "observation" in self.evaluator.out_keys
         evaluator = None if is_sensor else self.evaluator
@@ -182,30 +188,31 @@ class Counterfactuals:
             self._run("perception", misled, self.actor, self.plans, evaluator)
         true = with_true_answers(self.actor)
         can_answer = evaluator is not None or true is not self.actor
-        wrong = [one.which for one in seen if can_answer and bool((one.given != one.truth).any())]
+        wrong = [states.which for states in seen if can_answer and bool((states.answers != states.truth).any())]
         self._run("query", wrong, true, self.plans)
-        left = self._unmended(every, "perception", "query")
-        with_reference = [w for w in left if self.reference is not None and w[0] in self.reference]
+        left = self._unfixed(every, "perception", "query")
+        with_reference = [which for which in left if self.reference is not None and which[0] in self.reference]
         self._run("plan", with_reference, self.other, self.reference, self.other_evaluator)
-        self._run_scripts([one for one in seen if one.which in left])
-        left = self._unmended(left, "skill", "gripper", "actuation", "policy")
-        left = [one for one in left if one in same or not self._mends("plan", one)]
+        self._run_scripts([states for states in seen if states.which in left])
+        left = self._unfixed(left, "skill", "gripper", "actuation", "policy")
+        left = [which for which in left if which in same or not self._fixes("plan", which)]
         self._run("time", left, self.actor, self.plans, self.evaluator, longer=2)
-        left = self._unmended(left, "time")
-        pair = [one for one in left if one in wrong]
-        with_reference = [one for one in left if one in with_reference]
+        # Pairs are tried only where no replacement helps on its own.
+        left = self._unfixed(left, "time")
+        pair = [which for which in left if which in wrong]
+        with_reference = [which for which in left if which in with_reference]
         self._run("query + skill", pair, true, self.plans, wrap=self._scripted(self.plans))
-        both, other = [one for one in pair if one in with_reference], with_true_answers(self.other)
+        both, other = [which for which in pair if which in with_reference], with_true_answers(self.other)
         self._run("query + plan", both, other, self.reference)
-        left = self._unmended(with_reference, "query + skill", "query + plan")
+        left = self._unfixed(with_reference, "query + skill", "query + plan")
         wrap = self._scripted(self.reference)
         self._run("plan + skill", left, self.other, self.reference, self.other_evaluator, wrap=wrap)
 
-    def _mends(self, name: str, which: EpisodeId) -> bool:
+    def _fixes(self, name: str, which: EpisodeId) -> bool:
         return self.results.get(name, {}).get(which) is not None
 
-    def _unmended(self, which: Iterable[EpisodeId], *names: str) -> list[EpisodeId]:
-        return [one for one in which if not any(self._mends(name, one) for name in names)]
+    def _unfixed(self, episodes: Iterable[EpisodeId], *names: str) -> list[EpisodeId]:
+        return [which for which in episodes if not any(self._fixes(name, which) for name in names)]
 
     def _run(
         self, name: str, which: Sequence[EpisodeId], actor: Any, plans: Any, evaluator: Any = None, **options: Any
@@ -213,7 +220,7 @@ class Counterfactuals:
         again = {}
         if which and actor is not None and plans is not None:
             again = self.rerun(replacement_text(name), which, actor, plans, evaluator, **options)
-            kept = {one: None if episode.first_success is None else episode for one, episode in again.items()}
+            kept = {w: None if episode.first_success is None else episode for w, episode in again.items()}
             self.results.setdefault(name, {}).update(kept)
         return again
 
@@ -226,32 +233,33 @@ class Counterfactuals:
 
     def _run_scripts(self, seen: Sequence[EpisodeStates]) -> None:
         """Give scripts control of one step, trying the likeliest steps in turn; of gripper or motion; of everything."""
-        ranked = {}
-        for one in seen:
-            comparison = compare_with_scripts(self.actor, one, self.scripts)
+        ranked: dict[EpisodeId, list[int]] = {}  # the steps to try in each episode
+        for states in seen:
+            comparison = compare_with_scripts(self.actor, states, self.scripts)
             unlike = None if comparison is None else comparison.unlike()
             if comparison is not None:
-                self.comparisons[one.which] = comparison
-            if unlike is None or unlike.any():
-                ranked[one.which] = candidates(one, unlike)
+                self.comparisons[states.which] = comparison
+            if unlike is None or unlike.any():  # else the policy acts as the scripts do, so they would change nothing
+                ranked[states.which] = candidates(states, unlike)
         has_steps = plans_of(self.actor) is not None
         for turn in range(_TRIED_STEPS if has_steps else 0):
-            which = self._unmended([w for w, steps in ranked.items() if len(steps) > turn], "skill")
-            steps = {one: ranked[one][turn] for one in which}
+            episodes = self._unfixed([which for which, steps in ranked.items() if len(steps) > turn], "skill")
+            steps = {which: ranked[which][turn] for which in episodes}
             wrap = self._scripted(self.plans, steps=steps)
-            again = self._run("skill", which, self.actor, self.plans, self.evaluator, wrap=wrap)
-            self.step.update({one: steps[one] for one in which if self._mends("skill", one)})
-            for episode in set(which) & set(self.comparisons):
-                there = states_of(*episode, again[episode].steps, self.plans, None)
-                both = self.comparisons[episode].followed_by(compare_with_scripts(self.actor, there, self.scripts))
-                self.with_script.setdefault(episode, {})[steps[episode]] = both
-        left = [one for one in ranked if not (self._mends("skill", one) and self._in_one_step(one))]
+            again = self._run("skill", episodes, self.actor, self.plans, self.evaluator, wrap=wrap)
+            self.step.update({which: steps[which] for which in episodes if self._fixes("skill", which)})
+            for which in set(episodes) & set(self.comparisons):
+                states = states_of(*which, again[which].steps, self.plans, None)
+                both = self.comparisons[which].followed_by(compare_with_scripts(self.actor, states, self.scripts))
+                self.with_script.setdefault(which, {})[steps[which]] = both
+        left = [which for which in ranked if not (self._fixes("skill", which) and self._in_one_step(which))]
         for name, part in (("gripper", "gripper"), ("actuation", "displacement")):
             if self.plans.layout.gripper is not None:
                 wrap = self._scripted(self.plans, part=part)
                 self._run(name, left, self.actor, self.plans, self.evaluator, wrap=wrap)
-        parts = self._unmended(left, "skill", "gripper", "actuation")
-        left = [one for one in ranked if one in parts or self._mends("plan", one)]  # can scripts follow this plan?
+        parts = self._unfixed(left, "skill", "gripper", "actuation")
+        # Where the reference helps, "policy" shows whether scripts can follow the plan that was carried out.
+        left = [which for which in ranked if which in parts or self._fixes("plan", which)]
         self._run("policy", left, self.actor, self.plans, self.evaluator, wrap=self._scripted(self.plans))
 
     def _parts(self, comparison: ScriptComparison) -> tuple[ScriptComparison, ScriptComparison]:
@@ -272,44 +280,44 @@ class Counterfactuals:
         in_one = len(comparison.active[comparison.unlike()].unique()) == 1
         return in_one and bool(self._parts(comparison)[0].unlike().any())
 
-    def mending(self, one: EpisodeStates) -> list[str]:
+    def mending(self, states: EpisodeStates) -> list[str]:
         """Return the replacements that fix an episode and count.
 
-        Of two that help, scripts for a part of the action that is close to the scripts' do not count. A script in one
-        step does not count if only the gripper is wrong there, or if the same fault is in other steps, and scripts for
-        that part in all steps help too. If it counts, scripts for the motion do not.
+        If scripts for the gripper and for the motion both help, those for a part that is close to the scripts anyway do
+        not count. A script in one step does not count if only the gripper is wrong there, or if the same fault is in
+        other steps, and scripts for that part in all steps help too. If it counts, scripts for the motion do not.
         """
-        names = [name for name, results in self.results.items() if results.get(one.which) is not None]
-        comparison, step = self.comparisons.get(one.which), self.step.get(one.which)
-        numbers = range(one.truth.shape[1])
+        names = [name for name in self.results if self._fixes(name, states.which)]
+        comparison, step = self.comparisons.get(states.which), self.step.get(states.which)
+        steps = range(states.truth.shape[1])
         if comparison is None or self.plans.layout.gripper is None:
             return names
         if "gripper" in names and "actuation" in names:
-            motion, fingers = self._parts(comparison)
-            if fingers.often_far(numbers) and motion.seldom_far(numbers):
+            motion, gripper = self._parts(comparison)
+            if gripper.often_far(steps) and motion.seldom_far(steps):
                 names.remove("actuation")
-            elif motion.often_far(numbers) and fingers.seldom_far(numbers):
+            elif motion.often_far(steps) and gripper.seldom_far(steps):
                 names.remove("gripper")
         if step is None:
             return names
-        comparison, others = self.with_script[one.which][step], [other for other in numbers if other != step]
-        motion, fingers = self._parts(comparison)
+        comparison, others = self.with_script[states.which][step], [other for other in steps if other != step]
+        motion, gripper = self._parts(comparison)
         in_others = motion.in_other_steps(step)
         if in_others is False and "actuation" in names:
             names.remove("actuation")
         in_all = motion.often_far(others) if in_others is None else in_others
-        by_gripper = fingers.often_far(others) or (fingers.often_far([step]) and not motion.often_far([step]))
+        by_gripper = gripper.often_far(others) or (gripper.often_far([step]) and not motion.often_far([step]))
         if ("gripper" in names and by_gripper) or ("actuation" in names and in_all):
             names.remove("skill")
         return names
 
-    def step_of_motion(self, one: EpisodeStates) -> int | None:
+    def step_of_motion(self, states: EpisodeStates) -> int | None:
         """Return the only step in which the motion is wrong; None if others are wrong too, or that is unknown."""
-        numbers = range(one.truth.shape[1])
-        for comparison in self.with_script.get(one.which, {}).values():
+        steps = range(states.truth.shape[1])
+        for comparison in self.with_script.get(states.which, {}).values():
             motion, _ = self._parts(comparison)
-            for step in numbers:
-                others = [other for other in numbers if other != step]
+            for step in steps:
+                others = [other for other in steps if other != step]
                 if motion.often_far([step]) and motion.in_other_steps(step) is False and not motion.often_far(others):
                     return step
         return None

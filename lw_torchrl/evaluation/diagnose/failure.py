@@ -46,7 +46,7 @@ REPLACEMENTS: dict[str, tuple[Cause, ...]] = {
 
 Finite = Annotated[float, Is[lambda x: abs(x) < 1e300]]
 _Replacement = Annotated[str, Is[lambda name: name in REPLACEMENTS]]
-# beartype checks one entry of a mapping, and these check all of them.
+# beartype checks only one entry of a mapping; these annotations check all entries.
 _Numbers = Annotated[
     Mapping[str, Finite], Is[lambda table: all(type(x) in (int, float) and abs(x) < 1e300 for x in table.values())]
 ]

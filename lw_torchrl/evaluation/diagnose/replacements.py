@@ -57,10 +57,10 @@ class Perception:
         self._now = args[0].select(TRUE_OBSERVATION, "task_id", "episode", "_step", strict=False).clone()
 
     def _look(self, module: nn.Module, args: tuple[Any, ...]) -> None:
-        given = args[0] if args and isinstance(args[0], TensorDictBase) else None
-        shown = None if given is None else given.get("observation", None)
+        tensordict = args[0] if args and isinstance(args[0], TensorDictBase) else None
+        shown = None if tensordict is None else tensordict.get("observation", None)
         true = None if self._now is None else self._now.get(TRUE_OBSERVATION, None)
-        if given is None or self._now is None or shown is None or true is None or shown.shape != true.shape:
+        if tensordict is None or self._now is None or shown is None or true is None or shown.shape != true.shape:
             return
         error = (shown - true).abs()
         for row in (error.amax(-1) > 0).logical_and(self._now.get("_step")).nonzero().flatten().tolist():
@@ -69,7 +69,7 @@ class Perception:
             previous = self.misled.get(which, misled)
             self.misled[which] = max(previous, misled, key=lambda each: (each.error, each.number))
         if self.correct:
-            given.set("observation", true.clone())
+            tensordict.set("observation", true.clone())
 
 
 def _innermost(actor: nn.Module) -> list[nn.Module]:
@@ -124,7 +124,7 @@ class Scripts:
         rulers: dict[Any, list[ScriptedSkill]] = {}
         for task, plan in plans.items():
             listed = [table.get(step.skill) for step in plan.steps]
-            suitable = [one.for_task(plan.definition) if one and one.suits(plan.definition) else None for one in listed]
+            suitable = [s.for_task(plan.definition) if s and s.suits(plan.definition) else None for s in listed]
             self.known[task] = [skill is not None for skill in suitable]
             skills[plan.definition] = own = [skill or _REST for skill in suitable]
             gains: list[Any] = [tuple(_RULER if gain else 0.0 for gain in skill.gain) for skill in own]
@@ -190,11 +190,11 @@ class ScriptedControl(nn.Module):
         step = attended(weights, mask)
         replaced = step >= 0
         if self._steps is not None:
-            # Scripts take control in the rows in which the episode's given step has any weight.
+            # Scripts take control where the step that is replaced in the row's episode has any weight.
             episodes = zip(task.tolist(), seen.get("episode").tolist(), strict=True)
-            given = torch.tensor([self._steps.get(each, -1) for each in episodes], device=action.device)
-            weight = weights.gather(-1, given.clamp(min=0).unsqueeze(-1)).squeeze(-1)
-            replaced = replaced & (weight > ACTIVE_WEIGHT) & (given >= 0)
+            own = torch.tensor([self._steps.get(which, -1) for which in episodes], device=action.device)
+            weight = weights.gather(-1, own.clamp(min=0).unsqueeze(-1)).squeeze(-1)
+            replaced = replaced & (weight > ACTIVE_WEIGHT) & (own >= 0)
         scripted = (weights * known).unsqueeze(-1) * self.scripts.program(seen.get("observation"), task)
         proper = scripted.sum(-2).to(action.dtype)
         unknown = ~known.gather(-1, step.clamp(min=0).unsqueeze(-1)).squeeze(-1)

@@ -96,6 +96,7 @@ def _success_text(failure: Failure) -> str:
 
 def finding_text(finding: Finding) -> str:
     """Return a finding as a clause with its numbers."""
+    # Steps count from 1 for a reader, and from 0 in the data.
     match finding:
         case WrongAnswers(step, condition, states, of, first):
             often = f"{states} of {of} states, first at {first}"

@@ -107,7 +107,7 @@ def compare_with_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> S
         return None
     states = seen.steps.select(*keys).clone()
     if "qaf" in actor.in_keys and plans is not None:
-        states.set("qaf", pad(seen.given, (0, plans.num_steps - seen.given.shape[1])))
+        states.set("qaf", pad(seen.answers, (0, plans.num_steps - seen.answers.shape[1])))
     with torch.no_grad(), evaluating(actor), set_exploration_type(ExplorationType.DETERMINISTIC):
         action = actor(states.to(device_of(actor))).get("action").cpu()
     program = scripts.program(seen.steps.get("observation"), seen.steps.get("task_id"))[:, : seen.weights.shape[1]]
@@ -123,7 +123,7 @@ class EpisodeStates(NamedTuple):
     episode: int
     steps: TensorDictBase  # of batch (T,)
     truth: Tensor  # (T, S) bool, the exact answers
-    given: Tensor  # (T, S) bool, the answers that the policy acted on
+    answers: Tensor  # (T, S) bool, those that the policy acted on
     weights: Tensor  # (T, S) float32, the policy's attention over the plan's steps
     active: Tensor  # (T,) int64, the step with most attention; -1 where all steps have the same
 
@@ -160,19 +160,19 @@ def chosen(truth: Tensor, steps: int) -> Tensor:
     return torch.where(here.any(-1), here.int().argmax(-1), steps - 1)
 
 
-def states_of(task: str, episode: int, steps: TensorDictBase, plans: Plans, given: Tensor | None) -> EpisodeStates:
-    """Return an episode's states under the policy's plan; ``given`` are its answers, None for the recorded ones."""
+def states_of(task: str, episode: int, steps: TensorDictBase, plans: Plans, answers: Tensor | None) -> EpisodeStates:
+    """Return an episode's states under the policy's plan; ``answers`` are the policy's, None for the recorded ones."""
     number = len(plans[task].steps)
     truth = plan_program(Plans([plans[task]]))(steps.get("observation"), steps.get("task_id"))[:, :number]
     if (logits := steps.get("qaf_logits", None)) is not None:
-        given = logits > 0
-    elif given is None and (recorded := steps.get("qaf", None)) is not None:
-        given = recorded > 0.5
-    given = truth if given is None else given[:, :number]
+        answers = logits > 0
+    elif answers is None and (recorded := steps.get("qaf", None)) is not None:
+        answers = recorded > 0.5
+    answers = truth if answers is None else answers[:, :number]
     weights = steps.get("skill_weights", None)
-    weights = one_hot(chosen(given, number), number).float() if weights is None else weights[:, :number]
+    weights = one_hot(chosen(answers, number), number).float() if weights is None else weights[:, :number]
     active = attended(weights, torch.ones_like(weights, dtype=torch.bool))
-    return EpisodeStates(task, episode, steps, truth, given, weights, active)
+    return EpisodeStates(task, episode, steps, truth, answers, weights, active)
 
 
 def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
@@ -221,18 +221,20 @@ def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) ->
     stalled = stall_step(seen, stuck, scripts.plans.layout)
     blames, evidence = {}, {"states": float(length)}
 
-    wrong = seen.given != seen.truth
+    # Wrong answers; those that changed the chosen step matter most.
+    wrong = seen.answers != seen.truth
     share = evidence["answers_wrong"] = float(wrong.any(-1).float().mean())
     if share:
-        changes = chosen(seen.given, len(plan.steps)) != chosen(seen.truth, len(plan.steps))
+        changes = chosen(seen.answers, len(plan.steps)) != chosen(seen.truth, len(plan.steps))
         matter = wrong & changes.unsqueeze(-1) if changes.any() else wrong
         column = int(matter.sum(0).argmax())
         evidence["answers_wrong_late"] = float(wrong[-late:].any(-1).float().mean())
         here = wrong[:, column].int()
         condition = str(plan.steps[column].condition)
-        answers = WrongAnswers(column, condition, int(here.sum()), length, int(here.argmax()))
-        blames["query"] = Blame(column, int(matter[:, column].int().argmax()), answers)
+        wrong_answers = WrongAnswers(column, condition, int(here.sum()), length, int(here.argmax()))
+        blames["query"] = Blame(column, int(matter[:, column].int().argmax()), wrong_answers)
 
+    # The plan: states in which no condition holds, or in which the reference requests another action.
     none = ~seen.truth.any(-1)
     evidence["no_condition_late"] = float(none[-late:].float().mean())
     if reference is None or seen.task not in reference.plans:
@@ -254,6 +256,7 @@ def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) ->
         finding = PlanDeparts(step, plan.steps[step].skill, requested, states, of, bool(recent), uncovers)
         blames["plan"] = Blame(step, at, finding)
 
+    # The step in which the episode ended.
     evidence["in_step_late"] = float((seen.active == stuck)[-late:].float().mean())
     if scripts.known[seen.task][stuck]:
         last = seen.steps[-1:]

@@ -44,6 +44,7 @@ def _write(plan: ConditionalPlan, style: Style) -> str:
     return _opening(plan.definition) + "".join(f"{line}\n" for line in lines)
 
 
+# Headings: "The task `push`: ...", or a task's name alone on its line.
 _NAMED = re.compile(r"[\s#>*\"'`]*(?:the\s+)?task\b[\s:]*([`\"'“‘*]*)([A-Za-z0-9][\w-]*(?:/[\w-]+)?)", re.IGNORECASE)
 _ALONE = re.compile(r"[\s#>*\"'`]*([a-z0-9]+(?:[-_][a-z0-9]+)*)[\s\"'`:,*]*")
 _BULLET = re.compile(r"\s*(?:[-*•–+>]|\(?\[?\d{1,3}[.)\]]|[a-z]\))\s+")
@@ -58,6 +59,7 @@ _SHOULD = re.compile(
 )
 _UNTIL = re.compile(r",?\s(?:then\s)?move\s(?:the\s)?(?:robot's\s)?gripper\suntil\s", re.IGNORECASE)
 _COMMA = re.compile(r",\s(?:then\s)?")
+# After "When C, " these words begin a sentence that is not a skill.
 _NO_SKILL = frozenset(("the", "a", "an", "it", "this", "that", "you", "we", "they", "there", "and", "or"))
 
 

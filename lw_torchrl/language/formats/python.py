@@ -80,15 +80,18 @@ def py_md(style: Style) -> PlanFormat:
     return PlanFormat("md", encode, PythonReading, prompt, style)
 
 
+# A Python string, with any prefix; possessive quantifiers (*+) keep the time linear in broken text.
 _STRING = r'(?:[fFrRbBuU]{0,2}(?:"(?:[^"\\]|\\.)*+"|\'(?:[^\'\\]|\\.)*+\'))'
 _STRINGS = rf"{_STRING}(?:[\s+]*{_STRING})*"
 _LITERAL = re.compile(r'"(?:[^"\\]|\\.?)*+("|\Z)|\'(?:[^\'\\]|\\.?)*+(\'|\Z)')  # or the start of a cut-off string
 _BRANCH = re.compile(r"(if|elif|while)\b\s*|(else)\s*:")
+# An argument: an optional name, then strings or a plain value.
 _ARGUMENT = re.compile(rf"(?:(\w+)\s*=\s*)?(?:({_STRINGS})|([^\s,()\"'][^,()\"']*))\s*(?:,\s*)?")
 _PRINTED = re.compile(r"\s*print\(\s*(\"|')(.*)\1\s*\)\s*;?")
 _DEF = re.compile(r"(?:async\s+)?def\b\s*(\w*)")
 _CHECK = re.compile(rf"(and\b|or\b)?\s*(not\b)?\s*\(?\s*(?:self\.|robot\.)?check\s*\(\s*({_STRINGS})\s*\)?\s*")
 _CALL = re.compile(r"(?:self\.)?robot\.(\w+)\s*\(\s*")
+# A comment that may begin a task: "# drawer-open: ...".
 _HEADING = re.compile(r"#+\s*([A-Za-z][\w-]*)\s*:")
 _MOST_JOINED = 6  # lines that a statement may span
 
@@ -111,23 +114,10 @@ class PythonReading(Reading):
         self.blocks: list[_Block] = []
         self.reason: list[str] = []
         self.listing = False
-        self.ignored: tuple[int, int, str] | None = None  # lines outside a plan: first and last number, first line
+        self.is_outside = False  # whether the last line was not part of a plan
         for number, line in _statements(text):
             if not self.read(number, line):
                 break
-        self.flush()
-
-    def note(self, line: int, text: str) -> None:
-        self.flush()
-        super().note(line, text)
-
-    def flush(self) -> None:
-        """Add a note on the lines that were skipped."""
-        if self.ignored is not None:
-            first, last, line = self.ignored
-            self.ignored = None
-            which = "is" if first == last else f"to line {last} are"
-            super().note(first, f"{which} not part of a plan: {shown(line.strip())}")
 
     def read(self, number: int, line: str) -> bool:
         """Read a line; return False if the answer ends with it."""
@@ -138,7 +128,6 @@ class PythonReading(Reading):
         if code.startswith("#"):
             self.comment(number, line)
         elif code.startswith(("```", "~~~")):
-            self.flush()
             self.blocks.clear()
         elif code:
             self.listing = False
@@ -168,6 +157,7 @@ class PythonReading(Reading):
     def code(self, number: int, line: str, code: str) -> None:
         indent = len(line) - len(line.lstrip())
         call, branch = _CALL.match(code), _BRANCH.match(code)
+        # Models indent in many ways, so the blocks follow the indentation that was seen, not multiples of four.
         while self.blocks:  # close the blocks that do not contain the line
             last = self.blocks[-1]
             if last.body is None and call and indent == last.indent:
@@ -178,16 +168,17 @@ class PythonReading(Reading):
         if definition := _DEF.match(code):
             self.open(_task_name(definition[1]), number)
         elif branch:
-            self.flush()
             self.branch(number, indent, code, branch)
         elif call:
-            self.flush()
             self.call(number, indent, code, call)
         elif code.startswith("robot."):
             self.note(number, f"is cut off: {shown(code)}")
         else:
-            first = self.ignored or (number, number, line)
-            self.ignored = (first[0], number, first[2])
+            if not self.is_outside:  # one note for several such lines
+                self.note(number, f"is not part of a plan: {shown(code)}")
+            self.is_outside = True
+            return
+        self.is_outside = False
 
     def branch(self, number: int, indent: int, code: str, branch: re.Match[str]) -> None:
         condition, rest = (None, code[branch.end() :]) if branch[2] else self.condition(number, code, branch.end())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from lw_torchrl._util.checks import check_choice
@@ -44,19 +45,23 @@ def _make_engine(row_tasks: Sequence[str], **options: Any) -> Engine:
     """Return the vectorized engine, or the plain one for versions that the vectorized one was not compared with."""
     if not (changes := version_changes(COMPARED_VERSIONS, COMPARED_VERSIONS)):
         return VectorizedEngine(row_tasks, **options)
-    installation = " ".join(f"{package}=={version}" for package, version in COMPARED_VERSIONS.items())
-    warnings.warn(
-        f"engine: the vectorized engine was compared with other versions ({', '.join(changes)}), so Meta-World's own "
-        "environments run instead: about 4 times slower on one thread, 6 times on two. For the vectorized engine, "
-        f"pip install {installation}",
-        stacklevel=4,
-    )
+    _warn_once(", ".join(changes))
     return MetaWorldEngine(row_tasks, **options)
 
 
-def _make_expert(tasks: Sequence[str]) -> ExpertActor:
-    from lw_torchrl.suites.metaworld.experts import (
-        ExpertActor,  # imports TensorDict, which words and engines do not need
+@cache
+def _warn_once(changes: str) -> None:
+    installation = " ".join(f"{package}=={version}" for package, version in COMPARED_VERSIONS.items())
+    warnings.warn(
+        f"engine: the vectorized engine was compared with other versions ({changes}), so Meta-World's own environments "
+        "run instead: about 4 times slower on one thread, 6 times on two. For the vectorized engine, pip install "
+        f"{installation}",
+        stacklevel=6,  # the caller of LanguageWorldEnv(...)
     )
+
+
+def _make_expert(tasks: Sequence[str]) -> ExpertActor:
+    # Imports TensorDict, which tasks and engines do not need.
+    from lw_torchrl.suites.metaworld.experts import ExpertActor
 
     return ExpertActor(tasks)

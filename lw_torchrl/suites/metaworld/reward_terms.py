@@ -127,8 +127,8 @@ GAUSSIAN = np.sqrt(-2 * np.log(AT_MARGIN))
 
 
 def square(x: Array) -> Array:
-    """Return the square by C's ``pow``, as Python and NumPy do for a single number. For an array, ``x**2`` is ``x *
-    x``, whose last bit differs in one case out of a thousand."""
+    """Return the square by C's ``pow``, as Python and NumPy do for a single number. For an array, NumPy multiplies,
+    which gives another last bit in one case out of a thousand."""
     return np.float_power(x, 2.0)
 
 

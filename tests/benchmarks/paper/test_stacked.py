@@ -33,7 +33,7 @@ def make(kind, seed):
     torch.manual_seed(seed)
     features, decoder = ObservationFeatures(), MLPDecoder(width=32)
     if kind in ("description", "one-hot"):
-        return lw.DescriptorConditionedActor(TASKS, condition=kind, features=features, decoder=decoder)
+        return lw.modules.DescriptorConditionedActor(TASKS, condition=kind, features=features, decoder=decoder)
     if kind == "focused plan":
         features = Concat(features, FocusFeatures(PLANS))
     return lw.PlanConditionedActor(PLANS, features=features, decoder=decoder)

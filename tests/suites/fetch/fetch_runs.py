@@ -1,4 +1,4 @@
-"""Episodes of the Fetch suite: gymnasium-robotics' own, and those of our plans with scripted skills."""
+"""Episodes of Fetch: gymnasium-robotics' own, the engine's, and those of plans with scripted skills."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ORIGINS = {"fetch/slide": (0.395, 0.75, 0.3955)}  # in Fetch's axes; the others 
 
 
 def random_actions(seed: int, steps: int) -> np.ndarray:
-    """(steps, 4) float32 in [-1, 1]."""
+    """Draw actions (steps, 4) float32 in [-1, 1]."""
     return np.random.default_rng(seed).uniform(-1, 1, (steps, 4)).astype(np.float32)
 
 
@@ -34,7 +34,7 @@ def ours(task: str, positions: np.ndarray) -> np.ndarray:
 
 
 def observed(task: str, env: gymnasium.Env, told: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The 11 numbers of now and the three of the goal, from what gymnasium-robotics tells."""
+    """Return the 11 present numbers and the 3 of the goal from a state of gymnasium-robotics."""
     numbers, lift = told["observation"], np.array([0.0, 0.0, 0.03])
     thing = task != "fetch/reach"
     fingers = numbers[9:11] if thing else numbers[3:5]
@@ -49,7 +49,7 @@ def observed(task: str, env: gymnasium.Env, told: dict[str, np.ndarray]) -> tupl
 
 
 def gymnasium_episode(task: str, seed: int, actions: np.ndarray) -> dict[str, np.ndarray]:
-    """What a freshly made environment gives for actions of ours (steps, 4), its time limit apart."""
+    """Run our actions (steps, 4) in a new environment of gymnasium-robotics without its time limit."""
     env = gymnasium.make(f"{IDS[task]}Dense-v4", max_episode_steps=1_000)
     now, goal = observed(task, env, env.reset(seed=seed)[0])
     found: dict[str, list] = {
@@ -71,12 +71,12 @@ def gymnasium_episode(task: str, seed: int, actions: np.ndarray) -> dict[str, np
 
 
 def physics(data) -> np.ndarray:
-    """Positions and velocities of all joints."""
+    """Return the positions and velocities of all joints."""
     return np.concatenate((data.qpos, data.qvel))
 
 
 def engine_episode(engine: FetchEngine, row: int, seed: int, actions: np.ndarray) -> dict[str, np.ndarray]:
-    """What one row gives while the others rest."""
+    """Run actions in one row while the others rest."""
     found: dict[str, list] = {"observation": [engine.reset([row], [seed])[0]], "reward": [], "success": [], "state": []}
     active = np.arange(len(engine._rows)) == row
     given = np.zeros((len(active), 4), actions.dtype)
@@ -90,7 +90,7 @@ def engine_episode(engine: FetchEngine, row: int, seed: int, actions: np.ndarray
 
 
 def scripted(task: str, seeds: range, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The plan with scripted skills: actions (steps, rows, 4), successes (steps, rows), how many steps were true."""
+    """Run the plan with scripted skills; return actions (steps, rows, 4), successes and numbers of true steps."""
     plans = lw.Plans([load_plans()[task]])
     actor, program = lw.ScriptedSkillActor(plans, skills=load_skills()), plan_program(plans)
     rows = len(seeds)

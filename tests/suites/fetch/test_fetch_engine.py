@@ -1,4 +1,4 @@
-"""FetchEngine against gymnasium-robotics, bit for bit, and what it refuses."""
+"""FetchEngine against gymnasium-robotics, bit for bit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STEPS = 50
 
 def assert_same(task: str, seed: int, actions: np.ndarray) -> None:
     engine = FetchEngine([task, task], reward="dense", num_threads=1)
-    engine_episode(engine, 1, seed + 1, random_actions(seed, 7))  # an earlier episode leaves nothing over
+    engine_episode(engine, 1, seed + 1, random_actions(seed, 7))  # an earlier episode must not matter
     found, expected = engine_episode(engine, 1, seed, actions), gymnasium_episode(task, seed, actions)
     engine.close()
     for name, numbers in expected.items():
@@ -36,11 +36,11 @@ def test_episode_has_gymnasiums_bits(task):
 def test_random_and_scripted_episodes_have_gymnasiums_bits(task, seed):
     assert_same(task, seed, random_actions(seed, STEPS))
     assert_same(task, seed, scripted(task, range(seed, seed + 1), STEPS)[0][:, 0])
-    assert_same(task, seed, random_actions(seed, 10).astype(np.float64) * 1.5)  # cut off in double precision
+    assert_same(task, seed, random_actions(seed, 10).astype(np.float64) * 1.5)  # clipped in double precision
 
 
 def all_rows(tasks: list[str], threads: int) -> list[np.ndarray]:
-    """Eight steps of all rows, which have a seed and actions of their task."""
+    """Run eight steps of all rows; a row's seed and actions depend on its task."""
     engine = FetchEngine(tasks, num_threads=threads)
     names = sorted(IDS)
     seeds = [names.index(task) for task in tasks]

@@ -1,4 +1,4 @@
-"""The Fetch suite's words: tasks, skills and plans, and that the plans succeed."""
+"""The Fetch suite's tasks, skills and plans, and the success of the plans."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def test_every_step_has_a_scripted_skill_and_is_understood():
     for plan in plans.values():
         allowed = skills_for(plan.definition, skills)
         assert {step.skill for step in plan.steps} <= set(allowed)
-        found = explain_canonical(plan)
-        assert found.left_out == ()
-        assert (found.source, found.plan.confidence) == ("plan", 1.0)
+        canonical = explain_canonical(plan)
+        assert canonical.left_out == ()
+        assert (canonical.source, canonical.plan.confidence) == ("plan", 1.0)
 
 
 def test_plans_and_tasks_can_be_saved(tmp_path):
@@ -36,8 +36,8 @@ def test_plans_and_tasks_can_be_saved(tmp_path):
 @pytest.mark.parametrize("format", lw.PLAN_FORMATS)
 def test_plans_survive_every_format(format):
     for name, plan in load_plans().items():
-        told = lw.encode_plan(plan, format)
-        assert lw.decode_plan(told, TASKS[name], format, skills=load_skills()).plan == plan
+        text = lw.encode_plan(plan, format)
+        assert lw.decode_plan(text, TASKS[name], format, skills=load_skills()).plan == plan
 
 
 @pytest.mark.parametrize("name", ["fetch/", "/push", "a/b/c", "Fetch/push", "fetch_it/push", "fetch//push"])

@@ -1,4 +1,4 @@
-"""The dense reward over arrays against Meta-World's own, bit for bit."""
+"""The dense reward of all rows at once against Meta-World's own, bit for bit."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ EDGES = [0.005, 0.01, 0.015, 0.02, 0.025, 0.03, 0.035, 0.04, 0.05, 0.06, 0.065, 
 
 
 def play_both(tasks: list[str], steps: int, precisions: list[tuple[type, ...]], seed: int) -> dict[str, float]:
-    """The largest difference of each task's rewards over episodes of the experts' actions, with noise and with
-    random ones and random grips among them; of each episode the precisions of its steps, in turn."""
+    """Return the largest difference of each task's rewards over episodes of noisy experts, with random actions and
+    grips among them. ``precisions`` has an entry for each episode: the dtypes of its actions, in turn."""
     n, rng = len(tasks), np.random.default_rng(seed)
     oracle, engine = MetaWorldEngine(tasks, reward="dense"), VectorizedEngine(tasks, reward="dense", num_threads=1)
     policies = [ENV_POLICY_MAP[f"{task}-v3"]() for task in tasks]
@@ -84,8 +84,8 @@ def test_rewards_of_whole_episodes_have_metaworlds_bits(tasks):
 
 
 def construct_states(engine: VectorizedEngine, rng: np.random.Generator) -> np.ndarray:
-    """Put the hand, the objects and the joints of every row where a formula may look twice: at, near and far from
-    the object, the start, the goal and whatever else there is. Returns the actions."""
+    """Put the hand, objects and joints of every row where formulas change: at, near and far from the object, the start,
+    the goal and other points. Return actions."""
     for number, row in enumerate(engine._rows):
         goal, starts = engine._goal[number], engine._starts.points[number]
         start, tips_start = starts[:3], starts[3:6]
@@ -131,7 +131,7 @@ def construct_states(engine: VectorizedEngine, rng: np.random.Generator) -> np.n
         ]
         for columns, value in invented:
             index = row._sensor_index[columns]
-            if index.any():  # what a task has no use for points at the first number
+            if index.any():  # sensors that a task lacks have index 0
                 row._numbers[index] = value
     n = len(engine._rows)
     action = rng.uniform(-1, 1, (n, 4))
@@ -140,7 +140,7 @@ def construct_states(engine: VectorizedEngine, rng: np.random.Generator) -> np.n
 
 
 def test_formulas_have_metaworlds_bits_in_constructed_states():
-    """Positions are written into the states without any physics, so that even seldom branches are taken often."""
+    """Positions are written into the states without physics, so that rare branches are often taken."""
     n, rng = len(TASKS), np.random.default_rng(0)
     engine = VectorizedEngine(TASKS, reward="dense", num_threads=1)
     engine.reset(range(n), range(n))
@@ -159,7 +159,7 @@ def test_formulas_have_metaworlds_bits_in_constructed_states():
             try:
                 expected = float(row.program.compute_reward(action[number], observation[number])[0])
             except (AssertionError, ValueError):
-                continue  # Meta-World refuses some numbers that physics never gives
+                continue  # Meta-World raises for some states that physics never reaches
             compared[number] += 1
             full[number] += expected == 10.0
             seen_rewards[number].add(expected)
@@ -190,7 +190,7 @@ def test_reward_does_not_depend_on_other_rows():
 
 
 def test_reset_forgets_the_previous_episodes_first_distance():
-    """bin-picking measures by the distance after the first step."""
+    """bin-picking uses the distance after the first step."""
     engine = VectorizedEngine(["bin-picking"], reward="dense", num_threads=1)
     everyone, action = np.ones(1, bool), np.ones((1, 4), np.float32)
     rewards = []
@@ -226,7 +226,7 @@ def test_square_is_that_of_pow():
     x = np.random.default_rng(0).normal(size=100000)
     squares = terms.square(x)
     assert squares.tolist() == [float(value) ** 2 for value in x]
-    assert (squares != x * x).any(), "then x * x would do"
+    assert (squares != x * x).any(), "the test would not distinguish pow from x * x"
 
 
 def test_table_has_a_reward_for_every_task_and_uses_every_formula():

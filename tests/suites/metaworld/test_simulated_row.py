@@ -1,4 +1,4 @@
-"""A step's physics, part of which the look at the end of the step before has already done."""
+"""The shortened first substep, which reuses the last step's mj_forward."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def whole_substep(row: SimulatedRow) -> None:
 
 
 def test_shortened_substep_has_the_bits_of_a_whole_one(monkeypatch):
-    """All tasks, the state itself compared after every step, with a reset on the way."""
+    """Compare the states of all tasks after every step, with a reset in between."""
     n, rng = len(TASKS), np.random.default_rng(0)
     engine, plain = (VectorizedEngine(TASKS, num_threads=1) for _ in range(2))
     for row in plain._rows:
@@ -28,7 +28,7 @@ def test_shortened_substep_has_the_bits_of_a_whole_one(monkeypatch):
             for k in (engine, plain):
                 k.reset(range(n), range(step, step + n))
         action = rng.uniform(-1, 1, (n, 4)).astype(np.float32)
-        action[:, 2] -= 0.5  # downwards, where there is something to touch
+        action[:, 2] -= 0.5  # downwards, to make contacts
         for k in (engine, plain):
             k.step(action, np.ones(n, bool))
         for task, ours, whole in zip(TASKS, engine._rows, plain._rows, strict=True):
@@ -39,7 +39,7 @@ def test_shortened_substep_has_the_bits_of_a_whole_one(monkeypatch):
 
 
 def test_first_step_of_an_episode_is_not_shortened(monkeypatch):
-    """A reset may leave places as they were before its last change."""
+    """Positions computed in a reset may be older than its last change."""
     calls = []
     engine = VectorizedEngine(["push"], num_threads=1)
     monkeypatch.setattr(engine._rows[0], "_substep_after_look", lambda: calls.append(engine._rows[0]._data.time))
@@ -52,7 +52,6 @@ def test_first_step_of_an_episode_is_not_shortened(monkeypatch):
 
 
 def test_assumptions_of_the_shortened_substep_hold():
-    """What the shortened substep rests on."""
     for row in VectorizedEngine(TASKS, num_threads=1)._rows:
         model = row._model
         (body,) = np.flatnonzero(model.body_mocapid >= 0)

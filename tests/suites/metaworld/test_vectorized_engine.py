@@ -1,4 +1,4 @@
-"""The fast engine against Meta-World's own environments, bit for bit."""
+"""The vectorized engine against Meta-World's own environments, bit for bit."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from lw_torchrl.suites.metaworld.vectorized_engine import VectorizedEngine
 
 TASKS = list(simulation_table())
 
-# Three pairs of tasks that share a model; then a dial, two joints, constants, both kinds of quaternion.
+# Three pairs of tasks that share a model; then tasks with a dial, joints, constants and both kinds of quaternions.
 SHARING = ["drawer-open", "drawer-close", "assembly", "disassemble", "stick-push", "stick-pull"]
 VARIED = ["reach", "basketball", "dial-turn", "hammer", "lever-pull", "box-close"]
 
 
 def same_bits(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """(rows,) whether each row agrees in every bit: 0.0 is not -0.0, and a NaN is itself."""
+    """Return whether each row agrees in every bit, (rows,): 0.0 differs from -0.0, and NaN equals itself."""
     assert left.dtype == right.dtype
     assert left.shape == right.shape
     left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)
@@ -38,7 +38,7 @@ def same_bits(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def differences(expected: EngineStep, got: EngineStep) -> set[tuple[int, str]]:
-    """The (row, field) pairs in which two results differ."""
+    """Return the (row, field) pairs in which two results differ."""
     pairs = zip(EngineStep._fields, expected, got, strict=True)
     return {(int(row), field) for field, a, b in pairs for row in np.flatnonzero(~same_bits(a, b))}
 
@@ -50,25 +50,25 @@ def experts(tasks: list[str]) -> list:
 
 
 def expert_actions(policies: list, observation: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    clean = np.stack([policy.get_action(seen) for policy, seen in zip(policies, observation, strict=True)])
+    clean = np.stack([policy.get_action(row) for policy, row in zip(policies, observation, strict=True)])
     return np.clip(clean + noise, -1.0, 1.0)
 
 
 def play(engine, tasks: list[str], steps: int, *, seed: int = 0) -> list[np.ndarray]:
-    """Reset all rows and step them with random actions; the observations of each step."""
+    """Reset all rows and step them with random actions; return the observations of each step."""
     n = len(tasks)
     rng = np.random.default_rng(seed)
-    seen = [engine.reset(range(n), [seed + row for row in range(n)])]
+    observations = [engine.reset(range(n), [seed + row for row in range(n)])]
     for _ in range(steps):
         action = rng.uniform(-1, 1, (n, 4)).astype(np.float32)
-        seen.append(engine.step(action, np.ones(n, bool)).observation)
-    return seen
+        observations.append(engine.step(action, np.ones(n, bool)).observation)
+    return observations
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tasks", [TASKS[k : k + 10] for k in range(0, 50, 10)], ids=lambda tasks: tasks[0])
 def test_all_tasks_have_metaworlds_bits(tasks):
-    """2 episodes of 500 steps, expert actions with noise, single precision and then double."""
+    """Two episodes of 500 steps, with noisy actions of experts in single and in double precision."""
     n = len(tasks)
     rng = np.random.default_rng(TASKS.index(tasks[0]))
     oracle = MetaWorldEngine(tasks, reward="dense")
@@ -95,12 +95,12 @@ def test_all_tasks_have_metaworlds_bits(tasks):
     for engine in (oracle, *engines):
         engine.close()
     assert not wrong
-    assert succeeded.sum() >= 8, "the comparison of successes says little if nothing succeeds"
+    assert succeeded.sum() >= 8, "few successes were compared"
 
 
 @pytest.mark.parametrize("tasks", [SHARING * 2, VARIED], ids=["shared models", "varied tasks"])
 def test_masks_and_resets_in_any_order_have_metaworlds_bits(tasks):
-    """Rows that share models, stepped and reset in any mixture by one or two threads, do as if each were alone."""
+    """Rows that share models, stepped and reset in any mixture by one or two threads, act as if alone."""
     n = len(tasks)
     rng = np.random.default_rng(1)
     oracle, engines = MetaWorldEngine(tasks), [VectorizedEngine(tasks, num_threads=threads) for threads in (1, 2)]
@@ -126,7 +126,7 @@ def test_masks_and_resets_in_any_order_have_metaworlds_bits(tasks):
 
 
 def test_episode_depends_only_on_seed_and_actions():
-    """Neither what a row did before nor the rows beside it show in an episode."""
+    """Neither earlier episodes of a row nor other rows affect an episode."""
     tasks = ["faucet-open", "faucet-close", "window-open"]
     fresh = VectorizedEngine(tasks, num_threads=1)
     used = VectorizedEngine(tasks * 3, num_threads=2)
@@ -144,7 +144,7 @@ def test_episode_depends_only_on_seed_and_actions():
 
 
 def test_reset_restores_the_compiled_model():
-    """plate-slide moves a body that plate-slide-back, on the same model, leaves where it is."""
+    """plate-slide moves a body that plate-slide-back, on the same model, does not move."""
     tasks = ["plate-slide", "plate-slide-back"]
     engine = VectorizedEngine(tasks, num_threads=1)
     engine.reset([0], [0])
@@ -210,7 +210,7 @@ def break_by_force(engine: VectorizedEngine, action: np.ndarray) -> None:
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("damage", [break_by_action, break_by_position, break_by_speed, break_by_force])
 def test_fault_stays_in_its_row(damage, threads, tmp_path, monkeypatch, capfd):
-    """Rows 0 to 2 share a model; row 1 breaks at step 5."""
+    """Rows 0 to 2 share a model; row 1 becomes unstable at step 5."""
     monkeypatch.chdir(tmp_path)
     tasks = ["push", "push", "push", "drawer-open"]
     engine = VectorizedEngine(tasks, num_threads=threads, reward="dense")
@@ -235,7 +235,7 @@ def test_fault_stays_in_its_row(damage, threads, tmp_path, monkeypatch, capfd):
             assert got.reward[1] == 0.0
             assert not got.success[1]
             assert np.array_equal(got.observation[1], stable)
-    assert not engine.step(action, np.zeros(4, bool)).fault.any(), "a row that does not run does not fault"
+    assert not engine.step(action, np.zeros(4, bool)).fault.any(), "an inactive row does not fault"
 
     assert same_bits(twin.reset([1], [77]), engine.reset([1], [77])).all()
     for _ in range(20):
@@ -289,7 +289,7 @@ def test_rows_need_little_memory_and_models_are_reused():
     engine.step(np.zeros((80, 4)), np.ones(80, bool))
     if Path("/proc/self/statm").exists():
         assert (memory() - before) / 80 < 1.2e6
-    assert time.perf_counter() - start < 5.0, "80 rows take some 0.6 s; compiling a model each would take 10"
+    assert time.perf_counter() - start < 5.0, "80 rows take about 0.6 s; 80 compiled models would take 10 s"
     models = {id(row.shared) for row in engine._rows}
     assert len(models) == 2
     engine.close()
@@ -311,7 +311,7 @@ def test_collected_engine_returns_its_models():
 
 
 def test_reset_changes_only_places_of_bodies_and_sites():
-    """What a reset edits is kept for each row, so it must edit nothing that we do not keep."""
+    """Each row keeps its places of bodies and sites only, so a reset must change nothing else."""
 
     def arrays(model) -> dict[str, bytes]:
         fields = {name: getattr(model, name) for name in dir(model) if not name.startswith("_")}
@@ -330,12 +330,15 @@ def test_reset_changes_only_places_of_bodies_and_sites():
 def test_plain_engine_runs_other_versions_with_one_warning_unless_vectorized_is_asked_for(monkeypatch, package, other):
     monkeypatch.setattr(reproducibility, "version", lambda name: other if name == package else metadata.version(name))
     changed = rf"{package} 3\.\d\.\d, now {other}"
+    lw.suites.metaworld._warn_once.cache_clear()
+    make_envs = lambda: [lw.LanguageWorldEnv("reach", num_threads=2, max_steps=2) for _ in range(2)]  # noqa: E731
     with pytest.warns(UserWarning, match=f"{changed}.*4 times slower.*pip install metaworld==") as caught:
-        env = lw.LanguageWorldEnv("reach", num_threads=2, max_steps=2)
-    env.rollout(2)
-    assert isinstance(env.engine, MetaWorldEngine)
-    assert len([warning for warning in caught if "slower" in str(warning.message)]) == 1
-    env.close()
+        envs = make_envs()
+    assert [warning.filename for warning in caught if "slower" in str(warning.message)] == [__file__]
+    for env in envs:
+        env.rollout(2)
+        assert isinstance(env.engine, MetaWorldEngine)
+        env.close()
     for make in (lambda: VectorizedEngine(["reach"]), lambda: lw.LanguageWorldEnv("reach", engine="vectorized")):
         with pytest.raises(ImportError, match=f"^engine: .*{changed}.*engine='metaworld'"):
             make()
@@ -346,6 +349,15 @@ def test_versions_that_were_compared_give_the_vectorized_engine_without_a_warnin
     assert isinstance(env.engine, VectorizedEngine)
     env.close()
     assert not [warning for warning in recwarn if "slower" in str(warning.message)]
+
+
+def test_environment_runs_an_engine_that_was_added_by_name(monkeypatch):
+    monkeypatch.setitem(lw.suites.metaworld.ENGINES, "mine", MetaWorldEngine)
+    env = lw.LanguageWorldEnv("reach", engine="mine")
+    assert isinstance(env.engine, MetaWorldEngine)
+    env.close()
+    with pytest.raises(ValueError, match=r"engine must be one of .*'mine'.*got 'mime'"):
+        lw.LanguageWorldEnv("reach", engine="mime")
 
 
 def test_table_has_metaworlds_tasks():

@@ -1,4 +1,4 @@
-"""What a JSON file may hold instead of what it should: for tests of whoever reads one."""
+"""Mutations of JSON values, for tests of functions that read JSON files."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ ODD: list[Any] = [*_NUMBERS, *_LISTS, *_OTHERS]
 
 
 def places(value: Any, path: tuple = ()) -> list[tuple]:
-    """The paths of everything inside a JSON value, and of itself."""
+    """Return the paths of a JSON value and of everything inside it."""
     inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    return [path, *(found for key, one in inside for found in places(one, (*path, key)))]
+    return [path, *(place for key, part in inside for place in places(part, (*path, key)))]
 
 
 @st.composite
 def mutated(draw: st.DrawFn, value: Any) -> Any:
-    """The value with one to three of its parts replaced, removed, repeated or added to."""
-    found = copy.deepcopy(value)
+    """Draw a copy of a value with one to three of its parts replaced, removed, repeated or added to."""
+    mutant = copy.deepcopy(value)
     for _ in range(draw(st.integers(1, 3))):
-        *parents, key = draw(st.sampled_from(places(found)[1:] or [("nothing",)]))
-        node = found
+        *parents, key = draw(st.sampled_from(places(mutant)[1:] or [("nothing",)]))
+        node = mutant
         for name in parents:
             node = node[name]
         if not isinstance(node, (dict, list)) or (isinstance(node, dict) and key not in node):
@@ -33,7 +33,9 @@ def mutated(draw: st.DrawFn, value: Any) -> Any:
         kind = draw(st.sampled_from(["replace", "nudge", "remove", "repeat", "add"]))
         if kind == "replace":
             node[key] = copy.deepcopy(draw(st.sampled_from(ODD)))
-        elif kind == "nudge" and type(node[key]) in (int, float) and abs(node[key]) < 10**300:  # floats end at 1.8e308
+        elif (
+            kind == "nudge" and type(node[key]) in (int, float) and abs(node[key]) < 10**300
+        ):  # the largest float is 1.8e308
             node[key] += draw(st.sampled_from([-1, 1, 0.0, 0.5, 10**9]))
         elif kind == "remove":
             del node[key]
@@ -41,4 +43,4 @@ def mutated(draw: st.DrawFn, value: Any) -> Any:
             node.append(copy.deepcopy(node[key]))
         elif kind == "add" and isinstance(node, dict):
             node["more"] = copy.deepcopy(node[key])
-    return found
+    return mutant
