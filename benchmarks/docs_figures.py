@@ -12,6 +12,7 @@ import tyro
 
 from benchmarks.figures import METHOD_COLORS, NEUTRAL_STYLE, draw_rates, plot_panels
 from lw_torchrl.evaluation.figures import new_figure, saved
+from lw_torchrl.evaluation.result import wilson_interval
 
 NUMBERS = Path(__file__).parent / "data" / "published_results.json"
 
@@ -64,11 +65,26 @@ def offline(numbers: Any) -> Any:
     return figure
 
 
+def scripted(numbers: Any) -> Any:
+    """Success of plans with scripted skills, without training, in the tasks that fail at all."""
+    figure = new_figure(9.6, 4.2)
+    axes = figure.subplots()
+    episodes, successes = numbers["episodes"], numbers["successes"]
+    rates = [[hits / episodes, *wilson_interval(hits, episodes)] for hits in successes.values()]
+    draw_rates(axes, [*successes], rates, [METHOD_COLORS["scripted skills"]] * len(rates))
+    figure.suptitle("Plans with scripted skills, without training: 50 tasks", fontsize=16, fontweight="bold")
+    figure.supxlabel(
+        f"success in {episodes} episodes of each task, no action noise; lines: 95 % intervals", fontsize=13
+    )
+    return figure
+
+
 FIGURES = {
     "zero-shot-plans.png": ("zero_shot_test_tasks", zero_shot),
     "demonstrations.png": ("demonstrations", demonstrations),
     "truth.png": ("truth", truth),
     "offline.png": ("offline", offline),
+    "scripted.png": ("scripted", scripted),
 }
 """A picture's name to its numbers and the function that draws it."""
 
