@@ -41,7 +41,7 @@ COMMANDS = {
 }
 _MORE = """`lw-torchrl COMMAND --help` explains a command. Every command accepts --import MODULE, which first
 imports your Python module, for example one that registers a suite or a policy class
-(docs/extending.md). Commands that print a table accept --json. --version prints the version.
+(docs/custom-networks.md). Commands that print a table accept --json. --version prints the version.
 
 Exit status: 0: done; 1: a bug, with a traceback; 2: an error that you can fix
 (LW_TORCHRL_TRACEBACK=1 adds the traceback); 130: stopped by Ctrl-C; 141: broken pipe."""
