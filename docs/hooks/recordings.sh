@@ -36,8 +36,7 @@ $LW record pick-place --policy scripted --plans mine/pick-place.plan --attribute
 picture plan.rrd rerun-plan 1600x1000
 picture plan.rrd rerun-plan-small 1100x700
 
-$PYTHON "$docs/../examples/online/td3_with_demonstrations.py" --task hammer --frames 1000 --out clumsy
-$LW record hammer --policy clumsy/hammer-seed0/policy.safetensors --attribute --out gripper.rrd
+$LW record pick-place --policy few-shot-mt50 --episodes 2 --max-steps 150 --noise 0.3 --attribute --out gripper.rrd
 picture gripper.rrd rerun-gripper 1100x700
 
 # An evaluator that inverts the second condition.
