@@ -53,7 +53,7 @@ def reach(s: StepState, rows: Index, cast: Cast) -> Array:
 
 
 def press(s: StepState, rows: Index, cast: Cast) -> Array:
-    """Reward approaching with an open gripper (closed if ``shut``), then pressing; ``weights`` holds a weight for each."""
+    """Reward approaching with an open gripper (closed if ``shut``) and then pressing, with one weight for each part."""
     opening = s.features[rows, at.GRIPPER]
     opening = np.where(s.task.shut[rows], 1 - opening, opening)
     first, second = s.task.weights[rows].T
