@@ -247,7 +247,8 @@ class Import:
 class Info:
     """Describe a policy (its model card), a dataset (as `data show` does) or a recording (its episodes).
 
-    Without a path: versions, cores, GPU, extras, cache folders, and what is slow here and why, for a bug report.
+    Without a path, describe this installation for a bug report: versions, cores, GPU, extras, cache folders, and what
+    makes the library slow on this machine.
 
     Example: lw-torchrl info few-shot-mt50
     """

@@ -1,4 +1,4 @@
-"""``lw-torchrl info`` without arguments: the installation and the machine, to paste into a bug report."""
+"""The command ``lw-torchrl info`` without arguments: describe the installation and the machine for a bug report."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _VARIABLES = (
 
 
 def describe_machine(output: Output) -> Output:
-    """Report versions, processors, extras and cache folders, and what is slow here and why."""
+    """Print the versions, cores, extras and cache folders, and what makes the library slow on this machine."""
     slow = find_slow_parts()
     extras = {name: f"missing: {', '.join(of)}" if of else "installed" for name, of in find_extras().items()}
     sections = {
@@ -52,40 +52,40 @@ def find_version(package: str) -> str:
 
 
 def find_extras() -> dict[str, list[str]]:
-    """Return each extra of this package with those of its packages that are not installed."""
+    """Return a dict from each extra of lw_torchrl to the packages of that extra that are not installed."""
     extras: dict[str, list[str]] = {}
     try:
         lines = requires("lw_torchrl") or []
-    except PackageNotFoundError:  # a source tree on the path, without an installation
+    except PackageNotFoundError:  # lw_torchrl is on the path, but not installed
         return {}
     for line in lines:
-        if (found := re.match(r"([\w.-]+).*\bextra == ['\"]([\w-]+)['\"]", line)) and found[2] != "dev":
-            missing = extras.setdefault(found[2], [])
-            if find_version(found[1]) == "missing":
-                missing.append(found[1])
+        if (match := re.match(r"([\w.-]+).*\bextra == ['\"]([\w-]+)['\"]", line)) and match[2] != "dev":
+            missing = extras.setdefault(match[2], [])
+            if find_version(match[1]) == "missing":
+                missing.append(match[1])
     return extras
 
 
 def find_slow_parts() -> list[str]:
-    """Return a sentence for each part that is slower on this machine than it could be: why, and what helps."""
+    """Return a list of sentences, each with a reason why the library is slow on this machine and a remedy, if any."""
     cores, slow = available_cores(), []
     if find_kernel() is None:
         if importlib.util.find_spec("numba") is None:
-            slow.append("Conditions are checked without Numba: install it by pip install 'lw_torchrl[fast]'.")
+            slow.append("Conditions are checked without Numba: pip install 'lw_torchrl[fast]'.")
         else:
-            slow.append("Numba is installed but has no writable cache folder: set NUMBA_CACHE_DIR to one.")
+            slow.append("Numba has no writable cache folder: set NUMBA_CACHE_DIR to a writable folder.")
     elif os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
-        slow.append("NUMBA_DISABLE_JIT is set, so conditions are checked by uncompiled Python: unset it.")
+        slow.append("NUMBA_DISABLE_JIT is set, so conditions are checked in uncompiled Python; unset the variable.")
     if cores == 1:
-        slow.append("One core: simulation, collection and evaluation run in one thread for each core.")
+        slow.append("There is only one core: simulation, collection and evaluation use one thread per core.")
     if (total := os.cpu_count() or 1) > cores:
         slow.append(f"This process may use {cores} of the machine's {total} cores (affinity or a job's limit).")
     if hasattr(os, "getloadavg") and (load := os.getloadavg()[0]) > cores + 1:
-        slow.append(f"Other programs use the cores: the load is {load:.1f} on {cores}.")
+        slow.append(f"Other programs are using the cores: the load is {load:.1f} on {cores} cores.")
     if (accelerator := torch.accelerator.current_accelerator(check_available=True)) is None:
-        slow.append("No GPU that this PyTorch can use: networks train on the CPU. The simulation always does.")
+        slow.append("This PyTorch finds no GPU: networks train on the CPU. The simulation always runs on the CPU.")
     else:
-        slow.append(f"The simulation uses the CPU, not the GPU ({accelerator}): more cores help it.")
+        slow.append(f"The simulation runs on the CPU, not on the GPU ({accelerator}): more cores make it faster.")
     return slow
 
 
@@ -122,7 +122,7 @@ def _cache_folders() -> dict[str, str]:
 
 
 def _describe_folder(path: Path) -> str:
-    there = "" if path.is_dir() else " (not made yet)"
+    there = "" if path.is_dir() else " (does not exist yet)"
     locked = path.is_dir() and not os.access(path, os.W_OK)
     shown = str(path).replace(str(Path.home()), "~", 1) if path.is_relative_to(Path.home()) else str(path)
     return f"{shown}{there}{' (not writable)' if locked else ''}"

@@ -32,7 +32,7 @@ def test_missing_packages_of_an_extra_are_named(monkeypatch):
     ("name", "value", "sentence"),
     [
         ("find_kernel", lambda: None, "NUMBA_CACHE_DIR"),
-        ("available_cores", lambda: 1, "One core"),
+        ("available_cores", lambda: 1, "only one core"),
     ],
 )
 def test_slow_parts_are_explained(monkeypatch, name, value, sentence):
