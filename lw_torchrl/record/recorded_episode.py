@@ -219,8 +219,8 @@ class Ghost:
     motion: Motion | None = None
 
     def parts_at(self, other: RecordedEpisode) -> int:
-        """Return the first row in which the hand or an object differs from ``other`` by more than 1 cm, or the last row
-        if there is none."""
+        """Return the first row in which the hand or an object is more than 1 cm away from its position in ``other``, or
+        the last row if there is no such row."""
         length = min(len(self.episode), len(other))
         if self.episode.observation is None or other.observation is None or other.layout is None:
             return length - 1

@@ -38,7 +38,7 @@ class RolloutRecorder(Transform):
     Args:
         logger: the logger of the recording.
         rows: indices of the environment rows to record.
-        plans: the plans whose conditions ``qaf`` holds, with one plan for the task of each row; None without plans.
+        plans: the plans whose conditions are evaluated in ``qaf``, one for the task of each row; None without plans.
         every: record the first and then every N-th episode of a row.
         policy: the policy's name, shown in the tab of a LanguageWorldEnv's episode.
         objects: for other environments, a function that maps a rollout (T,) to the objects to draw: name -> T×3

@@ -71,7 +71,7 @@ def log_rollout(
             replaces the action, "episode" T int64, "qaf" T×S bool, "qaf_plan" T int64, "qaf_logits" T×S float32
             (positive: true), "skill_weights" T×S float32, "action_corrected" T×1, ("next", "reward") T×1 float32 and
             "pixels" T×H×W×3 uint8 (the policy's input).
-        plans: the plans whose conditions ``qaf`` holds; None without plans.
+        plans: the plans whose conditions are evaluated in ``qaf``; None without plans.
         seed: the environment's seed, which determines the initial state together with ``episode``.
         name: the episode's name in the recording, for batch size (T,); None for the task and episode ("push-7").
         policy: the policy's name, shown in the tab.

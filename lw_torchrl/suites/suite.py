@@ -19,7 +19,7 @@ from lw_torchrl.suites.engine import Engine
 @typed_fields
 @dataclass(frozen=True)
 class Suite:
-    """The tasks of one simulator and robot, for every ``suite=`` argument.
+    """A set of tasks for one simulator and robot, which is passed as ``suite=`` argument.
 
     Attributes:
         name: the suite's name, for example "fetch"; the tasks are then called "fetch/push" etc.
@@ -36,7 +36,7 @@ class Suite:
     Raises:
         ValueError: a task has a different layout, or its name does not begin with the suite's name.
 
-    Source: ours; like gymnasium's ``EnvSpec``.
+    Source: specific to this library; similar to gymnasium's ``EnvSpec``.
     """
 
     name: str

@@ -181,7 +181,7 @@ def test_a_connected_viewer_receives_everything(tmp_path):
     ("arguments", "error", "message"),
     [
         ({"path": "a.txt"}, ValueError, "path"),
-        ({}, ValueError, "path .* or connect"),
+        ({}, ValueError, "path .* connect .* required"),
         ({"connect": "rerun+http://127.0.0.1:9876/elsewhere"}, RuntimeError, "elsewhere"),
     ],
 )

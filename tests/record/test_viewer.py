@@ -66,7 +66,7 @@ def test_missing_or_unreadable_recordings_and_unknown_episodes_are_errors(tmp_pa
         open_viewer(tmp_path / "a.rrd", episode="push")
     for content in (b"", b"something else"):
         (tmp_path / "b.rrd").write_bytes(content)
-        with pytest.warns(UserWarning, match="was not closed"), pytest.raises(ValueError, match="rerun recording"):
+        with pytest.warns(UserWarning, match="was not closed"), pytest.raises(ValueError, match="Rerun recording"):
             open_viewer(tmp_path / "b.rrd")
 
 

@@ -43,7 +43,7 @@ TASKS: Tasks = ReadOnlyDict(
 
 
 def load_skills() -> Skills:
-    """Load Fetch's scripted skills by text; some equal Meta-World skills with different texts."""
+    """Load Fetch's scripted skills by text; some are Meta-World skills under a different text."""
     return skills.load_skills(str(_DATA / "skills.toml"), tasks=TASKS)
 
 

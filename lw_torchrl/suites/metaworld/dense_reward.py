@@ -43,7 +43,7 @@ class EpisodeStarts:
 
 
 class DenseReward:
-    """A function that computes the rewards of a fixed set of rows; ``starts`` covers all rows of the engine."""
+    """A callable that computes the rewards of a fixed set of rows; ``starts`` covers all rows of the engine."""
 
     def __init__(self, starts: EpisodeStarts, rows: Index) -> None:
         self._starts, self._rows = starts, rows

@@ -112,8 +112,8 @@ DIAL_RADIUS = 0.05  # metres
 
 
 class Observer:
-    """A function object that computes the observations of a fixed set of rows, with Meta-World's operations in
-    Meta-World's order, so that the results are bit-identical."""
+    """An observation builder for a fixed set of rows. The operations and their order are Meta-World's, so the results are
+    bit-identical."""
 
     def __init__(self, sources: Sequence[TaskSources]) -> None:
         self._matrices = np.flatnonzero([row.quaternion.startswith(MATRIX_OF) for row in sources])
@@ -198,7 +198,7 @@ STICK_UPWARD = 0.06
 
 
 class SuccessFunction:
-    """A function that computes the success of a fixed set of rows. ``programs`` maps a row to its current
+    """A callable that computes the success of a fixed set of rows. ``programs`` maps a row to its current
     :class:`TaskProgram`, for the one rule that reads contacts."""
 
     def __init__(self, sources: Sequence[TaskSources], programs: Callable[[int], Any]) -> None:

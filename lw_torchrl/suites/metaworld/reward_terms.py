@@ -172,7 +172,7 @@ class Proximity(NamedTuple):
 
 
 class ProximityTerms:
-    """A function that measures how close pairs of points are, for a fixed set of rows."""
+    """A callable that measures how close pairs of points are, for a fixed set of rows."""
 
     def __init__(self, task: Parameters) -> None:
         row = np.arange(len(task.within)).reshape(-1, 1, 1, 1, 1) * FEATURES
@@ -211,7 +211,7 @@ SIDES = np.array([1.0, -1.0])
 
 
 class CagingTerm:
-    """A function that measures how well the gripper encloses and grips the object, for a fixed set of rows."""
+    """A callable that measures how well the gripper encloses and grips the object, for a fixed set of rows."""
 
     def __init__(self, task: Parameters) -> None:
         self._rows = np.flatnonzero(task.cage.used)
@@ -269,7 +269,7 @@ FUNNEL_DEPTH = 0.01  # up to this far below the floor (metres), a point still co
 
 
 class FunnelTerm:
-    """A function that measures whether the hand stays above a funnel's floor, for a fixed set of rows."""
+    """A callable that measures whether the hand stays above a funnel's floor, for a fixed set of rows."""
 
     def __init__(self, task: Parameters) -> None:
         self._rows = np.flatnonzero(task.funnel.used)
