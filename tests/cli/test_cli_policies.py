@@ -59,8 +59,8 @@ def test_train_logs_and_fine_tunes(capsys, tmp_path, demos, policy):
     run(capsys, "train", demos, "--out", out, *options)
     assert lw.modules.describe(lw.load_actor(out)) == lw.modules.describe(lw.load_actor(policy))
     assert list((tmp_path / "logs").rglob("*.csv"))
-    assert "must be a different file" in fails(capsys, "train", demos, "--out", policy, "--begin", policy)
-    assert "leave them out" in fails(capsys, "train", demos, "--out", out, "--begin", policy, "--width", 8)
+    assert "must differ from --begin" in fails(capsys, "train", demos, "--out", policy, "--begin", policy)
+    assert "--begin fixes the network" in fails(capsys, "train", demos, "--out", out, "--begin", policy, "--width", 8)
 
 
 def test_the_baseline_is_trained_and_evaluated(capsys, demos, tmp_path):

@@ -318,7 +318,7 @@ RANDOM = lw.ScriptedSkillActor(PLANS, "random")
         (trained("description"), dict(tasks=("push", "drawer-open")), ValueError, "tasks must be .* drawer-open"),
         (Odd("value"), {}, ValueError, "NaN"),
         (Odd("key"), {}, ValueError, "must write 'action'"),
-        (lambda state: state["observation"], {}, TypeError, "policy must return the TensorDict"),
+        (lambda state: state["observation"], {}, TypeError, "policy must return its input TensorDict"),
         (Odd("dtype"), {}, ValueError, "must be float32"),
         (Odd("shape"), {}, ValueError, r"must be float32 of shape \(2, 4\), got torch.float32 of shape \(2, 3\)"),
         (RANDOM, {}, ValueError, "policy: this ScriptedSkillActor"),

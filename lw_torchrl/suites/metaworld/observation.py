@@ -112,8 +112,8 @@ DIAL_RADIUS = 0.05  # metres
 
 
 class Observer:
-    """An observation builder for a fixed set of rows. The operations and their order are Meta-World's, so the results are
-    bit-identical."""
+    """An observation builder for a fixed set of rows. It does Meta-World's operations in Meta-World's order, so that the
+    results are bit-identical."""
 
     def __init__(self, sources: Sequence[TaskSources]) -> None:
         self._matrices = np.flatnonzero([row.quaternion.startswith(MATRIX_OF) for row in sources])
