@@ -212,7 +212,7 @@ demo.QUICK = replace(demo.QUICK, training_steps={config.training_steps}, episode
 def test_a_demo_of_another_configuration_is_not_overwritten(capsys, tmp_path):
     (tmp_path / "config.json").write_text(json.dumps({**vars(QUICK), "training_steps": 7}))
     before = (tmp_path / "config.json").read_bytes()
-    assert "another configuration" in fails(capsys, "demo", "--quick", "--out", tmp_path)
+    assert "different configuration" in fails(capsys, "demo", "--quick", "--out", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
     assert (tmp_path / "config.json").read_bytes() == before
 

@@ -76,7 +76,7 @@ def test_check_measures_a_suite(capsys, own):
     assert ended.value.code == 2
     assert "OFF  fetch/reach  +x moves right" in printed.out
     assert "expected: 10.0 cm along x" in printed.out
-    assert "3 numbers of suite 'fetch'" in printed.err
+    assert "3 measurements of suite 'fetch'" in printed.err
 
 
 def test_import_registers_a_suite(capsys, tmp_path, monkeypatch):

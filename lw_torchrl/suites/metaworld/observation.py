@@ -112,7 +112,7 @@ DIAL_RADIUS = 0.05  # metres
 
 
 class Observer:
-    """An observation builder for a fixed set of rows. It does Meta-World's operations in Meta-World's order, so that the
+    """An observation builder for a fixed set of rows. It does Meta-World's operations in Meta-World's order, so the
     results are bit-identical."""
 
     def __init__(self, sources: Sequence[TaskSources]) -> None:
