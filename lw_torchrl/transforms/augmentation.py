@@ -198,7 +198,7 @@ class HideOpening(Augmentation):
 class JitterTarget(PlanAugmentation):
     """An augmentation that draws a random target offset for rows in which an active plan step pushes or pulls.
 
-    It models uncertain contact points: :class:`~lw_torchrl.modules.RoleFeatures` adds the offset to the target's
+    The offset models uncertain contact points: :class:`~lw_torchrl.modules.RoleFeatures` adds it to the target's
     position. For replay buffers, after a :class:`QAFTransform`. Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); writes
     ``target_offset`` (B, 3) float32, metres: normal noise of ``std`` in z and ``std / 2`` in x and y, or 0 without such
     a step. Draws from PyTorch's global generator. TorchRL's losses, except BCLoss, do not pass the offset on to the
@@ -261,6 +261,6 @@ def role_table(plans: Plans, tables: PlanTables, holds: Callable[[StepRole], boo
     for task, plan in plans.items():
         for number, step in enumerate(plan.steps):
             if step.role is None:
-                raise ValueError(f"plans must have roles, but step {number} of {task!r} has none: lw.canonical_plans")
+                raise ValueError(f"plans must come from lw.canonical_plans; step {number} of {task!r} has no role")
             table[tables.index.row(task), number] = holds(step.role)
     return table

@@ -117,8 +117,8 @@ class EnvState(KeepsEnvState):
 
     Without this transform, or a :class:`QAFTransform`, which does the same, a resumed Collector would run the same
     episodes again. After ``load_state_dict``, reset the environment (``collector.reset()``). Also use this transform
-    around a ParallelEnv, unless ``use_buffers=False``: its own ``load_state_dict`` desynchronizes the workers of
-    TorchRL 0.14.1.
+    around a ParallelEnv, unless ``use_buffers=False``: in TorchRL 0.14.1, ``ParallelEnv.load_state_dict``
+    desynchronizes the workers.
 
     Raises:
         ValueError: the loaded state belongs to other tasks or rows, or has no environment state.

@@ -30,8 +30,8 @@ class FallbackTurns(Transform):
     after at most ``longest`` time steps. :class:`~lw_torchrl.modules.PlanAttention` reads the turn if the plans have
     fallback steps, see :func:`~lw_torchrl.canonical_plans`.
 
-    In an environment, reads ``observation`` (B, 39) float32, metres, and writes ``turn`` (B,) int64, from 0. Rows of a
-    replay buffer keep the recorded ``turn``; rows without ``turn`` get 0.
+    In an environment, the transform reads ``observation`` (B, 39) float32, metres, and writes ``turn`` (B,) int64, from
+    0. Rows of a replay buffer keep the recorded ``turn``; rows without ``turn`` get 0.
 
     Args:
         layout: the layout of the observations.

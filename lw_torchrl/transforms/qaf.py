@@ -49,9 +49,9 @@ class QAFTransform(KeepsEnvState):
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``qaf`` (B, S) bool, the truth value of
     each plan step's condition (false beyond the last step), and ``qaf_plan`` (B,) int64, the plan's number in
-    :attr:`Plans.numbers`, by which an actor with other plans rejects the answers. On a replay buffer, also writes
-    ``("next", "qaf")`` if ``("next", "observation")`` exists. In an environment, the ``state_dict`` includes that of
-    the environment, as for :class:`EnvState`.
+    :attr:`Plans.numbers`, by which an actor with other plans rejects the answers. On a replay buffer, it also
+    writes ``("next", "qaf")`` if ``("next", "observation")`` exists. In an environment, the ``state_dict`` includes
+    that of the environment, as for :class:`EnvState`.
 
     Conditions compare metres, so put this transform before transforms that change the observation, such as
     ``ObservationNorm`` or :class:`RandomYaw`. A wrong order raises an error, except in the workers of a SerialEnv or
@@ -150,10 +150,10 @@ class CorruptQAF(EpisodeTransform):
       every · ⌊max(t - delay, 0) / every⌋;
     - **flip** (wrong): at each time step, including the reset, each answer is then inverted with this probability.
 
-    The random numbers depend only on (task, seed, episode, time step) and the plan step; with a larger probability,
-    more answers are inverted in addition. :func:`lw_torchrl.evaluate` accepts this transform as ``evaluator``. To
-    corrupt a learned evaluator's answers, put a transform that calls the evaluator in ``_reset`` and ``_call``
-    before this transform.
+    The random numbers depend only on (task, seed, episode, time step) and the plan step; a larger
+    probability inverts all answers that a smaller probability inverts. :func:`lw_torchrl.evaluate` accepts this
+    transform as ``evaluator``. To corrupt a learned evaluator's answers, put a transform that calls the evaluator in
+    ``_reset`` and ``_call`` before this transform.
 
     Args:
         plans: the plans whose conditions ``qaf`` answers.

@@ -78,8 +78,9 @@ class RandomYaw(PlanAugmentation):
 
     Args:
         scale: standard deviation of the angle, in radians; with 10, the angle is nearly uniform.
-        plans: the actor's plans. With plans, the transform also reads ``qaf`` (B, S) and ``task_id`` (B,) int64,
-            and draws a uniform angle for rows in which no active step has a direction, such as "move the puck to the target location".
+        plans: the actor's plans. With plans, the transform also reads ``qaf`` (B, S) and ``task_id`` (B,) int64, and
+            draws a uniform angle for rows in which no active step has a direction (for example, "move the puck to the
+            target location").
         tilt: probability of also applying a uniform 3-D rotation to a row whose active steps carry or move an object to
             a place. Writes ``observation_tilt`` (B, 3, 3) float32, by which :class:`~lw_torchrl.modules.RoleFeatures`
             rotates the relative position. Requires canonical plans, see :func:`~lw_torchrl.canonical_plans`.
@@ -155,7 +156,7 @@ class RandomYaw(PlanAugmentation):
         return torch.where(chosen[..., None, None], rotations, torch.eye(3, device=free.device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = tensordict.copy()  # replay[:] may give the storage itself
+        tensordict = tensordict.copy()  # replay[:] may return the storage itself
         (source, target), *actions = zip(self.in_keys, self.out_keys, strict=True)
         observation = tensordict.get(source, None)
         if observation is None or tensordict.get(actions[0][0], None) is None:
