@@ -1,4 +1,4 @@
-"""Critics, which estimate the values of states or of actions from the trunk of a policy."""
+"""Critics, which estimate the values of states or actions and are built on the trunk of a policy."""
 
 from __future__ import annotations
 

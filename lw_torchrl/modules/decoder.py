@@ -70,7 +70,7 @@ class GaussianDecoder(_ActionMLP):
 
     Args:
         width, depth, actions: see :class:`MLPDecoder`.
-        squash: squash the mean to (-1, 1), for a Normal of actions; False for a Normal whose samples tanh squashes.
+        squash: squash the mean to (-1, 1) by tanh; use False with ``TanhNormal``, which squashes the samples.
         init_std: initial standard deviation, the same in every state (above 0.001).
 
     Example:

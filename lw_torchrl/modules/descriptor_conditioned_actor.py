@@ -86,7 +86,7 @@ class TaskLatent(Part):
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         (task_id,) = read(tensordict, self.in_keys)
-        rows = self.index.rows(_one_per_row(task_id, tensordict), "tasks this actor was not made for")
+        rows = self.index.rows(_one_per_row(task_id, tensordict), "tasks that the actor does not know")
         return write(tensordict, self, [pick(self.encoder(self.vectors)[: len(self.tasks)], rows)])
 
 
@@ -150,9 +150,9 @@ def descriptor_trunk(
     features: nn.Module | None = None,
     text_encoder: TextEncoder | None = None,
 ) -> TensorDictSequential:
-    """Build a trunk that writes the latent of the task's description and the features; :func:`plan_trunk` uses plans.
+    """Build a trunk that writes the latent of the task's description and the features.
 
-    See :class:`DescriptorConditionedActor` for the arguments.
+    See :class:`DescriptorConditionedActor` for the arguments, and :func:`plan_trunk` for the counterpart with plans.
     """
     latent = TaskLatent(tasks, condition, task_encoder, text_encoder=text_encoder)
     return TensorDictSequential(OrderedDict(latent=latent, features=as_features(features, latent.layout)))

@@ -57,7 +57,7 @@ class Features(TensorDictModuleBase):
         raise NotImplementedError(f"{type(self).__name__} must override compute")
 
     def fit(self, rows: TensorDictBase, weights: Tensor | None = None) -> None:
-        """Compute statistics of R rows of a dataset; ``weights`` (R,) float32 sum to 1. The base class has none."""
+        """Compute statistics of R rows, weighted by ``weights`` (R,) float32 with sum 1; do nothing by default."""
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -238,7 +238,7 @@ def check_observation(observation: Tensor, layout: Layout) -> None:
 def check_rows(rows: Tensor) -> None:
     """Raise a :class:`ValueError` if there are no rows to compute statistics from."""
     if not len(rows):
-        raise ValueError("rows must have at least one row, got none")
+        raise ValueError("rows must not be empty: fit needs at least one row")
 
 
 def relative(observation: Tensor, layout: Layout) -> Tensor:
@@ -266,7 +266,7 @@ def differences(observation: Tensor, layout: Layout) -> Tensor:
 
 
 def squash(difference: Tensor) -> tuple[Tensor, Tensor]:
-    """Squash metres by tanh at a scale of 2 cm, which shows alignment, and of 10 cm, which shows direction."""
+    """Squash differences in metres by tanh at 2 cm, which shows alignment, and at 10 cm, which shows direction."""
     return torch.tanh(difference / _FINE), torch.tanh(difference / _COARSE)
 
 

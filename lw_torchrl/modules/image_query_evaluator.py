@@ -133,7 +133,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
     network: PointingNetwork
     seen_dims = 3
     rows_at_once = 4
-    """Number of rows in a forward pass of a rollout, which is fixed so that results do not depend on other rows."""
+    """Number of rows per forward pass in a rollout; fixed, so that results do not depend on other rows."""
 
     @typed
     def __init__(

@@ -60,7 +60,7 @@ class _Mixer(Part):
         self.register_buffer("vectors", unit_scale(vectors), persistent=False)  # (K, E) float32
         self.encoder = SkillEncoder() if encoder is None else encoder
         materialize(self.encoder, self.vectors)
-        if (weight := next(self.encoder.parameters(), None)) is not None:  # it may be on a GPU
+        if (weight := next(self.encoder.parameters(), None)) is not None:  # the encoder may be on a GPU
             self.index, self.vectors = self.index.to(weight.device), self.vectors.to(weight)
         self.latent_size = probe(self.encoder, self.vectors).shape[-1]
 
@@ -89,7 +89,7 @@ class _Mixer(Part):
 class SkillMixer(_Mixer):
     """A module that encodes each skill's text to a latent, and mixes the latents by attention over the plan's steps.
 
-    If the plan steps have roles (see :func:`~lw_torchrl.canonical_plans`), verb and manner replace the text.
+    If plan steps have roles (see :func:`~lw_torchrl.canonical_plans`), the vectors encode verb and manner, not text.
 
     Reads ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64; writes ``skill_latent`` (B, D) float32.
 
@@ -155,7 +155,7 @@ class ActionMixer(_Mixer):
         >>> actor.in_keys
         ['qaf', 'task_id', 'observation']
 
-    Source: a mixture of experts; the paper mixes latents.
+    Source: mixtures of experts; the paper mixes latents instead of actions.
     """
 
     _options = ("plans", "decoder", "encoder")

@@ -53,7 +53,7 @@ def materialize(module: nn.Module, *inputs: Tensor) -> None:
 
 @torch.no_grad()
 def probe(module: nn.Module, example: Tensor) -> Any:
-    """Return a module's output for an example, which is moved to the module's device; keep the global random state."""
+    """Return a module's output for an example (moved to the module's device); keep the global random state."""
     weight = next(module.parameters(), None)
     with evaluating(module), torch.random.fork_rng(devices=[]):
         return module(example if weight is None else example.to(weight.device))
@@ -72,7 +72,7 @@ def evaluating(network: nn.Module) -> Iterator[None]:
 
 
 def in_mode_of(own: nn.Module, other: Module) -> Module:
-    """Set the train or eval mode of ``other`` to that of ``own``, but not of the submodules, and return ``other``."""
+    """Set ``other`` itself, not its submodules, to the train or eval mode of ``own``, and return ``other``."""
     other.training = own.training
     return other
 
@@ -180,8 +180,8 @@ class NamedParts(RenamedInputs, TensorDictSequential):
         if name not in parts:
             # A misspelt part name would create an attribute that nothing uses. Users' subclasses may add modules.
             if parts and isinstance(value, nn.Module) and type(self).__module__.startswith("lw_torchrl."):
-                own = f"{type(self).__name__} has the parts {', '.join(parts)}"
-                raise AttributeError(f"{own}, and no {name}; a part holds its own modules: actor.mixer.encoder")
+                available = f"{type(self).__name__} has the parts {', '.join(parts)}"
+                raise AttributeError(f"{available}, but no {name}; set a part's modules like actor.mixer.encoder")
             super().__setattr__(name, value)
             return
         if not isinstance(value, nn.Module):
@@ -201,8 +201,8 @@ class NamedParts(RenamedInputs, TensorDictSequential):
     def out_keys(self, keys: Keys) -> None:
         if list(keys) != self._complete_out_keys:
             raise ValueError(
-                f"out_keys of a {type(self).__name__} cannot be assigned, got {list(keys)}; give out_keys= to its "
-                "constructor, or use select_out_keys to write fewer"
+                f"out_keys of a {type(self).__name__} cannot be assigned, got {list(keys)}; pass out_keys= to the "
+                "constructor, or use select_out_keys to write fewer keys"
             )
         self._out_keys = self._out_keys_apparent = list(keys)
 

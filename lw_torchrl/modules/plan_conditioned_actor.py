@@ -89,7 +89,7 @@ class ConditionedActor(NamedParts):
     def rebuild(cls, trunk: TensorDictSequential, decoder: TensorDictModuleBase) -> Self:
         """Build an actor from a trunk and a decoder."""
         actor = cls.__new__(cls)
-        ConditionedActor.__init__(actor, trunk, decoder)  # subclasses have other arguments
+        ConditionedActor.__init__(actor, trunk, decoder)  # the arguments of subclasses differ
         return actor
 
     @property
@@ -125,8 +125,8 @@ class PlanConditionedActor(ConditionedActor):
     """The policy of Plan Conditioned Behavioral Cloning.
 
     The policy attends to the skills whose conditions are true (to all equally if none is), mixes their latents, and
-    decodes the mixture and the observation's features into an action. With B rows, S steps of the longest plan and
-    latents of size D:
+    decodes the mixture and the observation's features into an action. The parts, for B rows, S steps in the
+    longest plan and latents of size D:
 
     ====================  ============================================  =================================
     part                  reads                                         writes

@@ -46,7 +46,7 @@ def one_hot_actor(plans: AnyPlans, **options: Any) -> TensorDictModuleBase:
 
 @typed
 def make_policy(method: str, plans: AnyPlans, **options: Any) -> TensorDictModuleBase:
-    """Make an untrained policy for the tasks of ``plans`` by a method.
+    """Make an untrained policy by the name of its method, for the tasks of ``plans``.
 
     Args:
         method: a name in :data:`METHODS`; an unknown name raises a :class:`ValueError` that suggests the nearest name.
@@ -72,7 +72,7 @@ def _first(actor: Any, name: str) -> Any:
 
 
 def plans_of(actor: Any) -> Plans | None:
-    """Return the plans that an actor, or one of its parts, follows; None if it follows none."""
+    """Return the plans that an actor, or one of its parts, follows; None if there are no plans."""
     plans: Plans | None = _first(actor, "plans")
     return plans
 
@@ -100,11 +100,11 @@ def with_plans(actor: Any, plans: AnyPlans) -> Any:
 
     Raises:
         TypeError: the actor follows no plans, or cannot follow other plans.
-        ValueError: the plans do not fit, for example because they have no roles.
+        ValueError: the plans do not fit the actor, for example because the plans have no roles.
     """
     plans = as_plans(plans)
     if plans_of(actor) is None:
-        raise TypeError(f"with_plans needs an actor that follows plans, got {type(actor).__name__}")
+        raise TypeError(f"with_plans needs an actor with plans, got {type(actor).__name__} without plans")
     return follow(actor, plans)
 
 

@@ -55,7 +55,7 @@ class QueryEvaluator(TensorDictModuleBase):
         >>> policy.in_keys
         ['observation', 'task_id']
 
-    Source: paper section 'Differentiability and Optimization', which names a visual question answering model.
+    Source: paper section 'Differentiability and Optimization', which suggests a visual question answering model.
     """
 
     text_encoder: TextEncoder | None = None
@@ -87,7 +87,7 @@ class QueryEvaluator(TensorDictModuleBase):
 
     @property
     def answers(self) -> Answers:
-        """The kind of answers in ``qaf``, "soft" or "hard". It can be assigned."""
+        """The kind of answers in ``qaf``, "soft" or "hard". The attribute can be assigned."""
         return self._answers
 
     @answers.setter
@@ -159,7 +159,7 @@ class Clauses(NamedTuple):
     """A batch (...,) of clauses, possibly from different tasks. A clause compares elements of an observation by their
     difference, ``observation[first] - observation[second] + shift``."""
 
-    first: Tensor  # (..., 3) int64, indices into the observation; its length D as an index reads 0
+    first: Tensor  # (..., 3) int64, indices into the observation; index D (past the end) reads 0
     second: Tensor  # (..., 3) int64
     shift: Tensor  # (..., 3) float32, metres
     predicate: Tensor  # (...) int64, an index into the list of predicates

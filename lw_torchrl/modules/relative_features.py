@@ -259,8 +259,8 @@ class RoleFeatures(_RelativePositions):
     def fit(self, rows: TensorDictBase, weights: Tensor | None = None) -> None:
         """Compute the contacts from demonstrations, in place.
 
-        A contact is the median of the hand's minus the first object's position over all time steps in which the active
-        plan step grasps, pushes, pulls or moves this object, except presses from above.
+        A contact is the median of hand position minus first-object position, over all time steps in which the active
+        plan step grasps, pushes, pulls or moves the object, except presses from above.
         """
         observation, task_id = read(rows, [self.in_keys[0], self.in_keys[2]])
         observation, task_id = observation.reshape(-1, self.layout.size), task_id.reshape(-1)

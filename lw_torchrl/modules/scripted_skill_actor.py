@@ -25,12 +25,12 @@ class ScriptedSkillActor(Part):
     """A policy that executes plans with scripted skills: a true step's skill acts, or the last step's if none is true.
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool, or float in [0, 1] for soft
-    truth; writes ``action`` (B, 4) float32 in [-1, 1] and ``skill_weights`` (B, S) float32, which sum to 1. Soft truth
-    counts as true above 0.5. If an observation is NaN, so is the action.
+    truth; writes ``action`` (B, 4) float32 in [-1, 1] and ``skill_weights`` (B, S) float32, whose rows sum to 1. Soft
+    truth above 0.5 counts as true. If an observation is NaN, the action is NaN.
 
     Args:
         plans: a plan for each task; every step's skill must be the text of a scripted skill.
-        select: which of several true steps acts: "first", "random" (as in the paper), or "mix" (all, equally).
+        select: which skill acts if several steps are true: "first", "random" (as in the paper), or "mix" (the mean).
         skills: a mapping from text to scripted skill, see :func:`load_skills`; None for the shipped skills.
         seed: seed of the random choice, from -2**63 to 2**64 - 1.
         in_keys, out_keys: replacements for the default keys, in the order above; nested keys are allowed.
@@ -76,7 +76,7 @@ class ScriptedSkillActor(Part):
 
     @property
     def config(self) -> dict[str, Any]:
-        """The keyword arguments that reconstruct this module. Custom skills raise a :class:`TypeError`."""
+        """The keyword arguments that reconstruct this module; a :class:`TypeError` is raised for custom skills."""
         if self._skills is not None:
             raise TypeError("a ScriptedSkillActor with custom skills cannot be saved; save the file of the skills")
         return super().config
