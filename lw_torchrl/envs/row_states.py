@@ -17,7 +17,7 @@ from lw_torchrl.language.tasks import MT50, task_id
 
 
 def _with_ids(method: Callable[..., Any], change: Callable[..., Tensor] = lambda ids, *_args, **_kwargs: ids) -> Any:
-    """Wrap a method of Categorical that returns a new spec, so that the new spec has the ids after ``change``."""
+    """Wrap a method of Categorical that returns a new spec; give the new spec the ids transformed by ``change``."""
 
     def wrapped(self: TaskIds, *args: Any, **kwargs: Any) -> TaskIds:
         spec = method(self, *args, **kwargs)
@@ -117,7 +117,7 @@ class RowStates:
 
     def as_tensordict(self, executed_action: NDArray[np.float32] | None = None, **more: Tensor) -> TensorDict:
         """Return a copy of the state as a TensorDict (N,), with ``executed_action`` (N, A) float32 (None for zeros) and
-        the entries ``more``."""
+        the additional entries ``more``."""
         n = len(self.tasks)
         over, terminated, fault, success = (torch.from_numpy(flag.copy()).unsqueeze(-1) for flag in self._flags)
         if executed_action is None:

@@ -142,7 +142,7 @@ def _rename_parts(
 ) -> None:
     """Replace a module's parts by copies that read renamed keys.
 
-    If the parts run ``in_order``, a key that an earlier part writes keeps its old name.
+    If the parts run ``in_order``, later parts read a key that an earlier part writes by its old name.
     """
     in_sequence, remaining, parts = isinstance(module, TensorDictSequential), renamed, {}
     for name, part in module._modules.items():
