@@ -272,7 +272,7 @@ def collect_demonstrations(
         next/success, next/done, next/terminated, next/truncated: (R, 1) bool.
 
     Args:
-        tasks: Meta-World tasks, as for :func:`resolve_tasks`, or another suite's; docs/training.md shows own tasks.
+        tasks: Meta-World tasks, as for :func:`resolve_tasks`, or another suite's; see docs/your-robot.md for your own.
         episodes_per_task: number of episodes of each task to keep.
         root: the dataset's folder, new or left by an earlier call.
         suite: the :class:`~lw_torchrl.suites.Suite` of the tasks; None for the suite that their names begin with.

@@ -29,7 +29,7 @@ _EMPTY = frozenset(("the", "a", "an", "is", "are", "be", "does", "do", "did", "h
 _LONGEST = 400  # maximum length (characters) of a text to map
 _MOST_CLAUSES = 8  # maximum number of clauses of a condition to map
 _MOST_COMPARED = 64  # maximum number of texts to map per answer, which bounds the decoding time
-LIMIT, SKILL_LIMIT = 0.4, 0.7  # maximum distance of a condition and of a skill; see docs/planners.md
+LIMIT, SKILL_LIMIT = 0.4, 0.7  # maximum distance of a condition and of a skill; see docs/language-models.md
 _TARGETS = ("target location", "reach target")
 _TARGET = re.compile(
     r"\b(?:the\s)?(?:reach\s)?(?:goal|target)(?:\s(?:location|position|area|place|point|destination))?\b"

@@ -327,7 +327,7 @@ def with_n_steps(loss: LossModule, batch: TensorDictBase) -> TensorDictBase:
         >>> from tensordict import TensorDict
         >>> from torchrl.objectives import IQLLoss
         >>> plans = lw.load_plans("MT10")
-        >>> actor = lw.PlanConditionedActor(plans).stochastic("tanh_normal")
+        >>> actor = lw.PlanConditionedActor(plans).stochastic("normal")
         >>> loss = IQLLoss(actor, lw.PlanConditionedQValue(plans), lw.PlanConditionedValue(plans))
         >>> loss.make_value_estimator(gamma=0.99)
         >>> batch = TensorDict(steps_to_next_obs=torch.tensor([5, 2]), next=TensorDict(), batch_size=[2])

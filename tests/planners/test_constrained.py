@@ -82,7 +82,7 @@ def test_a_task_without_scripted_skills(tmp_path):
     (tmp_path / "tasks.toml").write_text('[stack]\ndescription = "Stack it."\nobjects.brick = "obs[4:7]"\n')
     stack = lw.load_tasks(tmp_path / "tasks.toml")["stack"]
     skills = {"push": lw.load_skills()["place the gripper above the puck"]}
-    with pytest.raises(ValueError, match="stack.* no scripted skill.* free_skills=True"):
+    with pytest.raises(ValueError, match=r"stack.* no scripted skill.* free_skills=True"):
         plan_schema(stack, skills=skills)
     step = plan_schema(stack, skills=skills, free_skills=True)["properties"]["steps"]["items"]
     assert "pattern" in step["properties"]["skill"]
