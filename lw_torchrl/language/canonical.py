@@ -148,7 +148,7 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
 
 
 def fallback_plan(task: str | Task) -> ConditionalPlan:
-    """Return the generic plan for a task: grasp the first object and move that object to the goal.
+    """Build the generic plan for a task: grasp the first object and move that object to the goal.
 
     In a task without objects, the plan moves the gripper to the goal.
     """
@@ -206,7 +206,7 @@ def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> t
 
 
 def _approach(each: ParsedStep, purpose: ParsedStep | None) -> tuple[Verb, Manner, Direction | None]:
-    """Return the verb, manner and direction of a step that prepares the step ``purpose``; None stands for a grasp."""
+    """Return (verb, manner, direction) of a step that prepares for the step ``purpose``; None stands for a grasp."""
     verb = "descend" if each.verb == "beside" else each.verb
     if purpose is None:
         return verb, "grasp", None
@@ -233,7 +233,7 @@ def _manner(each: ParsedStep) -> Manner:
 
 
 def _at_points(condition: Query, task: Task) -> Query:
-    """Replace the first object with the point where the gripper touches it, in clauses about the gripper."""
+    """Replace the task's first object with the point to touch, in clauses about the gripper."""
     first = first_object(task)
 
     def at(name: str) -> str:
@@ -289,7 +289,7 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
         both = Query(tuple(clause for query in conditions for clause in query.clauses))
         return _step(both, StepRole(verb, GRIPPER, point, manner, way, confidence=0.0))
 
-    # A pull is completed as a grasp, which also holds what the fingers cannot hook.
+    # Complete a pull as a grasp, which also holds objects that the fingers cannot hook.
     if motion.manner in ("grasp", "pull"):
         held = object_of(task, point)
         if motion.verb == "pull":
@@ -416,7 +416,7 @@ def worth(plan: ConditionalPlan) -> tuple[bool, float, float]:
 
 
 def most_confident(plans: Iterable[ConditionalPlan]) -> ConditionalPlan:
-    """Return the first plan with the largest :func:`worth`."""
+    """Return the plan with the largest :func:`worth`; the first such plan if several tie."""
     return max(plans, key=worth)
 
 

@@ -69,7 +69,7 @@ class Layout:
             raise ValueError(f"things of {layout} must hold at least one Slot")
         present = (*self.present, *self._past(self.present))
         if max(part.stop for part in (*present, *self.positions)) > self.size:
-            raise ValueError(f"{layout} has an index outside its observations, which have {self.size} numbers")
+            raise ValueError(f"{layout} has an index outside the {self.size} numbers of an observation")
         used = [number for part in present for number in places(part)]
         if twice := sorted(number for number in used if used.count(number) > 1):
             raise ValueError(f"{layout} uses index {twice[0]} of the observation more than once")
@@ -124,7 +124,7 @@ class Layout:
         return slice(part.start + self.past, part.stop + self.past)
 
     def _past(self, parts: tuple[slice, ...]) -> tuple[slice, ...]:
-        """Return the same slices in the previous time step; empty if the layout has no ``past``."""
+        """Return the slices of the same numbers in the previous time step; empty without a ``past``."""
         return () if self.past is None else tuple(map(self.a_step_before, parts))
 
     def to_json(self) -> dict[str, Any]:

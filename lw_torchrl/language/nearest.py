@@ -98,7 +98,7 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
 
 
 def _nearest_part(part: str, task: Task, by: str) -> QueryPart:
-    """Return the base query (or its negation) that is nearest to one part of a text."""
+    """Match one part of a text to the nearest base query or negated base query."""
     if (query := read_query(part, task)) is not None:
         return QueryPart(part, query, 1.0)
     words, negated = _affirmed(part)
@@ -149,7 +149,7 @@ def nearest_skill(
         skills: the skills to choose from; None for the shipped skills.
 
     Raises:
-        SkillError: the task has the objects of none of the skills.
+        SkillError: every skill needs an object that the task lacks.
 
     Example:
         >>> nearest_skill("put gripper above puck", task="push")[0].text
@@ -163,7 +163,7 @@ def nearest_skill(
         table = {check_choice("skills", name, shipped): shipped[name] for name in table}
     allowed = tuple(name for name, skill in table.items() if task is None or skill.suits(task))
     if not allowed:
-        raise SkillError(f"task {task!r} lacks the objects of every scripted skill; pass other skills=")
+        raise SkillError(f"every scripted skill needs an object that task {task!r} lacks; pass other skills=")
     words = " ".join(text.lower().replace("_", " ").split())
     name, similarity, _ = process.extractOne(words, allowed, scorer=fuzz.ratio)
     return table[name], similarity / 100
@@ -214,7 +214,7 @@ class StepMapper:
 
 @lru_cache(maxsize=4096)
 def _nearest_condition(text: str, task: Task) -> tuple[Query | None, float]:
-    """Return the nearest query to a condition (None if it has too many clauses) and the distance."""
+    """Return the query nearest to a condition (None if the condition has too many clauses) and the distance."""
     words = _phrases("conditions").sub(lambda match: WORDS["conditions"][match[0]], _with_target(text, task))
     with suppress(QueryError):
         match = nearest_query(words, task)

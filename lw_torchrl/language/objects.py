@@ -45,9 +45,9 @@ class NamedObject:
 
     name: str  # "drawer handle": lower-case words without an article
     position: tuple[Coordinate, Coordinate, Coordinate]  # x, y and z
-    offset: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # metres from the object's position to a point on it
+    offset: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # metres from the object's position to this point
     ours: bool = False  # whether this is our added point, which the published object list lacks
-    opening: Natural | None = None  # index of the opening, from 0 (closed) to 1 (open); None if it cannot open
+    opening: Natural | None = None  # index of the opening, from 0 (closed) to 1 (open); None if the object cannot open
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9'-]*( [a-z0-9][a-z0-9'-]*)*", self.name):

@@ -41,7 +41,7 @@ class DecodedPlan:
 
     Attributes:
         plan: the plan, with queries as conditions and skills as written; None if the text has no plan.
-        scripted: the plan with the nearest scripted skill of each step that has one; None if no step has one.
+        scripted: the plan with the nearest scripted skills, without steps that have none; None if no step is left.
     """
 
     plan: ConditionalPlan | None
@@ -210,8 +210,8 @@ def _why_none(reading: Reading, steps: list[DecodedStep], task: Task, text: str)
     if not text.strip():
         return "the text is empty"
     if others := sorted({other.task for other in reading.sections if other.clauses}):
-        return f"it has no steps for {task.name}, but some for {', '.join(map(shown, others))}"
-    return f"it has no steps, neither for {task.name} nor for another task"
+        return f"the text has no steps for {task.name}, only for {', '.join(map(shown, others))}"
+    return f"the text has no steps for {task.name} or any other task"
 
 
 _OPENS = r"<think(?:ing)?>|\[think\]|<\|channel\|>(?:analysis|commentary)"
@@ -223,7 +223,7 @@ _IS_JSON = re.compile(r"\s*(?:```\w*\s*)?\{")
 
 
 def without_thoughts(text: str, notes: list[Note]) -> str:
-    """Remove the model's thoughts, which may hold drafts, from an answer; add a note. Line numbers do not change.
+    """Remove the model's thoughts, which may hold drafts, from an answer, and add a note. Line numbers do not change.
 
     A closing tag without an opening tag ends a thought that began before the text, if the closing tag ends its line and
     is not in a comment. An opening tag in a comment or a string is ignored. The tags of gpt-oss are never ignored. An

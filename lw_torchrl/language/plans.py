@@ -55,7 +55,7 @@ class PlanStep:
 
     condition: Query
     skill: str  # plain English, "place the gripper above the puck"
-    reason: str = field(default="", compare=False)  # a comment for human readers; it does not affect the policy
+    reason: str = field(default="", compare=False)  # a comment for human readers, without effect on policies
     goal: Query | None = None  # the state to reach; None for the skill's usual goal, see ConditionalPlan.goals
     role: StepRole | None = None  # the action and its objects, in plans of :func:`~lw_torchrl.canonical_plan`
 
@@ -131,7 +131,7 @@ class ConditionalPlan:
         return tuple(step.goal or usual_goal(step.skill, self.definition) for step in self.steps)
 
     def __str__(self) -> str:
-        """Return the plan as text in the chain_py format, which :func:`parse_plan` reads."""
+        """Convert the plan to text in the chain_py format, which :func:`parse_plan` parses."""
         lines = []
         for step in self.steps:
             if reason := one_line(step.reason).lstrip("# "):
@@ -142,7 +142,7 @@ class ConditionalPlan:
         return function_head(self.definition) + "".join(f"{line}\n" for line in lines)
 
     def to_json(self) -> dict[str, Any]:
-        """Convert the plan to JSON: its text, its task if not shipped, and its roles and confidence if it has any."""
+        """Convert the plan to JSON: its text, its task if not shipped, and its roles and confidence, if any."""
         row: dict[str, Any] = {"plan": str(self)}
         if self.definition != TASKS.get(self.task):
             row["task"] = self.definition.to_json()
@@ -234,8 +234,8 @@ class Plans(Mapping[str, ConditionalPlan]):
         """A hash (32 hex digits) of everything that queries and attention depend on.
 
         The hash covers each step's condition and skill, the number of steps, the objects of each task with their
-        positions and offsets, and the current definitions of the relations that the conditions use. It does not cover
-        reasons and descriptions. Plans with the same fingerprint give the same ``qaf``.
+        positions and offsets, and the current definitions of the relations that the conditions use. Reasons and
+        descriptions do not affect the hash. Plans with the same fingerprint give the same ``qaf``.
         """
         used = {clause.predicate for plan in self.values() for step in plan.steps for clause in step.condition.clauses}
 

@@ -113,7 +113,7 @@ class _ClauseParser:
     def error(self, expected: str) -> QueryError:
         if not self.explain:  # building the full error is slow, because of the search for the nearest query
             return QueryError("not a query")
-        word = f"{_cut(self.words[self.at], 40)!r} (word {self.at + 1})" if self.at < len(self.words) else "its end"
+        word = f"{_cut(self.words[self.at], 40)!r} (word {self.at + 1})" if self.at < len(self.words) else "the end"
         context = " ".join(self.words[max(0, self.at - 8) : self.at + 8])
         close = process.extractOne((self.inferred + context)[:300], supported_queries(self.task), scorer=fuzz.ratio)
         return QueryError(
@@ -140,7 +140,7 @@ class _ClauseParser:
         return None
 
     def name_error(self, expected: str = "") -> QueryError:
-        self.at += self.at_article()  # the noun is wrong, not its article
+        self.at += self.at_article()  # point at the noun, not at the article
         return self.error(expected or "one of " + ", ".join(repr(f"the {name}") for name in self.task.object_names))
 
     def at_article(self) -> bool:
@@ -165,8 +165,8 @@ class _ClauseParser:
             raise self.error("one of " + ", ".join(map(repr, PREDICATES)))
         if predicate in STATES and subject not in self.task.openings:
             self.at -= len(predicate.split())
-            those = " and ".join(f"the {name}" for name in self.task.openings).replace(GRIPPER, "gripper")
-            raise self.error(f"a predicate of the {subject}; only {those} can be {' or '.join(STATES)}")
+            openable = " and ".join(f"the {name}" for name in self.task.openings).replace(GRIPPER, "gripper")
+            raise self.error(f"a predicate of the {subject}; only {openable} can be {' or '.join(STATES)}")
         start, other = self.at, None if predicate in UNARY else self.name()
         if other is None and predicate not in UNARY:
             raise self.name_error()
@@ -183,7 +183,7 @@ def parse_query(text: str, task: str | Task) -> Query:
     """Parse an English condition on a state of ``task``.
 
     The text may be a question, use capitals, omit articles, and contain "the gripper" or "isn't". A clause may omit its
-    subject if that is the previous clause's subject ("... is open and not above the puck").
+    subject if the previous clause has the same subject ("... is open and not above the puck").
 
     Args:
         text: a condition of at most 64 clauses, such as "Is the gripper open and not above the puck?".

@@ -111,7 +111,7 @@ class QueryProgram(nn.Module):
         A comparison's margin is its distance to the threshold, divided by its temperature (see
         :class:`~lw_torchrl.language.relations.Comparison`). A conjunction has the smallest margin of its operands, a
         negation the negative margin. The logit is positive if the query is true, otherwise negative, and never zero.
-        The gradient is finite; it is the gradient of the comparison with the smallest margin.
+        The gradient is finite, and equals the gradient of the comparison with the smallest margin.
 
         Args:
             observation, task_id: as for :meth:`forward`.

@@ -82,7 +82,7 @@ def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
 class QueryTables(NamedTuple):
     """The atoms (A) of each task, and the J atoms of each clause (K) of each query (S).
 
-    The first dimension is the tasks (T); in tables that were selected for a batch, it is the rows of the batch.
+    The first dimension is the tasks (T), or the rows of the batch (B) in tables that were selected for a batch.
     """
 
     first: Tensor  # (T, 3*A) int64, index of each coordinate of the first position; an unused axis has the index of 0.0
@@ -175,7 +175,7 @@ def _task_facts(task: Task, queries: Sequence[Query]) -> tuple[dict[Atom, int], 
     def bits(clause: Clause) -> int:
         return sum({1 << places.setdefault(atom, len(places)) for atom in clause_atoms(clause, task)})
 
-    # All atoms first: the conjunctions' bits follow them.
+    # Number all atoms first, since the bits of conjunctions follow the bits of atoms.
     listed = [[(bits(clause), clause.negated) for clause in query.clauses] for query in queries]
     conjunctions: dict[int, int] = {}
     literals = []

@@ -79,7 +79,7 @@ UNARY = ChainMap[str, tuple[Comparison, ...]](STATES, _OF_POSITION)  # type: ign
 RELATIONS = Registry("relation", "lw_torchrl.relations", _predicates("relations"), _check_relation)
 """The relations between two objects: the paper's 13 relations, and those that you add (see docs/custom-networks.md).
 
-Source: paper section 'Query Answering Function'; with the published thresholds.
+Source: paper section 'Query Answering Function', with the published thresholds.
 """
 PUBLISHED: tuple[str, ...] = tuple(_TABLE["published"])
 """The names of the paper's 13 relations."""

@@ -56,7 +56,7 @@ class ScriptedSkill:
         skill = self.variants.get(owner.name, self)
         for name in (skill.target, skill.moved):
             if name not in owner.object_names:
-                lacks = f"needs {name!r}, which task {owner.name!r} lacks; it has {', '.join(owner.object_names)}"
+                lacks = f"needs {name!r}, which task {owner.name!r} lacks (objects: {', '.join(owner.object_names)})"
                 raise SkillError(f"skill {self.text!r} {lacks}{did_you_mean(name, owner.object_names)}")
         return skill
 

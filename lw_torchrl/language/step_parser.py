@@ -17,7 +17,7 @@ _DIRECTIONS: dict[str, Direction] = {
 }
 _PLACES = {name: frozenset(words) for name, words in WORDS["canonical"]["places"].items()}
 _KNOWN = frozenset().union(*_VERBS.values()) | {"align", "slide", "sweep"}
-# Drop the purpose in "put the gripper above the dial to turn it left", since a later step carries it out.
+# The purpose in "put the gripper above the dial to turn it left", which a later step of the plan carries out.
 _PURPOSE = re.compile(r"(?<=>) (?:in order )?to \w+ it\b.*")
 _TOOL = re.compile(r"(?<!line )(?<!level )(?<!aligned )\bwith <([^>]*)>")
 

@@ -18,7 +18,7 @@ Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
 
 
 def one_per_row(task_id: Tensor, values: Tensor) -> Tensor:
-    """Return task ids with the batch shape of ``values`` (..., N): ids (..., 1) are squeezed to (...)."""
+    """Return task ids (...) with the batch shape of ``values`` (..., N), squeezed from (..., 1) if necessary."""
     return task_id.squeeze(-1) if task_id.dim() == values.dim() and task_id.shape[-1] == 1 else task_id
 
 
@@ -37,7 +37,7 @@ class TaskIndex:
                 raise ValueError(f"tasks {names[number]!r} and {name!r} have the same id, {number}; rename one of them")
             names[number] = name
         self.tasks = tuple(names[number] for number in sorted(names))
-        self._ids = torch.tensor([*sorted(names), -1])  # -1 is never an id; lookups past the end find it
+        self._ids = torch.tensor([*sorted(names), -1])  # -1, never an id, ends the table
 
     def row(self, task: str) -> int:
         """Return the row of a task's name."""
@@ -58,7 +58,7 @@ class TaskIndex:
         wanted = task_id.long().contiguous()
         if is_plain or asserted(task_id):
             rows = torch.searchsorted(ids[:-1], wanted)
-        else:  # avoid searchsorted in vmap, where it warns about the memory layout
+        else:  # in vmap, searchsorted would warn about the memory layout
             rows = (wanted.unsqueeze(-1) > ids[:-1]).sum(-1)
         nearest = ids.index_select(0, rows.reshape(-1)).reshape(rows.shape)
         if is_plain and not waits(task_id):
@@ -129,8 +129,9 @@ class PlanTables:
 def answers_of(qaf: Tensor, task_id: Tensor, number: Tensor | None, tables: PlanTables) -> tuple[Tensor, Tensor]:
     """Return ``qaf`` (..., S), and each task's row (...) int64 in ``tables`` of plans with S steps.
 
-    ``qaf`` may be longer than S, if it was computed for a larger set of plans; it is cut to S if ``number`` (the
-    ``qaf_plan``) shows that the tasks' plans are equal. A task without a plan or with another plan is a ValueError.
+    ``qaf`` may be longer than S, if it was computed for a larger set of plans. In this case ``qaf`` is cut to S if
+    ``number`` (the ``qaf_plan``) shows that the tasks' plans are equal. A task without a plan or with another plan
+    raises a ValueError.
     """
     rows = tables.rows(one_per_row(task_id, qaf))
     tables.refuse_others(number, rows)
@@ -154,7 +155,7 @@ class TaskTables(nn.Module, Generic[Tables]):
         self._last: tuple[Tensor, _Kind, Tables] | None = None
 
     def plain(self, *tensors: Tensor) -> bool:
-        """Return whether the tensors and the tables are plain; a loss with ``vmap`` may batch the tables."""
+        """Return whether the tensors and the tables hold numbers; in ``vmap`` or while compiling they do not."""
         return plain(*tensors, next(iter(self._buffers.values())))  # type: ignore[arg-type]
 
     def select(self, task_id: Tensor, observation: Tensor) -> Tables:

@@ -76,7 +76,7 @@ class Task:
 
     @cached_property
     def openings(self) -> dict[str, int]:
-        """The observation index of the opening of each object that can open, by name; the gripper comes first."""
+        """The observation index of each opening, by the name of the object that can open; the gripper comes first."""
         openings = {named.name: named.opening for named in self.objects if named.opening is not None}
         return {GRIPPER: self.layout.opening, **openings}
 
@@ -156,7 +156,7 @@ def object_of(task: Task, name: str) -> str:
 
 
 def point_on(task: Task, name: str) -> str:
-    """Return the point where the gripper touches an object: the first named point on it, else the object itself."""
+    """Return the point where the gripper touches an object: the object's first named point, else the object itself."""
     if any(role_object(task, name).offset):
         return name
     points = (named.name for named in task.objects if any(named.offset) and same_object(task, named.name, name))

@@ -27,7 +27,7 @@ _Place = tuple[str, str, int]  # (format, task, attempt)
 
 
 class PlannerError(RuntimeError):
-    """The error for a request that a planner could not answer; it names the model, the task, the cause and a remedy.
+    """The error for a failed request to a planner; the message names the model, the task, the cause and a remedy.
 
     If ``fatal`` is true, every other request to the same planner would fail in the same way.
     """
@@ -141,7 +141,7 @@ def answer_path(folder: AnyPath, model: str, format: str, task: str, attempt: in
 
 @typed
 def write_answer(folder: AnyPath, model: str, answer: Answer) -> Path:
-    """Write an answer to :func:`answer_path`, and the server's JSON, if any, next to it; return the path."""
+    """Write an answer (and the server's JSON, if any) to the folder, and return the answer's :func:`answer_path`."""
     path = answer_path(folder, model, answer.format, answer.task, answer.attempt)
     if answer.raw != answer.text:
         write_text(path.with_suffix(".json"), answer.raw)
@@ -174,7 +174,7 @@ def recorded_answers(source: AnyPath) -> dict[str, dict[_Place, str | Path]]:
 
 
 def answer_text(answer: str | Path) -> str:
-    """Return the text of an answer from :func:`recorded_answers`, which may be a file."""
+    """Return the text of an answer (a text or a file) from :func:`recorded_answers`."""
     return _storable(read_text(answer, ValueError) if isinstance(answer, Path) else answer)
 
 

@@ -188,8 +188,8 @@ class OpenAIPlanner:
         Args:
             answers: the answers to revise, all in one format.
             facts: a report on each answer, as written by :func:`~lw_torchrl.planners.repairing.plan_facts`.
-            tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
             round: the number of the round, from 1.
+            tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
             out: as for :meth:`plans`, but with ``-round<round>`` appended to the folder's name.
             progress: show a progress bar.
         """
@@ -369,12 +369,12 @@ class _ChatClient:
         elif status is None:
             reason = _excerpt(self._without_key(str(error.__cause__ or error))) or type(error.__cause__).__name__
             cause = f"the connection failed or was interrupted, {tried}: {reason}"
-            advice = "Check that the server is running and that base_url is its address"
+            advice = "Check that the server is running and that base_url is correct"
         elif status in (401, 403):
             cause = f"the server rejects the key in {_KEY}" if self._key else f"the server needs a key in {_KEY}"
             advice = "Set the key for this server"
         elif status == 404:
-            cause, advice = "no such model or address", f"`GET {self.address}/models` lists its models"
+            cause, advice = "no such model or address", f"`GET {self.address}/models` lists the server's models"
         elif status == 429:
             cause, advice = f"too many requests, {tried}", "Retry later or with a lower concurrency"
         elif status >= 500:
@@ -388,7 +388,7 @@ class _ChatClient:
         return f"{cause}{f' ({message})' if status else ''}. {advice}", fatal
 
     def _without_key(self, text: Any) -> Any:
-        """Redact the key in a text or in bytes; a key under 8 characters may be an ordinary word, such as "none"."""
+        """Redact the API key in a text or in bytes. A key of under 8 characters may be an ordinary word, so is kept."""
         key, hidden = self._key, "(the key)"
         if len(key) < 8:
             return text
@@ -411,7 +411,7 @@ def _limited(openai: Any, timeout: float) -> Any:
                     content += part
                     if monotonic() > end:
                         raise openai.APITimeoutError(request)
-                    if len(content) > REPLY_LIMIT:  # _read_completion reports it
+                    if len(content) > REPLY_LIMIT:  # _read_completion raises the error
                         break
             headers = {name: value for name, value in response.headers.items() if name.lower() != "content-encoding"}
             status = _status(response.status_code, bytes(content))
@@ -470,7 +470,7 @@ def _read_completion(content: bytes) -> tuple[Reply, str]:
     except (ValueError, KeyError, IndexError, TypeError) as error:
         if isinstance(error, ValueError) and content.strip()[:1] in (b"", b"{"):
             raise PlannerError(f"the reply was cut off or is not JSON: {_excerpt(str(error))}. Retry") from None
-        advice = "Check that base_url is the address of an OpenAI-compatible server; it usually ends in /v1"
+        advice = "Check that base_url is the address of an OpenAI-compatible server, usually ending in /v1"
         text = _excerpt(content.decode("utf-8", "replace"))
         raise PlannerError(f"the reply is not a chat completion: {text}. {advice}", fatal=True) from None
     notes: tuple[str, ...] = ()

@@ -44,7 +44,7 @@ def prompt_examples(task: str | Task, plans: AnyPlans | None = None) -> tuple[Co
     owner = get_task(task)
     others = [plan for name, plan in example_plans(plans).items() if name != owner.name]
     if not others:
-        raise ValueError(f"plans must hold a plan for a task other than {owner.name!r}, got only its own plan")
+        raise ValueError(f"plans must hold a plan for a task other than {owner.name!r}, got only a plan for this task")
 
     def distance(plan: ConditionalPlan) -> tuple[bool, int]:
         return plan.task != _ALWAYS, Levenshtein.distance(plan.definition.description, owner.description)
@@ -217,7 +217,7 @@ def plan_schema(
         free_skills: allow free-form skills.
 
     Raises:
-        SkillError: (a ValueError) the task can use none of the scripted skills.
+        SkillError: (a ValueError) the task can use no scripted skill.
 
     Example:
         >>> plan_schema("reach")["properties"]["steps"]["items"]["properties"]["skill"]["enum"][0]

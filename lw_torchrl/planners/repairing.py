@@ -30,13 +30,13 @@ class PlanCheck:
     task: str
     decoded: DecodedPlan
     expert: TaskUse | None = None  # the plan's conditions in the expert's states; None without a plan
-    own: TaskUse | None = None  # the plan's own rollouts with scripted skills; None if a step has no scripted skill
+    own: TaskUse | None = None  # the plan's conditions in its own episodes; None if a step has no scripted skill
     success: float = 0.0  # success rate with scripted skills
     failed: tuple[Tensor, ...] = ()  # observations (T, 39) float32 of each failed episode
 
     @property
     def never(self) -> tuple[int, ...]:
-        """The plan steps (from 0) whose condition was never true, in the expert's rollouts or the plan's own."""
+        """The plan steps (from 0) whose condition was never true in the episodes of the expert and of the plan."""
         if self.expert is None:
             return ()
         own = [0.0] * len(self.expert.true) if self.own is None else self.own.true
@@ -47,7 +47,8 @@ class PlanCheck:
             return "\n".join([f"{self.task}: no plan: {self.decoded.reason}", *map(str, self.decoded.notes)])
         lines = [f"{self.task}, {len(self.decoded.plan.steps)} steps"]
         for k, step in enumerate(step for step in self.decoded.steps if not step.dropped):
-            own = "" if self.own is None else f", {self.own.true[k]:.0%} of its own; acts in {self.own.chosen[k]:.0%}"
+            use = self.own
+            own = "" if use is None else f" and {use.true[k]:.0%} of the plan's, acts in {use.chosen[k]:.0%} of these"
             lines += [
                 f"{k + 1}  when {step.condition}{_written(step.written_condition, step.condition_distance)}",
                 f"   {step.scripted or 'no scripted skill'}{_written(step.written_skill, step.skill_distance)}",
@@ -137,7 +138,7 @@ def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
     Example:
         >>> from lw_torchrl.language.tasks import TASKS
         >>> print(plan_facts(check_plan("I cannot.", "reach", "basic_py"), TASKS["reach"]))
-        The answer was read, and no plan was found in it: it has no steps, neither for reach nor for another task.
+        The answer was read, and no plan was found in it: the text has no steps for reach or any other task.
         In the answer, line 1: the text is not part of a plan: 'I cannot.'
         Write the plan for `reach` again, the whole of it, in the same form, with this corrected.
     """
@@ -197,8 +198,8 @@ def repair_plans(
         planner: the planner that wrote the answers.
         answers: the planner's answers, all in one format.
         rounds: maximum number of rounds.
-        enough: the success rate from which a plan is not revised.
-        episodes, seed: number and seed of the episodes with scripted skills per plan; evaluate with a different seed.
+        enough: the success rate (0 to 1) at which a plan is good enough and is not revised.
+        episodes, seed: number and seed of the episodes that check each plan; use a different seed for evaluation.
         tasks, out, progress: see :meth:`OpenAIPlanner.revise`.
     """
     check_value("rounds", rounds, Count)

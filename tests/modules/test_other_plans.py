@@ -73,7 +73,7 @@ def test_each_row_carries_the_number_of_its_plan():
     assert mixed["qaf_plan"][0] == state(PLANS)["qaf_plan"][0], "whatever stands beside it"
     lw.PlanConditionedActor(both)(mixed)
     other = lw.ConditionalPlan.from_pairs("reach", [("the gripper is closed", "close the gripper")] * 2)
-    with pytest.raises(ValueError, match="for reach; give"):
+    with pytest.raises(ValueError, match="for reach; pass"):
         lw.PlanConditionedActor(plans_of(STEPS, other))(mixed)
 
 

@@ -26,7 +26,7 @@ PLAN_FORMATS = Registry(
     {f"{name}_{container}": make(style) for name, style in STYLES.items() for container, make in _CONTAINERS.items()},
     _check_format,
 )
-"""The plan formats by name: the paper's nine; add a custom format with ``PLAN_FORMATS["mine"] = PlanFormat(...)``."""
+"""The plan formats by name. Add a custom format with ``PLAN_FORMATS["mine"] = PlanFormat(...)``."""
 
 
 @typed

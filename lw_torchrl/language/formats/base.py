@@ -42,7 +42,7 @@ _ITEM = re.compile(r"\s*\[?(\d{1,4})[.):\]]\s*(\S.*)")
 
 @dataclass(frozen=True)
 class Note:
-    """A remark on a line (from 1) of a text that was left out or changed."""
+    """A remark on a line (from 1) that was left out or changed while parsing a text."""
 
     line: int
     text: str
@@ -81,7 +81,7 @@ class Reading:
 
     @property
     def section(self) -> Section:
-        """The section that is being read, which is the last one."""
+        """The current section, which is the last in ``sections``."""
         return self.sections[-1]
 
     def note(self, line: int, text: str) -> None:
