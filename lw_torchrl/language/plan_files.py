@@ -92,7 +92,7 @@ def check_plan(
                 fault = fault or str(error)
         elif match := _SKILL.fullmatch(line):
             if not is_open:
-                fault = 'expected if check("condition"): above the skill'
+                fault = 'the skill has no condition; expected if check("condition"): above the skill'
             elif condition is not None:
                 goal = _unquote(match, 4)
                 try:
