@@ -117,7 +117,7 @@ def test_links_of_pages_lead_somewhere(page):
 
 
 def test_files_that_pages_name_exist():
-    named = re.findall(r"`([a-z_/]+(?:\.py|\.toml|/))`", (ROOT / "docs" / "developers.md").read_text("utf-8"))
+    named = re.findall(r"`([a-z_/]+(?:\.py|\.toml|/))`", (ROOT / "docs" / "design.md").read_text("utf-8"))
     tops = [ROOT / name for name in ("lw_torchrl", "benchmarks", "examples", "tests", "docs")]
     paths = [path for top in tops for path in (top, *top.rglob("*"))]
     existing = [f"{path.as_posix()}/" if path.is_dir() else path.as_posix() for path in paths]
