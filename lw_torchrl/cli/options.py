@@ -126,7 +126,7 @@ def _print_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[st
 
 PLANS = "MT10 or MT50 (the shipped plans), .plan files, .json files of (condition, skill) pairs, or folders"
 WHO = (
-    "expert (Meta-World's scripts, or the suite's own), scripted (plans by scripted skills), spoilt-60 or spoilt-30 "
+    "expert (Meta-World's scripts, or the suite's own), scripted (plans by scripted skills), noisy-60 or noisy-30 "
     "(the same, right 60 or 30 % of the time), wrong (any skill of the plan), random, a policy file, a shipped policy "
     "(few-shot-mt50), or your own policy in Python, as my_module:policy"
 )

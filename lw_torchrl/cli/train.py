@@ -258,7 +258,7 @@ class TrainEvaluator:
     out: Path  # folder for evaluator.safetensors, report.json and the collected episodes
     data: Annotated[tuple[Path, ...], options.OPTIONAL] = ()
     """datasets of `lw-torchrl collect` to use instead of collecting episodes"""
-    behaviours: tuple[str, ...] = ("expert", "scripted", "spoilt-30", "random")
+    behaviours: tuple[str, ...] = ("expert", "scripted", "noisy-30", "random")
     """policies that act, as for `collect --policy`"""
     episodes: Count = 5  # episodes collected of each task and policy
     max_steps: Count = 500  # steps of an episode

@@ -277,7 +277,7 @@ def collect_demonstrations(
         root: the dataset's folder, new or left by an earlier call.
         suite: the :class:`~lw_torchrl.suites.Suite` of the tasks; None for the suite that their names begin with.
         policy: the policy of the whole dataset. A name in :data:`BEHAVIOURS`: "expert" (Meta-World's script),
-            "scripted", "spoilt-60", "spoilt-30", "wrong" or "random"; a :class:`Behaviour`; a trained policy, any
+            "scripted", "noisy-60", "noisy-30", "wrong" or "random"; a :class:`Behaviour`; a trained policy, any
             TensorDictModule or a function, run as :func:`evaluate` runs it. It reads ``observation`` (N, 39) float32,
             ``task_id`` and ``episode`` (N,) int64, and ``qaf`` if it has ``plans``, and writes ``action`` (N, 4)
             float32. Its action in a row must depend only on that row. A function is identified only by its label:

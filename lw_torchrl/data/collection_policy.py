@@ -74,8 +74,8 @@ EXPERT: Behaviour = Behaviour("expert", "expert")
 NOISY = "noisy"  # the label of an expert's episodes that are executed with noise
 _SEGMENTS = (
     Behaviour("scripted"),
-    Behaviour("spoilt-60", right=0.6),
-    Behaviour("spoilt-30", right=0.3),
+    Behaviour("noisy-60", right=0.6),
+    Behaviour("noisy-30", right=0.3),
     Behaviour("wrong", right=0.0),
     Behaviour("random", right=0.0, otherwise="action"),
 )

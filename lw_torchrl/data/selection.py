@@ -27,7 +27,7 @@ class EpisodeFilter:
     Attributes:
         success: keep episodes that succeeded at some step, or, if False, those that did not.
         least_return: keep episodes of at least this return.
-        behaviours: keep episodes with these labels, "spoilt-30" for example.
+        behaviours: keep episodes with these labels, "noisy-30" for example.
         best: the fraction of each task's remaining episodes to keep, at least one: those of the highest return, the
             shorter at a tie.
         else_best: for a task without an episode that meets the conditions, the fraction of all its episodes to keep,

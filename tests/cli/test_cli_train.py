@@ -26,7 +26,7 @@ NET = ["--width", 8, "--depth", 1]
 def noisy(tmp_path_factory):
     root = tmp_path_factory.mktemp("data") / "noisy"
     short = {"episodes_per_task": 2, "max_steps": 40, "progress": False}
-    lw.collect_demonstrations(["push", "reach"], root=root, policy="spoilt-60", **short)
+    lw.collect_demonstrations(["push", "reach"], root=root, policy="noisy-60", **short)
     return root
 
 
