@@ -340,7 +340,7 @@ def test_unsuitable_losses_are_refused(demos):
     assert_refused(make_sac(CQLLoss, 0.0, with_lagrange=True), replay, "loss: with_lagrange")
     assert_refused(torch.nn.Sequential(make_loss("td3-bc")), replay, "loss must be a LossModule", TypeError)
     made = LOSSES["iql"](0.0).make_value_estimator(gamma=GAMMA)  # which is None
-    assert_refused(made, replay, "got NoneType; make_value_estimator", TypeError)
+    assert_refused(made, replay, "got NoneType; .*make_value_estimator", TypeError)
 
 
 def test_a_loss_without_entries_to_minimise_is_refused(demos):
