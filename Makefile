@@ -2,7 +2,7 @@
 # make test    the fast tests, about eight minutes on two cores; JOBS=4 for four processes instead of two
 # make test-all    the fast tests and the slow ones
 # make check   ruff and mypy
-# make bench   what everything costs, against rivals (docs/performance.md)
+# make bench   what everything costs, against rivals (benchmarks/results/performance.md)
 # make docs    the documentation as a site, in site/
 # make setup   the environment alone (.venv)
 # make test-python PYTHON=python3.13   the suite under another interpreter, in an environment of its own

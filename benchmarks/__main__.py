@@ -48,10 +48,10 @@ FORMAT_VERSION = 1
 
 @dataclass(frozen=True)
 class Arguments:
-    """Measure speed and memory of lw_torchrl against alternatives in the same run; see docs/performance.md."""
+    """Measure speed and memory against alternatives in the same run; see benchmarks/results/performance.md."""
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Benchmarks to run, all by default; see docs/performance.md for their names."""
+    """Benchmarks to run, all by default; see benchmarks/results/performance.md for their names."""
     quick: bool = False
     """Run a small version to see that it works; the numbers mean nothing."""
     compiled: Annotated[bool, tyro.conf.arg(name="compile")] = False

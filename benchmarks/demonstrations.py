@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import torch
 import tyro
 
 import lw_torchrl as lw
-from benchmarks.figures import markdown_table
+from benchmarks.figures import Panel, markdown_table, plot_panels
 from benchmarks.paper.imitation import ImitationRun
 from benchmarks.paper.recipes import PRESETS, SETTINGS
 from benchmarks.paper.runs import execute_run
 from benchmarks.statistics import mean_rate
 from lw_torchrl._util.files import write_json, write_text
 from lw_torchrl.evaluation import EvaluationResult
-from lw_torchrl.evaluation.figures import COLORS, new_figure, saved, trim
 
 
 @dataclass(frozen=True)
@@ -86,24 +85,20 @@ def report(arguments: Arguments, found: Rates) -> None:
 
 
 def draw(arguments: Arguments, found: Rates) -> None:
-    figure = new_figure(4.2 * len(found), 3.6)
-    panels: Any = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
-    for axes, (setting, methods) in zip(panels, found.items(), strict=True):
-        for color, (method, each) in zip(COLORS, methods.items(), strict=False):
-            means = {number: [sum(rates) / len(rates) for rates in seeds] for number, seeds in each.items()}
-            axes.plot([*means], [sum(one) / len(one) for one in means.values()], color=color, marker="o", label=method)
-            lows, highs = ([pick(one) for one in means.values()] for pick in (min, max))
-            axes.fill_between([*means], lows, highs, color=color, alpha=0.16, linewidth=0)
-        axes.set_xscale("log")
-        axes.set_xticks(arguments.numbers, [str(number) for number in arguments.numbers])
-        axes.minorticks_off()
-        axes.set_xlabel("demonstrations of each demonstrated task")
-        axes.set_title(f"{setting}, {'40 tasks outside MT10' if setting == 'zero-shot' else '50 tasks'}", fontsize=10)
-        axes.set_ylim(0.0, 1.02)
-        trim(axes, "y")
-    panels[0].set_ylabel("success")
-    panels[0].legend(frameon=False)
-    saved(figure, arguments.out / "figure.png")
+    """Draw the mean over seeds with the worst and best seed."""
+    tasks = {"zero-shot": "40 tasks without demonstrations", "few-shot": "50 tasks, all demonstrated"}
+    panels: list[Panel] = []
+    for setting, methods in found.items():
+        rates: dict[str, list[list[float] | None]] = {}
+        for method, each in methods.items():
+            seeds = [[mean_of(seed) for seed in each.get(number, ())] for number in arguments.numbers]
+            rates[method] = [[mean_of(means), min(means), max(means)] if means else None for means in seeds]
+        panels.append((tasks.get(setting, setting), [str(number) for number in arguments.numbers], rates))
+    plot_panels(panels, arguments.out / "figure.png", xlabel="demonstrations of each demonstrated task")
+
+
+def mean_of(numbers: Sequence[float]) -> float:
+    return sum(numbers) / len(numbers)
 
 
 if __name__ == "__main__":

@@ -6,16 +6,32 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from matplotlib import rc_context
 
 from benchmarks.statistics import Array, Summary, check_rates
 from lw_torchrl._util.files import AnyPath
-from lw_torchrl.evaluation.figures import COLORS, check_image, new_figure, saved, trim
+from lw_torchrl.evaluation.figures import check_image, new_figure, saved
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Rates = Mapping[str, float | Sequence[float]]
+NEUTRAL = "#7a828b"  # legible on white and on black
+NEUTRAL_STYLE: dict[str, Any] = {
+    **dict.fromkeys(("figure.facecolor", "axes.facecolor", "savefig.facecolor"), "none"),
+    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), NEUTRAL),
+    **{"font.size": 13, "axes.titlesize": 14, "axes.labelsize": 13, "grid.color": NEUTRAL, "grid.alpha": 0.3},
+}
+"""Matplotlib settings for pictures that are shown in light and in dark mode."""
+METHOD_COLORS = {
+    "plan": "#3f8fd2", "generic plan": "#3aa99f", "task description": "#e8833a", "task number": "#5aa85a",
+    "scripted skills": "#a678c8", "baseline": "#8d97a3",
+}  # fmt: skip
+"""A method's colour, the same in every figure."""
+METHODS = {"pcbc": "plan", "dc": "task description", "one-hot": "task number", "scripted": "scripted skills"}
+METHODS["PlanConditionedActor"] = "plan"
+"""Names of methods in experiments to their names in figures."""
 _DASHES = ((0, (5, 2)), (0, (1, 1.5)), (0, (5, 1, 1, 1)), (0, (3, 3)))
 
 
@@ -24,6 +40,75 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
     lines = [head, ["-" * width for width in widths], *rows]
     return "\n".join("| " + " | ".join(map(str.ljust, line, widths)) + " |" for line in lines)
+
+
+def draw_rates(
+    axes: Axes, names: Sequence[str], rates: Sequence[Sequence[float] | None], colors: Sequence[str]
+) -> None:
+    """Draw a horizontal bar for each rate, with its interval and its number; the first name is at the top.
+
+    Args:
+        rates: for each name (mean, low, high) or (mean,), in [0, 1], or None to draw nothing.
+    """
+    for place, (rate, color) in enumerate(zip(rates, colors, strict=True)):
+        if rate is None:
+            axes.text(0.02, place, "not measured", va="center", fontsize=10, style="italic")
+            continue
+        mean, *ends = rate
+        axes.barh(place, mean, color=color, height=0.68, alpha=0.4)
+        if ends:
+            axes.plot(ends, [place, place], color=color, linewidth=3, solid_capstyle="butt")
+        axes.plot(mean, place, "o", color=color, markersize=9)
+        axes.text(1.05, place, f"{mean + 1e-9:.2f}", va="center", fontweight="bold")  # 0.835 is 0.84
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_xlim(0, 1.02)
+    axes.set_xticks([0, 0.25, 0.5, 0.75, 1.0], ["0", "", "0.5", "", "1"])
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(axis="x")
+    axes.set_axisbelow(True)
+
+
+def draw_points(axes: Axes, places: Sequence[str], methods: Mapping[str, Sequence[Sequence[float] | None]]) -> None:
+    """Draw each method's rates over ordered places: points with intervals, joined by a thin line.
+
+    Args:
+        methods: a method to (mean, low, high) or (mean,) for each place, or None to draw nothing there.
+    """
+    looks = _look([*methods]).values()
+    for number, ((name, color), rates) in enumerate(zip(looks, methods.values(), strict=True)):
+        known = {place: rate for place, rate in enumerate(rates) if rate is not None}
+        x = np.array([*known]) + 0.12 * (number - (len(methods) - 1) / 2)
+        means = np.array([rate[0] for rate in known.values()])
+        errors = np.abs(np.array([rate[1:] or (rate[0], rate[0]) for rate in known.values()]).T - means)
+        look: dict[str, Any] = {"color": color, "capsize": 4, "markersize": 8, "linewidth": 1.5, "elinewidth": 2.5}
+        axes.errorbar(x, means, errors if errors.any() else None, marker="o", label=name, **look)
+    axes.set_xticks(range(len(places)), places)
+    axes.set_ylim(0, 1.03)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="y")
+    axes.set_axisbelow(True)
+
+
+Panel = tuple[str, Sequence[str], Mapping[str, Sequence[Sequence[float] | None]]]
+"""Title, places and rates, as :func:`draw_points` reads them."""
+
+
+def plot_panels(panels: Sequence[Panel], path: AnyPath | None = None, *, xlabel: str = "") -> Figure:
+    """Draw success over ordered places in panels side by side, with one legend below."""
+    check_image(path)
+    with rc_context(NEUTRAL_STYLE):
+        figure = new_figure(max(6.0, 4.8 * len(panels)), 4.2)
+        columns = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for axes, (title, places, methods) in zip(columns, panels, strict=True):
+            draw_points(axes, places, methods)
+            axes.set_title(title)
+            axes.set_xlabel(xlabel)
+        columns[0].set_ylabel("success")
+        handles, labels = columns[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+        return saved(figure, path)
 
 
 def plot_sorted_tasks(
@@ -35,23 +120,23 @@ def plot_sorted_tasks(
     of: str = "seed",
     title: str = "",
 ) -> Figure:
-    """Draw the paper's figure: tasks sorted by success rate on x, success on y, a line per method.
+    """Draw the paper's figure: tasks sorted by success rate.
 
-    A line is the mean over seeds, its band spans the least and the greatest seed, and a thin line across marks the
-    mean over tasks, which the legend gives too. Published curves are dashed.
+    A point is the mean over seeds; a line, or a band, spans the worst and the best seed. The legend gives the mean over
+    tasks. Published rates are grey.
 
     Args:
         curves: a method's name to its :class:`Summary`, or to (task to its rates, one per seed), in [0, 1]. All have
             the same tasks.
         path, title: as for :func:`plot_success`.
         published: label to (task to rate), of the same tasks at least.
-        order: "shared" sorts the tasks by the first method, so that each place on x is one named task; "own" sorts
-            every curve for itself, as the paper does: x is then a rank.
+        order: "shared" draws a row for each task, sorted by the first method; "own" sorts the rates of each method
+            separately, as the paper does, and draws curves over the rank.
         of: what a rate is of, for the legend: "seed", "plan".
 
     Example:
         >>> figure = plot_sorted_tasks({"PCBC": {"push": [0.5, 0.7], "reach": [1.0, 0.9]}})
-        >>> [label.get_text() for label in figure.axes[0].get_xticklabels()]
+        >>> [label.get_text() for label in figure.axes[0].get_yticklabels()]
         ['push', 'reach']
 
     Source: paper, figures of section 'Conditional Plan Experiments'.
@@ -71,52 +156,77 @@ def plot_sorted_tasks(
         if missing := [task for task in tasks if task not in rates]:
             raise ValueError(f"published[{label!r}] lacks the tasks {missing}")
 
-    figure = new_figure(max(7.0, 3.5 + 0.21 * len(tasks)), 6.4)
+    with rc_context(NEUTRAL_STYLE):
+        draw = _draw_tasks if order == "shared" else _draw_ranks
+        figure = draw({method: np.stack([rates[task] for task in tasks]) for method, rates in named.items()}, tasks, of)
+        (axes,) = figure.axes
+        for k, (label, rates) in enumerate(dashed.items()):
+            values = np.array([rates[task].mean() for task in tasks])
+            look = {
+                "color": ("#6b7580", "#a3acb5")[k % 2],
+                "label": f"{label}: mean {values.mean():.2f}",
+                "zorder": 1.5,
+            }
+            if order == "shared":
+                axes.plot(values, range(len(tasks)), linestyle="none", marker="|", markersize=9, **look)
+            else:
+                axes.plot(np.sort(values), linewidth=1.2, linestyle=_DASHES[k // 2 % len(_DASHES)], **look)
+        axes.set_title(title)
+        handles, _ = axes.get_legend_handles_labels()
+        columns = 2 if len(handles) > len(named) and order == "shared" else 1
+        figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False, fontsize=10)
+        return saved(figure, path)
+
+
+def _look(methods: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Return each method's name in figures and its colour."""
+    names = {method: METHODS.get(method, method) for method in methods}
+    spare = iter([color for color in METHOD_COLORS.values() if color not in map(METHOD_COLORS.get, names.values())])
+    return {method: (name, METHOD_COLORS.get(name) or next(spare, NEUTRAL)) for method, name in names.items()}
+
+
+def _label(name: str, rates: Array, of: str, range_shown: str) -> str:
+    seeds = rates.shape[1]
+    return f"{name}: mean {rates.mean():.2f} ({f'1 {of}' if seeds == 1 else f'{seeds} {of}s, {range_shown}'})"
+
+
+def _draw_tasks(methods: Mapping[str, Array], tasks: Sequence[str], of: str) -> Figure:
+    """Draw a row for each task: a point for each method's mean, and a line from its worst seed to its best."""
+    figure = new_figure(9.6, 2.0 + 0.27 * len(tasks))
     axes = figure.subplots()
-    for k, (method, rates) in enumerate(named.items()):
-        _draw_method(axes, method, np.stack([rates[task] for task in tasks]), COLORS[k % len(COLORS)], order, of)
-    for k, (label, rates) in enumerate(dashed.items()):
-        line = np.array([rates[task].mean() for task in tasks])
-        line, mean = np.sort(line) if order == "own" else line, float(line.mean())
-        look: dict[str, Any] = {"linestyle": _DASHES[k // 2 % len(_DASHES)], "zorder": 1.5}
-        look["color"] = ("#666666", "#aaaaaa")[k % 2]
-        axes.plot(line, linewidth=1, label=f"{label}: mean {mean:.2f}", **look)
-        axes.axhline(mean, linewidth=0.9, **look)
-    shown = [*tasks] if order == "shared" else [str(rank) for rank in range(1, len(tasks) + 1)]
-    axes.set_xticks(range(len(tasks)), shown, rotation=90 if order == "shared" else 0, fontsize=8)
-    axes.set_xlabel(f"tasks, sorted by {first}" if order == "shared" else "tasks, each curve sorted for itself")
-    axes.set_ylabel("episodes with success at any step")
-    axes.set_xlim(-0.5, len(tasks) - 0.5)
-    axes.set_ylim(-0.02, 1.02)
-    trim(axes, "y")
-    axes.set_title(title)
-    _add_legend(figure, axes, len(named))
-    return saved(figure, path)
+    for k, ((name, color), rates) in enumerate(zip(_look([*methods]).values(), methods.values(), strict=True)):
+        rows = np.arange(len(tasks)) + 0.22 * ((len(methods) - 1) / 2 - k)
+        axes.hlines(rows, rates.min(1), rates.max(1), color=color, linewidth=2, alpha=0.55)
+        label = _label(name, rates, of, "line: min–max")
+        axes.plot(rates.mean(1), rows, "o", color=color, markersize=5, zorder=3, label=label)
+    axes.set_yticks(range(len(tasks)), tasks, fontsize=10)
+    axes.set_ylim(-0.6, len(tasks) - 0.4)
+    axes.set_xlim(-0.02, 1.02)
+    axes.set_xlabel("episodes with success at any step")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid()
+    axes.set_axisbelow(True)
+    return figure
 
 
-def _add_legend(figure: Figure, axes: Axes, methods: int) -> None:
-    """Below the axes: the methods, and the published curves in a column beside, or under them in a narrow figure."""
-    from matplotlib.lines import Line2D
-
-    lines, _ = axes.get_legend_handles_labels()
-    wide = methods < len(lines) and figure.get_figwidth() > 10
-    columns = [lines[:methods], lines[methods:]] if wide else [lines]
-    longest = max(len(column) for column in columns)
-    blank = Line2D([], [], linestyle="none", label=" ")
-    handles = [handle for column in columns for handle in (*column, *[blank] * (longest - len(column)))]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(columns), frameon=False, fontsize=9)
-
-
-def _draw_method(axes: Axes, method: str, rates: Array, color: str, order: str, of: str) -> None:
-    """A line, a band and the mean of rates (tasks, seeds)."""
-    if order == "own":
+def _draw_ranks(methods: Mapping[str, Array], tasks: Sequence[str], of: str) -> Figure:
+    """Draw each method's rates in ascending order, the worst to best seed shaded."""
+    figure = new_figure(9.6, 5.4)
+    axes = figure.subplots()
+    for (name, color), rates in zip(_look([*methods]).values(), methods.values(), strict=True):
         rates = rates[np.argsort(rates.mean(1), kind="stable")]
-    mean, x, seeds = rates.mean(1), range(len(rates)), rates.shape[1]
-    spread = f"1 {of}" if seeds == 1 else f"{seeds} {of}s, min–max shaded"
-    axes.fill_between(x, rates.min(1), rates.max(1), color=color, alpha=0.16, linewidth=0)
-    label = f"{method}: mean {mean.mean():.2f} ({spread})"
-    axes.plot(x, mean, color=color, linewidth=2, marker=".", zorder=3, label=label)
-    axes.axhline(float(mean.mean()), color=color, linewidth=1.2, alpha=0.8)
+        axes.fill_between(range(len(rates)), rates.min(1), rates.max(1), color=color, alpha=0.2, linewidth=0)
+        label = _label(name, rates, of, "min–max shaded")
+        axes.plot(rates.mean(1), color=color, linewidth=2, marker=".", zorder=3, label=label)
+    every = max(1, len(tasks) // 10)
+    axes.set_xticks(range(0, len(tasks), every), [str(rank) for rank in range(1, len(tasks) + 1, every)])
+    axes.set_xlabel("rank of the task, for each method separately")
+    axes.set_ylabel("success at any step")
+    axes.set_ylim(-0.02, 1.02)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="y")
+    axes.set_axisbelow(True)
+    return figure
 
 
 def _as_rates(argument: str, given: Rates | Summary | Mapping[str, float]) -> dict[str, Array]:

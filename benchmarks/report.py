@@ -214,6 +214,6 @@ def as_text(rows: Sequence[Row]) -> str:
 
 
 def as_markdown(rows: Sequence[Row]) -> str:
-    """The same table for docs/performance.md."""
+    """The same table for benchmarks/results/performance.md."""
     cells = [COLUMNS, tuple("---" for _ in COLUMNS), *map(_cells, rows)]
     return "\n".join("| " + " | ".join(line) + " |" for line in cells) + "\n"

@@ -41,7 +41,7 @@ class Arguments:
     """Draw six tasks at the first success of an expert's episode, ours on the left and MuJoCo's on the right."""
 
     tasks: tuple[str, ...] = ("drawer-open", "window-close", "hammer", "peg-insert-side", "basketball", "coffee-pull")
-    out: Path = Path("docs/scene.png")
+    out: Path = Path("runs/scene.png")
     seed: int = 0
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -13,15 +13,13 @@ import torch
 import tyro
 
 import lw_torchrl as lw
-from benchmarks.figures import markdown_table
+from benchmarks.figures import Panel, markdown_table, plot_panels
 from benchmarks.statistics import Estimate, count_solved
 from lw_torchrl._util.files import write_text
 from lw_torchrl.evaluation import EvaluationResult
-from lw_torchrl.evaluation.figures import COLORS, check_image, saved
 from lw_torchrl.evaluation.result import wilson_interval
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 CLOSE = 0.05
@@ -214,38 +212,23 @@ def within(found: Found, curve: str, cells: Sequence[Cell]) -> str:
 
 
 def figure(found: Found, args: Arguments, path: Path | None = None) -> Figure:
-    """Success against both, a line for each curve, its 95 % interval shaded."""
-    from matplotlib.figure import Figure
-
-    check_image(path)
-    drawn = Figure(figsize=(10.0, 4.4), layout="constrained")
-    left, right = drawn.subplots(1, 2, sharey=True)
-    _panel(left, found, [Cell("every", k) for k in args.every], "steps from one answer to the next")
-    _panel(right, found, [Cell("flip", p) for p in args.flip], "answers flipped in each step, %")
-    left.set_ylabel("episodes with success")
-    lines, labels = left.get_legend_handles_labels()
-    drawn.legend(lines, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
-    return saved(drawn, path)
-
-
-def _panel(axes: Axes, found: Found, cells: Sequence[Cell], label: str) -> None:
-    for k, curve in enumerate(found.curves):
-        known = {place: hits for place, cell in enumerate(cells) if (hits := found.hits(curve, cell)) is not None}
-        _curve(axes, known, curve, COLORS[k % len(COLORS)])
-    axes.set_xticks(range(len(cells)), [f"{cell.value * (100 if cell.kind == 'flip' else 1):g}" for cell in cells])
-    axes.set_xlabel(label)
-    axes.set_ylim(-0.02, 1.02)
-    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    """Draw success with late and with wrong answers: a point for each rate, with its 95 % interval."""
+    columns = {
+        "Late answers: steps between answers": [Cell("every", k) for k in args.every],
+        "Wrong answers: flipped in each step": [Cell("flip", p) for p in args.flip],
+    }
+    panels: list[Panel] = []
+    for title, cells in columns.items():
+        places = [f"{cell.value:g}" if cell.kind == "every" else f"{100 * cell.value:g} %" for cell in cells]
+        rates = {curve: [_ends(found.hits(curve, cell)) for cell in cells] for curve in found.curves}
+        panels.append((title, places, rates))
+    return plot_panels(panels, path)
 
 
-def _curve(axes: Axes, known: Mapping[int, np.ndarray], label: str, color: str) -> None:
-    places = list(known)
-    rates = [_rate(hits) for hits in known.values()]
-    low, high = [one.low for one in rates], [one.high for one in rates]
-    axes.fill_between(places, low, high, color=color, alpha=0.16, linewidth=0)
-    axes.plot(places, [one.value for one in rates], color=color, linewidth=2, marker=".", label=label)
+def _ends(hits: np.ndarray | None) -> tuple[float, float, float] | None:
+    if hits is None:
+        return None
+    return float(hits.mean()), *wilson_interval(int(hits.sum()), hits.size)
 
 
 def main(args: Arguments) -> None:

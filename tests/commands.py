@@ -27,10 +27,10 @@ def fails(capsys, *args):
 
 
 def document(capsys, command, *args):
-    """Run a command with ``--json`` and return the document, whose keys must be in the table of docs/cli.md."""
+    """Run a command with ``--json`` and return the document, whose keys must be in the table of docs/reference.md."""
     printed = json.loads(run(capsys, *command.split(), *args, "--json"), parse_constant=pytest.fail)
     name = " ".join(command.split()[:2]) if command.split()[0] in ("data", "plan") else command.split()[0]
-    text = (Path(__file__).parent.parent / "docs" / "cli.md").read_text("utf-8")
+    text = (Path(__file__).parent.parent / "docs" / "reference.md").read_text("utf-8")
     (cell,) = re.findall(rf"^\| `{name}`[^|]*\| (.*) \|$", text, re.MULTILINE)
     documented = {}
     for part in cell.split("; "):

@@ -1,4 +1,4 @@
-"""The benchmarks run, write the tables of docs/performance.md, and survive a benchmark that fails."""
+"""The benchmarks run, write the tables of benchmarks/results/performance.md, and survive a benchmark that fails."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_rows_compare_medians_shares_and_factors_with_their_targets():
 
 
 def test_docs_explain_every_benchmark():
-    page = (ROOT / "docs" / "performance.md").read_text("utf-8")
+    page = (ROOT / "benchmarks" / "results" / "performance.md").read_text("utf-8")
     assert [name for name in cli.BENCHMARKS if f"`{name}`" not in page] == []
 
 

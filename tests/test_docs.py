@@ -21,8 +21,9 @@ from pictures import why_no_pictures
 import lw_torchrl
 
 ROOT = Path(__file__).parent.parent
-FAST_PAGES = {"README.md", "concepts.md", "training.md", "queries.md", "plans.md"}
-PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("**/*.md"))]
+FAST_PAGES = {"README.md", "first-plan.md", "how-it-works.md", "reference.md"}
+RESULTS = ROOT / "benchmarks" / "results"
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("**/*.md")), *sorted(RESULTS.glob("*.md"))]
 BLOCK = re.compile(
     r"(?P<skip><!--\s*no-run\s*-->\s*\n)?"
     r"^(?P<indent> *)```(?P<kind>python|py|pycon)[^\n]*\n(?P<code>.*?)^(?P=indent)```",
@@ -80,7 +81,7 @@ def test_every_public_class_has_a_docstring():
         for page in PAGES
         if any(blocks(page))
     ],
-    ids=lambda page: page.name,
+    ids=lambda page: page.relative_to(ROOT).as_posix(),
 )
 def test_code_of_a_page_runs(page):
     namespace = {"__name__": "__main__"}
@@ -105,7 +106,7 @@ def anchors(page):
     return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_links_of_pages_lead_somewhere(page):
     text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
     for target, anchor in re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]+))?\)", text):

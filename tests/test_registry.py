@@ -106,7 +106,7 @@ def test_plugins_evaluator_is_loaded(plugin, tmp_path):
     lw.save_actor(actor, tmp_path / "policy.safetensors")
     assert type(lw.load_actor(tmp_path / "policy.safetensors")[0]) is guess
     del sys.modules["my_plugin"]
-    with pytest.raises(ValueError, match=r"'my_plugin:Guess' is not known here: import my_plugin first"):
+    with pytest.raises(ValueError, match=r"'my_plugin:Guess' is unknown: import my_plugin first"):
         lw.load_actor(tmp_path / "policy.safetensors")
     assert "my_plugin" not in sys.modules
 

@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
 
-from benchmarks.figures import markdown_table
+from benchmarks.figures import METHOD_COLORS, NEUTRAL, NEUTRAL_STYLE, draw_rates, markdown_table
 from benchmarks.paper.runs import Run
 from benchmarks.statistics import Estimate, Summary, mean_difference, probability_of_improvement, summarize
 from lw_torchrl._util.files import write_json, write_text
 from lw_torchrl.evaluation import EvaluationResult
-from lw_torchrl.evaluation.figures import new_figure, saved, trim
+from lw_torchrl.evaluation.figures import new_figure, saved
 from lw_torchrl.language.tasks import MT10
 
 
@@ -111,25 +112,20 @@ def write_summary(path: Path, text: str, numbers: Mapping[str, Any]) -> None:
 
 
 def plot_methods(groups: Mapping[str, Mapping[str, Summary]], path: Path) -> None:
-    """Draw the mean success of each method, with its 95 % interval and a dot for each seed; a column for each group."""
+    """Draw the mean success of each method, its 95 % interval and a mark for each seed; a column for each group."""
     labels = list(dict.fromkeys(label for methods in groups.values() for label in methods))
-    figure = new_figure(2.6 + 3.0 * len(groups), 1.3 + 0.3 * len(labels))
-    columns = np.atleast_1d(figure.subplots(1, len(groups), sharey=True))
-    for axes, (group, methods) in zip(columns, groups.items(), strict=True):
-        for place, label in enumerate(labels):
-            if label not in methods:
-                continue
-            mean, seeds = methods[label].mean, methods[label].array.mean(1)
-            axes.barh(place, mean.value, color="#4c78a8" if place == 0 else "#b8c9de", height=0.7)
-            if mean.low is not None:
-                axes.plot([mean.low, mean.high], [place, place], color="#333333", linewidth=1.2)
-            axes.plot(seeds, np.full(len(seeds), place), ".", color="#f58518", markersize=5, zorder=3)
-            axes.text(1.04, place, f"{mean.value:.2f}", va="center", fontsize=8, color="#222222")
-        axes.set_title(group)
-        axes.set_xlim(0, 1.18)
-        axes.set_xticks(np.linspace(0, 1, 6))
-        axes.set_yticks(range(len(labels)), labels, fontsize=9)
-        trim(axes, "x")
-    figure.axes[0].invert_yaxis()
-    figure.supxlabel("episodes with success at any step; dots: seeds; lines: 95 %", fontsize=9)
-    saved(figure, path)
+    colors = [METHOD_COLORS["plan" if place == 0 else "baseline"] for place in range(len(labels))]
+    with rc_context(NEUTRAL_STYLE):
+        figure = new_figure(2.6 + 3.0 * len(groups), 1.6 + 0.36 * len(labels))
+        columns = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]
+        for axes, (group, methods) in zip(columns, groups.items(), strict=True):
+            means = [methods[label].mean if label in methods else None for label in labels]
+            rates = [None if mean is None else [mean.value, mean.low, mean.high] for mean in means]
+            draw_rates(axes, labels, [rate and [end for end in rate if end is not None] for rate in rates], colors)
+            for place, label in enumerate(labels):
+                if label in methods:
+                    seeds = methods[label].array.mean(1)
+                    axes.plot(seeds, np.full(len(seeds), place), "|", color=NEUTRAL, markersize=12, zorder=3)
+            axes.set_title(group)
+        figure.supxlabel("episodes with success at any step; small bars: seeds; lines: 95 %", fontsize=12)
+        saved(figure, path)

@@ -1,5 +1,4 @@
-"""Docstrings speak of names as Sphinx does, ``:class:`Task```; here a name becomes a link where the site has it, an
-example a block of code, and "a, b: words" two entries."""
+"""Adapt docstrings to the site: Sphinx roles become links, an example a block of code, "a, b: text" two entries."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ def linked(match: re.Match[str]) -> str:
 
 
 def one_by_one(match: re.Match[str]) -> str:
-    """ "a, b: words" is told of each name."""
+    """Turn "a, b: text" into an entry for each name."""
     indent, names, last = match.groups()
     return "".join(f"{indent}{name}: see `{last}`.\n" for name in names.split(", ")) + f"{indent}{last}:"
 

@@ -1,4 +1,4 @@
-"""Pages of the site that are no files of docs/: README, changelog, examples, code that pages link to, the reference."""
+"""Add the pages of the site that are not in docs/: README, changelog, laboratory, examples, linked code, reference."""
 
 from __future__ import annotations
 
@@ -19,13 +19,16 @@ import reference
 ROOT = Path(__file__).parents[2]
 TOUR = "examples/tour.ipynb"
 PAGES = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", TOUR: "tour.md"}
+for results_page in (ROOT / "benchmarks" / "results").glob("*.md"):
+    name = "index" if results_page.stem == "README" else results_page.stem
+    PAGES[f"benchmarks/results/{results_page.name}"] = f"results/{name}.md"
 LANGUAGES = {".py": "python", ".toml": "toml", ".cff": "yaml"}
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\[\]]*\])*)\]\(([^)\s#]*)(#[^)\s]*)?\)")
 CODE = re.compile(r"^ *(?P<fence>`{3,}).*?^ *(?P=fence)", re.MULTILINE | re.DOTALL)
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Adds the pages."""
+    """Add the pages."""
     made = {page: (ROOT / name).read_text("utf-8") for name, page in PAGES.items()}
     made["tour.md"] = notebook(made["tour.md"])
     examples = sorted((ROOT / "examples").rglob("*.py"))
@@ -44,7 +47,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Links as GitHub has them, as the site has them; one to a folder, which is no page, is left out."""
+    """Turn links for GitHub into links of the site; a link to a folder becomes plain text."""
     here = page.file.src_uri
     name = next((name for name, its_page in PAGES.items() if its_page == here), f"docs/{here}")
 
@@ -55,17 +58,15 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
             return match[0]
         if not full.startswith("docs/") and files.get_file_from_path(place(full)) is None:
             return text
-        if text.endswith(".md") and (found := files.get_file_from_path(place(full))) is not None:
-            text = found.content_string.partition("\n")[0].removeprefix(
-                "# "
-            )  # the page's title in the place of its name
+        if text.endswith(".md") and (target_page := files.get_file_from_path(place(full))) is not None:
+            text = target_page.content_string.partition("\n")[0].removeprefix("# ")  # not the file name
         return f"{mark}[{text}]({posixpath.relpath(place(full), posixpath.dirname(here) or '.')}{anchor})"
 
     return outside_code(markdown, lambda text: LINK.sub(moved, text))
 
 
 def place(name: str) -> str:
-    """The page of a file of the repository."""
+    """Return the page of a file of the repository."""
     return name.removeprefix("docs/") if name.startswith("docs/") else PAGES.get(name, f"code/{name}.md")
 
 
@@ -74,7 +75,7 @@ def resolved(name: str, target: str) -> str:
 
 
 def targets(name: str, text: str) -> list[str]:
-    """The files of the repository that a page links to."""
+    """Return the files of the repository that a page links to."""
     return [resolved(name, match[3]) for match in LINK.finditer(CODE.sub("", text)) if match[3] and ":" not in match[3]]
 
 
@@ -96,7 +97,7 @@ def example_list(paths: list[Path]) -> str:
 
 
 def notebook(text: str) -> str:
-    """The cells, and what they printed and drew."""
+    """Return a notebook's cells and their outputs as Markdown."""
     parts = []
     for cell in json.loads(text)["cells"]:
         source = "".join(cell["source"])

@@ -1,4 +1,4 @@
-"""The reference: the API by room, and the tables of what stands in the package's data files."""
+"""Generated pages of the reference: the API by room, the commands, and tables of the package's data files."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ WORDS = (
     "tasks queries relations query_program plans plan_files formats plan_decoding canonical roles skills nearest "
     "text layout"
 )
-"""The modules of ``language``, whose room names nothing itself."""
+"""The modules of ``language``, a room that exports no names itself."""
 
 
 def pages() -> dict[str, str]:
-    found = {f"api/{room}.md": room_page(room) for room in ROOMS}
-    return {"api/index.md": top_level(), "commands.md": commands(), "tables.md": tables(), **found}
+    rooms = {f"api/{room}.md": room_page(room) for room in ROOMS}
+    return {"api/index.md": top_level(), "commands.md": commands(), "tables.md": tables(), **rooms}
 
 
 def room_page(room: str) -> str:
@@ -37,20 +37,28 @@ def room_page(room: str) -> str:
 
 
 def commands() -> str:
-    """What ``--help`` says of each command."""
+    """Return a page with the ``--help`` of each command, by group."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "NO_COLOR": "1", "COLUMNS": "100"}
-    parts = ["# Commands", "", "What `lw-torchrl COMMAND --help` says. [Exit status, pipes and JSON](cli.md)", ""]
-    for name in COMMANDS:
+    about = "The `--help` of each command. [Exit status, pipes and JSON](reference.md#commands)"
+    parts, group = ["# Commands", "", about, ""], ""
+    for name, (its_group, _, _) in COMMANDS.items():
+        if its_group != group:
+            group = its_group
+            parts += [f"## {group}", ""]
         line = [sys.executable, "-m", "lw_torchrl", *name.split(), "--help"]
-        told = subprocess.run(line, env=environment, capture_output=True, text=True, check=True).stdout
-        parts += [f"## {name}", "", "``` {.text .wrap}", told.strip(), "```", ""]
+        text = subprocess.run(line, env=environment, capture_output=True, text=True, check=True).stdout
+        parts += [f"### {name}", "", "``` {.text .wrap}", text.strip(), "```", ""]
     return "\n".join(parts)
 
 
+FIRST = ("PlanConditionedActor", "load_plans", "LanguageWorldEnv", "QAFTransform", "evaluate")
+
+
 def top_level() -> str:
+    names = sorted(NAMES, key=lambda name: FIRST.index(name[1]) if name[1] in FIRST else len(FIRST))
     rows = [
         f'| <autoref identifier="{module}.{name}" optional>`lw.{name}`</autoref> | [{room}]({room}.md) |'
-        for module, name in NAMES
+        for module, name in names
         if module != "lw_torchrl"
         for room in [module.split(".")[1]]
     ]
@@ -66,54 +74,55 @@ Made from the library's data when the site is built.
 
 x, y, z are the first position minus the second, in metres; ‖·‖ is the length over the named axes. An opening is from 0,
 closed, to 1, open. A logit is the distance to the threshold divided by the temperature.
-[More](queries.md#what-the-relations-mean).
+[More](reference.md#relations).
 
 | predicate | holds where | temperature | published |
 |---|---|---|---|"""
 LAYOUTS = """
 ## Layouts
 
-Indices of the numbers of an observation and of an action. [Suites](suites.md).
+Indices of the numbers of an observation and of an action. [Your robot](your-robot.md).
 
 | | metaworld | fetch |
 |---|---|---|"""
 
 
 def tables() -> str:
-    """What relations, layouts and tasks are, as the library reads them."""
+    """Return a page with the relations, layouts and tasks of the library's data files."""
     parts = [RELATIONS]
     for name, comparisons in PREDICATES.items():
-        holds = " and ".join(written(one, name in STATES) for one in comparisons)
-        degree = ", ".join(sorted({f"{one.temperature:g}" for one in comparisons}))
-        parts.append(f"| {name} | {holds} | {degree} | {'yes' if name in PUBLISHED else ''} |")
-    both = zip(told(METAWORLD).items(), told(FETCH).values(), strict=True)
-    parts += [LAYOUTS, *(f"| {what} | {one} | {other} |" for (what, one), other in both)]
+        holds = " and ".join(comparison_text(comparison, name in STATES) for comparison in comparisons)
+        temperatures = ", ".join(sorted({f"{comparison.temperature:g}" for comparison in comparisons}))
+        parts.append(f"| {name} | {holds} | {temperatures} | {'yes' if name in PUBLISHED else ''} |")
+    layouts = zip(layout_rows(METAWORLD).items(), layout_rows(FETCH).values(), strict=True)
+    parts += [LAYOUTS, *(f"| {name} | {metaworld} | {fetch} |" for (name, metaworld), fetch in layouts)]
     for heading, tasks in (("Meta-World's tasks", TASKS), ("Fetch's tasks", FETCH_TASKS)):
-        parts += ["", f"## {heading}", "", "| task | description | things | our points |", "|---|---|---|---|"]
+        parts += ["", f"## {heading}", "", "| task | description | objects | our points |", "|---|---|---|---|"]
         parts += [task_row(task) for _, task in sorted(tasks.items())]
     return "\n".join([*parts, ""])
 
 
-def written(one: Comparison, opening: bool) -> str:
-    value = f"‖{one.axes}‖" if one.length else "opening" if opening else one.axes
-    return f"{value} {one.sense} {one.threshold:g}" + (f", z raised by {one.raise_z:g}" if one.raise_z else "")
+def comparison_text(comparison: Comparison, opening: bool) -> str:
+    value = f"‖{comparison.axes}‖" if comparison.length else "opening" if opening else comparison.axes
+    raised = f", z raised by {comparison.raise_z:g}" if comparison.raise_z else ""
+    return f"{value} {comparison.sense} {comparison.threshold:g}{raised}"
 
 
-def told(layout: Layout) -> dict[str, str]:
+def layout_rows(layout: Layout) -> dict[str, str]:
     places = [(span(thing.position, 3), thing.quaternion) for thing in layout.things]
-    things = [place if turned is None else f"{place}, quaternion {span(turned, 4)}" for place, turned in places]
+    objects = [place if turned is None else f"{place}, quaternion {span(turned, 4)}" for place, turned in places]
     moved = "none" if layout.displacement is None else f"{span(layout.displacement, 3)}, {layout.reach:g} m at 1"
     return {
         "numbers of an observation": f"{layout.size}",
         "the hand's position": span(layout.hand, 3),
         "its opening": f"{layout.opening}",
-        "the things' positions": "; ".join(things),
+        "the objects' positions": "; ".join(objects),
         "the goal's position": span(layout.goal, 3),
-        "the step before": "none" if layout.past is None else f"each index + {layout.past}",
+        "the previous step": "none" if layout.past is None else f"each index + {layout.past}",
         "numbers of an action": f"{layout.action_size}",
         "displacement of the hand": moved,
         "effort of the gripper": "none" if layout.gripper is None else f"{layout.gripper}, {layout.closes:+d} closes",
-        "thresholds of its own": ", ".join(f"{name} {at:g}" for name, at in layout.thresholds.items()) or "none",
+        "its own thresholds": ", ".join(f"{name} {at:g}" for name, at in layout.thresholds.items()) or "none",
     }
 
 
@@ -123,5 +132,5 @@ def span(start: int, length: int) -> str:
 
 def task_row(task: Task) -> str:
     mark = " (MT10)" if task.name in MT10 else ""
-    things, points = (", ".join(one.name for one in task.objects if one.ours == ours) for ours in (False, True))
-    return f"| {task.name}{mark} | {task.description} | {things} | {points} |"
+    objects, points = (", ".join(item.name for item in task.objects if item.ours == ours) for ours in (False, True))
+    return f"| {task.name}{mark} | {task.description} | {objects} | {points} |"

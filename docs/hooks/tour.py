@@ -1,4 +1,4 @@
-"""Runs examples/tour.ipynb in a kernel of its own and keeps what it shows: python docs/hooks/tour.py [another file]"""
+"""Run examples/tour.ipynb in its own kernel and store the outputs: python docs/hooks/tour.py [output file]"""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TOUR = Path(__file__).parents[2] / "examples" / "tour.ipynb"
 
 
 def run(folder: Path) -> nbformat.NotebookNode:
-    """The notebook with its outputs; a cell that fails is an error."""
+    """Return the notebook with its outputs; raise if a cell fails."""
     notebook = nbformat.read(TOUR, as_version=4)
     client = NotebookClient(notebook, timeout=300)
     client.create_kernel_manager().transport = "ipc"
@@ -21,7 +21,7 @@ def run(folder: Path) -> nbformat.NotebookNode:
 
 
 def kept(notebook: nbformat.NotebookNode) -> str:
-    """Return the notebook as text, without times."""
+    """Return the notebook as text, without execution times."""
     for cell in notebook.cells:
         cell.metadata = {}
     return nbformat.writes(notebook) + "\n"

@@ -7,6 +7,7 @@ import lw_torchrl as lw
 plans = lw.load_plans("MT10")
 actor = lw.PlanConditionedActor(plans).stochastic("tanh_normal", init_std=0.3)
 ppo = ClipPPOLoss(actor, lw.modules.Value(actor.trunk))
-iql = IQLLoss(actor, lw.PlanConditionedQValue(plans), lw.PlanConditionedValue(plans))
+cloned = lw.PlanConditionedActor(plans).stochastic("normal")  # IQL maximises the likelihood of the data's actions
+iql = IQLLoss(cloned, lw.PlanConditionedQValue(plans), lw.PlanConditionedValue(plans))
 for loss in (ppo, iql):
     print(type(loss).__name__, loss.in_keys, loss.out_keys)

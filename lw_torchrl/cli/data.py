@@ -243,15 +243,22 @@ class Import:
 
 @dataclass(kw_only=True)
 class Info:
-    """Describe a file: a policy (its model card), a dataset (as `data show` does) or a recording (its episodes).
+    """Describe a policy (its model card), a dataset (as `data show` does) or a recording (its episodes).
+
+    Without a path: versions, cores, GPU, extras, cache folders, and what is slow here and why, for a bug report.
 
     Example: lw-torchrl info few-shot-mt50
     """
 
-    path: Positional[Annotated[Path, arg(metavar="PATH")]]  # policy file or name, dataset folder or .rrd file
+    path: Positional[Annotated[Maybe[Path], arg(metavar="[PATH]")]] = None
+    """policy file or name, dataset folder or .rrd file"""
     json: options.Json = False
 
     def run(self) -> Output:
+        if self.path is None:
+            from lw_torchrl.cli.machine import describe_machine
+
+            return describe_machine(Output(self.json))
         if (self.path / "metadata.json").is_file():
             return Show(folders=(self.path,), json=self.json).run()
         output = Output(self.json)

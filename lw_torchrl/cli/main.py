@@ -37,11 +37,11 @@ COMMANDS = {
     "plan repair": ("Language", "plan:Repair", "Ask a language model to repair the plans that fail"),
     "demo": ("Other", "demo:Demo", "Train, evaluate and record a policy on MT10 in a few minutes"),
     "check": ("Other", "language:Check", "Validate a file of plans, skills or tasks, or a suite"),
-    "info": ("Other", "data:Info", "Describe a policy file, a dataset or a recording"),
+    "info": ("Other", "data:Info", "Describe a file, or without one this installation"),
 }
 _MORE = """`lw-torchrl COMMAND --help` explains a command. Every command accepts --import MODULE, which first
 imports your Python module, for example one that registers a suite or a policy class
-(docs/extending.md). Commands that print a table accept --json. --version prints the version.
+(docs/custom-networks.md). Commands that print a table accept --json. --version prints the version.
 
 Exit status: 0: done; 1: a bug, with a traceback; 2: an error that you can fix
 (LW_TORCHRL_TRACEBACK=1 adds the traceback); 130: stopped by Ctrl-C; 141: broken pipe."""

@@ -272,7 +272,7 @@ def collect_demonstrations(
         next/success, next/done, next/terminated, next/truncated: (R, 1) bool.
 
     Args:
-        tasks: Meta-World tasks, as for :func:`resolve_tasks`, or another suite's; docs/training.md shows own tasks.
+        tasks: Meta-World tasks, as for :func:`resolve_tasks`, or another suite's; see docs/your-robot.md for your own.
         episodes_per_task: number of episodes of each task to keep.
         root: the dataset's folder; a new folder, or a folder that an earlier call created.
         suite: the :class:`~lw_torchrl.suites.Suite` of the tasks; None to derive the suite from the tasks' names.

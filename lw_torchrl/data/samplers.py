@@ -215,7 +215,7 @@ class GroupSampler(Sampler):
         if worker is not None and worker.num_workers > 1 and self._process != os.getpid():
             raise RuntimeError(
                 f"each of the DataLoader's {worker.num_workers} workers would draw the same rows: in each, open the "
-                "buffer anew, or replay.set_sampler(...) and replay.set_rng(...); see docs/sampling.md"
+                "buffer anew, or replay.set_sampler(...) and replay.set_rng(...); see docs/data.md"
             )
         if not len(storage):
             raise ValueError("storage must hold at least one row, but it is empty")

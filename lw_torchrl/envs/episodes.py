@@ -1,4 +1,4 @@
-"""run_episodes: run exactly the requested episodes, on any number of rows, for collecting and evaluating."""
+"""run_episodes: run exactly the requested episodes on any number of rows, to collect data or evaluate a policy."""
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,13 +17,13 @@ from lw_torchrl.envs.seeding import action_noise
 
 
 def first_success(success: Tensor) -> int | None:
-    """Return the first successful step of (T, 1) bool, from 1; None without success."""
+    """Return the first successful time step of ``success`` (T, 1) bool, counted from 1; None without success."""
     successes = success.flatten().nonzero().flatten()
     return int(successes[0]) + 1 if len(successes) else None
 
 
 class FinishedEpisode(NamedTuple):
-    """A finished episode: its task's name, its index, and the recorded keys of its steps, batch (T,)."""
+    """A finished episode: the task's name, the episode's index, and the recorded keys of T time steps, batch (T,)."""
 
     task: str
     episode: int
@@ -31,12 +31,12 @@ class FinishedEpisode(NamedTuple):
 
     @property
     def first_success(self) -> int | None:
-        """The first successful step, from 1; None without success. It needs ("next", "success") in the steps."""
+        """The first successful time step, from 1; None without success. Requires ("next", "success") in ``steps``."""
         return first_success(self.steps.get(("next", "success")))
 
 
 def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[[TensorDictBase], TensorDictBase]:
-    """Return the actor on a device; networks run on blocks of one size, so that no row depends on the others."""
+    """Return the actor on a device; networks run on blocks of a fixed size, so that rows do not affect each other."""
     actor_device = place(actor, device)
     policy = actor if getattr(actor, "row_by_row", False) else in_blocks(actor)
     if actor_device == CPU:
@@ -45,7 +45,7 @@ def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[
 
 
 def read_action(tensordict: TensorDictBase, size: int) -> Tensor:
-    """Return the ``action`` that an actor wrote; ValueError unless it is (N, size) float32."""
+    """Return the ``action`` that an actor wrote; raise a ValueError unless the action is (N, size) float32."""
     action, shape = tensordict.get("action", None), (*tensordict.batch_size, size)
     if action is None:
         raise ValueError(f"the actor must write 'action', got {', '.join(map(str, tensordict.keys()))}")
@@ -74,34 +74,34 @@ def run_episodes(
     A row whose episode ends starts the next episode of its task.
 
     Args:
-        env: a LanguageWorldEnv, with transforms or without.
-        policy: called on all N rows, with a ``_step`` mask of the active ones.
-        episodes: task name to episode indices; an index that is listed several times is run as often.
-        keys: the keys to record of each step, for example ``("next", "success")``; ``action`` is the executed action.
-        noise: episode index to the A standard deviations of the action's noise.
-        noise_hold: number of steps for which each noise value is held.
-        after_success: end an episode N steps after its first success; None for never.
-        clean_action: key for the action before the noise.
+        env: a LanguageWorldEnv, with or without transforms.
+        policy: a callable on all N rows, with a ``_step`` mask of the active rows.
+        episodes: a mapping from task name to episode indices; repeated indices are run repeatedly.
+        keys: the keys to record at each time step, such as ``("next", "success")``; ``action`` is the executed action.
+        noise: a function that maps an episode index to A standard deviations of the action's noise; None for no noise.
+        noise_hold: number of time steps for which each noise value stays the same.
+        after_success: end an episode N time steps after its first success; None to never end early.
+        clean_action: key for the action before noise is added.
         place: key for the position of each row's episode in its task's list, (N,) int64, which the policy reads.
-        on_progress: called after each step with the number of steps done; an early end counts its remaining steps.
+        on_progress: called after each step with the number of new steps, including those that an early end skips.
     """
     base = env.base_env if isinstance(env, TransformedEnv) else env
     if not isinstance(base, LanguageWorldEnv):
-        raise TypeError(f"env must be a LanguageWorldEnv or a TransformedEnv of one, got {type(base).__name__}")
+        raise TypeError(f"env must be a LanguageWorldEnv, with or without transforms, got {type(base).__name__}")
     rows = len(base.row_tasks)
     waiting = {task: deque(enumerate(listed)) for task, listed in episodes.items()}
     if unknown := set(waiting) - set(base.tasks):
-        raise ValueError(f"episodes: env does not have the tasks {', '.join(sorted(unknown))}")
+        raise ValueError(f"episodes: env lacks the tasks {', '.join(sorted(unknown))}")
     episode = torch.zeros(rows, dtype=torch.int64)
     listed_at = torch.zeros(rows, dtype=torch.int64)
     active = torch.zeros(rows, dtype=torch.bool)
     steps = np.zeros(rows, dtype=np.int64)
-    last = np.zeros(rows, dtype=np.int64)  # the step after which an episode ends early
+    last = np.zeros(rows, dtype=np.int64)  # the time step after which an episode ends early
     noises = np.zeros((rows, base.max_steps, base.layout.action_size), dtype=np.float32)
     buffers: TensorDictBase | None = None
     state: TensorDictBase = env.full_done_spec.zero()
     idle = torch.ones(rows, dtype=torch.bool)
-    is_first = True  # the first reset is of all rows, because policies read the task of idle rows too
+    is_first = True  # the first reset covers all rows, because policies also read the task of idle rows
     while True:
         starting = torch.zeros(rows, dtype=torch.bool)
         for row in torch.nonzero(idle).flatten().tolist():
@@ -129,7 +129,7 @@ def run_episodes(
         if noise is not None:
             noise_now = noises[np.arange(rows), np.minimum(steps, base.max_steps - 1)]
             action = (action + torch.from_numpy(noise_now)).clamp(-1.0, 1.0)
-        # Idle rows get a harmless action: the policy computed theirs from a state that may be stale.
+        # Idle rows get a zero action: the policy may have computed their actions from stale states.
         state.set("action", torch.where(active.unsqueeze(-1), action, 0.0))
         state.set("_step", active)
         state = env.step(state)

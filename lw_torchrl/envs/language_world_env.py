@@ -1,4 +1,4 @@
-"""LanguageWorldEnv: Meta-World's tasks as one natively batched TorchRL environment."""
+"""LanguageWorldEnv: Meta-World's tasks, and those of other suites, as a natively batched TorchRL environment."""
 
 from __future__ import annotations
 
@@ -30,62 +30,65 @@ from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
 
 class LanguageWorldEnv(EnvBase):
-    """N environments over any mixture of the 50 tasks, stepped together, by the MT50-rand protocol: a random initial
-    state and goal at every reset, the goal observed, 500 steps, ended only by truncation.
+    """A batch of N environments with any mixture of the 50 tasks, by the MT50-rand protocol: each reset draws a random
+    initial state and goal, the goal is observed, and episodes are truncated after 500 time steps.
 
-    Row i has the task ``tasks[i % n]``. The m-th reset of the r-th of a task's R rows is that task's episode m·R + r;
-    in the w-th of W workers it is (m·W + w)·R + r. An episode starts as Meta-World's own environment does after
-    ``env.seed(episode_seed(task, seed, episode)); env.reset()``, whatever ran before. ``env.reset(episode=7)``, or
-    int64 (N,), starts these episodes and counts as a reset; a SerialEnv or ParallelEnv takes
-    ``reset(list_of_kwargs=[{"episode": ...}, ...])``. A reset ignores the ``episode`` in a tensordict.
+    Row i has the task ``tasks[i % n]``. If R rows have the same task, the m-th reset of the r-th of these rows starts
+    episode m·R + r of the task; in worker w of W, episode (m·W + w)·R + r. An episode's initial state is that of
+    Meta-World after ``env.seed(episode_seed(task, seed, episode)); env.reset()``, independent of earlier episodes.
+    ``env.reset(episode=7)``, or an int64 tensor (N,), starts these episodes and counts as a reset; with a SerialEnv or
+    ParallelEnv, use ``reset(list_of_kwargs=[{"episode": ...}, ...])``. A reset ignores ``episode`` in a tensordict.
 
-    Give each worker of a SerialEnv, ParallelEnv, AsyncEnvPool or multi-process collector its own ``worker=(w, W)``, as
-    in ``ParallelEnv(2, [partial(make_env, worker=(w, 2)) for w in range(2)])``; otherwise all run the same episodes.
+    Give each worker of a SerialEnv, ParallelEnv, AsyncEnvPool or multi-process collector a distinct ``worker=(w, W)``,
+    as in ``ParallelEnv(2, [partial(make_env, worker=(w, 2)) for w in range(2)])``; otherwise all workers run the same
+    episodes.
 
-    ``close()`` frees the simulators; the next ``reset()`` makes new ones and continues with the next episodes.
-    ``state_dict`` holds the seed and the counters; after loading it, reset the environment to continue likewise. A
-    TransformedEnv, and a Collector with it, saves it only with a :class:`~lw_torchrl.transforms.QAFTransform` or
-    :class:`~lw_torchrl.transforms.EnvState`.
+    ``close()`` frees the simulators; the next ``reset()`` makes new simulators and continues with the next episodes.
+    ``state_dict`` holds the seed and the episode counters; after loading, reset the environment to continue with the
+    next episodes. A TransformedEnv or Collector saves this state only with a
+    :class:`~lw_torchrl.transforms.QAFTransform` or :class:`~lw_torchrl.transforms.EnvState`.
 
     Keys (B = (N,)); rows outside a ``_step`` mask do not move, rows outside a ``_reset`` mask are not reset:
         observation: (N, 39) float32, Meta-World's vector: metres, gripper opening in [0, 1], quaternions.
         task_id, episode: (N,) int64, rank of the task's name among the 50 sorted names, and index of the episode.
-        success: (N, 1) bool, Meta-World's success at this step.
-        fault: (N, 1) bool, the row was truncated because its action was NaN or its simulation became unstable.
+        success: (N, 1) bool, Meta-World's success at this time step.
+        fault: (N, 1) bool, whether the row was truncated because of a NaN action or an unstable simulation.
         action: (N, 4) float32, end-effector displacement xyz and gripper effort, each in [-1, 1]. The environment never
-            writes it, so that an action out of range keeps its log-probability.
-        executed_action: (N, 4) float32 in [-1, 1], the action of the last step, clipped as Meta-World does; zeros after
-            a reset, and for a row that was not stepped.
+            overwrites ``action``, so that an action out of range keeps its log-probability.
+        executed_action: (N, 4) float32 in [-1, 1], the action of the last time step, clipped as in Meta-World; zeros
+            after a reset, and for a row that did not take a step.
         reward: (N, 1) float32.
         done, terminated, truncated: (N, 1) bool; terminated stays false unless ``terminate_on_success``.
 
     Args:
-        tasks: "MT10", "MT50", a task's name, "fetch/push" for another suite's, or a list of names. A
-            :class:`~lw_torchrl.Task` stands for its name; a task of no suite needs a custom engine.
-        num_envs: N, at least the number of tasks; None for one environment each.
-        seed: any integer; :meth:`set_seed` starts again at episode 0.
-        suite: the :class:`~lw_torchrl.suites.Suite` of the tasks, or its name; None for the suite that their names
-            begin with, as in "fetch/push", and Meta-World for names without one.
-        engine: None for the suite's; for Meta-World "vectorized", the default, or "metaworld", its own environments in
-            a loop, slower with the same numbers; another name of :data:`~lw_torchrl.suites.metaworld.ENGINES`; or a
-            callable ``(row_tasks, *, reward, num_threads) -> Engine``. For versions of Meta-World or MuJoCo that the
-            vectorized engine does not reproduce, the default is "metaworld", with a warning.
-        num_threads: threads of the simulation, by default the cores that this process may use. It never changes a
-            result.
-        reward: "sparse", the success as 0 and 1, or "dense", Meta-World's own.
-        max_steps: steps of the simulation until truncation; None for the suite's, Meta-World's 500.
-        frame_skip: steps of the simulation for each action; their rewards are added, and any may succeed.
-        terminate_on_success: end an episode at its first success, with ``terminated``.
-        strict: raise on a NaN action, instead of truncating the row with a warning as for an unstable simulation.
+        tasks: "MT10", "MT50", a task's name (with the suite, as in "fetch/push", if not Meta-World), or a list of names
+            or :class:`~lw_torchrl.Task` objects. A task that belongs to no suite needs a custom engine.
+        num_envs: N, at least the number of tasks; None for one environment per task.
+        seed: any integer; :meth:`set_seed` restarts at episode 0.
+        suite: the :class:`~lw_torchrl.suites.Suite` of the tasks, or its name; None for the suite in the tasks'
+            names, as in "fetch/push", or Meta-World for names without a suite.
+        engine: None for the suite's engine; for Meta-World, "vectorized" (default), or "metaworld", a slower loop over
+            Meta-World's environments with the same results; another name in
+            :data:`~lw_torchrl.suites.metaworld.ENGINES`; or a callable ``(row_tasks, *, reward, num_threads) ->
+            Engine``. For versions of Meta-World or MuJoCo that the vectorized engine does not reproduce, the default is
+            "metaworld", with a warning.
+        num_threads: number of simulation threads, by default the cores available to this process. The number of
+            threads never changes a result.
+        reward: "sparse", the success as 0 or 1; or "dense", Meta-World's dense reward.
+        max_steps: simulation steps until truncation; None for the suite's default (Meta-World: 500).
+        frame_skip: simulation steps for each action; their rewards are added, and any of these steps may succeed.
+        terminate_on_success: end an episode at its first success, and set ``terminated``.
+        strict: raise an error on a NaN action, instead of truncating the row with a warning.
         worker: (w, W), this environment's index among W environments; None for a single environment.
-        batch_size: () for a single environment without the dimension of rows, for AsyncEnvPool.
-        device: device of the tensors of resets and steps; "auto" for this machine's accelerator.
+        batch_size: () for a single environment without a batch dimension, for AsyncEnvPool.
+        device: device of the tensors that reset and step return; "auto" for this machine's accelerator.
 
     Raises:
-        RuntimeError: a step of a row that has ended; a reset or step in a process that was forked later.
-        TypeError: it is pickled or copied; pass the function that makes it.
-        ValueError: the step of a custom engine does not return an EngineStep.
-        ImportError: a rendering library named by MUJOCO_GL is missing, or ``engine="vectorized"`` does not reproduce
+        RuntimeError: a row takes a step after its episode has ended, or a process forked after construction uses the
+            environment.
+        TypeError: the environment is pickled or copied; pass a function that makes the environment instead.
+        ValueError: the ``step`` of a custom engine does not return an EngineStep.
+        ImportError: the rendering library set by MUJOCO_GL is missing, or ``engine="vectorized"`` does not reproduce
             the installed version of Meta-World or MuJoCo.
 
     Example:
@@ -98,7 +101,7 @@ class LanguageWorldEnv(EnvBase):
     Source: paper section 'Task Formalism'; ``metaworld.sawyer_xyz_env.SawyerXYZEnv``.
     """
 
-    _has_frame_skip = True  # otherwise TorchRL adds a FrameSkipTransform, which steps rows that have ended
+    _has_frame_skip = True  # otherwise TorchRL adds a FrameSkipTransform, which would step rows that have ended
 
     @typed
     def __init__(
@@ -130,7 +133,7 @@ class LanguageWorldEnv(EnvBase):
         self.max_steps = self.suite.max_steps if max_steps is None else max_steps
         self.frame_skip, self.strict, self.terminate_on_success = frame_skip, strict, terminate_on_success
         if batch_size is not None and num_envs != 1:
-            raise ValueError(f"batch_size=() is only for a single environment, num_envs is {num_envs}")
+            raise ValueError(f"batch_size=() requires num_envs=1, got num_envs={num_envs}")
         self.row_tasks = tuple(self.tasks[i % n] for i in range(num_envs))
         self.worker = (0, 1) if worker is None else worker
         if not 0 <= self.worker[0] < self.worker[1]:
@@ -147,11 +150,11 @@ class LanguageWorldEnv(EnvBase):
         make = self.suite.make_engine if engine is None else partial(make_engine, engine)
         self._make_engine = partial(make, list(self.row_tasks), reward=reward, num_threads=num_threads)
         self._engine: Engine = self._make_engine()
-        self.is_closed = False  # EnvBase starts with True
+        self.is_closed = False  # EnvBase sets it to True
 
     @typed
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        """Begin at episode 0, with another seed if one is given; return the seed for the next environment."""
+        """Restart at episode 0, with a new seed unless ``seed`` is None; return a seed for the next environment."""
         self._set_seed(seed)
         return seed if seed is None or static_seed else seed_generator(abs(seed))
 
@@ -165,12 +168,12 @@ class LanguageWorldEnv(EnvBase):
 
     @property
     def engine(self) -> Engine:
-        """The simulator of the rows, to read only: do not step or reset it."""
+        """The simulator of the rows (read only: do not call its ``step`` or ``reset``)."""
         return self._engine
 
     @property
     def seed(self) -> int:
-        """The seed that, with task and episode, fixes every reset."""
+        """The seed, which determines every reset together with task and episode."""
         return self._counter.seed
 
     def get_extra_state(self) -> Tensor:
@@ -183,7 +186,7 @@ class LanguageWorldEnv(EnvBase):
         self._rows.over[:] = True
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Restore seed and episode counters of an environment with the same rows; reset before the next step."""
+        """Restore seed and episode counters of an environment with the same rows; reset it before the next step."""
         if strict and not state_dict:
             raise ValueError(
                 "state_dict is empty: a Collector saves the state of an environment only in a TransformedEnv with a "
@@ -195,11 +198,11 @@ class LanguageWorldEnv(EnvBase):
         raise TypeError("a LanguageWorldEnv can be neither pickled nor copied: pass a function that makes it")
 
     def _check_process(self) -> None:
-        # The simulator's threads and its OpenGL context do not survive a fork: a child would hang.
+        # The simulator's threads and its OpenGL context do not survive a fork: a child process would hang.
         if os.getpid() != self._process:
             raise RuntimeError(
-                "this process was forked after the environment was made: make the environment in this process (give "
-                "ParallelEnv or a collector a function that makes it)"
+                "this process was forked after the environment was made: make the environment in this process (pass "
+                "ParallelEnv or the collector a function that makes the environment)"
             )
 
     def _reset(self, tensordict: TensorDictBase | None = None, *, episode: int | Tensor | None = None) -> TensorDict:
@@ -224,7 +227,7 @@ class LanguageWorldEnv(EnvBase):
             rows = np.flatnonzero(active & self._rows.over)[:5].tolist()
             raise RuntimeError(f"rows {rows} have ended, or were not reset: reset them before the next step")
         stepped = active
-        if math.isnan(action.sum()):  # numbers in [-1, 1] cannot overflow, so one of them is NaN
+        if math.isnan(action.sum()):  # the sum of numbers in [-1, 1] cannot overflow, so an action is NaN
             broken = active & np.isnan(action).any(-1)
             self._report(broken, "its action is NaN", self.strict)
             stepped = active & ~broken
@@ -240,11 +243,11 @@ class LanguageWorldEnv(EnvBase):
         return self._output(self._rows.as_tensordict(executed, reward=rewarded))
 
     def _simulate(self, action: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Simulate one step of some rows; return the reward, (N,) float64."""
+        """Simulate one time step of the rows in the mask ``rows``; return the reward (N,) float64."""
         result = self._engine.step(action, rows)
         if not isinstance(result, EngineStep):
             returned = f"{type(self._engine).__name__}.step returned {type(result).__name__}"
-            raise ValueError(f"engine: {returned}, it must return an EngineStep")
+            raise ValueError(f"engine: {returned}, but must return an EngineStep")
         self._report(result.fault & rows, "its simulation became unstable")
         np.copyto(self._rows.observation, result.observation, casting="same_kind", where=rows[:, None])
         success = result.success & rows
@@ -256,7 +259,7 @@ class LanguageWorldEnv(EnvBase):
         return np.where(rows, result.reward, 0.0)
 
     def _report(self, rows: np.ndarray, problem: str, is_error: bool = False) -> None:
-        """Flag rows as faulty and warn, or raise an error; do nothing if there are none."""
+        """Flag rows as faulty and warn, or raise an error if ``is_error``; do nothing if no row is set."""
         if not rows.any():
             return
         row = int(np.flatnonzero(rows)[0])
@@ -271,20 +274,20 @@ class LanguageWorldEnv(EnvBase):
     def render(
         self, *, camera: str = "corner2", height: int = 240, width: int = 320, rows: Sequence[int] | None = None
     ) -> Tensor:
-        """Return pictures of rows in their present state, (len(rows), height, width, 3) uint8; without the dimension
-        of rows with ``batch_size=()``. OpenGL draws them, by EGL on Linux without a display and MUJOCO_GL.
+        """Render pictures of the rows' current state, (len(rows), height, width, 3) uint8, or (height, width, 3) with
+        ``batch_size=()``. Rendering uses OpenGL (EGL on Linux without a display, unless MUJOCO_GL is set).
 
-        TorchRL's PixelRenderTransform and VideoRecorder, and our :class:`CameraTransform`, call it. With a
+        TorchRL's PixelRenderTransform and VideoRecorder, and :class:`CameraTransform`, call this method. With a
         PixelRenderTransform, read the environment's ``observation_spec`` before the first reset.
 
         Args:
             camera: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV".
-            height, width: pixels.
-            rows: indices of the rows to draw; None for all.
+            height, width: size of a picture, in pixels.
+            rows: indices of the rows to render; None for all rows.
 
         Raises:
-            RuntimeError: a row was not reset, or the process was forked from one that rendered.
-            ImportError: there is no OpenGL; the message names what to install.
+            RuntimeError: a row was not reset, or the process was forked from a process that rendered.
+            ImportError: OpenGL is missing; the message names what to install.
             NotImplementedError: a custom engine has no ``render``.
         """
         self._check_process()
@@ -295,7 +298,7 @@ class LanguageWorldEnv(EnvBase):
         if self.is_closed or (self._rows.episode[list(drawn)] < 0).any():
             raise RuntimeError("there is nothing to render before a reset: call env.reset()")
         if not hasattr(self._engine, "render"):
-            raise NotImplementedError(f"engine {type(self._engine).__name__} has no render; see suites.cameras")
+            raise NotImplementedError(f"engine {type(self._engine).__name__} has no method render; see suites.cameras")
         if not drawn:
             return torch.zeros(0, height, width, 3, dtype=torch.uint8, device=self.device)
         pixels = self._engine.render(drawn, camera=camera, height=height, width=width)
@@ -303,7 +306,7 @@ class LanguageWorldEnv(EnvBase):
         return pictures if self.batch_size else pictures[0]
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free the simulators, and end all episodes; the next reset makes new simulators."""
+        """Free the simulators and end all episodes; the next reset makes new simulators."""
         if not self.is_closed:
             self._engine.close()
             self._rows.over[:] = True

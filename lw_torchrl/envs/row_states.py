@@ -1,4 +1,4 @@
-"""The specs of LanguageWorldEnv, and the state of its rows."""
+"""The specs of LanguageWorldEnv, and the state of the N environments in the batch (rows)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lw_torchrl.language.tasks import MT50, task_id
 
 
 def _with_ids(method: Callable[..., Any], change: Callable[..., Tensor] = lambda ids, *_args, **_kwargs: ids) -> Any:
-    """Wrap a method of Categorical that returns a new spec, so that the new spec keeps the ids, changed likewise."""
+    """Wrap a method of Categorical that returns a new spec; give the new spec the ids transformed by ``change``."""
 
     def wrapped(self: TaskIds, *args: Any, **kwargs: Any) -> TaskIds:
         spec = method(self, *args, **kwargs)
@@ -28,8 +28,8 @@ def _with_ids(method: Callable[..., Any], change: Callable[..., Tensor] = lambda
 
 
 class TaskIds(Categorical):
-    """The spec of ``task_id``, whose zero is each row's own id, (N,) int64. TorchRL calls policies with
-    ``fake_tensordict()``, which holds zeros, and a policy may not know the task of id 0."""
+    """The spec of ``task_id``, whose zero is each row's own task id, (N,) int64. TorchRL calls policies on the zeros of
+    ``fake_tensordict()``, and a policy may not know the task with id 0."""
 
     ids: Tensor | None = None
 
@@ -38,7 +38,7 @@ class TaskIds(Categorical):
         self.ids = ids
 
     def zero(self, shape: torch.Size | None = None) -> Tensor:
-        """Return the rows' ids, with the dimensions of ``shape`` in front."""
+        """Return the rows' task ids, with ``shape`` as leading batch dimensions."""
         if self.ids is None or self.ids.numel() != self.shape.numel():
             return super().zero(shape)
         # Transforms such as UnsqueezeTransform assign a new shape to the spec.
@@ -55,7 +55,7 @@ class TaskIds(Categorical):
 
 
 def observation_spec(task_id: Tensor, layout: Layout) -> Composite:
-    """Return the spec of all outputs except reward and done, for rows with these tasks, (N,) int64."""
+    """Return the spec of all outputs except reward and done, for N rows with task ids (N,) int64."""
     n = len(task_id)
     ids = len(MT50) if int(task_id.max()) < len(MT50) else 2**32  # a custom task's id is a hash
     return Composite(
@@ -82,11 +82,11 @@ def _flag(n: int) -> Categorical:
 
 
 def clipped_action(tensordict: TensorDictBase, shape: tuple[int, ...]) -> Tensor:
-    """Return the action to execute, float32 of this shape in [-1, 1]."""
+    """Return the action, clipped to [-1, 1]; raise unless the action is float32 of this shape."""
     action = tensordict.get("action", None)
     if action is None or action.shape != shape or action.dtype != torch.float32:
-        given = "none" if action is None else f"{action.dtype} of shape {tuple(action.shape)}"
-        raise ValueError(f"action must be float32 of shape {shape}, got {given}")
+        got = "no action" if action is None else f"{action.dtype} of shape {tuple(action.shape)}"
+        raise ValueError(f"action must be float32 of shape {shape}, got {got}")
     return action.detach().clamp(-1.0, 1.0)
 
 
@@ -94,8 +94,9 @@ Rows = NDArray[np.intp]
 
 
 class RowStates:
-    """The state of N rows: the last observation (N, D) float32; the episode, -1 before the first reset, and the steps
-    since the reset, (N,) int64; the flags over, terminated, fault and success, (N,) bool. A row never reset is over."""
+    """The state of N rows: the last observation (N, D) float32; the episode (-1 before the first reset) and the time
+    steps since the reset, (N,) int64; and the flags over (true before the first reset), terminated, fault and success,
+    (N,) bool."""
 
     def __init__(self, tasks: Sequence[str], layout: Layout) -> None:
         self.tasks, self.layout = tasks, layout
@@ -115,8 +116,8 @@ class RowStates:
         self._flags[:, rows] = False
 
     def as_tensordict(self, executed_action: NDArray[np.float32] | None = None, **more: Tensor) -> TensorDict:
-        """Return copies as a TensorDict of N rows, with ``executed_action`` (N, A) float32, None for zeros, and
-        ``more``."""
+        """Return a copy of the state as a TensorDict (N,), with ``executed_action`` (N, A) float32 (None for zeros) and
+        the additional entries ``more``."""
         n = len(self.tasks)
         over, terminated, fault, success = (torch.from_numpy(flag.copy()).unsqueeze(-1) for flag in self._flags)
         if executed_action is None:

@@ -1,4 +1,4 @@
-"""The episode that each row runs next, and its random numbers, which depend only on (task, seed, episode)."""
+"""The episode that each row runs next, and random numbers of episodes, which depend only on (task, seed, episode)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from lw_torchrl.language.tasks import Task
 
 
 def episode_seed(task: str | Task, seed: int, episode: int) -> int:
-    """Return an episode's seed for Meta-World's ``env.seed``, in [0, 2**63): a stable hash, different for each (task,
-    seed, episode). The task is a name, "pick-place", or your own :class:`Task`.
+    """Return an episode's seed for Meta-World's ``env.seed``, in [0, 2**63): a stable hash of (task, seed, episode).
+
+    The task is a name, such as "pick-place", or a custom :class:`Task`.
 
     Example:
         >>> episode_seed("reach", 0, 1) == episode_seed("reach", 1, 0)
@@ -30,7 +31,7 @@ def episode_seed(task: str | Task, seed: int, episode: int) -> int:
 def action_noise(
     task: str | Task, seed: int, episode: int, steps: int, hold: int = 1, size: int = 4
 ) -> NDArray[np.float32]:
-    """Return standard normal noise for an episode's actions, (steps, size) float32, constant for ``hold`` steps."""
+    """Return standard normal noise for an episode's actions, (steps, size) float32, held for ``hold`` time steps."""
     generator = episode_generator("noise", task, seed, episode)
     draws = generator.standard_normal((-(-steps // hold), size), dtype=np.float32)
     return draws.repeat(hold, axis=0)[:steps]
@@ -41,7 +42,7 @@ Episodes = NDArray[np.int64]
 
 
 class EpisodeCounter:
-    """The counters of the episodes that the rows of :class:`LanguageWorldEnv` run; ``worker`` is (w, W)."""
+    """Counters of the episodes that the rows of a :class:`LanguageWorldEnv` run, in worker w of W (``worker``)."""
 
     def __init__(self, tasks: Sequence[Task], seed: int, worker: tuple[int, int]) -> None:
         self.tasks = tuple(tasks)
@@ -55,7 +56,7 @@ class EpisodeCounter:
         self._first, self._stride = worker[0] * copies + self._rank, worker[1] * copies
 
     def start_again(self, seed: int | None) -> None:
-        """Begin at the first episode, of another seed if one is given."""
+        """Restart at the first episode, with a new seed unless ``seed`` is None."""
         if seed is not None:
             self.seed = seed
         self.resets[:] = 0
@@ -64,12 +65,12 @@ class EpisodeCounter:
         return (self.resets * self._stride + self._first)[rows]
 
     def requested(self, episode: int | Tensor, rows: Rows) -> Episodes:
-        """Return the requested episodes of ``rows``, from one integer for all, or an int64 tensor (N,)."""
+        """Return the requested episodes of ``rows``; ``episode`` is an integer for all rows or an int64 tensor (N,)."""
         n = len(self.names)
         if isinstance(episode, Tensor):
             if episode.shape not in ((), (n,)) or episode.dtype not in (torch.int64, torch.int32):
-                given = f"{episode.dtype} of shape {tuple(episode.shape)}"
-                raise ValueError(f"episode must be an integer, or int64 of shape ({n},), one for each row, got {given}")
+                got = f"{episode.dtype} of shape {tuple(episode.shape)}"
+                raise ValueError(f"episode must be an integer, or int64 of shape ({n},), one for each row, got {got}")
         elif check_value("episode", episode, Natural) >= 2**63:
             raise ValueError(f"episode must be below 2**63, got {shown(episode)}")
         episodes = torch.as_tensor(episode).expand(n).cpu().numpy().astype(np.int64)[rows]
@@ -83,12 +84,12 @@ class EpisodeCounter:
         ]
 
     def dump(self) -> Tensor:
-        """Return tasks, seed and counters as JSON in a tensor (bytes,) uint8."""
+        """Return tasks, seed and counters as a tensor of JSON bytes (n,) uint8."""
         state = {"tasks": self.names, "seed": self.seed, "resets": self.resets.tolist()}
         return torch.frombuffer(bytearray(json.dumps(state).encode()), dtype=torch.uint8)
 
     def load(self, dumped: Tensor) -> None:
-        """Restore seed and counters from a :meth:`dump` of the same rows."""
+        """Restore seed and counters from the :meth:`dump` of a counter with the same rows."""
         state = parse_json(dumped.cpu().numpy().tobytes())
         if state["tasks"] != self.names:
             rows, own_rows = (f"{len(names)} rows, {shown(names)}" for names in (state["tasks"], self.names))

@@ -29,7 +29,7 @@ _EMPTY = frozenset(("the", "a", "an", "is", "are", "be", "does", "do", "did", "h
 _LONGEST = 400  # characters of a text that is mapped
 _MOST_CLAUSES = 8  # of a condition that is mapped
 _MOST_COMPARED = 64  # mapped conditions and goals of an answer, a limit to the time of decoding
-LIMIT, SKILL_LIMIT = 0.4, 0.7  # the largest distances of a mapped condition and of a mapped skill; docs/planners.md
+LIMIT, SKILL_LIMIT = 0.4, 0.7  # largest distances of a mapped condition and a mapped skill; docs/language-models.md
 _TARGETS = ("target location", "reach target")
 _TARGET = re.compile(
     r"\b(?:the\s)?(?:reach\s)?(?:goal|target)(?:\s(?:location|position|area|place|point|destination))?\b"

@@ -77,7 +77,7 @@ They are "open", "closed", and those that you add: ``STATES["on"] = STATES["open
 UNARY = ChainMap[str, tuple[Comparison, ...]](STATES, _OF_POSITION)  # type: ignore[arg-type]
 """The predicates of one object: "touching the table", which compares its z, and the states of its opening."""
 RELATIONS = Registry("relation", "lw_torchrl.relations", _predicates("relations"), _check_relation)
-"""The relations between two objects: the 13 published ones, and those that you add (docs/queries.md shows how).
+"""The relations between two objects: the 13 published ones, and those that you add (docs/custom-networks.md shows how).
 
 Source: paper section 'Query Answering Function'; the thresholds are the published ones.
 """

@@ -205,7 +205,7 @@ def _unknown_task(argument: str, name: str, tasks: Tasks) -> ValueError:
         return error
     message = str(error) if str(error).endswith("?") else f"{error}."
     return ValueError(
-        f"{message} Other tasks are Task objects with an engine=, see docs/training.md#a-task-of-your-own"
+        f"{message} Other tasks are Task objects with an engine=, see docs/your-robot.md#a-task-of-your-own"
     )
 
 

@@ -1,4 +1,4 @@
-"""Policies as TensorDict modules, in parts that can be used alone: attention, mixers, features, decoders, critics."""
+"""Policies as TensorDict modules, and their reusable parts: attention, mixers, features, decoders and critics."""
 
 import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.modules.attention import PlanAttention, attend

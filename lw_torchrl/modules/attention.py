@@ -1,4 +1,4 @@
-"""PlanAttention: turn the truth of a plan's conditions into attention over its steps."""
+"""PlanAttention: attention over a plan's steps, computed from the truth values of their conditions."""
 
 from __future__ import annotations
 
@@ -14,49 +14,49 @@ from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.task_index import PlanTables, answers_of, pick
 from lw_torchrl.modules.parts import Part, in_mode_of
 
-TRUE_LOGIT = 5.0  # a true condition counts 5, a false one -5 (paper, section "Plan Conditioning")
-ACTIVE_WEIGHT = 0.01  # a step is active above this weight; a false step next to a true one has about 1e-4
+TRUE_LOGIT = 5.0  # logit of a true condition; a false condition has -5 (paper, section "Plan Conditioning")
+ACTIVE_WEIGHT = 0.01  # a plan step with more attention is active; a false step has about 1e-4 if another step is true
 
 
 def attend(logits: Tensor, mask: Tensor) -> Tensor:
-    """Return the softmax of logits (..., S) over the steps that exist, mask (..., S) bool; 0 on the others."""
+    """Return the softmax of ``logits`` (..., S) over the steps where ``mask`` (..., S) bool is true; 0 elsewhere."""
     return logits.masked_fill(~mask, -torch.inf).softmax(-1)
 
 
 def read_truth(tensordict: TensorDictBase, keys: Keys, tables: PlanTables) -> tuple[Tensor, Tensor]:
-    """Return the truth (..., S) of a plan's conditions and the rows (...) of its tables; raise for other plans."""
+    """Read truth values (..., S) and each task's row (...) in ``tables``; raise if the truth belongs to other plans."""
     qaf, task_id = read(tensordict, keys)
     return answers_of(qaf, task_id, tensordict.get(key_beside(keys[0], "_plan"), None), tables)
 
 
 def check_truth(qaf: Tensor, shape: torch.Size) -> None:
-    """Raise :class:`ValueError` unless truth is bool, or numbers from 0 to 1, of a shape."""
+    """Raise a :class:`ValueError` unless ``qaf`` has this shape and is bool or holds numbers from 0 to 1."""
     if qaf.shape != shape:
         raise ValueError(
             f"qaf must have shape {tuple(shape)}, one column for each step of the actor's plans, got "
             f"{tuple(qaf.shape)}; give QAFTransform the same plans"
         )
     if qaf.dtype != torch.bool:
-        problem = "qaf must be bool, or numbers from 0 to 1 for soft truth; it holds other numbers, or NaN"
+        problem = "qaf must be bool, or numbers from 0 to 1 (soft truth), but holds NaN or other numbers"
         check_values(lambda truth: ((truth >= 0) & (truth <= 1)).all(), qaf, problem)
 
 
 class PlanAttention(Part):
-    """Attention over a plan's steps: the softmax of 10·truth - 5 over the steps that exist.
+    """An attention over a plan's steps: the softmax of 10·truth - 5 over the steps that the plan has.
 
     If no condition is true, the attention is uniform over the plan's steps.
 
     Reads ``qaf`` (B, S) bool, or float in [0, 1] for soft truth, and ``task_id`` (B,) int64; for plans with fallback
-    steps also ``turn`` (B,) int64, see :class:`~lw_torchrl.transforms.FallbackTurns` (0 if it is absent). Writes
-    ``skill_weights`` (B, S) float32, which sum to 1.
+    steps also ``turn`` (B,) int64, see :class:`~lw_torchrl.transforms.FallbackTurns` (0 if absent). Writes
+    ``skill_weights`` (B, S) float32, whose rows sum to 1.
 
     Args:
-        plans: the plans whose steps are attended to.
-        in_keys, out_keys: other names for what it reads and writes, in the order above; nested keys are allowed.
+        plans: the plans whose steps the module attends to.
+        in_keys, out_keys: replacements for the default keys, in the order above; nested keys are allowed.
 
     Raises:
-        ValueError: at call time, if ``qaf`` has another number of steps, holds values outside [0, 1] or belongs to
-            other plans, or if a task has no plan. A wider ``qaf`` is accepted if ``qaf_plan`` shows that the plans
+        ValueError: at call time, if ``qaf`` has the wrong number of steps, holds values outside [0, 1] or belongs
+            to other plans, or if a task has no plan. A wider ``qaf`` is accepted if ``qaf_plan`` shows that the plans
             agree.
 
     Example:
@@ -81,23 +81,23 @@ class PlanAttention(Part):
         super().__init__(("qaf", "task_id", "turn")[: 2 + has_fallback], ("skill_weights",), in_keys, out_keys)
         self.plans, self.tasks, self.layout = plans, tuple(plans), plans.layout
         self.tables, self.has_fallback = tables, has_fallback
-        # (T, 2, S) bool: the plan's own steps, and the fallback steps; both hold all steps of a plan without fallback.
+        # (T, 2, S) bool: the plan's own steps, and the fallback steps; without a fallback, both masks are all steps.
         self.register_buffer("mask", tables.turns, persistent=False)
 
     @property
     def truth_keys(self) -> tuple[NestedKey, NestedKey]:
-        """The keys of the conditions' truth and of the task."""
+        """The keys of the conditions' truth values and of the task id."""
         return self.in_keys[0], self.in_keys[1]
 
     @property
     def turn_key(self) -> NestedKey | None:
-        """The key of the turn; None for plans without fallback steps."""
+        """The key of ``turn``; None for plans without fallback steps."""
         return self.in_keys[2] if self.has_fallback else None
 
     def with_plans(self, plans: AnyPlans) -> PlanAttention:
-        """Return the attention over other plans' steps."""
+        """Return an attention over the steps of different plans."""
         other = PlanAttention(plans, out_keys=self.out_keys_source)
-        # Either of the two may have a turn, which comes last.
+        # Either module may read a turn, whose key comes last.
         other.in_keys = [*self.in_keys, *other.in_keys[len(self.in_keys) :]][: len(other.in_keys)]
         return in_mode_of(self, other.to(self.mask.device))
 

@@ -1,4 +1,4 @@
-"""Critics: the value of a state, or of an action in it, on the trunks of policies."""
+"""Critics, which estimate the values of states or actions and are built on the trunk of a policy."""
 
 from __future__ import annotations
 
@@ -20,18 +20,19 @@ from lw_torchrl.modules.policy import layout_of, plans_of
 
 
 class Value(RenamedInputs):
-    """The value of a state: a trunk with a head for values.
+    """A state-value network: a trunk with one or more value heads.
 
-    Reads what the trunk reads; writes ``state_value`` (B, 1) float32, the minimum of the ensemble, and with an ensemble
-    of several networks ``state_values`` (B, E) float32.
+    Reads the trunk's input keys; writes ``state_value`` (B, 1) float32, the minimum over the heads, and, with several
+    heads, ``state_values`` (B, E) float32.
 
     Args:
-        trunk: the parts before the head, such as :func:`plan_trunk`'s, or ``actor.trunk``, which both then train. The
-            last two keys that it writes are a latent (B, D) and features (B, F).
-        ensemble: E, the number of heads on the trunk. TorchRL's losses copy the whole critic ``num_qvalue_nets`` times
-            themselves, and draw the copies' weights anew.
-        width, depth: hidden layers, each followed by a LayerNorm; a sequence of widths gives both.
-        out_keys: other names for what it writes; nested keys are allowed.
+        trunk: the layers before the heads, such as :func:`plan_trunk`, or ``actor.trunk``, which actor and critic then
+            both train. The last two keys that the trunk writes are a latent (B, D) and features (B, F).
+        ensemble: E, the number of heads. TorchRL's losses make ``num_qvalue_nets`` copies of the whole critic
+            themselves, each with newly initialized weights.
+        width, depth: units per hidden layer and number of hidden layers, each followed by a LayerNorm; a sequence of
+            widths sets both.
+        out_keys: replacements for the default output keys; nested keys are allowed.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -44,7 +45,7 @@ class Value(RenamedInputs):
     """
 
     _written = ("state_value", "state_values")
-    _outputs = 1  # numbers that a head returns
+    _outputs = 1  # number of outputs of a head
     _also_read: Keys = ()
 
     @typed
@@ -82,16 +83,16 @@ class Value(RenamedInputs):
 
 
 class QValue(Value):
-    """The value of an action in a state: a trunk with a head that also reads the action.
+    """A state-action value network: a trunk with one or more value heads, which also read the action.
 
-    Reads what the trunk reads and ``action`` (B, A) float32; writes ``state_action_value`` (B, 1) float32, the minimum
-    of the ensemble, and with an ensemble of several networks ``state_action_values`` (B, E) float32. With
-    ``quantiles``, ``state_action_value`` is (B, Q) float32.
+    Reads the trunk's input keys and ``action`` (B, A) float32; writes ``state_action_value`` (B, 1) float32, minimal
+    over the heads, and, with several heads, ``state_action_values`` (B, E) float32. With ``quantiles`` above 1,
+    ``state_action_value`` is (B, Q) float32.
 
     Args:
-        trunk, ensemble, width, depth, out_keys: as for :class:`Value`.
+        trunk, ensemble, width, depth, out_keys: see :class:`Value`.
         action_key: the key of the action; nested keys are allowed.
-        quantiles: Q, the number of quantiles of the return, for ``torchrl.objectives.TQCLoss``; 1 for its mean.
+        quantiles: Q, the number of quantiles of the return, for ``torchrl.objectives.TQCLoss``; 1 for the mean return.
 
     Source: ``torchrl.modules.ValueOperator``.
     """
@@ -109,13 +110,13 @@ class QValue(Value):
         **options: Any,
     ) -> None:
         if quantiles > 1 and ensemble != 1:
-            raise ValueError(f"ensemble must be 1 with quantiles, got {ensemble}: TQCLoss makes several critics itself")
+            raise ValueError(f"ensemble must be 1 if quantiles > 1, got {ensemble}: TQCLoss makes its own ensemble")
         self._outputs, self._also_read = quantiles, (action_key,)
         super().__init__(trunk, ensemble=ensemble, **options)
 
 
 class _OnPlanTrunk:
-    """Base of critics on :func:`plan_trunk`."""
+    """A base class of critics whose trunk is :func:`plan_trunk`."""
 
     @typed
     def __init__(
@@ -132,13 +133,14 @@ class _OnPlanTrunk:
 
 
 class PlanConditionedValue(_OnPlanTrunk, Value):
-    """:class:`Value` on :func:`plan_trunk`.
+    """A :class:`Value` network on the trunk of :func:`plan_trunk`.
 
-    Reads ``qaf`` (B, S) bool, ``task_id`` (B,) int64 and ``observation`` (B, 39) float32; writes as :class:`Value`.
+    Reads ``qaf`` (B, S) bool, ``task_id`` (B,) int64 and ``observation`` (B, 39) float32; writes the same keys as
+    :class:`Value`.
 
     Args:
-        plans, skill_encoder, features, text_encoder: as for :class:`PlanConditionedActor`.
-        **options: of :class:`Value`.
+        plans, skill_encoder, features, text_encoder: see :class:`PlanConditionedActor`.
+        **options: keyword arguments of :class:`Value`.
 
     Example:
         >>> import lw_torchrl as lw
@@ -148,13 +150,14 @@ class PlanConditionedValue(_OnPlanTrunk, Value):
 
 
 class PlanConditionedQValue(_OnPlanTrunk, QValue):
-    """:class:`QValue` on :func:`plan_trunk`.
+    """A :class:`QValue` network on the trunk of :func:`plan_trunk`.
 
-    Reads what :class:`PlanConditionedValue` does, and ``action`` (B, A) float32; writes as :class:`QValue`.
+    Reads the input keys of :class:`PlanConditionedValue` and ``action`` (B, A) float32; writes the same keys as
+    :class:`QValue`.
 
     Args:
-        plans, skill_encoder, features, text_encoder: as for :class:`PlanConditionedActor`.
-        **options: of :class:`QValue`.
+        plans, skill_encoder, features, text_encoder: see :class:`PlanConditionedActor`.
+        **options: keyword arguments of :class:`QValue`.
 
     Example:
         >>> import lw_torchrl as lw

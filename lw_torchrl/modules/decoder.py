@@ -1,4 +1,4 @@
-"""Decoders: from a skill latent and features to an action, or to the parameters of its distribution."""
+"""Decoders, which map a skill latent and features to an action, or to the parameters of its distribution."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ LEAST_STD = 1e-3
 
 
 class _ActionMLP(MLP):
-    """Base of the decoders. ``squash`` can be set after construction, so ``config`` reads its present value."""
+    """A base class of MLP decoders. ``squash`` can change after construction, so ``config`` reads its current value."""
 
     _options: dict[str, Any]
     squash: bool
 
     @property
     def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
+        """The keyword arguments that reconstruct this module."""
         return {**self._options, "squash": self.squash}
 
 
 class MLPDecoder(_ActionMLP):
-    """The paper's action decoder, an MLP from a latent and features (..., D + F) to an action (..., A).
+    """The paper's action decoder: an MLP that maps a latent and features (..., D + F) to an action (..., A).
 
     Args:
-        width, depth: units and number of the hidden layers; a sequence of widths gives both.
-        actions: A.
-        squash: keep each number of the action in (-1, 1) by tanh; without, as in the paper, the environment clips it.
+        width, depth: units per hidden layer and number of hidden layers; a sequence of widths sets both.
+        actions: A, the size of an action.
+        squash: squash the action to (-1, 1) by tanh; if False, as in the paper, the environment clips the action.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -66,12 +66,12 @@ class MLPDecoder(_ActionMLP):
 
 
 class GaussianDecoder(_ActionMLP):
-    """An MLP from a latent and features (..., D + F) to mean and standard deviation of a Normal, (..., A) each.
+    """An MLP that maps a latent and features (..., D + F) to mean and standard deviation (..., A) of a Normal.
 
     Args:
-        width, depth, actions: as for :class:`MLPDecoder`.
-        squash: keep the mean in (-1, 1), for a Normal around the action; False for a Normal that goes through tanh.
-        init_std: the standard deviation at every state before training, above 0.001.
+        width, depth, actions: see :class:`MLPDecoder`.
+        squash: squash the mean to (-1, 1) by tanh; use False with ``TanhNormal``, which squashes the samples.
+        init_std: initial standard deviation, the same in every state (above 0.001).
 
     Example:
         >>> import lw_torchrl as lw
@@ -109,7 +109,7 @@ class GaussianDecoder(_ActionMLP):
 
     @torch.no_grad()
     def copy_from(self, decoder: MLPDecoder) -> None:
-        """Copy a deterministic decoder's weights to the mean; the standard deviation becomes the same everywhere."""
+        """Copy a deterministic decoder's weights to the mean, and reset the standard deviation to ``init_std``."""
         for own, theirs in zip([*self][:-1], [*decoder][:-1], strict=True):
             own.load_state_dict(theirs.state_dict())
         last, trained = self[-1], decoder[-1]
@@ -120,14 +120,14 @@ class GaussianDecoder(_ActionMLP):
 
 
 class Decode(Part):
-    """Make a network a decoder: it reads the latent and the features, concatenated.
+    """A TensorDict module that applies a network to the concatenation of the latent and the features.
 
-    Reads ``skill_latent`` (B, D) and ``features`` (B, F) float32; writes what the network returns, by default
+    Reads ``skill_latent`` (B, D) and ``features`` (B, F) float32; writes the network's outputs, by default
     ``action`` (B, A) float32.
 
     Args:
-        network: any module from the concatenation (B, D + F) to one tensor for each of ``out_keys``.
-        in_keys, out_keys: other names for what it reads and writes; nested keys are allowed.
+        network: a module that maps the concatenation (B, D + F) to one tensor for each of ``out_keys``.
+        in_keys, out_keys: replacements for the default input and output keys; nested keys are allowed.
     """
 
     _options = ("network",)
@@ -142,19 +142,19 @@ class Decode(Part):
         outputs = decoded if isinstance(decoded, tuple) else (decoded,)
         if len(outputs) != len(self.out_keys_source):
             names = ", ".join(map(str, self.out_keys_source))
-            raise ValueError(f"decoder must return a tensor for each of {names}, it returned {len(outputs)}")
+            raise ValueError(f"decoder must return one tensor for each of {names}, got {len(outputs)} tensors")
         return write(tensordict, self, outputs)
 
 
 def as_decoder(decoder: nn.Module, trunk: TensorDictSequential, out_keys: Keys | None = None) -> TensorDictModuleBase:
-    """Return a decoder behind a trunk: a plain module reads the trunk's latent and features and writes ``out_keys``."""
+    """Convert a module to a decoder; a plain module reads the trunk's latent and features and writes ``out_keys``."""
     width = encoding_width(trunk)
     network = decoder.network if isinstance(decoder, Decode) else decoder
     if width is not None and not isinstance(network, TensorDictModuleBase):
         materialize(network, torch.zeros(1, width))
     if isinstance(decoder, TensorDictModuleBase):
         if out_keys is not None and list(out_keys) != list(decoder.out_keys_source):
-            raise ValueError(f"out_keys: a TensorDict module has its own, {decoder.out_keys_source}; got {out_keys}")
+            raise ValueError(f"out_keys must be None or the decoder's own {decoder.out_keys_source}, got {out_keys}")
         return decoder
     decode = Decode(decoder, in_keys=encoding_keys(trunk), out_keys=("action",) if out_keys is None else out_keys)
     if width is not None and len(decode.out_keys) == 1:  # several outputs are parameters of a distribution

@@ -1,4 +1,4 @@
-"""Descriptions of modules as JSON: the class and the arguments of each part, from which it is built again."""
+"""Descriptions of modules as JSON: the class and the constructor arguments of each part."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ _NETWORKS: dict[type[nn.Module], tuple[str, ...]] = {
     nn.Dropout: ("p",),
     nn.LayerNorm: ("normalized_shape", "eps", "elementwise_affine"),
 }
-"""PyTorch's own modules that need no ``config``, and the arguments that rebuild them."""
+"""The PyTorch modules that need no ``config``, and the arguments that reconstruct them."""
 _SEQUENCES: dict[str, Any] = {"TensorDictSequential": TensorDictSequential, "Sequential": nn.Sequential}
 _KEYS = ("in_keys", "out_keys")
 
 
 def describe(module: nn.Module) -> dict[str, Any]:
-    """Return a module's description, from which :func:`from_description` builds it again, with fresh weights.
+    """Return a module's description, from which :func:`from_description` rebuilds the module with new random weights.
 
-    It holds the class of each part, by its import path, and its arguments, from the attribute ``config``: JSON values,
-    plans, tasks, layouts and other modules.
+    The description holds the import path of each part's class, and the part's arguments from the attribute ``config``:
+    JSON values, plans, tasks, layouts and other modules.
 
     Raises:
-        TypeError: a part that has no ``config``, by name.
+        TypeError: a part has no ``config``; the message names the part.
 
     Example:
         >>> import lw_torchrl as lw
@@ -63,7 +63,7 @@ def _encode_module(module: nn.Module, plans: list[Plans], path: str) -> dict[str
     if kind is TensorDictModule:
         wrapped: Any = module
         if wrapped._kwargs is not None or wrapped.method or wrapped.method_kwargs:
-            raise TypeError(f"{where} is a TensorDictModule with method= or keyword arguments; wrap them")
+            raise TypeError(f"{where} is a TensorDictModule with method= or keyword arguments, which cannot be saved")
         inner = _encode_module(wrapped.module, plans, path)
         keys = {"in_keys": list(wrapped.in_keys), "out_keys": list(wrapped.out_keys_source)}
         return {"class": "TensorDictModule", "options": {"module": {"module": inner}, **keys}}
@@ -76,8 +76,8 @@ def _encode_module(module: nn.Module, plans: list[Plans], path: str) -> dict[str
         options = getattr(module, "config", None)
         if not isinstance(options, Mapping):
             raise TypeError(
-                f"{where} is a {kind.__qualname__}, which cannot be saved: give it an attribute config, a dict of its "
-                "constructor's keyword arguments, as JSON"
+                f"{where} is a {kind.__qualname__}, which cannot be saved: add an attribute config, a dict of the "
+                "constructor's keyword arguments as JSON"
             )
         if "plans" not in options and "plans" in signature(getattr(kind, "rebuild", kind)).parameters:
             options = {"plans": module.plans, **options}
@@ -93,7 +93,7 @@ def _encode(value: Any, plans: list[Plans], path: str) -> Any:
     if isinstance(value, nn.Module):
         return {"module": _encode_module(value, plans, path)}
     if isinstance(value, Plans):
-        # Most parts have the same plans, so a description holds each Plans once.
+        # Most parts share the same plans, so a description holds each Plans once.
         if value not in plans:
             plans.append(value)
         return {"plans": plans.index(value)}
@@ -103,7 +103,7 @@ def _encode(value: Any, plans: list[Plans], path: str) -> Any:
         return {"layout": METAWORLD.name if value == METAWORLD else value.to_json()}
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
         return {"dict": {key: _encode(each, plans, _join(path, key)) for key, each in value.items()}}
-    raise TypeError(f"{path} must be JSON, plans, a task, a layout or a module to be saved, got {shown(value)}")
+    raise TypeError(f"{path} must be a JSON value, plans, a task, a layout or a module to be saved, got {shown(value)}")
 
 
 def _join(path: str, name: str) -> str:
@@ -114,19 +114,19 @@ def _join(path: str, name: str) -> str:
 def from_description(
     description: Any, text_encoder: TextEncoder | None = None, parts: Sequence[type[nn.Module]] = ()
 ) -> Any:
-    """Build the module of a description, with fresh weights.
+    """Build the module that a description describes, with new random weights.
 
     Args:
-        description: what :func:`describe` returned.
+        description: a result of :func:`describe`.
         text_encoder: passed to parts that encode texts; None for the shipped sentence encoder.
-        parts: custom classes. A class is also found if the module that defines it is imported already. Modules are
-            never imported because a file names them: the file may come from a stranger.
+        parts: custom classes. A class is also found if its Python module is already imported. A description never
+            causes an import, because its file may be untrusted.
 
     Raises:
-        ValueError: not a description, or a class that is not known here.
+        ValueError: ``description`` is malformed, or a class is unknown.
     """
     if not isinstance(description, Mapping) or not isinstance(description.get("plans"), list):
-        raise ValueError(f"a description must have class, options and plans, got {shown(description)}")
+        raise ValueError(f"description must have the keys class, options and plans, got {shown(description)}")
     plans = [Plans.from_json(row) for row in description["plans"]]
     return _Decoder(plans, text_encoder, parts).module(description)
 
@@ -135,7 +135,7 @@ class _Decoder:
     def __init__(self, plans: list[Plans], text_encoder: TextEncoder | None, parts: Sequence[type[nn.Module]]) -> None:
         self.plans, self.text_encoder = plans, text_encoder
         self.custom = {f"{kind.__module__}:{kind.__qualname__}": kind for kind in parts}
-        # A class that was saved by a script may now be in a module.
+        # A class that was defined in a script when it was saved may have moved to a module.
         self.custom |= {f"__main__:{kind.__qualname__}": kind for kind in parts}
 
     def module(self, node: Any) -> Any:
@@ -147,11 +147,11 @@ class _Decoder:
             if isinstance(parts, Mapping):
                 return _SEQUENCES[name](OrderedDict((key, self.module(part)) for key, part in parts.items()))
             if not isinstance(parts, list):
-                raise ValueError(f"parts of a {name} must be a list or a table, got {shown(parts)}")
+                raise ValueError(f"parts of a {name} must be a list or a dict, got {shown(parts)}")
             return _SEQUENCES[name](*map(self.module, parts))
         kind = self.find(name)
         if not isinstance(node.get("options"), Mapping):
-            raise ValueError(f"options of a {name} must be a table, got {shown(node.get('options'))}")
+            raise ValueError(f"options of a {name} must be a dict, got {shown(node.get('options'))}")
         options = {key: self.value(value) for key, value in node["options"].items()}
         for key in {*_KEYS} & {*options}:  # JSON has no tuples
             options[key] = [tuple(each) if isinstance(each, list) else each for each in options[key]]
@@ -162,7 +162,7 @@ class _Decoder:
         return rebuild(*positional, **{key: value for key, value in options.items() if not key.startswith("*")})
 
     def find(self, name: str) -> Any:
-        """Return the class of a name: ours, a custom one, or one of a module that is imported already."""
+        """Return the class with this name: from this package, from ``parts``, or from an imported Python module."""
         from lw_torchrl import modules
 
         place, _, path = name.rpartition(":")
@@ -178,10 +178,10 @@ class _Decoder:
             kind = self.custom.get(name) or sys.modules.get(place)
             for step in path.split(".") if not isinstance(kind, type) else ():
                 kind = getattr(kind, step, None)
-            by_import = f"import {place} first, on the command line by --import {place}, or " * (place != "__main__")
+            by_import = f"import {place} first (on the command line: --import {place}), or " * (place != "__main__")
             hint = f": {by_import}pass parts=[{path}]"
         if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
-            raise ValueError(f"the class {shown(name)} is not known here{hint}")
+            raise ValueError(f"the class {shown(name)} is unknown{hint}")
         return kind
 
     def value(self, value: Any) -> Any:
@@ -204,7 +204,7 @@ class _Decoder:
 
 
 def same_keys(module: nn.Module, other: nn.Module) -> bool:
-    """Return whether both read and write the same keys."""
+    """Return whether two modules read and write the same keys; true for modules without keys."""
     return not isinstance(module, TensorDictModuleBase) or all(
         getattr(module, name) == getattr(other, name) for name in _KEYS
     )

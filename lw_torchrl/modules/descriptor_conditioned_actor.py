@@ -1,4 +1,4 @@
-"""DescriptorConditionedActor: the baseline that is conditioned on the task's description instead of a plan."""
+"""DescriptorConditionedActor: a baseline policy, conditioned on the task's description instead of a plan."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ Condition = Literal["description", "one-hot"]
 
 
 class TaskLatent(Part):
-    """Encode the task's description, or its number, to a latent.
+    """A module that encodes the task's description, or a one-hot vector of the task, to a latent.
 
     Reads ``task_id`` (B,) int64; writes ``task_latent`` (B, D) float32.
 
     Args:
-        tasks: the tasks that it knows, as for :func:`resolve_tasks`; a :class:`Task` brings its own description.
-        condition: "description", the text's vector; "one-hot", one number for each task, without words.
-        encoder: any module from T task vectors (T, E) float32 to latents (T, D); None for :class:`SkillEncoder`.
-        text_encoder: a function from n texts to vectors (n, E) float32; None for the shipped sentence encoder.
-        in_keys, out_keys: other names for what it reads and writes; nested keys are allowed.
+        tasks: the known tasks, see :func:`resolve_tasks`; a :class:`Task` contains its own description.
+        condition: "description", the embedding of the description; "one-hot", a one-hot vector of the task.
+        encoder: a module that maps T task vectors (T, E) float32 to latents (T, D); None for :class:`SkillEncoder`.
+        text_encoder: a function that maps n texts to vectors (n, E) float32; None for the shipped sentence encoder.
+        in_keys, out_keys: replacements for the default input and output keys; nested keys are allowed.
 
     Raises:
-        ValueError: an unknown task; at call time, a task_id outside ``tasks``.
+        ValueError: a task is unknown; at call time, a ``task_id`` is not among ``tasks``.
 
     Source: paper section 'Conditional Plan Experiments'.
     """
@@ -75,23 +75,23 @@ class TaskLatent(Part):
 
     @property
     def text_vectors(self) -> Tensor:
-        """The vectors of the descriptions, (T, E) float32."""
+        """The embeddings of the descriptions, (T, E) float32."""
         return self.vectors
 
     @property
     def config(self) -> dict[str, object]:
-        """The keyword arguments that rebuild it."""
+        """The keyword arguments that reconstruct this module."""
         return {"tasks": list(self.definitions.values()), **super().config}
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         (task_id,) = read(tensordict, self.in_keys)
-        rows = self.index.rows(_one_per_row(task_id, tensordict), "tasks this actor was not made for")
+        rows = self.index.rows(_one_per_row(task_id, tensordict), "tasks that the actor does not know")
         return write(tensordict, self, [pick(self.encoder(self.vectors)[: len(self.tasks)], rows)])
 
 
 def _one_per_row(task_id: Tensor, tensordict: TensorDictBase) -> Tensor:
-    """Return task ids (...) for ids (...) or (..., 1); the shapes of the batch and of all entries decide which."""
+    """Return task ids (...) from ids (...) or (..., 1); a last dimension of 1 is removed if an entry lacks it."""
     if task_id.shape[-1:] != (1,) or task_id.dim() <= tensordict.batch_dims:
         return task_id
     shapes = [value.shape[: task_id.dim()] for value in tensordict.values(True, True)]
@@ -99,19 +99,19 @@ def _one_per_row(task_id: Tensor, tensordict: TensorDictBase) -> Tensor:
 
 
 class DescriptorConditionedActor(ConditionedActor):
-    """A policy that is conditioned on the task's description instead of a plan, the paper's baseline DC.
+    """A policy that is conditioned on the task's description instead of a plan (the paper's baseline DC).
 
-    Its parts are ``latent``, a :class:`TaskLatent`, then ``features`` and ``decoder`` as in
+    The parts are ``latent`` (a :class:`TaskLatent`), and ``features`` and ``decoder`` as in
     :class:`PlanConditionedActor`. Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes
     ``task_latent`` (B, D), ``features`` (B, F) and ``action`` (B, 4) float32 in (-1, 1).
 
     Args:
-        tasks, condition, text_encoder: as for :class:`TaskLatent`.
-        task_encoder: any module from task vectors (T, E) float32 to latents (T, D); None for :class:`SkillEncoder`.
-        features, decoder, in_keys, out_keys: as for :class:`PlanConditionedActor`.
+        tasks, condition, text_encoder: see :class:`TaskLatent`.
+        task_encoder: a module that maps task vectors (T, E) float32 to latents (T, D); None for :class:`SkillEncoder`.
+        features, decoder, in_keys, out_keys: see :class:`PlanConditionedActor`.
 
     Raises:
-        ValueError: an unknown task; at call time, a task_id outside ``tasks``.
+        ValueError: a task is unknown; at call time, a ``task_id`` is not among ``tasks``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -150,9 +150,9 @@ def descriptor_trunk(
     features: nn.Module | None = None,
     text_encoder: TextEncoder | None = None,
 ) -> TensorDictSequential:
-    """Return the description's latent and the features, as :func:`plan_trunk` does for plans.
+    """Build a trunk that writes the latent of the task's description and the features.
 
-    The arguments are :class:`DescriptorConditionedActor`'s.
+    See :class:`DescriptorConditionedActor` for the arguments, and :func:`plan_trunk` for the counterpart with plans.
     """
     latent = TaskLatent(tasks, condition, task_encoder, text_encoder=text_encoder)
     return TensorDictSequential(OrderedDict(latent=latent, features=as_features(features, latent.layout)))

@@ -1,4 +1,4 @@
-"""Features: what a policy sees of an observation, normalised with statistics that are part of the module."""
+"""Features of an observation as inputs of a policy, normalized with statistics that the module stores."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.modules.parts import follow, in_mode_of, probe, written_key
 
 Kind = Literal["raw", "differences", "relative", "opening", "none", "both"]
-_FINE, _COARSE = 0.02, 0.1  # metres: the scales at which tanh squashes each difference
+_FINE, _COARSE = 0.02, 0.1  # metres, the scales at which tanh squashes each difference
 
 
 class Features(TensorDictModuleBase):
-    """Base class of features. A subclass implements :meth:`compute`; noise is added while training.
+    """A base class of feature modules. A subclass implements :meth:`compute`; noise is added during training.
 
     Reads ``in_keys``; writes ``features`` (B, F) float32. The noise is drawn from PyTorch's global generator.
 
     Args:
-        noise: standard deviation of Gaussian noise while training, in units of the normalised features.
-        in_keys: what it reads.
-        out_keys: another name for ``features``.
+        noise: standard deviation of the Gaussian noise during training, in units of the normalized features.
+        in_keys: the keys to read.
+        out_keys: a replacement for the default key ``features``.
 
     Attributes:
         width: F, the number of features.
@@ -57,7 +57,7 @@ class Features(TensorDictModuleBase):
         raise NotImplementedError(f"{type(self).__name__} must override compute")
 
     def fit(self, rows: TensorDictBase, weights: Tensor | None = None) -> None:
-        """Compute statistics from R rows of a dataset, weighted by ``weights`` (R,) float32 of sum 1; none here."""
+        """Compute statistics of R rows, weighted by ``weights`` (R,) float32 with sum 1; do nothing by default."""
 
     @dispatched
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -67,20 +67,20 @@ class Features(TensorDictModuleBase):
         return write(tensordict, self, [features])
 
 
-add_random_module(Features)  # losses that vmap over networks then let each network draw its own noise
+add_random_module(Features)  # so that losses that vmap over networks let each network draw its own noise
 
 
 class ObservationFeatures(Features):
-    """Normalised features of the observation only.
+    """Normalized features of the observation only.
 
-    Reads ``observation`` (B, D) float; writes ``features`` (B, F), within 10 standard deviations of the mean.
+    Reads ``observation`` (B, D) float; writes ``features`` (B, F), clipped to 10 standard deviations from the mean.
 
     Args:
         kind: "raw", the observation; "differences", see :func:`differences`; "relative", see :func:`relative`;
-            "opening", only the gripper's opening; "none", nothing; "both", the observation and the differences.
-        noise: standard deviation of the noise while training, in standard deviations of each feature.
+            "opening", only the gripper's opening; "none", no features; "both", the observation and the differences.
+        noise: standard deviation of the noise during training, in standard deviations of each feature.
         layout: the layout of the observations; None for Meta-World's.
-        in_keys, out_keys: other names for what it reads and writes; nested keys are allowed.
+        in_keys, out_keys: replacements for the default input and output keys; nested keys are allowed.
 
     Attributes:
         width: F, the number of features.
@@ -113,23 +113,23 @@ class ObservationFeatures(Features):
 
     @property
     def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
+        """The keyword arguments that reconstruct this module."""
         keys = {"in_keys": self.in_keys, "out_keys": self.out_keys_source}
         return {"kind": self.kind, "noise": self.noise, "layout": self.layout, **keys}
 
     def with_plans(self, plans: AnyPlans) -> ObservationFeatures:
-        """Return the features, with the same statistics, for the layout of other plans.
+        """Return features with the same statistics for the layout of different plans.
 
         Raises:
-            ValueError: features that mean something else in that layout.
+            ValueError: the features have a different meaning in that layout.
         """
         layout = as_plans(plans).layout
         if layout == self.layout:
             return self
         if self.kind not in TRANSFERS:
             raise ValueError(
-                f"features {self.kind!r} of layout {self.layout.name!r} do not transfer to {layout.name!r}; those that "
-                f"do are RoleFeatures, with {' or '.join(map(repr, TRANSFERS))} of the observation"
+                f"features {self.kind!r} of layout {self.layout.name!r} do not transfer to {layout.name!r}; use "
+                f"RoleFeatures and ObservationFeatures of kind {' or '.join(map(repr, TRANSFERS))}"
             )
         other = ObservationFeatures(**{**self.config, "layout": layout})
         other.mean, other.std = self.mean, self.std
@@ -142,12 +142,12 @@ class ObservationFeatures(Features):
 
     @torch.no_grad()
     def fit(self, rows: TensorDictBase, weights: Tensor | None = None) -> None:
-        """Compute mean and standard deviation of the rows; a feature that hardly varies keeps its scale."""
+        """Compute mean and standard deviation of the rows; a nearly constant feature is not rescaled."""
         (observation,) = read(rows, self.in_keys)
         features = self._select(observation.reshape(-1, self.layout.size))
         check_rows(features)
         if not features.shape[-1]:
-            return  # PyTorch warns about the deviation of nothing
+            return  # PyTorch warns about the standard deviation of an empty tensor
         if weights is None:
             mean, std = features.mean(0), features.std(0, unbiased=False)
         else:
@@ -163,12 +163,12 @@ class ObservationFeatures(Features):
 
 
 class Concat(TensorDictModuleBase):
-    """Concatenate the features of several modules.
+    """A module that concatenates the features of several modules.
 
-    Reads what the modules read; writes ``features`` (B, F), those of the first module first.
+    Reads the input keys of all modules; writes ``features`` (B, F), in the order of the modules.
 
     Args:
-        parts: :class:`Features`, or any TensorDict modules that write one key, or one that is named ``features``.
+        parts: :class:`Features`, or TensorDict modules that write a single key or a key named ``features``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -182,7 +182,7 @@ class Concat(TensorDictModuleBase):
     def __init__(self, *parts: TensorDictModuleBase, out_keys: Keys | None = None) -> None:
         super().__init__()
         if not parts or not all(isinstance(part, TensorDictModuleBase) for part in parts):
-            raise TypeError(f"parts must be at least one TensorDict module, got {parts!r:.200}")
+            raise TypeError(f"parts must be one or more TensorDict modules, got {parts!r:.200}")
         self.parts: Any = nn.ModuleList(parts)
         self.out_keys = as_keys("out_keys", out_keys, ("features",))
 
@@ -203,11 +203,11 @@ class Concat(TensorDictModuleBase):
 
     @property
     def config(self) -> dict[str, Any]:
-        """The arguments that rebuild it."""
+        """The arguments that reconstruct this module."""
         return {"*parts": list(self.parts), "out_keys": self.out_keys_source}
 
     def with_plans(self, plans: AnyPlans) -> Concat:
-        """Return the same features for other plans."""
+        """Return the same features for different plans."""
         parts = [follow(part, plans) for part in self.parts]
         return in_mode_of(self, Concat(*parts, out_keys=self.out_keys_source))
 
@@ -218,7 +218,7 @@ class Concat(TensorDictModuleBase):
 
 
 def as_features(features: nn.Module | None, layout: Layout, noise: float = 0.0) -> TensorDictModuleBase:
-    """Return features as a TensorDict module: a plain one reads ``observation``, None stands for the differences."""
+    """Convert features to a TensorDict module: a plain module reads ``observation``; None gives the differences."""
     if features is None:
         return ObservationFeatures(noise=noise, layout=layout)
     if isinstance(features, TensorDictModuleBase):
@@ -229,25 +229,25 @@ def as_features(features: nn.Module | None, layout: Layout, noise: float = 0.0) 
 
 
 def check_observation(observation: Tensor, layout: Layout) -> None:
-    """Raise :class:`ValueError` unless observations are floats (..., D) of a layout."""
+    """Raise a :class:`ValueError` unless observations are floats (..., D), with the D of the layout."""
     if observation.shape[-1:] != (layout.size,) or not observation.is_floating_point():
         got = f"{observation.dtype} of shape {tuple(observation.shape)}"
         raise ValueError(f"observation must be float32 of shape (..., {layout.size}), got {got}")
 
 
 def check_rows(rows: Tensor) -> None:
-    """Raise :class:`ValueError` unless there are rows to compute statistics from."""
+    """Raise a :class:`ValueError` if there are no rows to compute statistics from."""
     if not len(rows):
-        raise ValueError("fit needs at least one of rows, got none")
+        raise ValueError("rows must not be empty: fit needs at least one row")
 
 
 def relative(observation: Tensor, layout: Layout) -> Tensor:
-    """Return the pairwise differences between hand, objects and goal: metres, and squashed at 2 cm and at 10 cm.
+    """Return the differences between positions of hand, objects and goal, in metres and squashed at 2 cm and 10 cm.
 
-    With Meta-World's two objects, (..., 39) gives (..., 54). Differences to an object that a task lacks are 0.
+    For Meta-World (two objects), observations (..., 39) give (..., 54). Differences to an absent object are 0.
     """
     positions = [observation[..., place] for place in layout.positions]
-    # Positions of all zeros mark an absent object; only objects after the first can be absent.
+    # An all-zero position marks an absent object; only objects after the first can be absent.
     absent = {n: (positions[n] == 0).all(-1, keepdim=True) for n in range(2, len(positions) - 1)}
     pairs = []
     for first, second in combinations(range(len(positions)), 2):
@@ -260,13 +260,13 @@ def relative(observation: Tensor, layout: Layout) -> Tensor:
 
 
 def differences(observation: Tensor, layout: Layout) -> Tensor:
-    """Return :func:`relative`, the hand's height and the gripper's opening: (..., 39) gives (..., 56)."""
+    """Return :func:`relative` with the hand's height and the gripper's opening appended: (..., 39) gives (..., 56)."""
     height, opening = (observation[..., at : at + 1] for at in (layout.hand + 2, layout.opening))
     return torch.cat((relative(observation, layout), height, opening), -1)
 
 
 def squash(difference: Tensor) -> tuple[Tensor, Tensor]:
-    """Return metres through tanh at 2 cm, which shows alignment, and at 10 cm, which shows direction."""
+    """Squash differences in metres by tanh at 2 cm, which shows alignment, and at 10 cm, which shows direction."""
     return torch.tanh(difference / _FINE), torch.tanh(difference / _COARSE)
 
 
@@ -279,4 +279,4 @@ _KINDS: dict[str, Callable[[Tensor, Layout], Tensor]] = {
     "both": lambda observation, layout: torch.cat((observation, differences(observation, layout)), -1),
 }
 TRANSFERS = ("opening", "none")
-"""The kinds of features that mean the same in every layout."""
+"""The kinds of features that have the same meaning in every layout."""

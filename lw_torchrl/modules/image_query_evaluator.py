@@ -1,4 +1,4 @@
-"""ImageQueryEvaluator: a network that answers plans' conditions from camera pictures."""
+"""ImageQueryEvaluator: a network that evaluates plan conditions from camera pictures."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from lw_torchrl.modules.parts import MLP, materialize
 from lw_torchrl.modules.query_evaluator import Answers, ClauseEvaluator, ClauseNetwork, Clauses
 from lw_torchrl.transforms.camera import CameraTransform
 
-KEYS = 32  # size of the vector by which an object is located in a picture
-_KEPT = 16  # features at an object's place from which its position is estimated
-_LANDMARKS = 32  # points that are located in every picture
-_SHARP = 30.0  # scale of the scores in the softmax over a picture: at 1 a fresh network attends to the whole picture
-_LARGEST = 512  # pixels
+KEYS = 32  # size of the learned vector that represents an object
+_KEPT = 16  # number of features at an object's place from which its position is estimated
+_LANDMARKS = 32  # number of landmarks that are located in every picture
+_SHARP = 30.0  # scale of the attention scores; with 1, an untrained network would attend to the whole picture
+_LARGEST = 512  # maximum height and width of a picture, in pixels
 
 
 class SmallImageEncoder(nn.Module):
-    """Five convolutions from pictures (n, 3, H, W) float32 in [0, 1] to features (n, 32, H/2, W/2)."""
+    """A CNN that maps pictures (n, 3, H, W) float32 in [0, 1] to features (n, 32, H/2, W/2) by five convolutions."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -44,11 +44,11 @@ def _conv(before: int, after: int, stride: int = 1) -> nn.Sequential:
 
 
 class PointingNetwork(ClauseNetwork):
-    """A network that locates objects in pictures and judges clauses by their positions.
+    """A network that locates objects in pictures and evaluates clauses about their positions.
 
-    An object's learned vector is compared with the features at every place of each camera's picture; a softmax over the
-    places attends to one of them. From the mean coordinates and features there, and the coordinates of landmarks that
-    all objects share, an MLP estimates the object's position in metres and how far it is open.
+    In each camera's picture, an object's learned vector is compared with the features at every place, and a softmax
+    over the places attends to the object. From the attended coordinates and features, and from the coordinates of
+    landmarks that all objects share, an MLP estimates the object's position in metres and its opening.
 
     Source: the spatial softmax of 'Deep spatial autoencoders for visuomotor learning' (Finn et al., 2016).
     """
@@ -66,11 +66,11 @@ class PointingNetwork(ClauseNetwork):
         materialize(self.place, torch.zeros(1, cameras * (2 + _KEPT + 2 * _LANDMARKS) + KEYS))
 
     def forward(self, seen: Tensor, clauses: Clauses) -> Tensor:
-        """Return logits (B, Q) from pictures (B, H, W·C, 3) uint8 side by side and clauses (B, Q)."""
+        """Return logits (B, Q) of clauses (B, Q) from pictures (B, H, W·C, 3) uint8 of C cameras side by side."""
         return self.judge_at(self.places(seen, self.names.weight)[0], clauses)
 
     def judge_at(self, places: Tensor, clauses: Clauses) -> Tensor:
-        """Return logits (B, Q) of clauses (B, Q) about N objects at ``places`` (B, N, 4)."""
+        """Return logits (B, Q) of clauses (B, Q) from the positions and openings of N objects, ``places`` (B, N, 4)."""
         known = torch.cat((places, torch.zeros_like(places[:, :1])), -2)
         first, second = (
             known.gather(-2, which.unsqueeze(-1).expand(*which.shape, self.numbers))
@@ -79,10 +79,10 @@ class PointingNetwork(ClauseNetwork):
         return self.judge(first - second, clauses)
 
     def places(self, seen: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
-        """Locate objects, described by learned vectors (N, 32) float32, in pictures (B, H, W·C, 3) uint8.
+        """Locate objects, given by learned vectors (N, 32) float32, in pictures (B, H, W·C, 3) uint8.
 
         Returns:
-            Positions in metres and how far each object is open, (B, N, 4) float32; and the attention over each picture,
+            The objects' positions in metres and openings (B, N, 4) float32, and the attention over each picture
             (B, C, N, h, w) float32.
         """
         rows = len(seen)
@@ -103,25 +103,25 @@ class PointingNetwork(ClauseNetwork):
 
 
 IMAGE_ENCODERS = Registry("image encoder", "lw_torchrl.image_encoders", {"small": SmallImageEncoder}, is_function)
-"""Factories of picture encoders by name: modules from (n, 3, H, W) float32 in [0, 1] to features (n, F, h, w). Add your
-own, which may be frozen by ``requires_grad_(False)``, so that files can name it."""
+"""A registry of factories of picture encoders, which map (n, 3, H, W) float32 in [0, 1] to features (n, F, h, w).
+Register a custom encoder, frozen by ``requires_grad_(False)`` or not, so that saved files can refer to it by name."""
 
 
 class ImageQueryEvaluator(ClauseEvaluator):
-    """A query evaluator that answers conditions from camera pictures, by a network trained on exact answers.
+    """A query evaluator that predicts conditions from camera pictures, with a network trained on exact answers.
 
-    Reads ``pixels`` (B, height, width·C, 3) uint8, of C cameras side by side, and ``task_id`` (B,) int64; writes
+    Reads ``pixels`` (B, height, width·C, 3) uint8 of C cameras side by side, and ``task_id`` (B,) int64; writes
     ``qaf`` and ``qaf_logits`` (B, S) float32 as :class:`QueryEvaluator` does. See :class:`PointingNetwork` for the
-    network. ``transform()`` returns the :class:`CameraTransform` that renders its pictures.
+    network. ``transform()`` returns the :class:`CameraTransform` that renders the pictures.
 
     Args:
-        plans, answers, predicates: as for :class:`~lw_torchrl.modules.query_evaluator.ClauseEvaluator`, with its
-            errors and source.
-        cameras, height, width: as for :class:`CameraTransform`; at most 512 pixels.
-        every: take a picture every N steps when it acts; the answers stay the same in between.
+        plans, answers, predicates: see :class:`~lw_torchrl.modules.query_evaluator.ClauseEvaluator`, also for the
+            errors.
+        cameras, height, width: see :class:`CameraTransform`; height and width are at most 512 pixels.
+        every: render a picture every N time steps; the answers stay the same in between.
         encoder: a name in :data:`IMAGE_ENCODERS`.
-        hidden, depth: units and number of the hidden layers of the network that judges differences.
-        names: the objects that it can tell apart; None for those of the plans' tasks.
+        hidden, depth: units per hidden layer and number of hidden layers of the network that evaluates clauses.
+        names: the objects that the network can distinguish; None for the objects of the plans' tasks.
 
     Example:
         >>> import lw_torchrl as lw
@@ -133,7 +133,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
     network: PointingNetwork
     seen_dims = 3
     rows_at_once = 4
-    """Number of rows that are evaluated together when it acts, so that results do not depend on other rows."""
+    """Number of rows per forward pass in a rollout; fixed, so that results do not depend on other rows."""
 
     @typed
     def __init__(
@@ -174,7 +174,7 @@ class ImageQueryEvaluator(ClauseEvaluator):
         self.config |= dict(hidden=hidden, depth=depth, names=list(self.names))
 
     def transform(self) -> CameraTransform:
-        """Return a new transform that renders its pictures."""
+        """Return a new transform that renders the pictures that this module reads."""
         return CameraTransform(self.cameras, height=self.height, width=self.width, every=self.every)
 
     def check_seen(self, seen: Tensor) -> None:
@@ -186,10 +186,10 @@ class ImageQueryEvaluator(ClauseEvaluator):
 
 @torch.no_grad()
 def _num_features(encoder: nn.Module, name: str, height: int, width: int) -> int:
-    """Return F, the number of features that an encoder returns."""
+    """Return F, the number of channels of an encoder's feature map."""
     features = encoder(torch.zeros(1, 3, height, width))
     is_tensor = isinstance(features, Tensor)
     if not is_tensor or features.dim() != 4 or len(features) != 1 or not features.is_floating_point():
         got = tuple(features.shape) if is_tensor else type(features).__name__
-        raise ValueError(f"encoder {name!r} must return a map of features (n, F, h, w), got {got}")
+        raise ValueError(f"encoder {name!r} must return a feature map (n, F, h, w), got {got}")
     return features.shape[1]

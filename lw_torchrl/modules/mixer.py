@@ -1,4 +1,4 @@
-"""Mix skills by attention: SkillMixer mixes their latents, ActionMixer the actions that are decoded from them."""
+"""Mixers of skills by attention: SkillMixer mixes latents, ActionMixer mixes the actions decoded from latents."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from lw_torchrl.modules.parts import MLP, Part, Width, in_mode_of, materialize, 
 
 
 def unit_scale(vectors: Tensor) -> Tensor:
-    """Rescale vectors (n, E) to a root mean square of 1: a fresh network hardly tells smaller vectors apart."""
+    """Rescale vectors (n, E) to an RMS of 1: a freshly initialized network can hardly distinguish smaller vectors."""
     vectors = vectors.to(torch.float32)
     return vectors / vectors.square().mean(-1, keepdim=True).sqrt().clamp(min=1e-6)
 
 
 class SkillEncoder(MLP):
-    """An MLP from a skill's vector (K, E) to its latent (K, D).
+    """An MLP that maps skill vectors (K, E) to skill latents (K, D).
 
     Args:
-        latent_size: D.
-        width, depth: units and number of the hidden layers.
+        latent_size: D, the size of a latent.
+        width, depth: units per hidden layer and number of hidden layers; a sequence of widths sets both.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -43,7 +43,7 @@ class SkillEncoder(MLP):
 
 
 class _Mixer(Part):
-    """Base of the mixers: the vector of each different skill, and the index of each step's skill."""
+    """A base class of mixers, which hold the vectors of the distinct skills and the index of each plan step's skill."""
 
     index: Tensor
     vectors: Tensor
@@ -55,52 +55,52 @@ class _Mixer(Part):
             index, vectors = _vectors_of_roles(self.plans, self.tables)
         else:
             index, vectors = self.tables.skill_index, encoded(self.plans.skills, text_encoder)
-        # The tables come from the plans, not from training: they are not part of the state that is saved.
+        # The tables are computed from the plans, so the state_dict does not need them.
         self.register_buffer("index", index, persistent=False)  # (T, S) int64
         self.register_buffer("vectors", unit_scale(vectors), persistent=False)  # (K, E) float32
         self.encoder = SkillEncoder() if encoder is None else encoder
         materialize(self.encoder, self.vectors)
-        if (weight := next(self.encoder.parameters(), None)) is not None:  # with_plans: an encoder that was moved
+        if (weight := next(self.encoder.parameters(), None)) is not None:  # the encoder may be on a GPU
             self.index, self.vectors = self.index.to(weight.device), self.vectors.to(weight)
         self.latent_size = probe(self.encoder, self.vectors).shape[-1]
 
     @property
     def text_vectors(self) -> Tensor | None:
-        """The vectors of the skills' texts, (K, E) float32; None for skills that are encoded by their roles."""
+        """The embeddings (K, E) float32 of the skill texts; None for skills that are encoded by their roles."""
         return None if self.plans.has_roles else self.vectors
 
     def with_plans(self, plans: AnyPlans) -> Self:
-        """Return a mixer of other plans' skills with the same networks: training either trains both."""
+        """Return a mixer for different plans that shares the networks: training one also trains the other."""
         other = type(self)(**{**self.config, "plans": plans, "text_encoder": self.text_encoder})
         return in_mode_of(self, other.to(self.index.device))
 
     def latents(self) -> Tensor:
-        """Return the latent of each different skill, (K, D)."""
+        """Return the latents (K, D) of the distinct skills."""
         latents: Tensor = self.encoder(self.vectors)
         return latents
 
     def per_skill(self, weights: Tensor, task_id: Tensor, latents: Tensor) -> Tensor:
-        """Sum attention over steps (..., S) to attention over the K different skills, (..., K)."""
+        """Sum the attention over plan steps (..., S) to attention over the K distinct skills (..., K)."""
         zeros = weights.new_zeros((*weights.shape[:-1], len(latents)))
         rows = self.tables.rows(one_per_row(task_id, weights))
         return zeros.scatter_add(-1, pick(self.index, rows), weights).to(latents.dtype)
 
 
 class SkillMixer(_Mixer):
-    """Encode each skill's text to a latent, and mix the latents by the attention over the plan's steps.
+    """A module that encodes each skill's text to a latent, and mixes the latents by attention over the plan's steps.
 
-    Plans whose steps carry roles, see :func:`~lw_torchrl.canonical_plans`, are encoded by verb and manner, not by text.
+    If plan steps have roles (see :func:`~lw_torchrl.canonical_plans`), the vectors encode verb and manner, not text.
 
     Reads ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64; writes ``skill_latent`` (B, D) float32.
 
     Args:
         plans: the plans whose skills are mixed.
-        encoder: any module from K skill vectors (K, E) float32 to latents (K, D); None for :class:`SkillEncoder`.
-        text_encoder: a function from n texts to vectors (n, E) float32; None for the shipped sentence encoder.
-        in_keys, out_keys: other names for what it reads and writes, in the order above; nested keys are allowed.
+        encoder: a module that maps K skill vectors (K, E) float32 to latents (K, D); None for :class:`SkillEncoder`.
+        text_encoder: a function that maps n texts to vectors (n, E) float32; None for the shipped sentence encoder.
+        in_keys, out_keys: replacements for the default keys, in the order above; nested keys are allowed.
 
     Raises:
-        ImportError: a skill's text is not shipped, and the extra ``[text]`` is not installed.
+        ImportError: a skill text has no precomputed embedding, and the extra ``[text]`` is not installed.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -132,19 +132,19 @@ class SkillMixer(_Mixer):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         weights, task_id = read(tensordict, self.in_keys)
         latents = self.latents()
-        # One matrix product over the K skills is faster than picking a latent for each step, (B, S, D).
+        # One matrix product over the K skills is faster than gathering a latent for each step (B, S, D).
         return write(tensordict, self, [self.per_skill(weights, task_id, latents) @ latents])
 
 
 class ActionMixer(_Mixer):
-    """Decode each skill's latent to an action, and mix the actions by the attention over the plan's steps.
+    """A module that decodes each skill's latent to an action, and mixes the actions by attention over the plan's steps.
 
-    It replaces :class:`SkillMixer` and the decoder. Reads ``skill_weights`` (B, S) float32, ``task_id``
+    This module replaces :class:`SkillMixer` and the decoder. Reads ``skill_weights`` (B, S) float32, ``task_id``
     (B,) int64 and ``features`` (B, F) float32; writes ``action`` (B, A) float32.
 
     Args:
-        plans, encoder, text_encoder, in_keys, out_keys: as for :class:`SkillMixer`.
-        decoder: any module from a latent and the features, (..., D + F) float32, to an action (..., A).
+        plans, encoder, text_encoder, in_keys, out_keys: see :class:`SkillMixer`.
+        decoder: a module that maps a latent and the features (..., D + F) float32 to an action (..., A).
 
     Example:
         >>> import lw_torchrl as lw
@@ -155,7 +155,7 @@ class ActionMixer(_Mixer):
         >>> actor.in_keys
         ['qaf', 'task_id', 'observation']
 
-    Source: a mixture of experts; the paper mixes latents.
+    Source: mixtures of experts; the paper mixes latents instead of actions.
     """
 
     _options = ("plans", "decoder", "encoder")
@@ -186,7 +186,7 @@ class ActionMixer(_Mixer):
 
 
 def _vectors_of_roles(plans: Plans, tables: PlanTables) -> tuple[Tensor, Tensor]:
-    """Return the index (T, S) int64 of each step's vector, and the different vectors (K, E) float32."""
+    """Return the index (T, S) int64 of each plan step's vector, and the distinct vectors (K, E) float32."""
     index, numbers = torch.zeros_like(tables.skill_index), dict[tuple[float, ...], int]()
     for task, plan in sorted(plans.items()):
         for step, vector in enumerate(role_vectors([step.role for step in plan.steps if step.role is not None])):

@@ -1,4 +1,4 @@
-"""Building blocks of policies: multilayer perceptrons, parts, and sequences whose named parts can be replaced."""
+"""Building blocks of policies: MLPs, parts, and sequences whose named parts can be replaced."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ Width = Count | Sequence[Count]
 
 
 class MLP(TorchRLMLP):
-    """TorchRL's MLP with ReLU, whose input width is that of the first input. Several inputs are concatenated.
+    """TorchRL's MLP with ReLU, which infers its input width from the first input and concatenates several inputs.
 
-    A sequence of widths gives the hidden layers and replaces ``depth``.
+    A sequence of widths sets the hidden layers and overrides ``depth``.
     """
 
     def __init__(self, out_features: int, *, width: Width = 256, depth: int = 3, layer_norm: bool = False) -> None:
@@ -45,7 +45,7 @@ class MLP(TorchRLMLP):
 
 @torch.no_grad()
 def materialize(module: nn.Module, *inputs: Tensor) -> None:
-    """Give a module's lazy layers their shapes by a forward pass, if it has lazy layers."""
+    """Initialize the lazy layers of a module, if any, by a forward pass."""
     if any(isinstance(parameter, nn.parameter.UninitializedParameter) for parameter in module.parameters()):
         with evaluating(module):
             module(*inputs)
@@ -53,7 +53,7 @@ def materialize(module: nn.Module, *inputs: Tensor) -> None:
 
 @torch.no_grad()
 def probe(module: nn.Module, example: Tensor) -> Any:
-    """Return a module's output for an example, moved to its device, without drawing from the global generator."""
+    """Return a module's output for an example (moved to the module's device); keep the global random state."""
     weight = next(module.parameters(), None)
     with evaluating(module), torch.random.fork_rng(devices=[]):
         return module(example if weight is None else example.to(weight.device))
@@ -61,7 +61,7 @@ def probe(module: nn.Module, example: Tensor) -> Any:
 
 @contextmanager
 def evaluating(network: nn.Module) -> Iterator[None]:
-    """Put a network into eval mode within the block; afterwards each of its modules is in its own mode again."""
+    """Put a network into eval mode within a ``with`` block, and then restore the mode of every submodule."""
     modes = [(module, module.training) for module in network.modules()]
     network.eval()
     try:
@@ -72,7 +72,7 @@ def evaluating(network: nn.Module) -> Iterator[None]:
 
 
 def in_mode_of(own: nn.Module, other: Module) -> Module:
-    """Return the other module in train or eval mode as ``own`` is; the modules that both share keep their modes."""
+    """Set ``other`` itself, not its submodules, to the train or eval mode of ``own``, and return ``other``."""
     other.training = own.training
     return other
 
@@ -81,9 +81,9 @@ def in_mode_of(own: nn.Module, other: Module) -> Module:
 
 
 class Part(TensorDictModuleBase):
-    """Base of the parts of a policy. ``reads`` and ``writes`` are the default names of its keys."""
+    """A base class of policy parts. ``reads`` and ``writes`` are the default input and output keys."""
 
-    _options: ClassVar[Sequence[str]] = ()  # arguments of the constructor, which are attributes of the same names
+    _options: ClassVar[Sequence[str]] = ()  # constructor arguments that are also attributes
 
     def __init__(
         self, reads: Sequence[str], writes: Sequence[str], in_keys: Keys | None, out_keys: Keys | None
@@ -94,26 +94,26 @@ class Part(TensorDictModuleBase):
 
     @property
     def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
+        """The keyword arguments that reconstruct this module."""
         options = {name: getattr(self, name) for name in self._options}
         return {**options, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
 
 
 class RenamedInputs(TensorDictModuleBase):
-    """Base of modules that hold TensorDict modules, which read the new names that are assigned to ``in_keys``.
+    """A base class of modules whose ``in_keys`` can be assigned, which renames the keys that their submodules read.
 
-    Another module that shares parts with this one keeps reading the names that it read.
+    Other modules that share these submodules keep their own keys.
     """
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """What is read. New names can be assigned, in the same order."""
+        """The keys that the module reads. New keys can be assigned, in the same order."""
         return self._in_keys
 
     @in_keys.setter
     def in_keys(self, keys: Keys) -> None:
         before = self.__dict__.get("_in_keys")
-        if before is not None:  # not in the constructor, where the parts read these names already
+        if before is not None:  # false in the constructor, where the parts already read these keys
             keys = as_keys("in_keys", keys, list(map(str, before)))
             check_apart(keys, self.out_keys_source)
             renamed = dict(zip(before, keys, strict=True))
@@ -121,12 +121,12 @@ class RenamedInputs(TensorDictModuleBase):
         self._in_keys = list(keys)
 
 
-# Two policies may share a part, and each must keep the names that it reads. So renaming copies the module objects, but
-# not their weights.
+# Two policies may share a part, and each policy must keep its own keys. So renaming copies the module objects, but not
+# their weights.
 
 
 def _reading(module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any], in_order: bool) -> Any:
-    """Return a module on the same weights that reads renamed keys; ``copies`` are those made so far."""
+    """Return a copy of a module that shares the weights and reads renamed keys; ``copies`` holds earlier copies."""
     if not isinstance(module, (TensorDictModuleBase, nn.ModuleDict, nn.ModuleList)):
         return module
     if module not in copies:
@@ -142,7 +142,7 @@ def _rename_parts(
 ) -> None:
     """Replace a module's parts by copies that read renamed keys.
 
-    Parts that run ``in_order`` read a key that an earlier part writes by its old name.
+    If the parts run ``in_order``, later parts read a key that an earlier part writes by its old name.
     """
     in_sequence, remaining, parts = isinstance(module, TensorDictSequential), renamed, {}
     for name, part in module._modules.items():
@@ -156,19 +156,19 @@ def _rename_parts(
 
 
 class NamedParts(RenamedInputs, TensorDictSequential):
-    """A sequence of named parts: ``actor.decoder`` is a part, and ``actor.decoder = network`` replaces it."""
+    """A sequence of named parts: ``actor.decoder`` is a part, and ``actor.decoder = network`` replaces this part."""
 
     @any_arguments
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         return super().forward(*args, **kwargs)
 
     def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
-        """Return a module as the part ``name``: a plain module reads and writes the keys of the part before it."""
+        """Convert a module to the part ``name``; a plain module gets the keys of the part that it replaces."""
         before = self.module[name]
         if not isinstance(module, TensorDictModuleBase):
             return TensorDictModule(module, in_keys=before.in_keys[:1], out_keys=before.out_keys)
         if missing := [key for key in before.out_keys_source if key not in module.out_keys_source]:
-            raise ValueError(f"{name} must write {before.out_keys_source}, which later parts read; it lacks {missing}")
+            raise ValueError(f"{name} must write {before.out_keys_source}, which later parts read; missing: {missing}")
         return module
 
     def __getattr__(self, name: str) -> Any:
@@ -178,10 +178,10 @@ class NamedParts(RenamedInputs, TensorDictSequential):
     def __setattr__(self, name: str, value: Any) -> None:
         parts = self.__dict__.get("_modules", {}).get("module") or {}
         if name not in parts:
-            # A misspelt part would be a new attribute that nothing uses. Users' subclasses may have more modules.
+            # A misspelt part name would create an attribute that nothing uses. Users' subclasses may add modules.
             if parts and isinstance(value, nn.Module) and type(self).__module__.startswith("lw_torchrl."):
-                own = f"{type(self).__name__} has the parts {', '.join(parts)}"
-                raise AttributeError(f"{own}, and no {name}; a part holds its own modules: actor.mixer.encoder")
+                available = f"{type(self).__name__} has the parts {', '.join(parts)}"
+                raise AttributeError(f"{available}, but no {name}; set a part's modules like actor.mixer.encoder")
             super().__setattr__(name, value)
             return
         if not isinstance(value, nn.Module):
@@ -194,15 +194,15 @@ class NamedParts(RenamedInputs, TensorDictSequential):
 
     @property
     def out_keys(self) -> list[NestedKey]:
-        """What is written. Parts have their own ``out_keys``: assign theirs, or give them to the constructor."""
+        """The keys that the sequence writes. To rename them, use the ``out_keys`` of a part or of the constructor."""
         return self._out_keys_apparent
 
     @out_keys.setter
     def out_keys(self, keys: Keys) -> None:
         if list(keys) != self._complete_out_keys:
             raise ValueError(
-                f"out_keys of a {type(self).__name__} cannot be assigned, got {list(keys)}; give out_keys= to its "
-                "constructor, or use select_out_keys to write fewer"
+                f"out_keys of a {type(self).__name__} cannot be assigned, got {list(keys)}; pass out_keys= to the "
+                "constructor, or use select_out_keys to write fewer keys"
             )
         self._out_keys = self._out_keys_apparent = list(keys)
 
@@ -212,7 +212,7 @@ class NamedParts(RenamedInputs, TensorDictSequential):
 
 
 def action_spec(key: NestedKey, layout: Layout) -> Composite:
-    """Return the specification of actions of a layout, (A,) float32 in [-1, 1]."""
+    """Return the spec of a layout's actions, (A,) float32 in [-1, 1]."""
     spec = Composite()
     spec[key] = Bounded(-1.0, 1.0, (layout.action_size,))
     return spec
@@ -222,30 +222,30 @@ def action_spec(key: NestedKey, layout: Layout) -> Composite:
 
 
 def check_same_plans(parts: Mapping[str, nn.Module]) -> None:
-    """Raise :class:`ValueError` unless all parts follow the same plans."""
+    """Raise a :class:`ValueError` unless all parts follow the same plans."""
     followed = [(name, plans) for name, part in parts.items() if (plans := _plans_inside(part)) is not None]
     for name, plans in followed[1:]:
         if plans is not followed[0][1] and plans != followed[0][1]:
-            raise ValueError(f"{followed[0][0]} and {name} must follow the same plans; give both the same Plans")
+            raise ValueError(f"{followed[0][0]} and {name} must follow the same plans; pass the same Plans to both")
 
 
 def _plans_inside(part: nn.Module) -> Any:
-    """Return the plans of a part, or of its own parts, such as features that are concatenated; else None."""
+    """Return the plans of a part or of its first submodule with plans; None if no submodule has plans."""
     return next((plans for each in part.modules() if (plans := getattr(each, "plans", None)) is not None), None)
 
 
 def follow(part: Any, plans: AnyPlans) -> Any:
-    """Return a part that follows other plans, with the same networks; a part without plans is returned itself.
+    """Return a part that follows different plans but shares the networks; a part without plans is returned unchanged.
 
     Raises:
-        TypeError: the part follows plans, and has no method ``with_plans``.
+        TypeError: the part follows plans but has no method ``with_plans``.
     """
     if hasattr(part, "with_plans"):
         return part.with_plans(plans)
     if isinstance(part, nn.Module) and _plans_inside(part) is None:
         return part
     if type(part) is not TensorDictSequential:
-        raise TypeError(f"{type(part).__name__} cannot follow other plans: give it a method with_plans(plans)")
+        raise TypeError(f"{type(part).__name__} cannot follow other plans: add a method with_plans(plans)")
     parts = {name: follow(each, plans) for name, each in part.module._modules.items()}
     named = isinstance(part.module, nn.ModuleDict)
     other = TensorDictSequential(OrderedDict(parts)) if named else TensorDictSequential(*parts.values())
@@ -259,7 +259,7 @@ def _named_parts(trunk: TensorDictSequential) -> list[Any]:
 
 
 def trunk_attributes(trunk: TensorDictSequential) -> tuple[Any, Any, Layout]:
-    """Return ``plans``, ``tasks`` and ``layout`` of a trunk's first part with a layout; the first two may be None."""
+    """Return ``plans`` and ``tasks`` (or None) and ``layout`` of the first part of a trunk that has a layout."""
     part = next((part for part in _named_parts(trunk) if hasattr(part, "layout")), None)
     if part is None:
         raise ValueError("trunk must have a part with a layout: PlanAttention, SkillMixer, TaskLatent or features")
@@ -267,22 +267,22 @@ def trunk_attributes(trunk: TensorDictSequential) -> tuple[Any, Any, Layout]:
 
 
 def encoding_width(trunk: TensorDictSequential) -> int | None:
-    """Return D + F, the size of the trunk's latent and features together; None if its parts do not state it."""
+    """Return D + F, the total size of a trunk's latent and features; None if the parts do not state their sizes."""
     latent, features = _named_parts(trunk)[-2:]
     size, width = getattr(latent, "latent_size", None), getattr(features, "width", None)
     return None if size is None or width is None else size + width
 
 
 def encoding_keys(trunk: TensorDictSequential) -> list[NestedKey]:
-    """Return the keys of the trunk's latent and of its features, which its last two parts write."""
+    """Return the keys of a trunk's latent and features, which the last two parts write."""
     return [written_key(part) for part in _named_parts(trunk)[-2:]]
 
 
 def written_key(part: TensorDictModuleBase) -> NestedKey:
-    """Return the key that a part writes; if it writes several, the one that is named ``features``."""
+    """Return the key that a part writes; if the part writes several keys, return the key named ``features``."""
     keys: list[NestedKey] = list(part.out_keys_source)
     named = keys if len(keys) == 1 else [key for key in keys if last_name(key) == "features"]
     if len(named) != 1:
         kind = type(part).__name__
-        raise ValueError(f"features must write one key, or one of them named 'features'; {kind} writes {keys}")
+        raise ValueError(f"features must write a single key or a key named 'features', but {kind} writes {keys}")
     return named[0]

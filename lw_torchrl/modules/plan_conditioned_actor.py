@@ -1,4 +1,4 @@
-"""PlanConditionedActor: a conditional plan as a policy, in four parts that can be replaced."""
+"""PlanConditionedActor: a policy that follows a conditional plan, with four replaceable parts."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def plan_trunk(
     features: nn.Module | None = None,
     text_encoder: TextEncoder | None = None,
 ) -> TensorDictSequential:
-    """Return attention, mixer and features as one sequence: the latent of the active skills, and the features.
+    """Build a trunk of attention, mixer and features, which writes the latent of the active skills and the features.
 
     Reads ``qaf`` (B, S) bool, ``task_id`` (B,) int64 and ``observation`` (B, 39) float32; writes ``skill_weights``
-    (B, S), ``skill_latent`` (B, D) and ``features`` (B, F) float32. The arguments are :class:`PlanConditionedActor`'s,
-    but the default features have no noise.
+    (B, S), ``skill_latent`` (B, D) and ``features`` (B, F) float32. See :class:`PlanConditionedActor` for the
+    arguments; here the default features have no noise.
     """
     attention, mixer = PlanAttention(plans), SkillMixer(plans, skill_encoder, text_encoder=text_encoder)
     features = as_features(features, mixer.plans.layout)
@@ -42,17 +42,18 @@ def plan_trunk(
 
 
 class ConditionedActor(NamedParts):
-    """A policy made of a trunk, which writes a latent and features, and a decoder, which maps them to the action.
+    """A policy made of a trunk, which writes a latent and features, and a decoder, which maps both to the action.
 
-    Reads what the trunk reads; writes what the trunk and the decoder write, ``action`` (B, A) float32 last. Each part
-    is an attribute of its name, and can be replaced: ``actor.decoder = network``.
+    Reads the trunk's input keys; writes the output keys of trunk and decoder, ``action`` (B, A) float32 last. Each part
+    is an attribute and can be replaced: ``actor.decoder = network``.
 
     Args:
-        trunk: a sequence of named parts; the last two keys that it writes are a latent (B, D) and features (B, F).
-        decoder: any module from latent and features, (B, D + F) float32, to the action (B, A), or a TensorDict module;
+        trunk: a sequence of named parts; the last two keys that the trunk writes are a latent (B, D) and
+            features (B, F).
+        decoder: a module that maps latent and features (B, D + F) float32 to the action (B, A), or a TensorDict module;
             None for :class:`MLPDecoder`.
-        in_keys: other names for what the policy reads, in the order of ``in_keys``; nested keys are allowed.
-        out_keys: the names of what a plain decoder returns; None for ``action``.
+        in_keys: replacements for the keys that the policy reads, in the order of ``in_keys``; nested keys are allowed.
+        out_keys: the keys for the outputs of a plain decoder; None for ``action``.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -86,46 +87,46 @@ class ConditionedActor(NamedParts):
 
     @classmethod
     def rebuild(cls, trunk: TensorDictSequential, decoder: TensorDictModuleBase) -> Self:
-        """Return an actor of these parts."""
+        """Build an actor from a trunk and a decoder."""
         actor = cls.__new__(cls)
-        ConditionedActor.__init__(actor, trunk, decoder)  # subclasses have other arguments
+        ConditionedActor.__init__(actor, trunk, decoder)  # the arguments of subclasses differ
         return actor
 
     @property
     def config(self) -> dict[str, Any]:
-        """The arguments of :meth:`rebuild`, from which a file builds the actor again."""
+        """The arguments of :meth:`rebuild`, from which a saved actor is reconstructed."""
         return {"trunk": self.trunk, "decoder": self.decoder}
 
     @property
     def trunk(self) -> TensorDictSequential:
-        """All parts but the decoder, with the same weights; critics can be built on it."""
+        """The policy without its decoder. The trunk shares the policy's weights; critics can be built on the trunk."""
         return TensorDictSequential(OrderedDict([*self.module.items()][:-1]))
 
     @property
     def spec(self) -> Composite:
-        """The specification of the action, (A,) float32 in [-1, 1], which TorchRL's losses read."""
+        """The spec of the action, (A,) float32 in [-1, 1], which TorchRL's losses read."""
         written = self.decoder.out_keys_source
         return action_spec(written[0] if len(written) == 1 else "action", self.layout)
 
     def with_plans(self, plans: AnyPlans) -> Self:
-        """Return an actor with the same networks that follows other plans: training either trains both."""
+        """Return an actor that follows different plans but shares the networks: training one also trains the other."""
         parts = {name: follow(part, plans) for name, part in self.module.items()}
         decoder = parts.pop("decoder")
         return in_mode_of(self, self.rebuild(TensorDictSequential(OrderedDict(parts)), decoder))
 
     def stochastic(self, distribution: DistributionName = "tanh_normal", init_std: float = 0.3) -> StochasticActor:
-        """Return a copy that draws its actions, for RL, see :class:`~lw_torchrl.modules.StochasticActor`."""
+        """Return a copy that samples its actions, for RL; see :class:`~lw_torchrl.modules.StochasticActor`."""
         from lw_torchrl.modules.stochastic import StochasticActor
 
         return StochasticActor.of(self, distribution, init_std)
 
 
 class PlanConditionedActor(ConditionedActor):
-    """Plan Conditioned Behavioral Cloning's policy.
+    """The policy of Plan Conditioned Behavioral Cloning.
 
-    The policy attends to the skills whose conditions are true (to all alike if none is), mixes their latents, and
-    decodes the mixture and the observation's features into an action. With B rows, S steps of the longest plan and
-    latents of size D:
+    The policy attends to the skills whose conditions are true (to all equally if none is), mixes their latents, and
+    decodes the mixture and the observation's features into an action. The parts, for B rows, S steps in the
+    longest plan and latents of size D:
 
     ====================  ============================================  =================================
     part                  reads                                         writes
@@ -136,23 +137,24 @@ class PlanConditionedActor(ConditionedActor):
     ``decoder``           ``skill_latent``, ``features``                ``action`` (B, 4) float32
     ====================  ============================================  =================================
 
-    Each part is an attribute and can be replaced: ``actor.decoder = network``. Features draw noise only in training;
-    a trainer, or :func:`~lw_torchrl.training.fit_normalization`, fits their statistics.
+    Each part is an attribute and can be replaced: ``actor.decoder = network``. Features add noise only in training;
+    a trainer or :func:`~lw_torchrl.training.fit_normalization` fits the statistics of the features.
 
     Args:
         plans: a plan for each task that the policy will see.
-        skill_encoder: any module from skill vectors (K, E) to latents (K, D); None for :class:`SkillEncoder`.
-        features: any module from an observation to features (B, F), or a TensorDict module with other inputs; None for
-            :class:`ObservationFeatures` with noise 0.05. Several are joined by :class:`Concat`.
-        decoder: any module from (B, D + F) to the action (B, A), or a TensorDict module; None for :class:`MLPDecoder`.
-        text_encoder: a function from n texts to vectors (n, E) float32; None for the shipped sentence encoder.
-        in_keys: other names for ``qaf``, ``task_id`` and ``observation``; nested keys are allowed. With fallback steps,
-            see :func:`~lw_torchrl.canonical_plans`, ``turn`` stands before ``observation``.
-        out_keys: the names of what a plain decoder returns; None for ``action``.
+        skill_encoder: a module that maps skill vectors (K, E) to latents (K, D); None for :class:`SkillEncoder`.
+        features: a module that maps an observation to features (B, F), or a TensorDict module with any input keys; None
+            for :class:`ObservationFeatures` with noise 0.05. :class:`Concat` joins several feature modules.
+        decoder: a module that maps (B, D + F) to the action (B, A), or a TensorDict module; None for
+            :class:`MLPDecoder`.
+        text_encoder: a function that maps n texts to vectors (n, E) float32; None for the shipped sentence encoder.
+        in_keys: replacements for the keys ``qaf``, ``task_id`` and ``observation``; nested keys are allowed. For plans
+            with fallback steps (see :func:`~lw_torchrl.canonical_plans`), ``turn`` comes before ``observation``.
+        out_keys: the keys for the outputs of a plain decoder; None for ``action``.
 
     Raises:
-        ValueError: at call time, a task without a plan, or ``qaf`` of other plans.
-        ImportError: a skill's text is not shipped, and the extra ``[text]`` is not installed.
+        ValueError: at call time, a task has no plan, or ``qaf`` belongs to other plans.
+        ImportError: a skill text has no precomputed embedding, and the extra ``[text]`` is not installed.
 
     Example:
         >>> import lw_torchrl as lw

@@ -1,4 +1,4 @@
-"""Functions that return the plans of any actor, its tasks, and the transforms that must run before it."""
+"""Functions that make a policy, and that return the plans, tasks, layout and transforms of any actor."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ METHODS: Registry[Method] = Registry(
     },
     is_function,
 )
-"""Functions from plans, and keyword arguments, to an actor: conditioned on plans, on descriptions, or on numbers."""
+"""A registry of functions that make an actor from plans and keyword arguments."""
 
 
 def descriptor_actor(plans: AnyPlans, **options: Any) -> TensorDictModuleBase:
@@ -40,18 +40,18 @@ def descriptor_actor(plans: AnyPlans, **options: Any) -> TensorDictModuleBase:
 
 
 def one_hot_actor(plans: AnyPlans, **options: Any) -> TensorDictModuleBase:
-    """Return an actor for the tasks of ``plans`` that knows only the task's number."""
+    """Return an actor for the tasks of ``plans`` that is conditioned on a one-hot vector of the task."""
     return descriptor_actor(plans, condition="one-hot", **options)
 
 
 @typed
 def make_policy(method: str, plans: AnyPlans, **options: Any) -> TensorDictModuleBase:
-    """Return a policy of a method for the tasks of some plans.
+    """Make an untrained policy by the name of its method, for the tasks of ``plans``.
 
     Args:
-        method: a name in :data:`METHODS`; another is a :class:`ValueError` that names the nearest.
-        plans: the plans that it follows, or, for a method without plans, those of its tasks.
-        **options: of the method, for example ``features`` and ``decoder``.
+        method: a name in :data:`METHODS`; an unknown name raises a :class:`ValueError` that suggests the nearest name.
+        plans: the plans that the policy follows; a method without plans uses only their tasks.
+        **options: keyword arguments of the method, for example ``features`` and ``decoder``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -72,49 +72,49 @@ def _first(actor: Any, name: str) -> Any:
 
 
 def plans_of(actor: Any) -> Plans | None:
-    """Return the plans that an actor, or one of its parts, follows; None if it follows none."""
+    """Return the plans that an actor, or one of its parts, follows; None if there are no plans."""
     plans: Plans | None = _first(actor, "plans")
     return plans
 
 
 def tasks_of(actor: Any) -> tuple[str, ...] | None:
-    """Return the tasks that an actor knows: its own ``tasks``, or those of its plans; None if unknown."""
+    """Return the tasks that an actor, or one of its parts, knows; None if no part has the attribute ``tasks``."""
     tasks = _first(actor, "tasks")
     return None if tasks is None else tuple(tasks)
 
 
 def layout_of(actor: Any) -> Layout:
-    """Return the layout of an actor's observations: its own ``layout``, that of its plans, or Meta-World's."""
+    """Return the layout of an actor's observations: that of the actor, its plans or its parts, or Meta-World's."""
     own, plans = getattr(actor, "layout", None), plans_of(actor)
     layout: Layout = own or (plans.layout if plans is not None else _first(actor, "layout")) or METAWORLD
     return layout
 
 
 def draws(actor: Any) -> bool:
-    """Return whether an actor draws random numbers even without exploration: actions then depend on earlier calls."""
+    """Return whether an actor draws random numbers without exploration, so that actions depend on earlier calls."""
     return any(getattr(part, "draws", False) for part in _parts(actor))
 
 
 def with_plans(actor: Any, plans: AnyPlans) -> Any:
-    """Return an actor with the same networks that follows other plans: training either trains both.
+    """Return an actor that follows different plans but shares the networks: training one also trains the other.
 
     Raises:
-        TypeError: the actor follows no plans, or cannot follow others.
-        ValueError: the plans do not fit, for example because they have no roles.
+        TypeError: the actor follows no plans, or cannot follow other plans.
+        ValueError: the plans do not fit the actor, for example because the plans have no roles.
     """
     plans = as_plans(plans)
     if plans_of(actor) is None:
-        raise TypeError(f"with_plans needs an actor that follows plans, and this {type(actor).__name__} does not")
+        raise TypeError(f"with_plans needs an actor with plans, got {type(actor).__name__} without plans")
     return follow(actor, plans)
 
 
 def transform_of(actor: Any, plans: Plans | None = None) -> Transform | None:
-    """Return a new transform that writes the keys that an actor reads and an environment lacks; None if none.
+    """Return a new transform that writes the keys that an actor reads but an environment lacks; None if not needed.
 
     Args:
-        actor: any actor; a part with a method ``transform()`` states its own.
-        plans: the plans whose conditions are answered even if the actor does not read ``qaf``; None for the actor's,
-            if it reads ``qaf``.
+        actor: any actor; the transforms of parts with a method ``transform()`` are included.
+        plans: the plans whose conditions are answered even if the actor does not read ``qaf``; None for the actor's
+            plans, if the actor reads ``qaf``.
     """
     own, reads = plans_of(actor), list(getattr(actor, "in_keys", ()))
     transforms: list[Transform] = []

@@ -1,4 +1,4 @@
-"""Query evaluators: modules in front of a policy that answer the plans' conditions instead of the exact function."""
+"""Query evaluators: learned modules that answer a policy's plan conditions instead of the exact function."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ Answers = Literal["soft", "hard"]
 
 
 class QueryEvaluator(TensorDictModuleBase):
-    """Base class of modules that answer plans' conditions for a policy: ``TensorDictSequential(evaluator, actor)``.
+    """A base class of modules that answer plan conditions for a policy: ``TensorDictSequential(evaluator, actor)``.
 
-    Training the sequence trains both. A subclass implements :meth:`logits`, and adds the keyword arguments that rebuild
-    it to ``config``.
+    Training the sequence trains both modules. A subclass implements :meth:`logits`, and adds the keyword arguments of
+    its constructor to ``config``.
 
     Reads ``in_keys``, by default ``observation`` (B, 39) float32 and ``task_id`` (B,) int64. Writes ``qaf_logits``
-    (B, S) float32, positive where a condition of the row's plan holds, in the order of its steps, and ``qaf`` (B, S)
+    (B, S) float32, positive where the condition of a plan step holds, in the order of the plan, and ``qaf`` (B, S)
     float32 in [0, 1], which the policy reads.
 
     Args:
-        plans: the plans whose conditions it answers.
+        plans: the plans whose conditions the module answers.
         answers: "soft": ``qaf`` is the probability, the sigmoid of the logit. "hard": ``qaf`` is 1 where the logit is
             positive and 0 elsewhere, with the gradient of "soft"; for a policy that was trained on exact answers. A
-            subclass with a constructor of its own must accept ``answers`` to be "hard".
+            subclass that overrides the constructor must accept ``answers`` to support "hard".
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -55,7 +55,7 @@ class QueryEvaluator(TensorDictModuleBase):
         >>> policy.in_keys
         ['observation', 'task_id']
 
-    Source: paper section 'Differentiability and Optimization', which names a visual question answering model.
+    Source: paper section 'Differentiability and Optimization', which suggests a visual question answering model.
     """
 
     text_encoder: TextEncoder | None = None
@@ -78,7 +78,7 @@ class QueryEvaluator(TensorDictModuleBase):
 
     @property
     def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it, as JSON."""
+        """The keyword arguments that reconstruct this module, as JSON."""
         return {**self._config, "answers": self.answers} if self._accepts_answers else self._config
 
     @config.setter
@@ -87,25 +87,25 @@ class QueryEvaluator(TensorDictModuleBase):
 
     @property
     def answers(self) -> Answers:
-        """Whether ``qaf`` is "soft" or "hard"; it can be set."""
+        """The kind of answers in ``qaf``, "soft" or "hard". The attribute can be assigned."""
         return self._answers
 
     @answers.setter
     def answers(self, answers: Answers) -> None:
         self._answers: Answers = check_choice("answers", answers, ("soft", "hard"))
-        if answers != "soft" and not self._accepts_answers:  # a file would lose it
+        if answers != "soft" and not self._accepts_answers:  # a saved file would lose the value
             raise TypeError(f"the constructor of {type(self).__name__} must accept answers=, got answers={answers!r}")
 
     def logits(self, *read: Any, **_: Any) -> Tensor:  # a subclass may have any signature
-        """Return (B, S) float32 from the tensors of ``in_keys``."""
+        """Return the logits (B, S) float32 for the tensors of ``in_keys``."""
         raise NotImplementedError(f"{type(self).__name__} must override logits")
 
     def logits_of(self, tensordict: TensorDictBase) -> Tensor:
-        """Return :meth:`logits` for the rows of a tensordict as float32; raise unless they are floats (B, S)."""
+        """Compute :meth:`logits` for a tensordict and convert them to float32; raise unless they are floats (B, S)."""
         logits = self.logits(*read(tensordict, self.in_keys))
         name = f"logits of {type(self).__name__}"
         if not logits.is_floating_point():
-            raise TypeError(f"{name} must be float32, above 0 where a condition holds, got {logits.dtype}")
+            raise TypeError(f"{name} must be float32 logits (positive where a condition holds), got {logits.dtype}")
         if logits.shape[-1:] != (self.plans.num_steps,):
             raise ValueError(f"{name} must be (B, {self.plans.num_steps}), got shape {tuple(logits.shape)}")
         return logits.to(torch.float32)
@@ -116,24 +116,24 @@ class QueryEvaluator(TensorDictModuleBase):
         qaf = logits.sigmoid()
         if self.answers == "hard":
             qaf = (logits > 0).to(qaf.dtype) + (qaf - qaf.detach())  # straight-through: the gradient of the sigmoid
-        if "task_id" in self.in_keys:  # with the plan's number, an actor of other plans refuses the answers
+        if "task_id" in self.in_keys:  # by the plan's number, an actor with other plans rejects the answers
             rows = self.plan_tables.rows(tensordict.get("task_id"))
             tensordict.set(key_beside(self.out_keys_source[0], "_plan"), pick(self.plan_number, rows))
         return write(tensordict, self, [qaf, logits])
 
     def transform(self) -> Transform | None:
-        """Return a new transform that writes the keys that it reads and an environment lacks; None if none."""
+        """Return a new transform that writes the keys that the module reads but an environment lacks, or None."""
         return None
 
     def with_plans(self, plans: AnyPlans) -> QueryEvaluator:
-        """Return an evaluator on the same weights for other plans; RuntimeError if the weights differ in shape."""
+        """Return an evaluator for different plans that shares the weights; RuntimeError if their shapes differ."""
         options: dict[str, Any] = dict(self.config)
         if "text_encoder" in signature(type(self)).parameters:
             options["text_encoder"] = self.text_encoder
         other = type(self)(as_plans(plans), **options)
         other.load_state_dict(self.state_dict())  # checks names and shapes
-        # Share the weights and saved buffers themselves, so that training either trains both. Tables of the plans are
-        # buffers that are not saved: they stay the other's own.
+        # Share the parameters and the persistent buffers, so that training one also trains the other. The tables of the
+        # plans are non-persistent buffers, and are not shared.
         for name, module in other.named_modules():
             own, tables = self.get_submodule(name), module._non_persistent_buffers_set
             module._parameters.update(own._parameters)
@@ -142,7 +142,7 @@ class QueryEvaluator(TensorDictModuleBase):
 
 
 def evaluators_of(policy: Any) -> list[QueryEvaluator]:
-    """Return the evaluators inside a policy, for example in a TensorDictSequential."""
+    """Return the query evaluators inside a policy, for example in a TensorDictSequential."""
     modules = policy.modules() if isinstance(policy, nn.Module) else ()
     return [module for module in modules if isinstance(module, QueryEvaluator)]
 
@@ -151,55 +151,55 @@ def evaluators_of(policy: Any) -> list[QueryEvaluator]:
 
 _PADDING = -1e4  # the logit beyond a plan's last step, as in QueryProgram.logits
 LARGEST_LOGIT = 30.0
-"""The size of the largest logit of a clause, a probability of 1e-13."""
-_SCALES = (0.005, 0.02, 0.1, 0.5)  # metres: the scales at which tanh squashes a difference
+"""The maximum absolute logit of a clause, which is a probability of 1e-13."""
+_SCALES = (0.005, 0.02, 0.1, 0.5)  # metres, the scales at which tanh squashes a difference
 
 
 class Clauses(NamedTuple):
-    """Clauses (...,) of any tasks. A clause compares two positions of an observation, whose difference is
-    ``observation[first] - observation[second] + shift``."""
+    """A batch (...,) of clauses, possibly from different tasks. A clause compares elements of an observation by their
+    difference, ``observation[first] - observation[second] + shift``."""
 
-    first: Tensor  # (..., 3) int64, indices into the observation; one beyond its end stands for 0
+    first: Tensor  # (..., 3) int64, indices into the observation; index D (past the end) reads 0
     second: Tensor  # (..., 3) int64
     shift: Tensor  # (..., 3) float32, metres
     predicate: Tensor  # (...) int64, an index into the list of predicates
     negated: Tensor  # (...) bool
     subject: Tensor  # (...) int64, an index into the list of names
-    object: Tensor  # (...) int64, likewise; beyond the last for a clause without an object
-    # Only for the plans of T tasks, each of whose clauses (T, C) is listed once:
-    parts: Tensor = torch.empty(0)  # (T, S, K) int64, which of its task's clauses make up each condition
+    object: Tensor  # (...) int64, likewise; the number of names for a clause without an object
+    # Only for clauses (T, C) of the plans of T tasks, where each distinct clause of a plan is listed once:
+    parts: Tensor = torch.empty(0)  # (T, S, K) int64, indices of the clauses of each condition
     mask: Tensor = torch.empty(0)  # (T, S, K) bool, true where there is such a clause
 
     def pick(self, which: Tensor) -> Clauses:
-        """Select from (G,) clauses by their indices, (...) int64."""
+        """Return the clauses (...) at indices ``which`` (...) int64 of these clauses (G,)."""
         return Clauses(*(table[which] for table in self[:7]))
 
 
 def conjunction(logits: Tensor, mask: Tensor) -> Tensor:
-    """Return the logit (...) that all statements with logits (..., K) hold, where ``mask`` (..., K) bool is true.
+    """Return the logit (...) of the conjunction of statements with logits (..., K) where ``mask`` (..., K) is true.
 
-    The statements are taken as independent, so their probabilities sigmoid(l) multiply to p, and the logit of p is
-    -log(expm1(sum(softplus(-l)))). Logits are at most 30 in size; without any statement the result is 30.
+    The statements are assumed to be independent, so p is the product of their probabilities sigmoid(l), and its logit
+    is -log(expm1(sum(softplus(-l)))). The result is at most 30, and is 30 without any statement.
     """
     doubt = torch.where(mask, nn.functional.softplus(-logits), 0.0).sum(-1).clamp(min=1e-13)
     return -(doubt + torch.log(-torch.expm1(-doubt)))
 
 
 class ClauseEvaluator(QueryEvaluator):
-    """Base class of query evaluators whose network was trained on exact answers.
+    """A base class of query evaluators whose networks are trained on exact answers.
 
-    Reads a view of a state, such as an observation or pictures, and ``task_id``; writes as :class:`QueryEvaluator`,
-    -1e4 beyond a plan's last step. Clauses are answered one by one and combined by :func:`conjunction`. A subclass sets
-    ``network``, from views of B states and their clauses (B, C) to logits (B, C), and ``seen_dims``, the number of
-    dimensions of a view.
+    Reads a view of a state, such as an observation or pictures, and ``task_id``; writes the keys of
+    :class:`QueryEvaluator`, with logits of -1e4 beyond a plan's last step. The network answers single clauses, which
+    :func:`conjunction` combines. A subclass sets ``network``, which maps views of B states and their clauses (B, C) to
+    logits (B, C), and ``seen_dims``, the number of dimensions of a view.
 
     Args:
-        plans, answers: as for :class:`QueryEvaluator`.
-        predicates: the relations and predicates that it can answer; None for all.
-        names: the objects that it can tell apart; None if it does not tell them apart by name.
+        plans, answers: see :class:`QueryEvaluator`.
+        predicates: the relations and predicates that the network can answer; None for all.
+        names: the objects that the network can distinguish; None if it does not distinguish objects by name.
 
     Raises:
-        ValueError: a plan uses another predicate or object; at call time, a wrong shape, or a task_id without a plan.
+        ValueError: a plan uses an unknown predicate or object; at call time, a wrong shape, or a task without a plan.
     """
 
     network: nn.Module
@@ -222,11 +222,11 @@ class ClauseEvaluator(QueryEvaluator):
         self.tables: TaskTables[Clauses] = TaskTables(index, tables, f"tasks without a plan in {plans!r}")
 
     def check_seen(self, seen: Tensor) -> None:
-        """Raise :class:`ValueError` unless the view has the shape and dtype that the network reads."""
+        """Raise a :class:`ValueError` unless the view has the shape and dtype that the network reads."""
         raise NotImplementedError(f"{type(self).__name__} must override check_seen")
 
     def logits(self, *read: Tensor) -> Tensor:
-        """Return (..., S) float32 from views (..., ...) and task_id (...) int64."""
+        """Return the logits (..., S) float32 for views (..., *view shape) and task ids (...) int64."""
         seen, task_id = read
         self.check_seen(seen)
         shape = seen.shape[: -self.seen_dims]
@@ -241,18 +241,18 @@ class ClauseEvaluator(QueryEvaluator):
         return logits.reshape(*task_id.shape, self.plans.num_steps)
 
     def code(self, clauses: Sequence[tuple[Task, Clause]]) -> Clauses:
-        """Return clauses (G,) of any tasks as tensors. An evaluator without ``names`` gives every object index 0."""
+        """Encode clauses (G,) of any tasks as tensors. Without ``names``, every object has index 0."""
         predicate_index = {name: number for number, name in enumerate(self.predicates)}
         name_index = {name: number for number, name in enumerate(self.names)}
         for task, clause in clauses:
             where = f"of {str(clause)!r}, in {task.name}"
             if clause.predicate not in predicate_index:
                 error = unknown_name(f"predicate {where}", clause.predicate, self.predicates)
-                raise ValueError(f"{error}; make and train an evaluator that has this predicate")
+                raise ValueError(f"{error}; train an evaluator with this predicate")
             for name in (clause.subject, clause.object):
                 if self.names and name is not None and name not in name_index:
                     error = unknown_name(f"object {where}", name, self.names)
-                    raise ValueError(f"{error}; make and train an evaluator that has this object")
+                    raise ValueError(f"{error}; train an evaluator with this object")
         first, second, shift = zip(*(_compared(clause, task) for task, clause in clauses), strict=True)
         return Clauses(
             first=torch.tensor(first),
@@ -265,9 +265,9 @@ class ClauseEvaluator(QueryEvaluator):
         )
 
     def _clauses_of_plans(self, tasks: Sequence[str]) -> Clauses:
-        """Return the clauses of the plans as tensors, with a row for each of ``tasks``."""
+        """Encode the clauses of the plans as tensors, with a row for each of ``tasks``."""
         plans = [self.plans[task] for task in tasks]
-        # The different clauses of each plan, in the order of its steps.
+        # The distinct clauses of each plan, in the order of the steps.
         by_plan = [list(dict.fromkeys(c for step in plan.steps for c in step.condition.clauses)) for plan in plans]
         width = max(len({*step.condition.clauses}) for plan in plans for step in plan.steps)
         number = torch.zeros(len(tasks), max(map(len, by_plan)), dtype=torch.int64)
@@ -287,7 +287,7 @@ class ClauseEvaluator(QueryEvaluator):
 
 def _different(argument: str, names: Sequence[str]) -> tuple[str, ...]:
     if isinstance(names, str) or not names or len({*names}) < len(names):
-        raise ValueError(f"{argument} must be different names, at least one, got {shown(names)}")
+        raise ValueError(f"{argument} must be at least one name, without duplicates, got {shown(names)}")
     return tuple(names)
 
 
@@ -304,7 +304,7 @@ def _compared(clause: Clause, task: Task) -> tuple[list[int], list[int], list[fl
 
 
 def _position(task: Task, name: str) -> tuple[list[int], list[float]]:
-    """Return the indices of an object's three coordinates in an observation, and what is added to them."""
+    """Return the indices of an object's three coordinates in an observation, and the offsets to add to them."""
     item = task.object(name)
     index = [at if isinstance(at, int) else task.layout.size for at in item.position]
     fixed = [0.0 if isinstance(at, int) else at for at in item.position]
@@ -312,10 +312,10 @@ def _position(task: Task, name: str) -> tuple[list[int], list[float]]:
 
 
 class ClauseNetwork(nn.Module):
-    """The logit of a clause: a trunk reads the difference of two positions, and a learned vector of the predicate
-    weighs its output. "not" changes the sign."""
+    """A network that maps clauses to logits: a trunk encodes the difference of two positions, and a learned vector of
+    the predicate weights the trunk's output. "not" flips the sign of the logit."""
 
-    numbers: int = 3  # of a difference
+    numbers: int = 3  # components of a difference
 
     def __init__(self, width: int, depth: int, *, predicates: int) -> None:
         super().__init__()
@@ -330,13 +330,13 @@ class ClauseNetwork(nn.Module):
         self.predicates = nn.Embedding(predicates, width + 1)
 
     def forward(self, observation: Tensor, clauses: Clauses) -> Tensor:
-        """Return logits (B, C) of size 30 at most from observations (B, 39) and clauses (B, C)."""
+        """Return the logits (B, C), in [-30, 30], of clauses (B, C) for observations (B, 39)."""
         numbers = torch.cat((observation, torch.zeros_like(observation[..., :1])), -1)
         first, second = (numbers.gather(-1, index.flatten(-2)) for index in (clauses.first, clauses.second))
         return self.judge((first - second).unflatten(-1, (-1, 3)) + clauses.shift, clauses)
 
     def judge(self, difference: Tensor, clauses: Clauses) -> Tensor:
-        """Return logits (B, C) from differences (B, C, 3) in metres."""
+        """Return the logits (B, C) of clauses from differences (B, C, 3) in metres."""
         predicates = self.predicates.weight[clauses.predicate]
         features = torch.cat([torch.tanh(difference / scale) for scale in _SCALES], -1)
         logits = (self.trunk(features.to(predicates.dtype)) * predicates[..., :-1]).sum(-1) / sqrt(self.width)
@@ -345,16 +345,16 @@ class ClauseNetwork(nn.Module):
 
 
 class StateQueryEvaluator(ClauseEvaluator):
-    """A query evaluator that answers conditions from the observation, by a network trained on exact answers.
+    """A query evaluator that predicts conditions from the observation, with a network trained on exact answers.
 
     Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``qaf`` and ``qaf_logits`` (B, S) float32
-    as :class:`QueryEvaluator` does. It looks objects' positions up in the observation, so it only learns what
-    predicates mean.
+    as :class:`QueryEvaluator` does. The evaluator looks up the objects' positions in the observation, so the network
+    only learns the meaning of predicates.
 
     Args:
-        plans, answers, predicates: as for :class:`~lw_torchrl.modules.query_evaluator.ClauseEvaluator`, with its
-            errors and source.
-        width, depth: units and number of the hidden layers.
+        plans, answers, predicates: see :class:`~lw_torchrl.modules.query_evaluator.ClauseEvaluator`, also for the
+            errors.
+        width, depth: units per hidden layer and number of hidden layers.
 
     Example:
         >>> import lw_torchrl as lw

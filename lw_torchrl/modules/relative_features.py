@@ -1,4 +1,4 @@
-"""FocusFeatures and RoleFeatures: relative positions of the objects that a plan's active steps are about."""
+"""FocusFeatures and RoleFeatures: relative positions of the objects that a plan's active steps refer to."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from lw_torchrl.modules.features import Features, check_observation, check_rows,
 from lw_torchrl.transforms.qaf import plan_program
 from lw_torchrl.transforms.random_yaw import tilt_key, turn_observation, turn_vectors, yaw_key
 
-_SCALE = 0.1  # metres: the unit of the positions that a network reads
-_FAR = 0.25  # metres: farther positions count as this far, since demonstrations hardly show them
-_LIFTED = 0.15  # metres: the height at which an object is carried above its target
-_AWAY = 0.15  # metres: "move the puck to the left" has a target this far away
+_SCALE = 0.1  # metres, the unit of positions in the features
+_FAR = 0.25  # metres; longer positions, which are rare in demonstrations, are shortened to this length
+_LIFTED = 0.15  # metres, the height at which an object is carried above its target
+_AWAY = 0.15  # metres, the distance of the target of "move the puck to the left"
 _KEYS = ("observation", "skill_weights", "task_id")
 Pair = tuple[NamedObject, NamedObject]
 
 
 class _RelativePositions(Features):
-    """Positions of objects relative to other objects, mixed by the attention over a plan's steps.
+    """A base class of features that are relative positions of objects, mixed by the attention over a plan's steps.
 
-    ``pairs`` returns for each step of a plan at most ``number`` = P pairs of objects, of which the position of the
-    second relative to the first is shown. A step with fewer pairs has zeros.
+    ``pairs`` returns at most ``number`` = P pairs of objects for each plan step. The features contain the position of
+    each pair's second object relative to the first, and zeros for missing pairs.
     """
 
     begin: Tensor
@@ -57,8 +57,8 @@ class _RelativePositions(Features):
         self.plans = plans = as_plans(plans)
         self.tables = PlanTables(plans)
         self.width = 9 * number
-        # Coordinates are looked up in the observation followed by constants, of which the first is 0: fixed places
-        # are constants, and a pair that is absent is the difference of two zeros.
+        # Coordinates are indices into the observation with constants appended. Fixed places are constants. The first
+        # constant is 0, and a missing pair is the difference of two zeros.
         constants = [0.0]
         shape = (len(plans), plans.num_steps, number, 3)
         self.layout, size = plans.layout, plans.layout.size
@@ -70,7 +70,7 @@ class _RelativePositions(Features):
                     for side, item in enumerate(pair):
                         index[(side, *at)] = torch.tensor(coordinate_indices(item.position, constants, size))
                         offset[at] += torch.tensor(item.offset) * (2 * side - 1)
-        # The tables come from the plans, not from training: they are not part of the state that is saved.
+        # The tables are computed from the plans, so the state_dict does not need them.
         self.register_buffer("begin", index[0], persistent=False)
         self.register_buffer("end", index[1], persistent=False)
         self.register_buffer("offset", offset, persistent=False)
@@ -78,25 +78,25 @@ class _RelativePositions(Features):
 
     @property
     def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
+        """The keyword arguments that reconstruct this module."""
         return {"plans": self.plans, "noise": self.noise, "in_keys": self.in_keys, "out_keys": self.out_keys_source}
 
     def with_plans(self, plans: AnyPlans) -> Any:
-        """Return the same features of other plans."""
+        """Return the same features for different plans."""
         return type(self)(**{**self.config, "plans": plans}).to(self.offset.device).train(self.training)
 
     def positions(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
-        """Return the relative positions (..., P, 3) in metres, by the attention (..., S) over the steps of table rows.
+        """Return relative positions (..., P, 3) in metres, mixed by the attention ``weights`` (..., S) over plan steps.
 
-        ``yaw`` (...) is the angle in radians by which :class:`RandomYaw` turned the observation (..., D).
+        ``rows`` (...) index the tables; :class:`RandomYaw` turned the observation (..., D) by ``yaw`` (...) radians.
         """
-        if yaw is not None:  # fixed places and offsets are those of the scene before it was turned
+        if yaw is not None:  # fixed places and offsets belong to the scene before it was turned
             observation = turn_observation(observation, -yaw, self.layout)
         positions = (weights[..., None, None] * self.of_steps(observation, rows)).sum(-3)
         return positions if yaw is None else turn_vectors(positions, yaw.unsqueeze(-1))
 
     def of_steps(self, observation: Tensor, rows: Tensor) -> Tensor:
-        """Return the relative positions of each step, (..., S, P, 3) in metres."""
+        """Return the relative positions of each plan step, (..., S, P, 3) in metres."""
         numbers = torch.cat((observation, self.constants.expand(*observation.shape[:-1], -1)), -1)
         begin, end = pick(self.begin, rows), pick(self.end, rows)  # (..., S, P, 3)
         flat = (*begin.shape[: rows.ndim], begin.shape[rows.ndim :].numel())
@@ -117,27 +117,27 @@ class _RelativePositions(Features):
 
 
 def _compared(plan: ConditionalPlan) -> list[list[Pair]]:
-    """Return for each step the pairs of objects in its condition's first and last clause with two objects."""
+    """Return for each plan step the object pairs of the first and the last clause that compare two objects."""
     item = plan.definition.object
     steps = [[(item(c.subject), item(c.object)) for c in step.condition.clauses if c.object] for step in plan.steps]
     return [[pairs[0], pairs[-1]] if pairs else [] for pairs in steps]
 
 
 class FocusFeatures(_RelativePositions):
-    """Positions of the objects that the active steps' conditions compare.
+    """Relative positions of the objects that the conditions of the active plan steps compare.
 
-    A condition names what its skill is about: "the gripper is above the handle and not near the handle". The position
-    of the handle relative to the gripper stands in the same place as that of the puck in another task, so that what was
-    learned there helps here.
+    A condition names the objects of its skill: "the gripper is above the handle and not near the handle". The same
+    features contain the handle's position relative to the gripper in one task and the puck's in another task, so the
+    policy can transfer its behavior between tasks.
 
     Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64; writes
     ``features`` (B, 18): for the first and the last clause with two objects, the position of the second object relative
-    to the first, in units of 10 cm, and through tanh at 2 cm and at 10 cm. Both are 0 for a step without such clauses.
+    to the first, in units of 10 cm, and squashed by tanh at 2 cm and at 10 cm; 0 for a plan step without such clauses.
 
     Args:
-        plans: the plans whose conditions are read.
-        noise: standard deviation of the noise while training.
-        in_keys, out_keys: other names for what it reads and writes; nested keys are allowed.
+        plans: the plans whose conditions name the objects.
+        noise: standard deviation of the Gaussian noise during training.
+        in_keys, out_keys: replacements for the default input and output keys; nested keys are allowed.
 
     Example:
         >>> import lw_torchrl as lw
@@ -153,32 +153,32 @@ class FocusFeatures(_RelativePositions):
 
 
 class RoleFeatures(_RelativePositions):
-    """The target's position relative to the object that the active step moves, and the step's direction.
+    """Features of the active plan step: the target's position relative to the moved object, and the direction.
 
-    "lower the gripper around the puck" and "... the mug" are the same motion in this relative position, so that what
-    was learned in one task helps in another. "push the dial to the right" points right, "push it toward the target
-    location" from the object to the goal. Positions farther than 25 cm count as 25 cm away.
+    "lower the gripper around the puck" and "... the mug" are the same motion in these features, so policies can
+    transfer it between tasks. The direction of "push the dial to the right" is to the right; that of "push it toward
+    the target location" is from the object to the goal. Positions longer than 25 cm are shortened to 25 cm.
 
-    Where the gripper touches an object away from its position, the target is the *contact*, which demonstrations of
-    the task show, see :meth:`fit`; a task without demonstrations has the points that its plan names. An object that is
-    carried in such a task is lifted first, to 15 cm above its target, and comes down over it.
+    If the gripper touches an object away from the object's position, the target is the *contact*, which :meth:`fit`
+    computes from demonstrations of the task. In a task without demonstrations, the target is the point that the plan
+    names, and a carried object is first lifted to 15 cm above the target, then lowered.
 
-    Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64, and what
-    :class:`RandomYaw` and :class:`JitterTarget` wrote; writes ``features`` (B, 12): the relative position in units of
-    10 cm, through tanh at 2 cm and at 10 cm, and a unit vector, which is 0 for a step without a direction.
+    Reads ``observation`` (B, D) float32, ``skill_weights`` (B, S) float32 and ``task_id`` (B,) int64, and the outputs
+    of :class:`RandomYaw` and :class:`JitterTarget` if present; writes ``features`` (B, 12): the relative position, in
+    units of 10 cm and squashed by tanh at 2 cm and 10 cm, and the direction, a unit vector (0 if the step has none).
 
     Args:
         plans: plans whose steps have roles, see :func:`~lw_torchrl.canonical_plans`.
-        noise: standard deviation of the noise while training.
-        in_keys, out_keys: other names for what it reads and writes; nested keys are allowed.
+        noise: standard deviation of the Gaussian noise during training.
+        in_keys, out_keys: replacements for the default input and output keys; nested keys are allowed.
 
     Attributes:
-        contact: (T, 3) float32, metres, for each task, from the first object to the hand while it acts on the object.
-        demonstrated: (T,) bool, the tasks with demonstrations.
+        contact: (T, 3) float32 in metres, each task's hand position minus first-object position while the hand acts.
+        demonstrated: (T,) bool, whether a task has demonstrations.
         fitted: () bool, whether :meth:`fit` was called.
 
     Raises:
-        ValueError: plans without roles.
+        ValueError: the plans have no roles.
 
     Example:
         >>> import lw_torchrl as lw
@@ -186,7 +186,7 @@ class RoleFeatures(_RelativePositions):
         >>> lw.PlanConditionedActor(plans, features=lw.modules.RoleFeatures(plans)).features.width
         12
 
-    Source: ours; like the keypoints of task-axis controllers, but read from language.
+    Source: original to this library; like the keypoints of task-axis controllers, but derived from language.
     """
 
     contact: Tensor
@@ -228,7 +228,7 @@ class RoleFeatures(_RelativePositions):
         self.register_buffer("contact", torch.zeros(len(plans), 3))
         self.register_buffer("demonstrated", torch.zeros(len(plans), dtype=torch.bool))
         self.register_buffer("fitted", torch.tensor(False))
-        self._sharing: WeakSet[RoleFeatures] = WeakSet([self])  # features of actors with the same weights
+        self._sharing: WeakSet[RoleFeatures] = WeakSet([self])  # features of actors that share weights
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_sharing": None}  # a copy or a pickle has its own contacts
@@ -238,7 +238,7 @@ class RoleFeatures(_RelativePositions):
         self._sharing = WeakSet([self])
 
     def with_plans(self, plans: AnyPlans) -> RoleFeatures:
-        """Return the features of other plans; the same tasks share contacts, now and whenever either is fitted."""
+        """Return features for different plans, which share the contacts of common tasks, also after a later fit."""
         other: RoleFeatures = super().with_plans(plans)
         other._sharing = self._sharing
         other._sharing.add(other)
@@ -246,7 +246,7 @@ class RoleFeatures(_RelativePositions):
         return other
 
     def share(self) -> None:
-        """Copy the contacts to the features that :meth:`with_plans` made; call it after changing the buffers."""
+        """Copy the contacts to all features made by :meth:`with_plans`; call this method after changing the buffers."""
         for other in self._sharing:
             if other is not self:
                 other._copy(self)
@@ -259,8 +259,8 @@ class RoleFeatures(_RelativePositions):
     def fit(self, rows: TensorDictBase, weights: Tensor | None = None) -> None:
         """Compute the contacts from demonstrations, in place.
 
-        A contact is the median of hand minus object while a step is active that closes the gripper around the first
-        object, pushes or pulls it, or moves it, but not while it is pressed from above.
+        A contact is the median of hand position minus first-object position, over all time steps in which the active
+        plan step grasps, pushes, pulls or moves the object, except presses from above.
         """
         observation, task_id = read(rows, [self.in_keys[0], self.in_keys[2]])
         observation, task_id = observation.reshape(-1, self.layout.size), task_id.reshape(-1)
@@ -285,7 +285,7 @@ class RoleFeatures(_RelativePositions):
             self.contact[own], self.demonstrated[own] = other.contact[theirs], other.demonstrated[theirs]
 
     def of_steps(self, observation: Tensor, rows: Tensor) -> Tensor:
-        """Return the relative positions of each step; targets are contacts, and carried objects are lifted first."""
+        """Return the relative positions of each plan step, with contacts as targets and carried objects lifted."""
         contact = pick(self.at_contact, rows)[..., None] * pick(self.contact, rows).unsqueeze(-2)
         positions = super().of_steps(observation, rows) + contact.unsqueeze(-2)
         lifts = (pick(self.lifts, rows) & ~pick(self.demonstrated, rows).unsqueeze(-1))[..., None, None]
@@ -298,7 +298,7 @@ class RoleFeatures(_RelativePositions):
         return torch.cat((sideways * lifted, height), -1)
 
     def directions(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
-        """Return the direction of the active step, (..., 3); arguments as for :meth:`positions`."""
+        """Return the direction (..., 3) of the active plan step; see :meth:`positions` for the arguments."""
         if yaw is not None:
             observation = turn_observation(observation, -yaw, self.layout)
         ahead = self.ahead.of_steps(observation, rows).squeeze(-2)
@@ -328,7 +328,7 @@ def _moved_to_target(plan: ConditionalPlan) -> list[list[Pair]]:
 
 
 def _ahead(plan: ConditionalPlan) -> list[list[Pair]]:
-    """Return for each step toward the goal, or toward an object, the pair from the first object to it."""
+    """Return for each plan step toward the goal, or toward an object, the pair of the first object and this target."""
     task = plan.definition
     x, y, z = places(task.layout.positions[1])
     first = NamedObject("first object", (x, y, z))
@@ -338,6 +338,6 @@ def _ahead(plan: ConditionalPlan) -> list[list[Pair]]:
 
 
 def _is_first(plan: ConditionalPlan, name: str) -> bool:
-    """Return whether a name is that of the first object itself, not of a point beside it."""
+    """Return whether a name refers to the first object itself, rather than to a point next to the object."""
     item = role_object(plan.definition, name)
     return item.position == places(plan.definition.layout.things[0].xyz) and not any(item.offset)

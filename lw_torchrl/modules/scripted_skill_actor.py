@@ -1,4 +1,4 @@
-"""ScriptedSkillActor: a conditional plan carried out by scripted skills, without any training."""
+"""ScriptedSkillActor: a policy that executes conditional plans with scripted skills, without training."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from lw_torchrl.modules.parts import Part, in_mode_of
 
 
 class ScriptedSkillActor(Part):
-    """Carry out a plan by scripted skills: the skill of a true step acts, or the last step's if none is true.
+    """A policy that executes plans with scripted skills: a true step's skill acts, or the last step's if none is true.
 
     Reads ``observation`` (B, 39) float32, ``task_id`` (B,) int64 and ``qaf`` (B, S) bool, or float in [0, 1] for soft
-    truth; writes ``action`` (B, 4) float32 in [-1, 1] and ``skill_weights`` (B, S) float32, which sum to 1. Soft truth
-    counts as true above 0.5. If an observation is NaN, so is the action.
+    truth; writes ``action`` (B, 4) float32 in [-1, 1] and ``skill_weights`` (B, S) float32, whose rows sum to 1. Soft
+    truth above 0.5 counts as true. If an observation is NaN, the action is NaN.
 
     Args:
-        plans: a plan for each task; every step's skill is the text of a scripted skill.
-        select: which of several true steps acts: "first", "random" (as in the paper), or "mix" (all, equally).
-        skills: the scripted skills by text, as from :func:`load_skills`; None for the shipped ones.
+        plans: a plan for each task; every step's skill must be the text of a scripted skill.
+        select: which skill acts if several steps are true: "first", "random" (as in the paper), or "mix" (the mean).
+        skills: a mapping from text to scripted skill, see :func:`load_skills`; None for the shipped skills.
         seed: seed of the random choice, from -2**63 to 2**64 - 1.
-        in_keys, out_keys: other names for what it reads and writes, in the order above; nested keys are allowed.
+        in_keys, out_keys: replacements for the default keys, in the order above; nested keys are allowed.
 
     Raises:
-        ValueError: a skill text that is not a scripted skill (with the nearest), or that names objects that its task
-            lacks; at call time, ``qaf`` of other steps, outside [0, 1], or of other plans.
+        ValueError: a skill text is unknown (the message suggests the nearest) or names objects that the task lacks; at
+            call time, ``qaf`` has the wrong number of steps or values outside [0, 1], or belongs to other plans.
 
     Example:
         >>> import lw_torchrl as lw
@@ -76,14 +76,14 @@ class ScriptedSkillActor(Part):
 
     @property
     def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it; :class:`TypeError` with custom skills, which no file holds."""
+        """The keyword arguments that reconstruct this module; a :class:`TypeError` is raised for custom skills."""
         if self._skills is not None:
-            raise TypeError("a ScriptedSkillActor with custom skills cannot be saved; keep the file of the skills")
+            raise TypeError("a ScriptedSkillActor with custom skills cannot be saved; save the file of the skills")
         return super().config
 
     @property
     def truth_keys(self) -> tuple[NestedKey, NestedKey]:
-        """The keys of the conditions' truth and of the task."""
+        """The keys of the conditions' truth values and of the task id."""
         return self.in_keys[2], self.in_keys[1]
 
     @property
@@ -93,12 +93,12 @@ class ScriptedSkillActor(Part):
         return key
 
     def with_plans(self, plans: AnyPlans) -> ScriptedSkillActor:
-        """Return the same skills under other plans."""
+        """Return an actor that follows different plans with the same skills."""
         options = {**super().config, "plans": plans, "skills": self._skills}
         return in_mode_of(self, ScriptedSkillActor(**options))
 
     def skill_weights(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the weight of each step, (B, S) float32."""
+        """Return the weight of each plan step, (B, S) float32."""
         qaf, rows = read_truth(tensordict, self.truth_keys, self.tables)
         check_truth(qaf, torch.Size((*rows.shape, self.tables.mask.shape[-1])))
         qaf, steps = qaf > 0.5, qaf.shape[-1]
@@ -106,12 +106,12 @@ class ScriptedSkillActor(Part):
         active = torch.where(qaf.any(-1, keepdim=True), qaf, last).float()
         if self.select == "mix":
             return active / active.sum(-1, keepdim=True)
-        # Noise in [0, 1) orders the active steps at random, and never lifts another step above them.
+        # Noise in [0, 1) orders the active steps at random, and never ranks an inactive step above an active step.
         noise = torch.rand(active.shape, generator=self._generator).to(active.device) if self.draws else 0.0
         return one_hot((noise + active).argmax(-1), steps).float()
 
     def skill_actions(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the action of each step's skill, (B, S, A) float32."""
+        """Return the action of each plan step's skill, (B, S, A) float32."""
         observation, task_id, _ = read(tensordict, self.in_keys)
         actions: Tensor = self.program(observation, task_id)
         return actions

@@ -37,16 +37,16 @@ DISTRIBUTIONS: dict[str, Any] = {"tanh_normal": TanhNormal, "normal": Independen
 
 
 class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
-    """A policy whose actions are drawn from a Normal, as TorchRL's ``ProbabilisticActor``.
+    """A policy that samples its actions from a Normal distribution, like TorchRL's ``ProbabilisticActor``.
 
-    Reads what the trunk reads; writes what the trunk writes, ``loc`` and ``scale`` (B, A) float32, ``action`` (B, A)
-    float32, drawn under ``set_exploration_type(ExplorationType.RANDOM)`` and the mode otherwise, and
-    ``action_log_prob`` (B,) float32.
+    Reads the trunk's input keys; writes the trunk's output keys, ``loc``, ``scale`` and ``action`` (B, A) float32, and
+    ``action_log_prob`` (B,) float32. The action is a sample under ``set_exploration_type(ExplorationType.RANDOM)`` and
+    the mode otherwise.
 
     Args:
-        trunk: a sequence of named parts, as for :class:`ConditionedActor`.
-        decoder: writes the Normal's mean and standard deviation.
-        distribution: "tanh_normal", a Normal through tanh; "normal", whose actions the environment clips.
+        trunk: a sequence of named parts, see :class:`ConditionedActor`.
+        decoder: a TensorDict module that writes the Normal's mean and standard deviation.
+        distribution: "tanh_normal", a Normal squashed by tanh; "normal", whose actions the environment clips.
         action: the key of the action.
 
     Example:
@@ -89,25 +89,25 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
 
     @classmethod
     def of(cls, actor: Any, distribution: DistributionName, init_std: float) -> StochasticActor:
-        """Return a copy of a deterministic actor whose mode is that actor's action.
+        """Make a stochastic copy of a deterministic actor; the mode of the copy is the actor's action.
 
-        Its features have no noise, which would change the likelihoods from call to call.
+        The copy's features have no noise, because noise would change the likelihoods from call to call.
 
         Raises:
             TypeError: the actor's decoder is not an :class:`MLPDecoder`.
-            ValueError: a Normal through tanh, of an actor that does not squash its actions.
+            ValueError: ``distribution`` is "tanh_normal", but the actor does not squash its actions.
         """
         old = getattr(actor.decoder, "network", None)
         if not isinstance(old, MLPDecoder):
             raise TypeError(
-                f"stochastic() needs an MLPDecoder, this actor has {type(old or actor.decoder).__name__}; give it a "
-                "decoder that returns mean and standard deviation, with out_keys=['loc', 'scale'], and wrap it in "
-                "torchrl.modules.ProbabilisticActor"
+                f"stochastic() needs an actor with an MLPDecoder, got {type(old or actor.decoder).__name__}; otherwise "
+                "use a decoder that returns mean and standard deviation, with out_keys=['loc', 'scale'], and wrap "
+                "the actor in torchrl.modules.ProbabilisticActor"
             )
         if distribution == "tanh_normal" and not old.squash:
-            raise ValueError("distribution 'tanh_normal' squashes actions, and this actor does not; use 'normal'")
+            raise ValueError("distribution 'tanh_normal' squashes actions, but this actor does not; use 'normal'")
         options = {**old.config, "squash": distribution == "normal" and old.squash, "init_std": init_std}
-        with torch.random.fork_rng(devices=[]):  # the fresh weights are replaced: do not advance the user's generator
+        with torch.random.fork_rng(devices=[]):  # the new weights are overwritten: keep the global random state
             decoder = GaussianDecoder(**options)
             materialize(decoder, torch.zeros(1, old[0].weight.shape[-1]))
         decoder.to(next(old.parameters())).copy_from(old)
@@ -122,24 +122,24 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
 
     @property
     def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
+        """The keyword arguments that reconstruct this module."""
         options = {"distribution": self.distribution, "action": self.action}
         return {"trunk": self.trunk, "decoder": self.module["decoder"], **options}
 
     def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
-        raise TypeError(f"{name} of a StochasticActor cannot be replaced; replace the deterministic actor's part first")
+        raise TypeError(f"{name} of a StochasticActor cannot be replaced; replace the part of the actor first")
 
     @property
     def spec(self) -> Composite:
-        """The specification of the action, (A,) float32 in [-1, 1], which TorchRL's losses read."""
+        """The spec of the action, (A,) float32 in [-1, 1], which TorchRL's losses read."""
         return action_spec(self.action, self.layout)
 
     @property
     def trunk(self) -> TensorDictSequential:
-        """All parts but decoder and sampler, with the same weights; critics can be built on it."""
+        """The policy without its decoder and sampler. It shares the policy's weights; critics can be built on it."""
         return TensorDictSequential(OrderedDict([*self.module.items()][:-2]))
 
     def with_plans(self, plans: Any) -> StochasticActor:
-        """Return a policy with the same networks that follows other plans: training either trains both."""
+        """Return a policy that follows different plans but shares the networks: training one also trains the other."""
         options: dict[str, Any] = {**self.config, "trunk": follow(self.trunk, plans)}
         return in_mode_of(self, StochasticActor(**options))

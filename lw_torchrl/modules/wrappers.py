@@ -1,4 +1,4 @@
-"""Wrappers of any actor: an ensemble, a decided gripper, a second policy for demonstrated tasks, another robot."""
+"""Wrappers of actors: an ensemble, a binary gripper, a separate policy for demonstrated tasks, another robot."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from lw_torchrl.modules.policy import layout_of, plans_of, tasks_of, with_plans
 
 
 class _Wrapper(RenamedInputs):
-    """Base of the wrappers. ``_options`` are the constructor's arguments, which are attributes of the same names."""
+    """A base class of wrappers. ``_options`` are the constructor arguments, which are also attributes."""
 
     _options: ClassVar[Sequence[str]]
 
     def _wrap(self, actors: Sequence[TensorDictModuleBase], out_keys: Sequence[NestedKey]) -> None:
-        """Read what all actors read, and state the plans, tasks and layout of the first."""
+        """Set the input keys to those of all actors, and plans, tasks and layout to those of the first actor."""
         self.plans, self.tasks, self.layout = plans_of(actors[0]), tasks_of(actors[0]), layout_of(actors[0])
         self.in_keys = list(dict.fromkeys(key for actor in actors for key in actor.in_keys))
         self.out_keys = list(out_keys)
 
     @property
     def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
+        """The keyword arguments that reconstruct this module."""
         return {name: getattr(self, name) for name in self._options}
 
 
 class _ActionWrapper(_Wrapper):
-    """Base of the wrappers of one actor, which change its action."""
+    """A base class of wrappers that change the action of a single actor."""
 
     def __init__(self, actor: TensorDictModuleBase) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ class _ActionWrapper(_Wrapper):
         self._wrap([actor], actor.out_keys)
 
     def converted(self, action: Tensor) -> Tensor:
-        """Return the actor's actions, (..., A), as this policy's."""
+        """Convert the wrapped actor's actions (..., A) to this policy's actions."""
         raise NotImplementedError(f"{type(self).__name__} must override converted")
 
     @dispatched
@@ -58,19 +58,19 @@ class _ActionWrapper(_Wrapper):
 
 
 class ActorEnsemble(_Wrapper):
-    """The mean action of actors that were trained separately on the same demonstrations.
+    """An ensemble that averages the actions of actors trained separately on the same demonstrations.
 
-    Where the demonstrations do not say what to do, each member errs in its own way, and the mean errs less, most so
+    In states unlike the demonstrations, the members make different errors, which partly cancel in the mean, especially
     if the members have different features or augmentations.
 
-    Reads what the members read; writes ``action`` (B, A) float32, and the mean ``skill_weights`` (B, S) float32 if the
-    members write them.
+    Reads the input keys of the members; writes ``action`` (B, A) float32, and the mean ``skill_weights`` (B, S) float32
+    if the members write them.
 
     Args:
-        members: M actors of the same plans, or of the same tasks.
+        members: actors with the same plans, or with the same tasks.
 
     Raises:
-        ValueError: no member, or members of different plans or tasks.
+        ValueError: there are no members, or their plans or tasks differ.
 
     Example:
         >>> import lw_torchrl as lw
@@ -105,21 +105,21 @@ class ActorEnsemble(_Wrapper):
         return write(tensordict, self, means)
 
     def with_plans(self, plans: AnyPlans) -> ActorEnsemble:
-        """Return the ensemble with the same networks that follows other plans."""
+        """Return an ensemble that follows different plans but shares the networks."""
         return in_mode_of(self, ActorEnsemble([with_plans(member, plans) for member in self.members]))
 
 
 class DecidedGripper(_ActionWrapper):
-    """Open or close the gripper fully while not training.
+    """A wrapper that opens or closes the gripper fully, except during training.
 
-    Half open fingers push objects over, and half closed ones lose them.
+    Half-open fingers knock objects over, and half-closed fingers drop objects.
 
-    Reads what the actor reads; writes what the actor writes, where the effort of ``action`` (B, A) is -1 or 1.
+    Reads and writes the actor's keys; the gripper effort in ``action`` (B, A) is -1 or 1.
 
     Args:
         actor: any actor.
-        closes_above: the effort above which the gripper closes; None for the layout's.
-        layout: the layout of the actions; None for the actor's.
+        closes_above: the effort above which the gripper closes; None for the layout's threshold.
+        layout: the layout of the actions; None for the actor's layout.
 
     Example:
         >>> import lw_torchrl as lw
@@ -137,20 +137,20 @@ class DecidedGripper(_ActionWrapper):
 
     @property
     def config(self) -> dict[str, Any]:
-        """The keyword arguments that rebuild it."""
+        """The keyword arguments that reconstruct this module."""
         return {"actor": self.actor, "closes_above": self.closes_above, "layout": self.action_layout}
 
     def converted(self, action: Tensor) -> Tensor:
-        """Return actions whose effort is -1 or 1; while training, the same actions."""
+        """Return actions with a gripper effort of -1 or 1, or the same actions during training."""
         return action if self.training else decided(action, self.action_layout, self.closes_above)
 
     def with_plans(self, plans: AnyPlans) -> DecidedGripper:
-        """Return the policy with the same networks that follows other plans; the actions keep their layout."""
+        """Return a policy that follows different plans but shares the networks; the action layout stays the same."""
         return in_mode_of(self, DecidedGripper(**{**self.config, "actor": with_plans(self.actor, plans)}))
 
 
 def decided(action: Tensor, layout: Layout, closes_above: float | None = None) -> Tensor:
-    """Return actions (..., A) of a layout with an effort of -1 or 1: closing above ``closes_above``."""
+    """Return actions (..., A) with the gripper effort set to -1 or 1; the gripper closes above ``closes_above``."""
     at, action = layout.effort, action.clone()
     bound = layout.closes_above if closes_above is None else closes_above
     action[..., at] = torch.where(action[..., at] * layout.closes > bound, 1.0, -1.0) * layout.closes
@@ -158,18 +158,18 @@ def decided(action: Tensor, layout: Layout, closes_above: float | None = None) -
 
 
 class DemonstratedActor(_Wrapper):
-    """Two policies: one without plans for the tasks that were demonstrated, one with plans for all others.
+    """A policy that uses an actor without plans for demonstrated tasks, and an actor with plans for all other tasks.
 
-    A plan adds nothing in a task that ten demonstrations cover.
+    Plans do not help in tasks that ten demonstrations already cover.
 
-    Reads what the two read; writes ``action`` (B, A) float32, and what else ``others`` writes.
+    Reads the input keys of both actors; writes ``action`` (B, A) float32 and the other keys that ``others`` writes.
 
     Args:
         demonstrated: an actor without plans, for example :class:`DescriptorConditionedActor`.
-        others: an actor with plans, of any tasks.
+        others: an actor with plans, for any tasks.
 
     Raises:
-        ValueError: different layouts; ``demonstrated`` with plans, or ``others`` without.
+        ValueError: the layouts differ, ``demonstrated`` has plans, or ``others`` has none.
 
     Example:
         >>> import lw_torchrl as lw
@@ -180,7 +180,7 @@ class DemonstratedActor(_Wrapper):
         >>> actor(state)["action"].shape
         torch.Size([2, 4])
 
-    Source: ours.
+    Source: original to this library.
     """
 
     _options = ("demonstrated", "others")
@@ -190,10 +190,10 @@ class DemonstratedActor(_Wrapper):
         super().__init__()
         known = tasks_of(demonstrated)
         if plans_of(demonstrated) is not None or plans_of(others) is None or known is None:
-            raise ValueError("demonstrated must be an actor of tasks without plans, and others one with plans")
+            raise ValueError("demonstrated must be an actor with tasks but no plans, and others an actor with plans")
         if layout_of(demonstrated) != layout_of(others):
             layouts = f"{layout_of(demonstrated).name!r} and {layout_of(others).name!r}"
-            raise ValueError(f"demonstrated and others must have one layout, got {layouts}")
+            raise ValueError(f"demonstrated and others must have the same layout, got {layouts}")
         self.demonstrated, self.others = demonstrated, others
         self._wrap([others, demonstrated], others.out_keys)
         self._ids = torch.tensor([task_id(task) for task in known])
@@ -205,8 +205,8 @@ class DemonstratedActor(_Wrapper):
         (task,) = read(tensordict, [key])
         ids = self._ids.to(task.device)
         known = torch.isin(task, ids)
-        # The first policy acts on all rows, as shapes must not depend on data; a task that it does not know becomes
-        # one that it knows, and its action is dropped.
+        # The first actor acts on all rows, because shapes must not depend on data. Unknown tasks are replaced by a
+        # known task, and the resulting actions are dropped.
         rows = tensordict.copy().set(key, torch.where(known, task, ids[0]))
         learned = self.demonstrated(rows).get(_action_key(self.demonstrated))
         key = _action_key(self.others)
@@ -214,7 +214,7 @@ class DemonstratedActor(_Wrapper):
         return write(tensordict, self, [outputs.get(key) for key in self.others.out_keys])
 
     def with_plans(self, plans: AnyPlans) -> TensorDictModuleBase:
-        """Return the policy for other plans; for those of another suite only ``others``."""
+        """Return a policy for different plans; for plans of another suite, return only ``others``."""
         others: TensorDictModuleBase = with_plans(self.others, plans)
         if layout_of(others) != self.layout:  # no task of that suite was demonstrated
             return others
@@ -222,23 +222,23 @@ class DemonstratedActor(_Wrapper):
 
 
 class TransferredActor(_ActionWrapper):
-    """An actor with the same weights for another suite's plans, whose actions are converted to that suite's.
+    """A wrapper that runs an actor on another suite's plans, and converts the actions to that suite's layout.
 
-    A displacement keeps its metres a step, times ``speed``: it is multiplied by the ratio of the layouts' ``reach`` and
-    clipped at 1. A ``binary_gripper``, which opens and closes at once, closes at an effort above ``closes_above``.
+    The displacement per time step, in metres, is multiplied by ``speed``; actions are scaled by the ratio of the
+    layouts' ``reach`` and clipped to [-1, 1]. A ``binary_gripper`` closes at an effort above ``closes_above``.
 
-    Reads what the actor reads, in the other layout; writes ``action`` (B, A) float32 in [-1, 1], and what else the
-    actor writes.
+    Reads the actor's input keys, in the other layout; writes ``action`` (B, A) float32 in [-1, 1] and the actor's other
+    output keys.
 
     Args:
-        actor: an actor whose features mean the same in both layouts: :class:`RoleFeatures` with the "opening".
+        actor: an actor whose features have the same meaning in both layouts: :class:`RoleFeatures` and "opening".
         plans: plans for the other suite's tasks.
-        speed: scale factor of the displacement, for simulators whose steps last longer.
-        trained: the layout that the actor was trained with; None for the actor's.
+        speed: scale factor of the displacement, for simulators with longer time steps.
+        trained: the layout with which the actor was trained; None for the actor's layout.
 
     Raises:
-        ValueError: features that do not transfer; a layout without a displacement.
-        TypeError: an actor without plans.
+        ValueError: the features do not transfer, or a layout has no displacement.
+        TypeError: the actor has no plans.
 
     Example:
         >>> import lw_torchrl as lw
@@ -249,7 +249,7 @@ class TransferredActor(_ActionWrapper):
         >>> lw.modules.TransferredActor(actor, lw.canonical_plans(load_suite("fetch").plans)).tasks
         ('fetch/pick-and-place', 'fetch/push', 'fetch/reach', 'fetch/slide')
 
-    Source: ours; a plan says what matters, so the motion relative to it is the same with another robot.
+    Source: original to this library; the motion relative to the objects that a plan names is the same for any robot.
     """
 
     _options = ("actor", "plans", "speed", "trained")
@@ -266,7 +266,7 @@ class TransferredActor(_ActionWrapper):
             layout.displaced("TransferredActor")  # raises for a layout without a displacement
 
     def converted(self, action: Tensor) -> Tensor:
-        """Return actions of the layout that was trained with, (..., A), as actions of this layout."""
+        """Convert actions (..., A) of the layout in training to actions of this layout."""
         old, new = self.trained, self.layout
         result = action.new_zeros((*action.shape[:-1], new.action_size))
         moved = action[..., old.displaced("TransferredActor")] * (self.speed * old.reach / new.reach)
@@ -276,7 +276,7 @@ class TransferredActor(_ActionWrapper):
         return decided(result, new) if new.binary_gripper else result
 
     def with_plans(self, plans: AnyPlans) -> TransferredActor:
-        """Return the policy with the same networks that follows other plans."""
+        """Return a policy that follows different plans but shares the networks."""
         other = {"actor": with_plans(self.actor, plans), "plans": plans}
         return in_mode_of(self, TransferredActor(**{**self.config, **other}))
 

@@ -21,11 +21,11 @@ from lw_torchrl.objectives.offline import Reduction
 if TYPE_CHECKING:
     from torchrl.objectives import LossModule as _Loss
 else:
-    _Loss = object  # a LossModule's metaclass would wrap this class's methods
+    _Loss = object  # the metaclass of LossModule would wrap the methods of this class
 
 
 class _ImitatesDemonstrations(_Loss):
-    _fixed: Mapping[str, Any] = {}  # options that users cannot set
+    _fixed: Mapping[str, Any] = {}  # options that users cannot change
     _in_keys: list[NestedKey]
 
     @typed
@@ -39,7 +39,7 @@ class _ImitatesDemonstrations(_Loss):
         **options: Any,
     ) -> None:
         if "alpha" in self._fixed and "alpha" in options:
-            raise ValueError("alpha is fixed to 1; use bc_weight, the weight of the imitation")
+            raise ValueError("alpha is fixed to 1; use bc_weight to weight the imitation loss")
         spec = options.get("action_spec")
         if spec is not None and not isinstance(spec, Composite) and len(spec.shape) > 1:
             got = f"shape {tuple(spec.shape)}; use env.action_spec_unbatched"
@@ -49,20 +49,20 @@ class _ImitatesDemonstrations(_Loss):
         super().__init__(actor_network, qvalue_network, reduction=reduction, **self._fixed, **options)
         self.bc_weight = bc_weight
 
-    def _set_in_keys(self) -> None:  # TorchRL calls it when in_keys are first read, and when set_keys changes them
+    def _set_in_keys(self) -> None:  # TorchRL calls this method when in_keys are first read, and in set_keys
         super()._set_in_keys()
         self._in_keys.append(self.tensor_keys.is_demonstration)
 
     def _imitation(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
-        """Return the squared distance of actions (B, A) to the demonstrated ones, (B,) float32, 0 for other rows.
+        """Return the squared distance of actions (B, A) to demonstrated actions, (B,) float32, 0 in other rows.
 
-        It is scaled so that the mean over all rows is the mean over demonstrations.
+        The distance is scaled so that its mean over all rows is the mean over demonstrations.
         """
         key = self.tensor_keys.is_demonstration
         if (is_demonstration := tensordict.get(key, None)) is None:
             raise ValueError(
-                f"the batch lacks {key!r}, which marks the rows to imitate: load_demonstrations "
-                "writes it; in other rows add it, (B,) bool, or set its name with set_keys"
+                f"the batch lacks {key!r}, (B,) bool, which marks the rows to imitate: load_demonstrations "
+                "writes this key; add it to other rows, or choose another key with set_keys"
             )
         if is_demonstration.dtype != torch.bool:
             raise ValueError(f"{key!r} must be torch.bool, true for demonstrations, got {is_demonstration.dtype}")
@@ -72,13 +72,13 @@ class _ImitatesDemonstrations(_Loss):
 
 
 class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
-    """TD3 loss on demonstrations and collected rows; the actor also imitates the demonstrations.
+    """A TD3 loss on demonstrations and collected rows, in which the actor also imitates the demonstrations.
 
-    The actor's loss is -Q / mean(abs(Q)) over all rows, where Q is the mean of the critics, plus ``bc_weight`` times
-    the mean squared distance to ``action`` over the rows where ``is_demonstration`` is true: the rows of datasets,
-    not those of a collector. The critics' loss is TD3's.
+    The actor's loss is -Q / mean(abs(Q)) over all rows, where Q is the mean over the critics, plus ``bc_weight``
+    times the mean squared distance to ``action`` over the rows where ``is_demonstration`` is true (rows of datasets,
+    but not of a collector). The critics' loss is TD3's.
 
-    Reads what TD3 reads, and ``is_demonstration`` (B,) bool. Writes what :class:`torchrl.objectives.TD3BCLoss` writes:
+    Reads the keys of TD3 and ``is_demonstration`` (B,) bool. Writes the keys of :class:`torchrl.objectives.TD3BCLoss`:
     ``loss_actor`` and ``loss_qvalue``, () float32 each, and, detached, the unweighted ``bc_loss`` (), ``lmbd`` (),
     which is 1 / mean(abs(Q)), ``state_action_value_actor`` (B,), ``pred_value`` (E, B), ``target_value`` and
     ``next_state_value`` (B,).
@@ -86,12 +86,12 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
     Args:
         actor_network: a deterministic actor.
         qvalue_network: the critic, copied ``num_qvalue_nets`` times.
-        bc_weight: weight of the imitation.
-        **options: those of :class:`torchrl.objectives.TD3BCLoss` except ``alpha``, which is 1: ``bounds`` or
-            ``action_spec``, ``num_qvalue_nets``, ``policy_noise``, ...
+        bc_weight: weight of the imitation loss.
+        **options: keyword arguments of :class:`torchrl.objectives.TD3BCLoss` except ``alpha``, which is 1: ``bounds``
+            or ``action_spec``, ``num_qvalue_nets``, ``policy_noise``, ...
 
     Raises:
-        ValueError: ``action_spec`` has a batch dimension; at call time, rows without ``is_demonstration``.
+        ValueError: ``action_spec`` has a batch dimension; at call time, ``is_demonstration`` is missing.
 
     Example:
         >>> import lw_torchrl as lw
@@ -103,7 +103,7 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
         True
 
     Source: Fujimoto and Gu, 'A Minimalist Approach to Offline Reinforcement Learning' (TD3+BC); Ball et al., 'Efficient
-    Online Reinforcement Learning with Offline Data', for equal shares of demonstrations.
+    Online Reinforcement Learning with Offline Data', for batches of equally many demonstrations and collected rows.
     """
 
     @dataclass
@@ -123,7 +123,7 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
         judged = self._vmap_qvalue_network00(
             rows.expand(self.num_qvalue_nets, *rows.batch_size), self._cached_detach_qvalue_network_params
         )
-        # TD3BCLoss takes the first critic's value; the mean of all is smoother.
+        # TD3BCLoss uses only the first critic; the mean over all critics is smoother.
         value = judged.get(self.tensor_keys.state_action_value).squeeze(-1).mean(0)
         bc = self._imitation(tensordict, outputs.get(self.tensor_keys.action))
         scale = self.alpha / value.abs().mean().detach().clamp(min=1e-6)
@@ -134,21 +134,21 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
 
 
 class DemonstratedSACLoss(_ImitatesDemonstrations, SACLoss):
-    """SAC loss on demonstrations and collected rows; the actor also imitates the demonstrations.
+    """A SAC loss on demonstrations and collected rows, in which the actor also imitates the demonstrations.
 
     The actor's loss is SAC's over all rows, plus ``bc_weight`` times the imitation loss of
-    :class:`DemonstratedTD3Loss`, computed on the distribution's mode. It is a distance instead of a likelihood because
-    half of the demonstrated actions have a component at ±1, where the likelihood of a TanhNormal explodes. Raises the
-    same errors.
+    :class:`DemonstratedTD3Loss`, computed for the distribution's mode. The imitation loss is a distance instead of a
+    likelihood because half of the demonstrated actions have a component at ±1, where the likelihood of a TanhNormal
+    explodes. Raises the same errors as :class:`DemonstratedTD3Loss`.
 
-    Reads what SAC reads, and ``is_demonstration`` (B,) bool. Writes what :class:`torchrl.objectives.SACLoss` writes:
+    Reads the keys of SAC and ``is_demonstration`` (B,) bool. Writes the keys of :class:`torchrl.objectives.SACLoss`:
     ``loss_actor``, ``loss_qvalue``, ``loss_alpha``, ``alpha`` and ``entropy``, () float32 each.
 
     Args:
         actor_network: a stochastic actor, for example ``actor.stochastic()``.
         qvalue_network: the critic, copied ``num_qvalue_nets`` times.
-        bc_weight: weight of the imitation; Q is not normalised.
-        **options: those of :class:`torchrl.objectives.SACLoss`.
+        bc_weight: weight of the imitation loss; Q is not normalized.
+        **options: keyword arguments of :class:`torchrl.objectives.SACLoss`.
 
     Example:
         >>> import lw_torchrl as lw
@@ -157,8 +157,8 @@ class DemonstratedSACLoss(_ImitatesDemonstrations, SACLoss):
         >>> loss = lw.objectives.DemonstratedSACLoss(actor, lw.PlanConditionedQValue(plans), bc_weight=2.0)
         >>> loss.make_value_estimator(gamma=0.99)
 
-    Source: Haarnoja et al., 'Soft Actor-Critic Algorithms and Applications', with the term of
-    :class:`DemonstratedTD3Loss`.
+    Source: Haarnoja et al., 'Soft Actor-Critic Algorithms and Applications', with the
+    imitation loss of :class:`DemonstratedTD3Loss`.
     """
 
     @dataclass

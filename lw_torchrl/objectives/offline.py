@@ -1,4 +1,4 @@
-"""Offline losses: the value of a state by expectile regression, imitation weighted by advantages, n-step rows."""
+"""Offline losses: state values by expectile regression, advantage-weighted imitation, and n-step targets."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ Reduction = Literal["none", "mean", "sum"]
 
 
 class ExpectileValueLoss(LossModule):
-    """Loss of a state value V by expectile regression, without a value of actions.
+    """A loss that trains a state-value network V by expectile regression, without a state-action value network.
 
     The loss of a row is |τ - 1(u < 0)|·u², where u is the target minus V. The target is the reward plus the discounted
-    value, by the target network, of the next state (n steps ahead where the rows have ``steps_to_next_obs``). With an
-    expectile above one half, V follows the better rows. :class:`AdvantageWeightedLoss` imitates rows by u.
+    value of the next state by the target network (n time steps ahead if the rows have ``steps_to_next_obs``). With an
+    expectile above one half, V follows the better rows. :class:`AdvantageWeightedLoss` weights rows by u.
 
-    Reads what the network reads, also in ``next``; ``("next", "reward")`` (B, 1) float32; ``("next", "done")`` and
+    Reads the network's input keys, also in ``next``; ``("next", "reward")`` (B, 1) float32; ``("next", "done")`` and
     ``("next", "terminated")`` (B, 1) bool; and, if present, ``steps_to_next_obs`` (B,) int64 and ``priority_weight``
-    (B,) float32. Returns ``loss_value`` () float32, (B,) with ``reduction="none"``, and ``value`` () float32, the
+    (B,) float32. Returns ``loss_value`` () float32, or (B,) with ``reduction="none"``, and ``value`` () float32, the
     detached mean of V. Writes ``td_error`` (B,) float32, a row's largest u², into its input.
 
     Args:
-        value_network: writes ``state_value`` (B, 1) float32. If it also writes ``state_values`` (B, E) float32, as
-            :class:`PlanConditionedValue` with an ensemble does, each member learns by itself, and losses are added.
+        value_network: a module that writes ``state_value`` (B, 1) float32. If it also writes ``state_values`` (B, E)
+            float32, like a :class:`PlanConditionedValue` ensemble, each member has its own loss; the losses are added.
         expectile: τ, from 0 to 1.
-        delay_value: compute targets by a target network, which :class:`torchrl.objectives.SoftUpdate` updates.
+        delay_value: compute targets with a target network, which :class:`torchrl.objectives.SoftUpdate` updates.
         reduction: "mean", "none" or "sum" over the rows.
 
     Raises:
-        ValueError: at call time, keys that the network does not write, or rows without a key.
+        ValueError: at call time, the network does not write a required key, or the rows lack a key.
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -60,8 +60,8 @@ class ExpectileValueLoss(LossModule):
         >>> loss(batch)["loss_value"].shape, loss.advantage(batch).shape
         (torch.Size([]), torch.Size([5, 1]))
 
-    Source: Kostrikov, Nair, Levine, "Offline Reinforcement Learning with Implicit Q-Learning", 2021, equation 5, of
-    which this keeps only V; n steps as in Sutton, Barto, "Reinforcement Learning", section 7.1.
+    Source: Kostrikov, Nair, Levine, "Offline Reinforcement Learning with Implicit Q-Learning", 2021, equation 5,
+    without Q; n-step targets as in Sutton, Barto, "Reinforcement Learning", section 7.1.
     """
 
     @dataclass
@@ -96,7 +96,7 @@ class ExpectileValueLoss(LossModule):
         reduction: Reduction | None = None,
     ) -> None:
         super().__init__()
-        if reduction not in (None, self.reduction):  # checkpoints describe only what differs from the class
+        if reduction not in (None, self.reduction):  # checkpoints describe only attributes that differ from the class
             self.reduction = reduction
         self.expectile = expectile
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
@@ -108,12 +108,12 @@ class ExpectileValueLoss(LossModule):
         return list(dict.fromkeys([*inputs, *(unravel_key(("next", key)) for key in following)]))
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> ExpectileValueLoss:
-        """Set the estimator of the targets, and return the loss.
+        """Set the estimator of the targets, and return this loss.
 
         Args:
-            value_type: an estimator, its class, or ``ValueEstimators.TD0``; None for the last. Others need rows in the
-                order of time and raise :class:`NotImplementedError`.
-            **hyperparams: ``gamma``, the discount of a step, by default 0.99.
+            value_type: an estimator, an estimator class, or ``ValueEstimators.TD0``; None for TD0. The other members of
+                ``ValueEstimators`` need rows in time order, and raise a :class:`NotImplementedError`.
+            **hyperparams: ``gamma``, the discount per time step, by default 0.99.
         """
         value_type = self.default_value_estimator if value_type is None else value_type
         if not isinstance(value_type, (str, ValueEstimators)):
@@ -124,7 +124,7 @@ class ExpectileValueLoss(LossModule):
         return self
 
     def train(self, mode: bool = True) -> ExpectileValueLoss:
-        """Set the mode of the network too, which the loss does not hold as a submodule."""
+        """Set the mode of the loss and of the network, which is not a submodule of the loss."""
         self.value_network.train(mode)
         return super().train(mode)
 
@@ -144,7 +144,7 @@ class ExpectileValueLoss(LossModule):
 
     @torch.no_grad()
     def advantage(self, tensordict: TensorDictBase) -> Tensor:
-        """Return each row's advantage, (B, 1) float32: the target minus the mean value, by the target network in eval
+        """Return each row's advantage (B, 1) float32: the target minus the mean value of the target network in eval
         mode."""
         with evaluating(self.value_network):
             value = self._values(tensordict, self.target_value_network_params).mean(-1, keepdim=True)
@@ -153,46 +153,46 @@ class ExpectileValueLoss(LossModule):
     @torch.no_grad()
     def _target(self, tensordict: TensorDictBase) -> Tensor:
         next_value = self._values(tensordict.get("next"), self.target_value_network_params).mean(-1, keepdim=True)
-        # The estimator may write averaged rewards into its input, so it gets a copy.
+        # The estimator may write averaged rewards into its input, so pass a copy.
         return self.value_estimator.value_estimate(tensordict.copy(), next_value=next_value)
 
     def _values(self, tensordict: TensorDictBase, params: TensorDictParams) -> Tensor:
-        """Return the value of each member, (B, E)."""
+        """Return the values (B, E) of the ensemble's members."""
         network, keys = self.value_network, self.tensor_keys
         key = keys.values if unravel_key(keys.values) in network.out_keys else keys.value
-        # An ensemble also writes its minimum, from which its members could not learn by themselves.
+        # An ensemble also writes the minimum, but each member needs a loss on its own value.
         is_ensemble = len(getattr(network, "heads", ())) > 1
         if unravel_key(key) not in network.out_keys or (is_ensemble and key != keys.values):
             needed = keys.values if is_ensemble else keys.value
             raise ValueError(
-                f"value_network must write {needed!r}, it writes {network.out_keys}; use loss.set_keys(...)"
+                f"value_network must write {needed!r}, but writes {network.out_keys}; use loss.set_keys(...)"
             )
         with params.to_module(network, preserve_module_state=False):
-            # in_keys are not all that a network reads: features also read RandomYaw's angle, the attention qaf_plan.
+            # Pass all keys, because networks also read optional keys: RandomYaw's angle, qaf_plan.
             (values,) = read(network(tensordict.copy()), [key])
         return values
 
 
 class AdvantageWeightedLoss(LossModule):
-    """Imitation loss with weights exp(β·A), at most ``max_weight``, where A is a row's advantage.
+    """An imitation loss whose rows have the weight exp(β·A), at most ``max_weight``, where A is a row's advantage.
 
-    Reads what the actor reads, ``action`` (B, 4) float32, and ``advantage`` (B, 1) float32, which
-    :meth:`ExpectileValueLoss.advantage` returns and :func:`standardize_by_task` makes comparable. Returns
-    ``loss_actor`` () float32, (B,) with ``reduction="none"``, and detached ``weight_clipped`` () float32, the fraction
-    of rows with the maximum weight, and ``ESS`` () float32 in (0, 1], the effective sample size over B.
+    Reads the actor's input keys, ``action`` (B, 4) float32, and ``advantage`` (B, 1) float32, which
+    :meth:`ExpectileValueLoss.advantage` returns and :func:`standardize_by_task` standardizes. Returns ``loss_actor`` ()
+    float32, or (B,) with ``reduction="none"``, and, detached, ``weight_clipped`` () float32, the fraction of rows with
+    the maximum weight, and ``ESS`` () float32 in (0, 1], the effective sample size divided by B.
 
     Args:
-        actor_network: an actor; one with a distribution is compared by its mode.
-        beta: β, in units of 1 / advantage. With 0 this is :class:`torchrl.objectives.BCLoss`.
+        actor_network: an actor; for an actor with a distribution, the distance uses the mode.
+        beta: β, in units of 1 / advantage. With 0, the loss is :class:`torchrl.objectives.BCLoss`.
         max_weight: maximum weight, above 0.
-        loss_function: "l2", "l1" or "smooth_l1", the mean distance to the action's numbers; or "log_prob", minus the
-            action's log-probability, for an actor with a distribution.
-        reduction: "mean", weighted; "none", each row's distance times its weight; or "sum", their sum.
+        loss_function: "l2", "l1" or "smooth_l1", the mean distance over the action's components; or "log_prob", the
+            negative log-probability of the action, for an actor with a distribution.
+        reduction: "mean", the weighted mean; "none", each row's distance times its weight; or "sum", the weighted sum.
 
     Raises:
-        ValueError: at call time, a missing key, or an advantage that is not (B, 1) or not finite.
-        RuntimeError: the actor's action has another shape than the one to imitate.
-        TypeError: "log_prob" for an actor without a distribution.
+        ValueError: at call time, a key is missing, or the advantage is not (B, 1) or not finite.
+        RuntimeError: the shapes of the actor's action and of the action to imitate differ.
+        TypeError: the loss function is "log_prob", but the actor has no distribution.
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -233,7 +233,7 @@ class AdvantageWeightedLoss(LossModule):
         reduction: Reduction | None = None,
     ) -> None:
         super().__init__()
-        if reduction not in (None, self.reduction):  # checkpoints describe only what differs from the class
+        if reduction not in (None, self.reduction):  # checkpoints describe only attributes that differ from the class
             self.reduction = reduction
         self.beta, self.max_weight, self.loss_function = beta, max_weight, loss_function
         self.convert_to_functional(actor_network, "actor_network")
@@ -244,14 +244,14 @@ class AdvantageWeightedLoss(LossModule):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the loss; the input is not changed."""
+        """Return the loss and the logged values, without changing the input."""
         action, advantage = read(tensordict, [self.tensor_keys.action, self.tensor_keys.advantage])
         if advantage.shape != (*tensordict.batch_size, 1) or advantage.dtype != action.dtype:
             got = f"shape {tuple(advantage.shape)} in {advantage.dtype}"
             raise ValueError(f"advantage must be {(*tensordict.batch_size, 1)} in {action.dtype}, got {got}")
         check_finite("advantage", advantage)
         logs, most = self.beta * advantage.detach().squeeze(-1), math.log(self.max_weight)
-        # A mean depends only on the weights' ratios. Divided by the largest, they cannot all underflow.
+        # A weighted mean depends only on ratios of weights. Divided by the largest, they cannot all underflow.
         largest = logs.max().clamp(max=most) if self.reduction == "mean" else 0.0
         weights = (logs.clamp(max=most) - largest).exp()
         loss = self._reduce_loss(self._distance(tensordict, action), tensordict, weights=weights)
@@ -264,7 +264,7 @@ class AdvantageWeightedLoss(LossModule):
         return losses
 
     def _distance(self, tensordict: TensorDictBase, action: Tensor) -> Tensor:
-        """Return the distance of each row, (B,)."""
+        """Return the distance (B,) of each row's action."""
         inputs = tensordict.exclude(self.tensor_keys.action)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             if self.loss_function == "log_prob":
@@ -275,9 +275,9 @@ class AdvantageWeightedLoss(LossModule):
 
 @typed
 def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
-    """Standardise advantages to mean 0 and standard deviation 1 over the rows of each task.
+    """Standardize advantages to mean 0 and standard deviation 1 over the rows of each task.
 
-    Without this, tasks with large rewards would get all the weight.
+    Without standardization, tasks with large rewards would get all the weight.
 
     Args:
         advantage: (R, 1) float32, finite.
@@ -287,7 +287,7 @@ def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
         (R, 1) float32; 0 for a task whose advantages are all equal.
 
     Raises:
-        ValueError: another shape or dtype, NaN or infinity.
+        ValueError: a shape or dtype is wrong, or an advantage is NaN or infinite.
 
     Example:
         >>> import torch
@@ -303,31 +303,31 @@ def standardize_by_task(advantage: Tensor, task_id: Tensor) -> Tensor:
     for task in task_id.unique():
         rows = task_id == task
         own = advantage[rows].detach().double()
-        if own.max() > own.min():  # otherwise only the rounding of the mean would be left
+        if own.max() > own.min():  # otherwise only rounding errors would remain
             standardized[rows] = ((own - own.mean()) / own.std(correction=0)).to(advantage.dtype)
     return standardized
 
 
 @typed
 def with_n_steps(loss: LossModule, batch: TensorDictBase) -> TensorDictBase:
-    """Make a loss's value estimator read n-step rows: ``loss(with_n_steps(loss, batch))``.
+    """Prepare a batch of n-step rows and a loss's value estimator: ``loss(with_n_steps(loss, batch))``.
 
     TorchRL's :class:`~torchrl.objectives.IQLLoss` and :class:`~torchrl.objectives.REDQLoss` only pass ``next`` to the
-    estimator, so this copies ``steps_to_next_obs`` there. Other losses and rows are left alone.
+    estimator, so this function copies ``steps_to_next_obs`` into ``next``. Other losses and rows stay unchanged.
 
     Args:
-        loss: any loss; call ``make_value_estimator`` before.
-        batch: rows of a buffer, with ``steps_to_next_obs`` (B,) int64.
+        loss: any loss whose ``make_value_estimator`` was called.
+        batch: rows of a replay buffer, with ``steps_to_next_obs`` (B,) int64.
 
     Returns:
-        ``batch``, with ``("next", "steps_to_next_obs")`` (B,) int64 if the loss needs it.
+        ``batch``, with ``("next", "steps_to_next_obs")`` (B,) int64 if the loss needs this key.
 
     Example:
         >>> import lw_torchrl as lw, torch
         >>> from tensordict import TensorDict
         >>> from torchrl.objectives import IQLLoss
         >>> plans = lw.load_plans("MT10")
-        >>> actor = lw.PlanConditionedActor(plans).stochastic("tanh_normal")
+        >>> actor = lw.PlanConditionedActor(plans).stochastic("normal")
         >>> loss = IQLLoss(actor, lw.PlanConditionedQValue(plans), lw.PlanConditionedValue(plans))
         >>> loss.make_value_estimator(gamma=0.99)
         >>> batch = TensorDict(steps_to_next_obs=torch.tensor([5, 2]), next=TensorDict(), batch_size=[2])

@@ -1,4 +1,4 @@
-"""TorchRL transforms: query answers, also corrupted ones, pictures and language for environments, and augmentations."""
+"""TorchRL transforms that add condition answers, pictures or task descriptions, and augmentations of datasets."""
 
 import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.transforms.augmentation import HideOpening, JitterTarget, SwapUnmentioned

@@ -1,4 +1,4 @@
-"""Augmentations of sampled rows: transforms of a replay buffer that keep a policy from relying on chance details."""
+"""Augmentations for replay buffers, which keep a policy from relying on accidental details of demonstrations."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from lw_torchrl.language.task_index import PlanTables, answers_of
 from lw_torchrl.language.tasks import role_object
 from lw_torchrl.transforms.qaf import plan_number_key
 
-ACTIVE = 0.01  # a step with more attention is active; a false step next to a true one has about 1e-4
+ACTIVE = 0.01  # a plan step with more attention is active; a false step has about 1e-4 if another step is true
 
 
 class Augmentation(Transform):
-    """Base class of transforms that change sampled rows at random. An environment refuses them."""
+    """A base class of transforms that change sampled rows at random. Use in an environment raises a TypeError."""
 
     def _refuse(self) -> NoReturn:
         name = type(self).__name__
-        raise TypeError(f"{name} is for replay buffers: in an environment it would change what the policy acts on")
+        raise TypeError(f"{name} is only for replay buffers: in an environment it would change the policy's input")
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._refuse()
@@ -43,7 +43,7 @@ class Augmentation(Transform):
         super().set_container(container)
 
     def table(self, name: str, device: torch.device) -> Tensor:
-        """Return a buffer on a device; it stays there for the next batch."""
+        """Return the buffer ``name`` on a device, and keep the buffer there for later batches."""
         table: Tensor = getattr(self, name)
         if table.device != device:
             table = table.to(device)
@@ -53,22 +53,22 @@ class Augmentation(Transform):
 
 
 class PlanAugmentation(Augmentation):
-    """Base class of augmentations that depend on which steps of a row's plan are active.
+    """A base class of augmentations that depend on which steps of a row's plan are active.
 
-    A step is active if its attention weight is above 0.01, see :class:`~lw_torchrl.modules.PlanAttention`.
+    A plan step is active if its attention weight is above 0.01, see :class:`~lw_torchrl.modules.PlanAttention`.
     """
 
     steps: Tensor
 
     def _read_plans(self, plans: AnyPlans) -> Plans:
         plans = as_plans(plans)
-        self.fingerprint = plans.fingerprint  # identifies this transform in checkpoints of trainers
+        self.fingerprint = plans.fingerprint  # identifies this transform in training checkpoints
         self._tables = PlanTables(plans)
         self.register_buffer("steps", self._tables.turns, persistent=False)  # (T, 2, S) bool
         return plans
 
     def answers(self, tensordict: TensorDictBase, keys: Keys) -> tuple[Tensor, Tensor, Tensor]:
-        """Return qaf (B, S), the rows' place in the tables (B,) int64, and the steps of the row's turn (B, S) bool."""
+        """Return qaf (B, S), row indices of the tables (B,) int64, and a mask (B, S) bool of the turn's steps."""
         qaf, task_id = read(tensordict, keys)
         qaf, rows = answers_of(qaf, task_id, tensordict.get(plan_number_key(keys[0]), None), self._tables)
         if qaf.shape != (shape := (*rows.shape, self._tables.mask.shape[-1])):
@@ -77,29 +77,29 @@ class PlanAugmentation(Augmentation):
         return qaf, rows, self.table("steps", rows.device)[rows, torch.zeros_like(rows) if turn is None else turn % 2]
 
     def active(self, tensordict: TensorDictBase, keys: Keys) -> tuple[Tensor, Tensor]:
-        """Return which steps are active, (B, S) bool, and the rows' place in the tables, (B,) int64."""
+        """Return a mask of the active plan steps (B, S) bool, and the row indices of the tables (B,) int64."""
         qaf, rows, steps = self.answers(tensordict, keys)
         weights = (10.0 * qaf.to(torch.float32) - 5.0).masked_fill(~steps, -torch.inf).softmax(-1)
         return weights > ACTIVE, rows
 
 
 class SwapUnmentioned(PlanAugmentation):
-    """Put objects that no active step mentions where they are in another row, so that a policy cannot rely on them.
+    """An augmentation that replaces the positions of objects that no active plan step mentions by those of another row.
 
-    A step mentions the objects and the goal that its condition and its skill name. For replay buffers, after a
-    :class:`QAFTransform`, which must see the unchanged scene.
+    A policy then cannot rely on these objects. A plan step mentions the objects and the goal that its condition and
+    skill name. For replay buffers, after a :class:`QAFTransform`, which must see the unchanged scene.
 
-    Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); changes ``observation`` (B, D), and ``("next", "observation")``
-    alike: an object stays if an active step of either mentions it. Draws from PyTorch's global generator.
+    Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); changes ``observation`` (B, D) and ``("next", "observation")`` in
+    the same way: an object stays if an active step of either mentions it. Draws from PyTorch's global generator.
 
     Args:
         plans: the plans whose conditions ``qaf`` answers.
-        probability: probability of swapping each object, and the goal, in each row.
-        in_keys: other names for observation, task_id and qaf, in this order.
+        probability: probability of replacing each object, and the goal, in each row.
+        in_keys: replacements for the keys ``observation``, ``task_id`` and ``qaf``, in this order.
 
     Raises:
-        ValueError: at call time, a missing key, a task without a plan, or the answers of other plans.
-        TypeError: use in an environment.
+        ValueError: at call time, a key is missing, a task has no plan, or ``qaf`` belongs to other plans.
+        TypeError: the transform is used in an environment.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -110,7 +110,7 @@ class SwapUnmentioned(PlanAugmentation):
         >>> swap(lw.QAFTransform(plans)(rows))["observation"].shape
         torch.Size([2, 39])
 
-    Source: domain randomisation.
+    Source: domain randomization.
     """
 
     mentioned: Tensor
@@ -125,17 +125,17 @@ class SwapUnmentioned(PlanAugmentation):
         self.register_buffer("mentioned", mentioned(plans, self._tables), persistent=False)  # (T, S, P) bool
 
     def _kept(self, tensordict: TensorDictBase) -> Tensor:
-        """Return which objects, and the goal, stay where they are, (B, P) bool."""
+        """Return whether each object, and the goal, keeps its position, (B, P) bool."""
         active, rows = self.active(tensordict, [self.in_keys[2], self.in_keys[1]])
         return (active.unsqueeze(-1) & self.table("mentioned", rows.device)[rows]).any(-2)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = tensordict.copy()  # replay[:] may give the storage itself
+        tensordict = tensordict.copy()  # replay[:] may return the storage itself
         key, task, qaf = self.in_keys
         observations = {key: read(tensordict, [key])[0]}
         kept = self._kept(tensordict)
         if not kept.numel():
-            return tensordict  # no row to swap with
+            return tensordict  # there is no row to swap with
         following = tensordict.get("next", None)
         if following is not None and following.get(key, None) is not None:
             observations[unravel_key(("next", key))] = following.get(key)
@@ -157,18 +157,18 @@ class SwapUnmentioned(PlanAugmentation):
 
 
 class HideOpening(Augmentation):
-    """Replace the gripper's opening by that of another row: it often reveals the task of a demonstration.
+    """An augmentation that replaces the gripper's opening by the opening in another row.
 
-    For replay buffers. Changes ``observation`` (B, D), not ``("next", "observation")``. Draws from PyTorch's global
-    generator.
+    The opening often reveals the task of a demonstration. For replay buffers. Changes ``observation`` (B, D), not
+    ``("next", "observation")``. Draws from PyTorch's global generator.
 
     Args:
         probability: probability of replacing the opening of a row.
         layout: the layout of the observations.
-        in_keys: another name for observation.
+        in_keys: a replacement for the key ``observation``.
 
     Raises:
-        TypeError: use in an environment.
+        TypeError: the transform is used in an environment.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -187,7 +187,7 @@ class HideOpening(Augmentation):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observation = read(tensordict, self.in_keys)[0].clone()
         if not observation.numel():
-            return tensordict  # no row to take the opening from
+            return tensordict  # there is no row to take the opening from
         opening = observation[..., self._opening]
         others = opening.flatten()[torch.randint(opening.numel(), opening.shape, device=opening.device)]
         hidden = torch.rand(opening.shape, device=opening.device) < self.probability
@@ -196,22 +196,22 @@ class HideOpening(Augmentation):
 
 
 class JitterTarget(PlanAugmentation):
-    """Draw an offset of the target for rows in which an active step pushes or pulls: contact points are uncertain.
+    """An augmentation that draws a random target offset for rows in which an active plan step pushes or pulls.
 
-    :class:`~lw_torchrl.modules.RoleFeatures` adds the offset to the position of the target that it shows. For replay
-    buffers, after a :class:`QAFTransform`. Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); writes ``target_offset``
-    (B, 3) float32, metres: normal noise of ``std`` in z and half of it in x and y, or 0 in rows without such a step.
-    Draws from PyTorch's global generator. TorchRL's losses, except BCLoss, do not pass the offset on to the features,
-    so :class:`~lw_torchrl.OfflineTrainer` refuses them.
+    The offset models uncertain contact points: :class:`~lw_torchrl.modules.RoleFeatures` adds it to the target's
+    position. For replay buffers, after a :class:`QAFTransform`. Reads ``task_id`` (B,) int64 and ``qaf`` (B, S); writes
+    ``target_offset`` (B, 3) float32, metres: normal noise of ``std`` in z and ``std / 2`` in x and y, or 0 without such
+    a step. Draws from PyTorch's global generator. TorchRL's losses, except BCLoss, do not pass the offset on to the
+    features, so :class:`~lw_torchrl.OfflineTrainer` rejects these losses.
 
     Args:
         plans: canonical plans, see :func:`~lw_torchrl.canonical_plans`, whose conditions ``qaf`` answers.
-        std: standard deviation of the offset's height, metres.
-        in_keys: other names for task_id and qaf, in this order.
+        std: standard deviation of the offset in z, metres.
+        in_keys: replacements for the keys ``task_id`` and ``qaf``, in this order.
 
     Raises:
-        ValueError: the plans have no roles; or at call time, as for :class:`SwapUnmentioned`.
-        TypeError: use in an environment.
+        ValueError: the plans have no roles; at call time, see :class:`SwapUnmentioned`.
+        TypeError: the transform is used in an environment.
 
     Example:
         >>> import torch, lw_torchrl as lw
@@ -243,7 +243,7 @@ class JitterTarget(PlanAugmentation):
 
 
 def mentioned(plans: Plans, tables: PlanTables) -> Tensor:
-    """Return (T, S, P) bool, whether a step mentions each object of the layout and, last, the goal."""
+    """Return whether each plan step mentions each object of the layout and, last, the goal, (T, S, P) bool."""
     numbers = [{number for part in parts for number in places(part)} for parts in plans.layout.parts]
     table = torch.zeros(*tables.mask.shape, len(numbers), dtype=torch.bool)
     for task, plan in plans.items():
@@ -256,11 +256,11 @@ def mentioned(plans: Plans, tables: PlanTables) -> Tensor:
 
 
 def role_table(plans: Plans, tables: PlanTables, holds: Callable[[StepRole], bool]) -> Tensor:
-    """Return (T, S) bool, the steps for whose role ``holds`` is true; :class:`ValueError` if a step has no role."""
+    """Return whether ``holds`` is true for each plan step's role, (T, S) bool; raise if a plan step has no role."""
     table = torch.zeros_like(tables.mask)
     for task, plan in plans.items():
         for number, step in enumerate(plan.steps):
             if step.role is None:
-                raise ValueError(f"plans must be those of lw.canonical_plans; step {number} of {task!r} has no role")
+                raise ValueError(f"plans must come from lw.canonical_plans; step {number} of {task!r} has no role")
             table[tables.index.row(task), number] = holds(step.role)
     return table

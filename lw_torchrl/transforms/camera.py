@@ -1,4 +1,4 @@
-"""CameraTransform: pictures of an environment's rows, taken by Meta-World's cameras."""
+"""CameraTransform: camera pictures of an environment's rows as observations."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from lw_torchrl.transforms.environment import KeepsEnvState, base_env, reset_row
 
 
 class CameraTransform(KeepsEnvState):
-    """Write ``pixels`` (B, height, width·C, 3) uint8, pictures by C cameras side by side, the first on the left.
+    """A transform that writes ``pixels`` (B, height, width·C, 3) uint8, the pictures of C cameras from left to right.
 
-    A picture of a row is taken at its reset and then every N steps of its episode, and held in between; rows that a
-    ``_step`` or ``_reset`` mask leaves out are not rendered. Its ``state_dict`` holds the environment's, as
-    :class:`EnvState` does. With SerialEnv and ParallelEnv put it into each worker.
+    A row is rendered at its reset and then every N time steps of its episode; its picture stays the same in between.
+    Rows outside a ``_step`` or ``_reset`` mask are not rendered. The ``state_dict`` includes that of the environment,
+    as for :class:`EnvState`. With SerialEnv and ParallelEnv, put this transform into each worker.
 
     Args:
-        cameras: "corner2", "corner", "corner3", "corner4", "topview", "behindGripper" or "gripperPOV", or several.
+        cameras: one or several of "corner2", "corner", "corner3", "corner4", "topview", "behindGripper", "gripperPOV".
         height, width: size of each picture, in pixels.
-        every: N.
-        out_keys: another name for pixels.
+        every: N, the number of time steps between two pictures.
+        out_keys: a replacement for the key ``pixels``.
 
     Raises:
-        ValueError: an unknown camera, a picture that is too large, or use on a replay buffer.
-        TypeError: there is no LanguageWorldEnv right under it.
-        RuntimeError: a step of an environment that was never reset, or not since ``load_state_dict``.
-        ImportError: there is no OpenGL; it names what to install.
+        ValueError: a camera is unknown, a picture is too large, or the transform is used on a replay buffer.
+        TypeError: the base environment is not a LanguageWorldEnv.
+        RuntimeError: the environment takes a step without a reset, or without a reset since ``load_state_dict``.
+        ImportError: OpenGL is missing; the message names what to install.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -44,7 +44,7 @@ class CameraTransform(KeepsEnvState):
         >>> env.reset()["pixels"].shape
         torch.Size([1, 64, 128, 3])
 
-    Source: mirrors ``torchrl.record.PixelRenderTransform``, for some rows and some steps.
+    Source: ``torchrl.record.PixelRenderTransform``, for selected rows and time steps.
     """
 
     @typed
@@ -60,12 +60,12 @@ class CameraTransform(KeepsEnvState):
         self.cameras = check_cameras(cameras, height, width)
         self.height, self.width, self.every = height, width, every
         super().__init__(in_keys=[], out_keys=as_keys("out_keys", out_keys, ("pixels",)))
-        self.shape = self.height, self.width * len(self.cameras), 3  # of a row's pictures
+        self.shape = self.height, self.width * len(self.cameras), 3  # the shape of a row's pictures
         self._forget_episodes()
 
     def _forget_episodes(self) -> None:
         self._taken: Tensor | None = None  # (N, height, width·C, 3) uint8
-        self._steps: Tensor | None = None  # (N,) int64, of each row's episode
+        self._steps: Tensor | None = None  # (N,) int64, time steps since each row's reset
 
     def set_container(self, container: Transform | EnvBase) -> None:
         super().set_container(container)
@@ -73,10 +73,10 @@ class CameraTransform(KeepsEnvState):
         if isinstance(env, BatchedEnvBase):
             raise TypeError(f"CameraTransform must be in each worker of a {type(env).__name__}, not around it")
         if env is not None and not hasattr(env, "row_tasks"):
-            raise TypeError(f"CameraTransform must be around a LanguageWorldEnv, got {type(env).__name__}")
+            raise TypeError(f"CameraTransform needs a LanguageWorldEnv, got {type(env).__name__}")
 
     def _draw(self, which: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
-        """Render the rows ``which``, (N,) bool, and write all rows' pictures."""
+        """Render the rows where ``which`` (N,) bool is true, and write the pictures of all rows."""
         env: Any = base_env(self)
         rows = which.nonzero().flatten()
         if self._taken is None:
@@ -84,7 +84,7 @@ class CameraTransform(KeepsEnvState):
         if len(rows):
             size = {"height": self.height, "width": self.width, "rows": rows.tolist()}
             pictures = [env.render(camera=camera, **size) for camera in self.cameras]
-            # An environment of one row returns its picture without a batch dimension.
+            # With batch_size=(), the environment returns a picture without a batch dimension.
             self._taken[rows] = torch.cat([each if each.dim() == 4 else each[None] for each in pictures], -2)
         return tensordict.set(self.out_keys[0], self._taken.clone().reshape(*tensordict.batch_size, *self.shape))
 

@@ -1,4 +1,4 @@
-"""Transforms of environments: their state, the transforms before this one, and each row's task as a sentence."""
+"""Transforms that save an environment's state or write task descriptions, and helpers for other transforms."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lw_torchrl.language.tasks import TASKS, TaskList, named_tasks, task_id
 
 
 def base_env(transform: Transform) -> EnvBase | None:
-    """Return the environment under all transforms; None on a replay buffer and in a Compose without a container."""
+    """Return the environment below all transforms, or None on a replay buffer or in a Compose without a container."""
     try:
         env = transform.container
     except ValueError:
@@ -31,11 +31,11 @@ def base_env(transform: Transform) -> EnvBase | None:
 
 
 def refuse_changed(transform: Transform, key: NestedKey) -> None:
-    """Raise :class:`ValueError` if a transform before this one in its Composes or environments writes ``key``."""
+    """Raise a :class:`ValueError` if a transform that runs before ``transform`` writes ``key``."""
     for earlier in reversed(_before(transform)):
         written = [unravel_key(out) for out in earlier.__dict__.get("_out_keys") or ()]
         if getattr(earlier, "makes_observation", False):
-            return  # it writes the original observation, so the transforms before it do not matter
+            return  # earlier transforms do not matter: this transform writes the original observation
         if isinstance(earlier, RenameTransform) and key in written:
             key = unravel_key(earlier.in_keys[written.index(key)])
         elif key in written or unravel_key(("next", key)) in written:
@@ -44,7 +44,7 @@ def refuse_changed(transform: Transform, key: NestedKey) -> None:
 
 
 def _before(transform: Transform) -> list[Transform]:
-    """Return the transforms that run before this one, in order."""
+    """Return the transforms that run before ``transform``, in order."""
     transforms: list[Transform] = []
     inner, container = transform, _container(transform)
     while isinstance(container, Compose):
@@ -57,7 +57,7 @@ def _before(transform: Transform) -> list[Transform]:
 
 
 def _container(transform: Transform) -> Compose | EnvBase | None:
-    # Transform.container skips Composes and raises without a container.
+    # Unlike Transform.container, do not skip Composes, and return None without a container.
     reference = transform.__dict__.get("_container")
     return None if reference is None else reference()
 
@@ -69,10 +69,10 @@ def _flat(transform: Transform) -> list[Transform]:
 
 
 class EpisodeTransform(Transform):
-    """A transform that keeps a state of each row's episode; a clone, or a loaded one, requires a reset first."""
+    """A base class of transforms with a state for each row's episode; cloning or loading them requires a reset."""
 
     def _forget_episodes(self) -> None:
-        """Delete the states: no episode has begun."""
+        """Delete the state of all episodes, so that a reset is required."""
 
     def clone(self) -> Self:
         other: Self = super().clone()
@@ -85,14 +85,14 @@ class EpisodeTransform(Transform):
 
 
 class KeepsEnvState(EpisodeTransform):
-    """A transform whose ``state_dict`` also holds the environment's, which TorchRL does not save."""
+    """A base class of transforms whose ``state_dict`` includes that of the environment, which TorchRL does not save."""
 
     def get_extra_state(self) -> Tensor:
-        """Return the environment's ``state_dict``, as bytes (n,) uint8; empty on a replay buffer."""
+        """Return the environment's ``state_dict`` as bytes (n,) uint8, or an empty tensor on a replay buffer."""
         env = base_env(self)
         if isinstance(env, BatchedEnvBase) and env.is_closed:
             name, env = type(env).__name__, None
-            warnings.warn(f"this {name} is not running, so the state_dict lacks its episodes", stacklevel=2)
+            warnings.warn(f"this {name} is not running, so the state_dict lacks the episode counters", stacklevel=2)
         if env is None:
             return torch.zeros(0, dtype=torch.uint8)
         buffer = io.BytesIO()
@@ -100,30 +100,31 @@ class KeepsEnvState(EpisodeTransform):
         return torch.frombuffer(bytearray(buffer.getvalue()), dtype=torch.uint8)
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Load the environment's state; on a replay buffer there is nothing to load."""
+        """Load the environment's state; do nothing on a replay buffer."""
         env = base_env(self)
         if env is None:
             return
         if not state.numel():
-            raise ValueError("state_dict lacks an environment's episodes: none was running when it was saved")
+            raise ValueError("state_dict lacks episode counters: it was saved while the environment was not running")
         env.load_state_dict(torch.load(io.BytesIO(state.cpu().numpy().tobytes()), weights_only=True))
         if (flags := env.__dict__.get("_shm_done_flags")) is not None:
-            # TorchRL 0.14.1 leaves them up after loading: a ParallelEnv would answer the next reset too early.
+            # TorchRL 0.14.1 does not clear these flags after loading: a ParallelEnv would reset too early.
             flags[:] = [0] * len(flags)
 
 
 class EnvState(KeepsEnvState):
-    """Keep the environment's seed and episode counters in a TransformedEnv's ``state_dict``, and so in a Collector's.
+    """A transform that adds the environment's seed and episode counters to the ``state_dict`` of a TransformedEnv.
 
-    Without it, or a :class:`QAFTransform`, which does the same, a resumed collector would run the same episodes again.
-    After ``load_state_dict`` the environment must be reset (``collector.reset()``). Put it around a ParallelEnv too,
-    whose own ``load_state_dict`` leaves TorchRL 0.14.1 one answer behind, unless it has ``use_buffers=False``.
+    Without this transform, or a :class:`QAFTransform`, which does the same, a resumed Collector would run the same
+    episodes again. After ``load_state_dict``, reset the environment (``collector.reset()``). Also use this transform
+    around a ParallelEnv, unless ``use_buffers=False``: in TorchRL 0.14.1, ``ParallelEnv.load_state_dict``
+    desynchronizes the workers.
 
     Raises:
-        ValueError: at loading, a state of other tasks or rows, or of no environment.
+        ValueError: the loaded state belongs to other tasks or rows, or has no environment state.
 
     Warns:
-        UserWarning: a SerialEnv or ParallelEnv that has been closed, or not started, has no state to save.
+        UserWarning: a SerialEnv or ParallelEnv that is closed, or not started, has no state to save.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -139,19 +140,19 @@ class EnvState(KeepsEnvState):
 
 
 class LanguageInstruction(Transform):
-    """Write ``language_instruction``, the description of each row's task: "Push the puck to the target location."
+    """A transform that writes ``language_instruction``, the task description: "Push the puck to the target location."
 
-    Policies such as ``torchrl.modules.VLAWrapperBase`` read it. For environments and replay buffers. Reads ``task_id``
-    (B,) int64; writes one string for each row. Strings make a step of an environment 1.15 to 2.5 times slower,
-    therefore :class:`~lw_torchrl.LanguageWorldEnv` does not write them itself.
+    Policies such as ``torchrl.modules.VLAWrapperBase`` read this key. For environments and replay buffers. Reads
+    ``task_id`` (B,) int64; writes one string for each row. Strings make an environment step 1.15 to 2.5 times slower,
+    so :class:`~lw_torchrl.LanguageWorldEnv` does not write them itself.
 
     Args:
-        tasks: the tasks whose descriptions are written, as for :class:`~lw_torchrl.LanguageWorldEnv`, or plans for
-            them; None for the 50, and those of the environment.
-        in_keys, out_keys: other names for task_id and language_instruction.
+        tasks: the tasks whose descriptions are known, as for :class:`~lw_torchrl.LanguageWorldEnv`, or their plans;
+            None for the 50 tasks and the tasks of the environment.
+        in_keys, out_keys: replacements for the keys ``task_id`` and ``language_instruction``.
 
     Raises:
-        ValueError: at call time, a task that is not among ``tasks``.
+        ValueError: at call time, a task is not among ``tasks``.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -177,7 +178,7 @@ class LanguageInstruction(Transform):
             for task in getattr(base_env(self), "task_of_row", ()):
                 self._texts.setdefault(task_id(task.name), NonTensorData(task.description))
         if number not in self._texts:
-            raise ValueError(f"task_id {number} is not among the tasks of LanguageInstruction: give it tasks=")
+            raise ValueError(f"task_id {number} is not among the tasks of LanguageInstruction: pass tasks=")
         return self._texts[number]
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -202,9 +203,9 @@ class LanguageInstruction(Transform):
 
 
 def reset_rows(before: Tensor | None, now: Tensor, begun: Tensor | None, more: int = 0) -> Tensor:
-    """Return ``now`` (B, ...) in rows that have ``begun``, B bool or None for all, and ``before`` in the others.
+    """Return ``now`` (B, ...) in rows where ``begun`` (B bool, or None for all rows) is true, and ``before`` elsewhere.
 
-    The tensors have ``more`` dimensions after those of B.
+    The tensors have ``more`` dimensions in addition to the batch dimensions B.
     """
     if before is None or begun is None or before.shape != now.shape:
         return now

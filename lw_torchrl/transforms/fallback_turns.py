@@ -1,4 +1,4 @@
-"""FallbackTurns: switch between a plan's own steps and the fallback plan's when nothing moves any more."""
+"""FallbackTurns: switch between a plan and its fallback plan when nothing moves any more."""
 
 from typing import NamedTuple
 
@@ -18,30 +18,30 @@ class _Rows(NamedTuple):
     """The state of each row's episode."""
 
     turn: Tensor  # B int64
-    waited: Tensor  # B int64, steps without motion
-    lasted: Tensor  # B int64, steps of the turn
-    stood: Tensor  # (B, P, 3) metres, positions at the last motion
+    waited: Tensor  # B int64, time steps without motion
+    lasted: Tensor  # B int64, time steps of the turn
+    stood: Tensor  # (B, P, 3), metres, positions at the last motion
 
 
 class FallbackTurns(Transform):
-    """Count the turns of an episode: the plan's own steps have the even turns, the fallback plan's steps the odd ones.
+    """A transform that counts the turns of an episode: the plan runs in even turns, the fallback plan in odd turns.
 
-    A turn ends when neither the hand nor an object has moved farther than ``still`` for ``patience`` steps, and at the
-    latest after ``longest`` steps. :class:`~lw_torchrl.modules.PlanAttention` reads the turn if its plans have fallback
-    steps, see :func:`~lw_torchrl.canonical_plans`.
+    A turn ends when neither the hand nor an object has moved farther than ``still`` for ``patience`` time steps, and
+    after at most ``longest`` time steps. :class:`~lw_torchrl.modules.PlanAttention` reads the turn if the plans have
+    fallback steps, see :func:`~lw_torchrl.canonical_plans`.
 
-    In an environment it reads ``observation`` (B, 39) float32, metres, and writes ``turn`` (B,) int64, from 0. Rows of
-    a replay buffer keep the turn with which they were collected; rows without one get 0.
+    In an environment, the transform reads ``observation`` (B, 39) float32, metres, and writes ``turn`` (B,) int64, from
+    0. Rows of a replay buffer keep the recorded ``turn``; rows without ``turn`` get 0.
 
     Args:
         layout: the layout of the observations.
-        patience: number of steps without motion that end a turn.
-        longest: maximum length of a turn, in steps.
-        still: metres, the largest motion that counts as none.
-        in_keys, out_keys: other names for observation and turn.
+        patience: number of time steps without motion that end a turn.
+        longest: maximum length of a turn, in time steps.
+        still: the largest distance, in metres, that does not count as motion.
+        in_keys, out_keys: replacements for the keys ``observation`` and ``turn``.
 
     Raises:
-        ValueError: at call time, no observation.
+        ValueError: at call time, the observation is missing.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -50,7 +50,7 @@ class FallbackTurns(Transform):
         >>> env.rollout(12, lambda td: td.set("action", td["observation"].new_zeros(1, 4)))["turn"].max()
         tensor(2)
 
-    Source: ours; time-outs of a behaviour tree's fallback node.
+    Source: original to this library; time-outs of a behavior tree's fallback node.
     """
 
     @typed
@@ -71,12 +71,12 @@ class FallbackTurns(Transform):
         self._rows: _Rows | None = None
 
     def _positions(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the positions of the hand and the objects, (B, P, 3); the goal, which comes last, does not move."""
+        """Return the positions (B, P, 3) of the hand and the objects, without the goal, which does not move."""
         (observation,) = read(tensordict, self.in_keys)
         return torch.stack([observation[..., part] for part in self.layout.positions[:-1]], -2)
 
     def _keep(self, tensordict: TensorDictBase, now: _Rows, which: Tensor | None) -> TensorDictBase:
-        """Keep the state of the rows ``which``, B bool or None for all, and write the turn."""
+        """Store the state of the rows where ``which`` (B bool, or None for all rows) is true, and write ``turn``."""
         before = self._rows or [None] * len(now)
         kept = (reset_rows(old, new, which, new.dim() - now.turn.dim()) for old, new in zip(before, now, strict=True))
         self._rows = _Rows(*kept)

@@ -1,4 +1,4 @@
-"""QAFTransform: answer the conditions of each row's plan as a tensor; CorruptQAF: make the answers late or wrong."""
+"""QAFTransform, which answers the conditions of each row's plan, and CorruptQAF, which makes answers late or wrong."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from lw_torchrl.transforms.environment import (
     reset_rows,
 )
 
-_HALF = (torch.float16, torch.bfloat16)  # too coarse for metres: conditions compare centimetres
-_BLOCK = 64  # steps of an episode whose random numbers are drawn together
+_HALF = (torch.float16, torch.bfloat16)  # too coarse for positions in metres: conditions compare centimetres
+_BLOCK = 64  # number of time steps whose random numbers are drawn together
 
 
 class _Number(NamedTuple):
@@ -35,7 +35,7 @@ class _Number(NamedTuple):
 
 
 def plan_program(plans: Plans) -> QueryProgram:
-    """Return the conditions of ``plans`` as one :class:`QueryProgram`, a column for each step."""
+    """Return a :class:`QueryProgram` of the conditions of ``plans``, with a column for each plan step."""
     return QueryProgram({plan.definition: [step.condition for step in plan.steps] for plan in plans.values()})
 
 
@@ -45,26 +45,27 @@ def plan_number_key(qaf: NestedKey) -> NestedKey:
 
 
 class QAFTransform(KeepsEnvState):
-    """Answer the conditions of each row's plan, in an environment and on a replay buffer.
+    """A transform that answers the conditions of each row's plan, in an environment or on a replay buffer.
 
-    Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``qaf`` (B, S) bool, the truth of each
-    condition of the row's plan, in the order of its steps, false beyond its last, and ``qaf_plan`` (B,) int64, that
-    plan's number in :attr:`Plans.numbers`, by which an actor of other plans refuses the answers. On a replay buffer it
-    writes ``("next", "qaf")`` too, wherever ``("next", "observation")`` is. In an environment its ``state_dict`` holds
-    the environment's, as :class:`EnvState` does.
+    Reads ``observation`` (B, 39) float32 and ``task_id`` (B,) int64; writes ``qaf`` (B, S) bool, the truth value of
+    each plan step's condition (false beyond the last step), and ``qaf_plan`` (B,) int64, the plan's number in
+    :attr:`Plans.numbers`, by which an actor with other plans rejects the answers. On a replay buffer, it also
+    writes ``("next", "qaf")`` if ``("next", "observation")`` exists. In an environment, the ``state_dict`` includes
+    that of the environment, as for :class:`EnvState`.
 
-    Conditions are about metres, so put it before transforms that change the observation, such as a normaliser or
-    :class:`RandomYaw`. It raises an error behind one, except in the workers of a SerialEnv or ParallelEnv.
+    Conditions compare metres, so put this transform before transforms that change the observation, such as
+    ``ObservationNorm`` or :class:`RandomYaw`. A wrong order raises an error, except in the workers of a SerialEnv or
+    ParallelEnv.
 
     Args:
         plans: a plan for each task that will be seen.
-        in_keys: other names for observation and task_id, in this order.
-        out_keys: another name for qaf; the plan's number gets this name and ``_plan``.
+        in_keys: replacements for the keys ``observation`` and ``task_id``, in this order.
+        out_keys: a replacement for the key ``qaf``; the suffix ``_plan`` gives the key of the plan's number.
 
     Raises:
         PlanError: (a ValueError) the environment has a task without a plan.
-        ValueError: a task_id without a plan, an observation that is malformed or of half precision, or a transform
-            before it that changes it.
+        ValueError: a task has no plan, the observation is malformed or has half precision, or an earlier transform
+            changes the observation.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -86,10 +87,10 @@ class QAFTransform(KeepsEnvState):
         self.program = plan_program(self.plans)
         tables = PlanTables(self.plans)
         self._number = TaskTables(tables.index, _Number(tables.number), f"tasks without a plan in {self.plans!r}")
-        self._task: Tensor | None = None  # of each row, since its last reset
+        self._task: Tensor | None = None  # the task of each row since its last reset
 
     def with_plans(self, plans: AnyPlans) -> QAFTransform:
-        """Return a transform that answers the conditions of other plans."""
+        """Return a transform that answers the conditions of different plans."""
         return QAFTransform(plans, in_keys=self.in_keys, out_keys=self.out_keys[:1])
 
     def _write(self, tensordict: TensorDictBase, task_id: Tensor | None) -> None:
@@ -97,12 +98,12 @@ class QAFTransform(KeepsEnvState):
         if observation is None or task_id is None:
             raise missing_keys(tensordict.keys(True, True), *map(str, self.in_keys))
         if observation.dtype in _HALF:
-            got = f"got {observation.dtype}; put QAFTransform before the transform that casts it"
+            got = f"got {observation.dtype}; put QAFTransform before the transform that casts the observation"
             raise ValueError(f"observation must be float32 or float64, {got}")
         task_id = one_per_row(task_id, observation)
         tensordict.set(self.out_keys[0], self.program(observation, task_id))
         number = self._number.select(task_id.reshape(-1), observation).plan
-        tensordict.set(self.out_keys[1], number.reshape(task_id.shape).clone())  # a collector zeroes what it is given
+        tensordict.set(self.out_keys[1], number.reshape(task_id.shape).clone())  # a collector zeroes it in place
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         self._write(next_tensordict, next_tensordict.get(self.in_keys[1], None))
@@ -127,12 +128,12 @@ class QAFTransform(KeepsEnvState):
         super().set_container(container)
         refuse_changed(self, self.in_keys[0])
         env = base_env(self)
-        if not isinstance(env, BatchedEnvBase):  # whose workers may not be there yet
+        if not isinstance(env, BatchedEnvBase):  # its workers may not be running yet
             self.plans.require(getattr(env, "tasks", ()))
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         assert isinstance(observation_spec, Composite)
-        refuse_changed(self, self.in_keys[0])  # a transform may have been inserted before it
+        refuse_changed(self, self.in_keys[0])  # a transform may have been inserted before this one
         steps, shape, device = self.program.num_queries, observation_spec.shape, observation_spec.device
         observation_spec[self.out_keys[0]] = Binary(steps, shape=(*shape, steps), dtype=torch.bool, device=device)
         observation_spec[self.out_keys[1]] = Unbounded(shape, dtype=torch.int64, device=device)
@@ -140,30 +141,31 @@ class QAFTransform(KeepsEnvState):
 
 
 class CorruptQAF(EpisodeTransform):
-    """Make the answers in ``qaf`` late, held and wrong, to measure what slow or unreliable answers cost.
+    """A transform that makes the answers in ``qaf`` outdated or wrong, to simulate slow or unreliable condition checks.
 
     For environments, after a :class:`QAFTransform`. Reads ``qaf`` (B, S) bool, or float in [0, 1], ``task_id`` (B,) and
-    ``episode`` (B,) int64, and ``qaf_plan`` (B,) int64 where it exists; changes only ``qaf``:
+    ``episode`` (B,) int64, and ``qaf_plan`` (B,) int64 if present; changes only ``qaf``:
 
-    - **every, delay** (held, late): in step t of its episode, 0 at the reset, a row shows the answers of step
+    - **every, delay** (outdated): at time step t of the episode (0 at the reset), a row has the answers of time step
       every · ⌊max(t - delay, 0) / every⌋;
-    - **flip** (wrong): in each step, the reset included, each answer is then inverted with this probability.
+    - **flip** (wrong): at each time step, including the reset, each answer is then inverted with this probability.
 
-    The draws depend only on (task, seed, episode, step) and the answer's place in its plan; a larger probability
-    inverts all that a smaller one inverts. In :func:`lw_torchrl.evaluate` it can be the ``evaluator``. To corrupt a
-    learned evaluator's answers, put a transform before this one that calls the evaluator in ``_reset`` and ``_call``.
+    The random numbers depend only on (task, seed, episode, time step) and the plan step; a larger
+    probability inverts all answers that a smaller probability inverts. :func:`lw_torchrl.evaluate` accepts this
+    transform as ``evaluator``. To corrupt a learned evaluator's answers, put a transform that calls the evaluator in
+    ``_reset`` and ``_call`` before this transform.
 
     Args:
         plans: the plans whose conditions ``qaf`` answers.
-        every: update a row's answers every N steps.
-        delay: number of steps until new answers are shown.
+        every: update a row's answers every N time steps.
+        delay: number of time steps until new answers appear.
         flip: probability of inverting an answer.
         seed: random seed, any integer.
-        in_keys: other names for qaf, task_id and episode, in this order.
+        in_keys: replacements for the keys ``qaf``, ``task_id`` and ``episode``, in this order.
 
     Raises:
-        ValueError: ``qaf`` is missing, or of another shape, dtype or plan; or the transform is used in a replay buffer.
-        RuntimeError: a step of an environment that was never reset, or not since ``load_state_dict``.
+        ValueError: ``qaf`` is missing, has a wrong shape, dtype or plan, or the transform is used in a replay buffer.
+        RuntimeError: the environment takes a step without a reset, or without a reset since ``load_state_dict``.
 
     Example:
         >>> import lw_torchrl as lw
@@ -172,7 +174,7 @@ class CorruptQAF(EpisodeTransform):
         >>> lw.evaluate(actor, tasks="reach", episodes_per_task=2, seed=1_000, evaluator=noisy).success_once
         {'reach': 1.0}
 
-    Source: the paper names a visual question answering model as a query answering function; such a model errs.
+    Source: the paper suggests a visual question answering model as query answering function, which makes errors.
     """
 
     @typed
@@ -191,19 +193,19 @@ class CorruptQAF(EpisodeTransform):
         self.plans = as_plans(plans)
         self.every, self.delay, self.flip, self.seed = every, delay, flip, seed
         self._tables = PlanTables(self.plans)
-        self._task: Tensor | None = None  # B int64, of the rows' episodes
+        self._task: Tensor | None = None  # B int64, the tasks of the rows' episodes
         self._episode: Tensor | None = None
-        self._plan = torch.empty(0, dtype=torch.int64)  # B int64, where their plans are in the tables
+        self._plan = torch.empty(0, dtype=torch.int64)  # B int64, row indices of the tables
         self._forget_episodes()
 
     def _forget_episodes(self) -> None:
-        self._places = -(-self.delay // self.every) + 1  # maximum number of answers waiting to be shown
-        self._steps: Tensor | None = None  # B int64, of each row's episode
-        self._answers: Tensor | None = None  # (B, places, S); the n-th answers are in place n % places
+        self._places = -(-self.delay // self.every) + 1  # maximum number of stored answers
+        self._steps: Tensor | None = None  # B int64, time steps since each row's reset
+        self._answers: Tensor | None = None  # (B, places, S); the n-th update is at place n % places
         self._draws = _Draws(self.seed, self._tables, self.plans)
 
     def with_plans(self, plans: AnyPlans) -> CorruptQAF:
-        """Return a transform that corrupts the answers of other plans alike."""
+        """Return a transform that corrupts the answers of different plans in the same way."""
         options = {name: getattr(self, name) for name in ("every", "delay", "flip", "seed", "in_keys")}
         return CorruptQAF(plans, **options)
 
@@ -223,7 +225,7 @@ class CorruptQAF(EpisodeTransform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         if self._steps is None or self._answers is None:
-            raise RuntimeError("no episode has begun, or none since load_state_dict: reset the environment")
+            raise RuntimeError("no episode has begun since the start or load_state_dict: reset the environment")
         moved = tensordict.get("_step", None)
         moved = torch.ones_like(self._steps, dtype=torch.bool) if moved is None else moved.reshape(self._steps.shape)
         self._steps = self._steps + moved
@@ -250,7 +252,7 @@ class CorruptQAF(EpisodeTransform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         raise ValueError(
             "CorruptQAF counts the steps of an environment's episodes, which rows of a replay buffer do not record: "
-            "put it into the environment, after QAFTransform, or give it to evaluate(evaluator=...)"
+            "put it into the environment, after QAFTransform, or pass it to evaluate(evaluator=...)"
         )
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
@@ -262,17 +264,17 @@ class CorruptQAF(EpisodeTransform):
 
 
 class _Draws:
-    """Uniform numbers for the answers of rows, in blocks of steps, by (task, seed, episode, block); 1 on padding."""
+    """Uniform random numbers for answers, in blocks of time steps, by (task, seed, episode, block); padding is 1."""
 
     def __init__(self, seed: int, tables: PlanTables, plans: Plans) -> None:
         self._seed = seed
         self._plans = [plans[task] for task in tables.index.tasks]
         self._width = plans.num_steps
-        self._which = torch.empty(0, 3, dtype=torch.int64)  # the row of the tables, episode and block of each row
+        self._which = torch.empty(0, 3, dtype=torch.int64)  # the table row, episode and block of each row
         self._numbers = torch.empty(0, _BLOCK, self._width)
 
     def __call__(self, rows: Tensor, episode: Tensor, step: Tensor) -> Tensor:
-        """Return numbers (B, S) float64 in [0, 1] for rows of the tables, their episodes and steps, each B int64."""
+        """Return numbers (B, S) float64 in [0, 1] for table rows, episodes and time steps (each B int64)."""
         which = torch.stack([each.reshape(-1).cpu() for each in (rows, episode, step // _BLOCK)], -1)
         if which.shape != self._which.shape:
             self._which = torch.full_like(which, -1)

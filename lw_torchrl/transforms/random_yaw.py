@@ -1,4 +1,4 @@
-"""RandomYaw: turn the scenes of demonstrations about the vertical."""
+"""RandomYaw: an augmentation that rotates the scenes of demonstrations about the vertical axis."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def _turned(values: Tensor, starts: tuple[int, ...], cos: Tensor, sin: Tensor) -
 
 
 def turn_observation(observation: Tensor, angle: Tensor, layout: Layout = METAWORLD) -> Tensor:
-    """Turn the positions in observations (..., D) about the vertical through the origin by (...) radians."""
+    """Rotate the positions in observations (..., D) about the vertical axis through the origin by (...) radians."""
     starts = tuple(part.start for part in layout.all_positions)
     return _turned(observation, starts, angle.cos(), angle.sin())
 
 
 def turn_vectors(vectors: Tensor, angle: Tensor) -> Tensor:
-    """Turn vectors (..., 3) about the vertical by (...) radians."""
+    """Rotate vectors (..., 3) about the vertical axis by (...) radians."""
     return _turned(vectors, (0,), angle.cos(), angle.sin())
 
 
@@ -44,12 +44,12 @@ def yaw_key(observation: NestedKey) -> NestedKey:
 
 
 def tilt_key(observation: NestedKey) -> NestedKey:
-    """Return the key of the rotation that :class:`RandomYaw` writes, ``observation_tilt``."""
+    """Return the key of the rotation that :class:`RandomYaw` writes next to ``observation``, ``observation_tilt``."""
     return key_beside(observation, "_tilt")
 
 
 def random_rotations(number: int, device: torch.device | None = None) -> Tensor:
-    """Return rotations (number, 3, 3) float32, uniform over all rotations, from PyTorch's global generator.
+    """Draw uniformly random rotations (number, 3, 3) float32 from PyTorch's global generator.
 
     Source: K. Shoemake, "Uniform random rotations", from unit quaternions.
     """
@@ -63,34 +63,34 @@ def random_rotations(number: int, device: torch.device | None = None) -> Tensor:
 
 
 class RandomYaw(PlanAugmentation):
-    """Turn each sampled row, its positions and its actions, by a random angle about the vertical.
+    """An augmentation that rotates the positions and actions of each row by a random angle about the vertical axis.
 
-    A policy then learns to move towards the goal, and not in the direction that the demonstrations happened to have.
-    For replay buffers, after a :class:`QAFTransform`, which must see the unchanged scene: "left of" has a direction.
+    A policy then learns to move toward the goal, rather than in the directions of the demonstrations. For replay
+    buffers, after a :class:`QAFTransform`, which must see the original scene, because "left of" has a direction.
 
-    Changes ``observation`` (B, 39), ``action`` (B, 4), and, where they exist, ``expert_action``, ``unclipped_action``
+    Changes ``observation`` (B, 39), ``action`` (B, 4), and, if present, ``expert_action``, ``unclipped_action``
     (B, 4) and ``("next", "observation")``, all float32. Writes the angle in radians, ``observation_yaw`` (B,) float32,
-    and ``("next", "observation_yaw")``, by which features turn fixed places. An action's displacement in the plane is
-    shortened if it would leave [-1, 1]. Orientations are not turned: use features without them, "differences" or
-    "relative". Angles are drawn from PyTorch's global generator. Rows that were turned before get the sum of both
-    angles. TorchRL's losses, except BCLoss, do not pass the angle on to features that read it, so
-    :class:`~lw_torchrl.OfflineTrainer` refuses them.
+    and ``("next", "observation_yaw")``, by which features rotate fixed places. An action's horizontal displacement is
+    shortened if it would leave [-1, 1]. Orientations are not rotated: use features without orientations, "differences"
+    or "relative". Angles are drawn from PyTorch's global generator; the angles of repeated rotations add up. TorchRL's
+    losses, except BCLoss, do not pass the angle on to the features, so :class:`~lw_torchrl.OfflineTrainer` rejects
+    these losses.
 
     Args:
-        scale: standard deviation of the angle, in radians; 10 is any angle.
-        plans: the actor's plans. Rows in which no active step has a direction ("move the puck to the target
-            location" has none), by ``qaf`` (B, S) and ``task_id`` (B,) int64, are then turned by any angle.
-        tilt: the probability that a row whose active steps carry or move an object to a place is also turned in space,
-            by any rotation, ``observation_tilt`` (B, 3, 3) float32, by which
-            :class:`~lw_torchrl.modules.RoleFeatures` turns the relative position. It needs canonical plans, see
-            :func:`~lw_torchrl.canonical_plans`.
+        scale: standard deviation of the angle, in radians; with 10, the angle is nearly uniform.
+        plans: the actor's plans. With plans, the transform also reads ``qaf`` (B, S) and ``task_id`` (B,) int64, and
+            draws a uniform angle for rows in which no active step has a direction (for example, "move the puck to the
+            target location").
+        tilt: probability of also applying a uniform 3-D rotation to a row whose active steps carry or move an object to
+            a place. Writes ``observation_tilt`` (B, 3, 3) float32, by which :class:`~lw_torchrl.modules.RoleFeatures`
+            rotates the relative position. Requires canonical plans, see :func:`~lw_torchrl.canonical_plans`.
         layout: the layout of observations and actions; None for that of the plans, or Meta-World's without plans.
-        in_keys: other names for observation, action, expert_action and unclipped_action, in this order.
-        out_keys: names for the turned ones; None for the same names.
+        in_keys: replacements for ``observation``, ``action``, ``expert_action``, ``unclipped_action``, in this order.
+        out_keys: the keys for the rotated tensors; None for ``in_keys``.
 
     Raises:
-        ValueError: a sample without observation or action, or, with plans, without their answers.
-        TypeError: use in an environment.
+        ValueError: at call time, the observation or action is missing, or, with plans, ``qaf`` or ``task_id``.
+        TypeError: the transform is used in an environment.
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -99,7 +99,7 @@ class RandomYaw(PlanAugmentation):
         >>> lw.RandomYaw(0.3)(rows)["action"][:, :2].norm(dim=-1)
         tensor([0.5000, 0.5000])
 
-    Source: data augmentation by a symmetry of the task, images in ``torchvision.transforms.RandomRotation``.
+    Source: data augmentation by a symmetry of the task, as in ``torchvision.transforms.RandomRotation`` for images.
     """
 
     @typed
@@ -131,7 +131,7 @@ class RandomYaw(PlanAugmentation):
             if tilt:
                 self.register_buffer("to_places", role_table(plans, self._tables, _moves_to_a_place), persistent=False)
         elif tilt:
-            raise ValueError(f"tilt needs plans, which say how objects move, got tilt={tilt} and plans=None")
+            raise ValueError(f"tilt needs plans, which describe how objects move, got tilt={tilt} and plans=None")
         self.layout = METAWORLD if layout is None else layout
         self._begin = self.layout.displaced("RandomYaw").start
 
@@ -143,20 +143,20 @@ class RandomYaw(PlanAugmentation):
         return torch.where(self._all_true(tensordict, "free"), any_angle, angle)
 
     def _all_true(self, tensordict: TensorDictBase, name: str) -> Tensor:
-        """Return (B,) bool, whether some step's condition is true, and the table ``name`` holds for all such steps."""
+        """Return (B,) bool: whether a plan step is true, and the table ``name`` is true for all true plan steps."""
         qaf, rows, steps = self.answers(tensordict, ["qaf", "task_id"])
         true = (qaf > 0.5) & steps
         return (self.table(name, rows.device)[rows] | ~true).all(-1) & true.any(-1)
 
     def _tilt(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the rotation of each row, (B, 3, 3) float32."""
+        """Draw the 3-D rotation of each row, (B, 3, 3) float32."""
         free = self._all_true(tensordict, "to_places")
         chosen = free & (torch.rand(free.shape, device=free.device) < self.tilt)
         rotations = random_rotations(free.numel(), free.device).reshape(*free.shape, 3, 3)
         return torch.where(chosen[..., None, None], rotations, torch.eye(3, device=free.device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        tensordict = tensordict.copy()  # replay[:] may give the storage itself
+        tensordict = tensordict.copy()  # replay[:] may return the storage itself
         (source, target), *actions = zip(self.in_keys, self.out_keys, strict=True)
         observation = tensordict.get(source, None)
         if observation is None or tensordict.get(actions[0][0], None) is None:
@@ -165,7 +165,7 @@ class RandomYaw(PlanAugmentation):
         tilt = self._tilt(tensordict) if self.tilt else None
         old_yaw, old_tilt = tensordict.get(yaw_key(source), None), tensordict.get(tilt_key(source), None)
         yaw = angle if old_yaw is None else old_yaw + angle
-        if old_tilt is not None:  # the row was tilted before this turn: in the turned axes the tilt has another matrix
+        if old_tilt is not None:  # express an earlier tilt in the rotated axes
             old_tilt = turn_vectors(turn_vectors(old_tilt.mT, angle.unsqueeze(-1)).mT, angle.unsqueeze(-1))
             tensordict.set(tilt_key(target), old_tilt if tilt is None else tilt @ old_tilt)
         elif tilt is not None:
@@ -179,7 +179,7 @@ class RandomYaw(PlanAugmentation):
             if (action := tensordict.get(key, None)) is None:
                 continue
             turned = _turned(action, (begin,), cos, sin)
-            # Shorten what leaves [-1, 1], unless it was outside before: unclipped actions may be.
+            # Shorten displacements that leave [-1, 1], unless they were outside before, as unclipped actions may be.
             plane = slice(begin, begin + 2)
             before, now = (each[..., plane].abs().amax(-1, keepdim=True) for each in (action, turned))
             turned[..., plane] /= torch.where(before <= 1.0, now.clamp(min=1.0), 1.0)

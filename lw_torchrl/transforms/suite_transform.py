@@ -1,4 +1,4 @@
-"""SuiteTransform: another library's environment with a layout's observations and actions."""
+"""SuiteTransform: convert the observations and actions of any environment to those of a layout."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from lw_torchrl.language.tasks import Task, task_id
 
 
 class SuiteTransform(Transform):
-    """Write the layout's ``observation`` and the ``task_id`` from the keys of any TorchRL environment.
+    """A transform that writes a layout's ``observation`` and the ``task_id`` in any TorchRL environment.
 
-    After it, :class:`QAFTransform`, actors, collectors and losses work as with :class:`~lw_torchrl.LanguageWorldEnv`.
+    :class:`QAFTransform`, actors, collectors and losses then work as with :class:`~lw_torchrl.LanguageWorldEnv`.
 
-    Reads ``in_keys``; writes ``observation`` (..., D) float32 and ``task_id`` (...) int64. If the layout has the
-    numbers of the previous step, it writes them; at a reset they are the present ones. With ``act``, ``action``
-    (..., A) float32 in [-1, 1] is an action of the layout.
+    Reads ``in_keys``; writes ``observation`` (..., D) float32 and ``task_id`` (...) int64. If the layout
+    contains the previous time step's numbers, the transform fills them in (at a reset, with the current numbers). With
+    ``act``, ``action`` (..., A) float32 in [-1, 1] is an action of the layout.
 
     Args:
         task: the task, whose layout has D numbers and A actions.
-        observe: a function from the tensors of ``in_keys`` to (..., D) numbers in the layout's order and frame; those
-            of the previous step may be any.
-        act: a function from an action of the layout (..., A) to an action of the environment; None if they are equal.
+        observe: a function that maps the tensors of ``in_keys`` to (..., D) numbers in the layout's order and frame;
+            the numbers of the previous time step are overwritten.
+        act: a function that maps an action of the layout (..., A) to one of the environment; None for the identity.
         in_keys: the keys that ``observe`` reads.
 
     Raises:
-        ValueError: at call time, a missing key, or an observation of another size than the layout's.
+        ValueError: at call time, a key is missing, or ``observe`` does not return D numbers.
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -42,7 +42,7 @@ class SuiteTransform(Transform):
         >>> env.reset()["observation"].shape
         torch.Size([1, 39])
 
-    Source: as ``torchrl.envs.transforms.CatTensors``, with a meaning for each number.
+    Source: ``torchrl.envs.transforms.CatTensors``, with a fixed order of numbers.
     """
 
     makes_observation = True
@@ -65,7 +65,7 @@ class SuiteTransform(Transform):
         if observation.shape[-1:] != (self.layout.size,):
             numbers = f"the {self.layout.size} numbers of layout {self.layout.name!r}"
             raise ValueError(f"observe must return {numbers}, got shape {tuple(observation.shape)}")
-        return observation.clone()  # it may be the environment's own tensor
+        return observation.clone()  # observe may return the environment's own tensor
 
     def _write(self, tensordict: TensorDictBase, before: Tensor | None) -> TensorDictBase:
         seen, past = self._seen(tensordict), self.layout.past

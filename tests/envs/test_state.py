@@ -184,7 +184,7 @@ def test_a_transform_of_a_buffer_has_no_environments_state():
     state = transform.state_dict()
     transform.load_state_dict(state)
     env = make_transformed()
-    with pytest.raises(ValueError, match="lacks an environment's episodes"):
+    with pytest.raises(ValueError, match="lacks episode counters"):
         env.transform[0].load_state_dict(state)
     env.close()
 

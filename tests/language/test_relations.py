@@ -104,14 +104,14 @@ def test_senses_differ_on_the_threshold():
 
 
 def written(part, opening):
-    """A comparison as docs/queries.md writes it."""
+    """A comparison as docs/reference.md writes it."""
     value = f"‖{part.axes}‖" if part.length else "opening" if opening else part.axes
     raised = f", z raised by {part.raise_z:g}" if part.raise_z else ""
     return f"{value} {part.sense} {part.threshold:g}{raised}"
 
 
 def test_the_page_on_queries_has_every_threshold():
-    page = (Path(__file__).parents[2] / "docs" / "queries.md").read_text("utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "reference.md").read_text("utf-8")
     table = page[page.index("| predicate | holds where |") :].split("\n\n")[0]
     rows = dict(re.findall(r"^\| ([a-z ]+) \| ([^|]+) \|$", table, re.MULTILINE))
     for name, parts in PREDICATES.items():

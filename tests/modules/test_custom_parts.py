@@ -44,41 +44,47 @@ def make_batch(rows=16):
 
 
 PROGRAM = """
-import sys
-import torch
+import json, sys
+from pathlib import Path
 import lw_torchrl as lw
 from users_parts import Closest, Gated, Pictures, Projection
 from small_actors import letters
 from tensordict import load_memmap
 
-actor = lw.load_actor(sys.argv[1], text_encoder=letters if "text" in sys.argv[2] else None)
-rows = load_memmap(sys.argv[3])
-print(actor(rows.clone())["action"].flatten().tolist())
+rows, actions = load_memmap(sys.argv[1]), {}
+for path in map(Path, sys.argv[2:]):
+    actor = lw.load_actor(path, text_encoder=letters if "text" in path.stem else None)
+    actions[path.stem] = actor(rows.clone())["action"].flatten().tolist()
+print(json.dumps(actions))
 """
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_custom_part_is_trained_saved_and_loaded_in_a_new_process(kind, tmp_path):
-    actor, batch = make(kind), make_batch()
+def test_custom_parts_are_trained_saved_and_loaded_in_a_new_process(tmp_path):
+    expected, batch = {}, make_batch()
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(len(batch)), batch_size=8)
     replay.extend(batch)
-    before = {name: value.clone() for name, value in actor.named_parameters()}
-    config = lw.BehavioralCloningConfig(steps=3, batch_size=8, learning_rate=1e-2)
-    path = tmp_path / "policy.safetensors"
-    lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=path, progress=False).train()
-    assert all(not torch.equal(value, before[name]) for name, value in actor.named_parameters())
-    if kind == "more features":
-        assert actor.features.parts[0].mean.any(), "statistics are fitted inside of Concat too"
     rows = batch.exclude("action").memmap(tmp_path / "rows")
-    command = [sys.executable, "-c", PROGRAM, str(path), kind, str(tmp_path / "rows")]
+    config = lw.BehavioralCloningConfig(steps=3, batch_size=8, learning_rate=1e-2)
+    for kind in KINDS:
+        actor, path = make(kind), tmp_path / f"{kind}.safetensors"
+        before = {name: value.clone() for name, value in actor.named_parameters()}
+        lw.BehavioralCloningTrainer(actor, replay, config, checkpoint=path, progress=False).train()
+        assert all(not torch.equal(value, before[name]) for name, value in actor.named_parameters()), kind
+        if kind == "more features":
+            assert actor.features.parts[0].mean.any(), "statistics are fitted inside of Concat too"
+        expected[kind] = action_of(actor.eval(), rows.clone())
+    paths = [str(tmp_path / f"{kind}.safetensors") for kind in KINDS]
     here = Path(__file__).parent
     search = os.pathsep.join([str(here), str(here.parent.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
     done = subprocess.run(
-        command, capture_output=True, text=True, timeout=240, env={**os.environ, "PYTHONPATH": search}
-    )
+        [sys.executable, "-c", PROGRAM, str(tmp_path / "rows"), *paths],
+        capture_output=True, text=True, timeout=240, env={**os.environ, "PYTHONPATH": search},
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    output = torch.tensor(json.loads(done.stdout)).reshape(len(batch), 4)
-    torch.testing.assert_close(output, action_of(actor.eval(), rows.clone()))
+    loaded = json.loads(done.stdout)
+    assert loaded.keys() == expected.keys()
+    for kind, action in expected.items():
+        torch.testing.assert_close(torch.tensor(loaded[kind]).reshape(len(batch), 4), action, msg=kind)
 
 
 class Plain(nn.Module):

@@ -187,7 +187,7 @@ def test_concat_of_modules_with_other_keys():
     module.in_keys = [("robot", "state"), "camera"]
     assert (module.parts[0].in_keys, pictures.in_keys) == ([("robot", "state")], ["camera"])
     for wrong in ((), (nn.Linear(3, 3),)):
-        with pytest.raises(TypeError, match="parts must be at least one TensorDict module"):
+        with pytest.raises(TypeError, match="parts must be one or more TensorDict modules"):
             Concat(*wrong)
 
 

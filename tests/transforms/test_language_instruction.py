@@ -62,5 +62,5 @@ def test_buffer_rows_have_the_descriptions_of_their_tasks():
     result = replay.sample()
     names = {lw.task_id(task): lw.TASKS[task].description for task in lw.MT10}
     assert result["language_instruction"] == [names[number] for number in result["task_id"].tolist()]
-    with pytest.raises(ValueError, match="is not among the tasks of LanguageInstruction: give it tasks="):
+    with pytest.raises(ValueError, match="is not among the tasks of LanguageInstruction: pass tasks="):
         LanguageInstruction("MT10")(TensorDict(task_id=torch.full((2,), lw.task_id("soccer")), batch_size=[2]))

@@ -107,7 +107,8 @@ def test_command_runs_in_a_process():
         run_command(["few-shot", "--run", "nonsense"])
 
 
-@pytest.mark.parametrize("launcher", ["local", pytest.param("ray", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["local", "ray"])
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::FutureWarning", "ignore::DeprecationWarning")
 def test_all_commands_run_before_an_error_is_raised(launcher):
     if launcher == "ray":

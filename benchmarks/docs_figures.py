@@ -1,0 +1,101 @@
+"""python -m benchmarks.docs_figures: draw the figures of README and docs from the numbers that our pages print."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import tyro
+
+from benchmarks.figures import METHOD_COLORS, NEUTRAL_STYLE, draw_rates, plot_panels
+from lw_torchrl.evaluation.figures import new_figure, saved
+from lw_torchrl.evaluation.result import wilson_interval
+
+NUMBERS = Path(__file__).parent / "data" / "published_results.json"
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Draw the figures of README and docs: with 95 % intervals, legible in light and in dark mode."""
+
+    out: Path = Path("docs")
+    """Folder for the pictures."""
+
+
+def zero_shot(numbers: Any) -> Any:
+    """Success on the test tasks, which nobody demonstrated: with plans, generic plans and descriptions."""
+    figure = new_figure(9.6, 4.4)
+    axes = figure.subplots()
+    names, methods, rates = zip(*numbers["rows"], strict=True)
+    draw_rates(axes, names, rates, [METHOD_COLORS[method] for method in methods])
+    figure.suptitle("Success on 20 tasks that nobody demonstrated", fontsize=16, fontweight="bold")
+    caption = "success; policies trained on 10 other tasks; lines: 95 % intervals, five training seeds"
+    figure.supxlabel(caption, fontsize=13)
+    return figure
+
+
+def demonstrations(numbers: Any) -> Any:
+    """Success by the number of demonstrations of each demonstrated task."""
+    places = [str(number) for number in numbers["numbers"]]
+    panels = [
+        (title, places, {name: [[rate] for rate in rates] for name, rates in methods.items()})
+        for title, methods in numbers["panels"]
+    ]
+    return plot_panels(panels, xlabel="demonstrations of each demonstrated task")
+
+
+def truth(numbers: Any) -> Any:
+    """Success with late and with wrong answers to conditions."""
+    return plot_panels(numbers["panels"])
+
+
+def offline(numbers: Any) -> Any:
+    """Success of offline-RL methods on three mixtures of noisy data."""
+    figure = new_figure(11.0, 4.4)
+    panels = figure.subplots(1, 3, sharey=True)
+    names = [row[0] for row in numbers["rows"]]
+    colors = [METHOD_COLORS["plan"] if name == "advantage" else METHOD_COLORS["baseline"] for name in names]
+    for column, (axes, title) in enumerate(zip(panels, numbers["panels"], strict=True), 1):
+        draw_rates(axes, names, [row[column] for row in numbers["rows"]], colors)
+        axes.set_title(title, fontsize=13)
+    figure.supxlabel("success; lines: 95 % intervals over three seeds", fontsize=13)
+    return figure
+
+
+def scripted(numbers: Any) -> Any:
+    """Success of plans with scripted skills, without training, in the tasks that fail at all."""
+    figure = new_figure(9.6, 4.2)
+    axes = figure.subplots()
+    episodes, successes = numbers["episodes"], numbers["successes"]
+    rates = [[hits / episodes, *wilson_interval(hits, episodes)] for hits in successes.values()]
+    draw_rates(axes, [*successes], rates, [METHOD_COLORS["scripted skills"]] * len(rates))
+    figure.suptitle("Plans with scripted skills, without training: 50 tasks", fontsize=16, fontweight="bold")
+    figure.supxlabel(
+        f"success in {episodes} episodes of each task, no action noise; lines: 95 % intervals", fontsize=13
+    )
+    return figure
+
+
+FIGURES = {
+    "zero-shot-plans.png": ("zero_shot_test_tasks", zero_shot),
+    "demonstrations.png": ("demonstrations", demonstrations),
+    "truth.png": ("truth", truth),
+    "offline.png": ("offline", offline),
+    "scripted.png": ("scripted", scripted),
+}
+"""A picture's name to its numbers and the function that draws it."""
+
+
+def main(arguments: Arguments) -> None:
+    numbers = json.loads(NUMBERS.read_text("utf-8"))
+    with matplotlib.rc_context(NEUTRAL_STYLE):
+        for name, (key, draw) in FIGURES.items():
+            saved(draw(numbers[key]), arguments.out / name)
+            print(f"written to {arguments.out / name}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))

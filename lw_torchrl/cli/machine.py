@@ -1,0 +1,128 @@
+"""``lw-torchrl info`` without arguments: the installation and the machine, to paste into a bug report."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import re
+import tempfile
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lw_torchrl.cli.options import Output
+from lw_torchrl.language.query_program import find_kernel
+from lw_torchrl.suites.cameras import Cameras
+from lw_torchrl.suites.metaworld.simulated_rows import available_cores
+
+_PACKAGES = ("lw_torchrl", "torch", "torchrl", "tensordict", "mujoco", "metaworld", "numpy", "rerun-sdk")
+_VARIABLES = (
+    "OMP_NUM_THREADS", "CUDA_VISIBLE_DEVICES", "MUJOCO_GL", "NUMBA_CACHE_DIR", "NUMBA_DISABLE_JIT", "HF_HOME",
+    "TORCHINDUCTOR_CACHE_DIR",
+)  # fmt: skip
+
+
+def describe_machine(output: Output) -> Output:
+    """Report versions, processors, extras and cache folders, and what is slow here and why."""
+    slow = find_slow_parts()
+    extras = {name: f"missing: {', '.join(of)}" if of else "installed" for name, of in find_extras().items()}
+    sections = {
+        "versions": {"python": platform.python_version(), **{name: find_version(name) for name in _PACKAGES}},
+        "machine": _machine(),
+        "extras": extras,
+        "cache folders": _cache_folders(),
+        "variables": {name: os.environ[name] for name in _VARIABLES if name in os.environ},
+    }
+    for title, values in sections.items():
+        width = max(map(len, values), default=0)
+        lines = [f"  {name:{width}}  {value}" for name, value in values.items()]
+        output.show(title.replace(" ", "_"), values, "\n".join([f"{title}:", *(lines or ["  none"]), ""]))
+    return output.show("slow", slow, "\n".join(["slow here:", *(f"  - {text}" for text in slow or ["nothing known"])]))
+
+
+def find_version(package: str) -> str:
+    """Return the version of an installed package, or "missing"."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "missing"
+
+
+def find_extras() -> dict[str, list[str]]:
+    """Return each extra of this package with those of its packages that are not installed."""
+    extras: dict[str, list[str]] = {}
+    try:
+        lines = requires("lw_torchrl") or []
+    except PackageNotFoundError:  # a source tree on the path, without an installation
+        return {}
+    for line in lines:
+        if (found := re.match(r"([\w.-]+).*\bextra == ['\"]([\w-]+)['\"]", line)) and found[2] != "dev":
+            missing = extras.setdefault(found[2], [])
+            if find_version(found[1]) == "missing":
+                missing.append(found[1])
+    return extras
+
+
+def find_slow_parts() -> list[str]:
+    """Return a sentence for each part that is slower on this machine than it could be: why, and what helps."""
+    cores, slow = available_cores(), []
+    if find_kernel() is None:
+        if importlib.util.find_spec("numba") is None:
+            slow.append("Conditions are checked without Numba: install it by pip install 'lw_torchrl[fast]'.")
+        else:
+            slow.append("Numba is installed but has no writable cache folder: set NUMBA_CACHE_DIR to one.")
+    elif os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
+        slow.append("NUMBA_DISABLE_JIT is set, so conditions are checked by uncompiled Python: unset it.")
+    if cores == 1:
+        slow.append("One core: simulation, collection and evaluation run in one thread for each core.")
+    if (total := os.cpu_count() or 1) > cores:
+        slow.append(f"This process may use {cores} of the machine's {total} cores (affinity or a job's limit).")
+    if hasattr(os, "getloadavg") and (load := os.getloadavg()[0]) > cores + 1:
+        slow.append(f"Other programs use the cores: the load is {load:.1f} on {cores}.")
+    if (accelerator := torch.accelerator.current_accelerator(check_available=True)) is None:
+        slow.append("No GPU that this PyTorch can use: networks train on the CPU. The simulation always does.")
+    else:
+        slow.append(f"The simulation uses the CPU, not the GPU ({accelerator}): more cores help it.")
+    return slow
+
+
+def _machine() -> dict[str, str]:
+    gpus = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
+    build = f"PyTorch built with CUDA {torch.version.cuda}" if torch.version.cuda else "PyTorch built without CUDA"
+    return {
+        "system": platform.platform(),
+        "cores": f"{available_cores()} of {os.cpu_count()}",
+        "gpu": f"{', '.join(gpus) or 'none'} ({build})",
+        "numba": f"{find_version('numba')} ({'in use' if find_kernel() else 'not in use'})",
+        "camera images": _camera_images(),
+    }
+
+
+def _camera_images() -> str:
+    try:
+        Cameras().close()
+    except ImportError as error:
+        return f"no: {error}"
+    return "yes"
+
+
+def _cache_folders() -> dict[str, str]:
+    user = Path.home() / ".cache"
+    inductor = Path(tempfile.gettempdir()) / f"torchinductor_{os.environ.get('USER', 'root')}"
+    folders: dict[str, Any] = {
+        "Numba": os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / "language" / "__pycache__",
+        "torch.compile": os.environ.get("TORCHINDUCTOR_CACHE_DIR") or inductor,
+        "Hugging Face": os.environ.get("HF_HOME") or user / "huggingface",
+        "language models' answers": Path("runs/answers"),
+    }
+    return {name: _describe_folder(Path(path)) for name, path in folders.items()}
+
+
+def _describe_folder(path: Path) -> str:
+    there = "" if path.is_dir() else " (not made yet)"
+    locked = path.is_dir() and not os.access(path, os.W_OK)
+    shown = str(path).replace(str(Path.home()), "~", 1) if path.is_relative_to(Path.home()) else str(path)
+    return f"{shown}{there}{' (not writable)' if locked else ''}"
