@@ -126,7 +126,7 @@ class EpisodeInfo:
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """The description of a finished dataset; :class:`LanguageWorldExperienceReplay` reads its rows.
+    """The description of a finished dataset; use :class:`LanguageWorldExperienceReplay` to read the rows.
 
     Attributes:
         root, config: the dataset's folder, and the config with which the dataset was collected.
@@ -175,7 +175,7 @@ def read_metadata(root: AnyPath) -> Demonstrations:
             f"root: the dataset in {str(folder)!r} is unfinished; repeat the call of collect_demonstrations to resume"
         )
     if not path.is_file():
-        raise DatasetError(f"root: {str(folder)!r} is not a dataset: it has no {METADATA}")
+        raise DatasetError(f"root: {str(folder)!r} is not a dataset, because it has no file {METADATA}")
     try:
         return parse_metadata(read_json(path, "root: the metadata"), folder)
     except DatasetError:

@@ -24,7 +24,7 @@ _MOST = 10.0  # the maximum of Meta-World's dense reward, given at success
 class Reward:
     """A reward computed from a stored reward ("sparse" or "dense") as ``(source + shift) * scale``.
 
-    If ``at_success`` is not None, it is the reward of a successful time step.
+    ``at_success`` is the reward of a successful time step; None applies the formula there, too.
     """
 
     source: Literal["sparse", "dense"]

@@ -145,7 +145,7 @@ def check_label(label: str, parts: Sequence[Demonstrations]) -> None:
     """Raise :class:`ValueError` if the label requires expert actions, but another policy collected a dataset."""
     others = sorted({part.config.behaviour for part in parts if part.config.policy.kind != "expert"})
     if others and label != "executed":
-        needs = f"label={label!r} needs an expert's actions, but this dataset was collected by {', '.join(others)!r}"
+        needs = f"label={label!r} requires expert actions, but this dataset was collected by {', '.join(others)!r}"
         raise ValueError(f"{needs}; use label='executed'")
 
 

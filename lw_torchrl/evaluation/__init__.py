@@ -1,4 +1,4 @@
-"""Evaluation: run exactly k episodes of each task, report and plot the results, and find out why episodes failed."""
+"""Evaluation: run a fixed number of episodes per task, report and plot results, and find out why episodes failed."""
 
 import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.evaluation.diagnose.attribution import attribute_failures

@@ -67,7 +67,7 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
 
 
 def _own_result(policy: AnyPath, result: EvaluationResult | None) -> EvaluationResult | None:
-    """Return ``result``, or if it is None the result stored with a shipped policy."""
+    """Return ``result``; if it is None, return the stored result of a shipped policy, or None for any other policy."""
     shipped = shipped_policy(policy)
     return EvaluationResult.load(shipped.with_suffix(".json")) if result is None and shipped is not None else result
 

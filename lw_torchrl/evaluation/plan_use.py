@@ -33,12 +33,12 @@ class TaskUse:
 
     states: int  # number of states
     true: list[float]  # for each plan step, the fraction of states in which the condition held
-    chosen: list[float]  # for each plan step, the fraction of states in which it had the largest skill weight
+    chosen: list[float]  # for each plan step, the fraction of states in which its skill weight was the largest
     covered: float  # the fraction of states before the first success in which some condition held
     gaps: list[tuple[int, int, int]]  # intervals in which no condition held: episode, first and last time step
     num_true: float  # the median number of conditions that held before the first success
-    stuck: list[int]  # for each plan step, the failed episodes in which it was chosen most often in the last 50 states
-    furthest: list[int]  # for each plan step, the failed episodes in which it was the last one chosen in 5 states
+    stuck: list[int]  # for each plan step, the number of failed episodes that chose it most in the last 50 states
+    furthest: list[int]  # for each plan step, the number of failed episodes in which it was the last chosen 5 times
     failed: int  # number of failed episodes
 
     def to_json(self) -> dict[str, Any]:

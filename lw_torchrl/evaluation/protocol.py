@@ -54,7 +54,8 @@ def evaluate(
     tasks: the actor runs on blocks of a fixed number of rows, and all randomness comes from (task, seed, episode).
 
     Args:
-        actor: reads ``observation``, ``task_id`` and, if it has plans, ``qaf``; writes ``action`` (N, 4) float32.
+        actor: a policy that reads ``observation``, ``task_id`` and, if it has plans, ``qaf``, and writes ``action``
+            (N, 4) float32.
         tasks: see :func:`resolve_tasks`; if the actor lists its tasks, a subset of that list.
         plans: the plans whose conditions are evaluated into ``qaf``; None for the actor's plans.
         episodes_per_task: the number k of episodes.

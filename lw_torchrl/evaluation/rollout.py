@@ -49,7 +49,7 @@ def rollout(
 ) -> None:
     """Run each listed episode once, in eval mode and without exploration, and pass each one to ``on_episode``.
 
-    The arguments not listed here are described in :func:`evaluate`, as is what an episode's randomness depends on.
+    See :func:`evaluate` for the arguments that are not listed here, and for the seeding of episodes.
 
     Args:
         label: title of the progress bar.

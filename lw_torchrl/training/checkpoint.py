@@ -220,7 +220,7 @@ def check_can_be_saved(module: nn.Module, kind: str = "actor") -> None:
             raise ValueError("in_keys or out_keys were changed after construction; pass them to the constructor")
         _copy_tensors(module.state_dict(), again.state_dict(keep_vars=True))
     except Exception as error:
-        message = f"{kind} cannot be saved, because its description does not reconstruct it"
+        message = f"{kind} cannot be saved, because it cannot be rebuilt from its description"
         raise ValueError(f"{message} ({_one_line(error)})") from error
 
 
@@ -268,7 +268,7 @@ def check_description(path: Path, expected: Mapping[str, Any], stored: Mapping[s
 
 
 class CheckpointFiles:
-    """The file of a policy or evaluator, and the training state next to it; only one training may write them.
+    """The files of one training: a policy or evaluator, and the training state next to it, with a lock against others.
 
     Args:
         checkpoint: the path of the policy, evaluator or training state.

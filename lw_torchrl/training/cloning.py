@@ -42,8 +42,8 @@ class BehavioralCloningConfig:
         max_grad_norm: maximum norm to which gradients are clipped.
         seed: seed of the minibatches, and of random numbers in the buffer's transforms and in the actor.
         checkpoint_every: number of minibatches between checkpoints; the last minibatch always writes a checkpoint.
-        qaf_anchor: weight of the cross entropy between a learned evaluator's answers and the exact answers. The term
-            keeps the meaning of the conditions while imitation trains the evaluator.
+        qaf_anchor: weight of the cross entropy between a learned evaluator's answers and the exact answers. This loss
+            term keeps the answers true to the conditions' meaning while imitation trains the evaluator.
     """
 
     steps: Count = 8000

@@ -80,7 +80,7 @@ class _PictureQueries:
         self.digest = _digest(part for task in tasks for part in (task.observation, task.truth, task.view("pixels")))
 
     def sample(self, size: int) -> TensorDictBase:
-        """Draw about ``size`` states in total, as one nested TensorDict per task with equally many states each."""
+        """Draw about ``size`` states in total, as one nested TensorDict per task with the same number of states."""
         each = max(1, size // len(self.tasks))
         batch = TensorDict()
         for number, task in enumerate(self.tasks):

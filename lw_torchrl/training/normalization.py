@@ -72,7 +72,7 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
 def share_contacts(module: nn.Module) -> None:
     """Call :meth:`RoleFeatures.share` for all features in a module or loss, after the features' buffers were changed.
 
-    The copies of a critic in a loss have buffers of their own, which need not be shared.
+    If a loss holds several copies of a critic, the copies have separate buffers, so there is nothing to share.
     """
     changed = {buffer.data_ptr() for buffer in statistics_of(module).values()}
     for _, part in _features_of(module):

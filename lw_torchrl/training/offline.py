@@ -114,8 +114,8 @@ class OfflineConfig:
 class OfflineTrainer(Training):
     """A trainer for the networks of a loss on a replay buffer.
 
-    Each optimizer step minimizes the sum of the loss's ``loss_`` entries, of which each has gradients only for its own
-    network, and then updates the target networks. The entry ``loss_actor_bc`` of CQL is left out.
+    Each optimizer step minimizes the sum of the loss's ``loss_`` entries (each has gradients only for one network), and
+    then updates the target networks. CQL's entry ``loss_actor_bc`` is left out.
 
     Args:
         loss: a loss from ``torchrl.objectives`` or ``lw_torchrl.objectives``, with its value estimator. The networks
@@ -226,7 +226,7 @@ def check_loss(loss: Any, replay: TensorDictReplayBuffer) -> None:
         raise ValueError("loss: with_lagrange=True keeps loss_cql from training the critics; use with_lagrange=False")
     ahead = [key for key in loss.in_keys if isinstance(key, tuple) and key[0] == "next"]
     if ahead and len(replay) and "next" not in replay.storage[0].keys():
-        lack = f"{type(loss).__name__} needs rewards and next observations, which replay's rows lack"
+        lack = f"{type(loss).__name__} requires rewards and next observations, which the rows of replay lack"
         raise ValueError(f"loss: {lack}; open the buffer with label='executed'")
     gammas = [part.gamma for part in replay.transform if isinstance(part, MultiStepTransform)]
     expected = next(iter(gammas), getattr(replay, "gamma", None))  # None where ``next`` is one step ahead

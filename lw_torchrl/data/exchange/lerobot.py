@@ -260,7 +260,7 @@ def _steps(source: Path, frames: Any) -> dict[str, Array]:
 
 
 def _task_texts(source: Path) -> dict[int, str]:
-    """Return, for each task_index, lw_torchrl's name of the task if the file has it, otherwise the description."""
+    """Return the name of each task by task_index, or the task's description if the file has no name."""
     import pyarrow.parquet as pq
 
     lines = source / "meta" / "tasks.jsonl"

@@ -238,7 +238,7 @@ def _converted(name: str, source_name: str, column: Array) -> Array:
             raise ExchangeError(f"{source_name} holds NaN or infinity")
         return column
     if (odd := column[~np.isin(column, (0, 1))]).size:
-        raise ExchangeError(f"{source_name} must hold booleans, or 0 and 1, got {odd[0]}")
+        raise ExchangeError(f"{source_name} must hold booleans, or the numbers 0 and 1, got {odd[0]}")
     return column.astype(bool)
 
 

@@ -50,13 +50,13 @@ def attribute_failures(
     device: str | torch.device | None = None,
     progress: bool = True,
 ) -> list[Failure]:
-    """Find the cause of each failed episode: the observations, the answers, the plan, a skill, another part of the
-    policy, or the time limit.
+    """Find the cause of each failed episode: the observations, the answers to the plan's conditions, the plan, a skill,
+    another part of the policy, or the time limit.
 
-    **A rule reads the states.** The cause is *query* if the policy acted on wrong answers; otherwise *plan* if, late in
-    the episode, plan and reference plan request different actions; otherwise *skill*. The rule proves nothing: a plan
-    that differs from the reference may succeed. Without a reference the rule detects only wrong answers, a plan without
-    a true condition, and a skill that stays far from its target. Without ``actor``, only the rule is used.
+    **A rule examines the states.** The cause is *query* if the policy acted on wrong answers; otherwise *plan* if, late
+    in the episode, plan and reference plan request different actions; otherwise *skill*. The rule is not a proof: a
+    plan that differs from the reference may succeed. Without a reference, the rule detects only wrong answers, a plan
+    without a true condition, and a skill that stays far from its target. Without ``actor``, only the rule is used.
 
     **Counterfactual re-runs decide**, if ``actor`` is given. First comes the null control: the episode is re-run with
     the same noise and nothing replaced. If the re-run succeeds, the failure is *not reproducible*, and the finding
@@ -214,7 +214,7 @@ def _by_counterfactuals(
         return Failure(seen.task, seed, seen.episode, "not reproducible", None, None, first.at, first, **record)
     tried_here = {name: results[which] is not None for name, results in tried.results.items() if which in results}
     record["counterfactuals"] = tried_here
-    # If both plans request the same actions, a success with the reference is not due to its content.
+    # If both plans request the same actions, a success with the reference is not due to the reference's content.
     same = _plans_agree(explanation)
     counting = [name for name in tried.mending(seen) if not (same and name == "plan")]
     decision = decide(counting, shares, share)

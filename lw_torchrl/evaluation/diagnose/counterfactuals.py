@@ -167,7 +167,7 @@ class Counterfactuals:
         reference = Plans(different)
         try:
             other = with_plans(actor, canonical_like(reference, plans_of(actor)))
-            reference = plans_of(other) or reference  # a policy may complete its plans
+            reference = plans_of(other) or reference  # a policy may add plans that the reference lacks
             other_evaluator = evaluator.with_plans(reference) if hasattr(evaluator, "with_plans") else evaluator
             self.other, self.other_evaluator, self.reference = other, other_evaluator, reference
         except (AttributeError, ImportError, RuntimeError, TypeError, ValueError) as error:
@@ -264,7 +264,7 @@ class Counterfactuals:
         self._run("policy", left, self.actor, self.plans, self.evaluator, wrap=self._scripted(self.plans))
 
     def _parts(self, comparison: ScriptComparison) -> tuple[ScriptComparison, ScriptComparison]:
-        """Split a comparison into those of the hand's motion and of the gripper."""
+        """Split a comparison into a comparison of the hand's motion and a comparison of the gripper."""
         gripper = torch.zeros(comparison.done.shape[-1], dtype=torch.bool)
         if self.plans.layout.gripper is not None:
             gripper[self.plans.layout.gripper] = True

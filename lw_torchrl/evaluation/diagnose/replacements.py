@@ -28,7 +28,7 @@ from lw_torchrl.transforms.qaf import plan_program
 EpisodeId = tuple[str, int]  # task and episode index
 TRUE_OBSERVATION = "true_observation"  # the environment's observation, before any transform or module changes it
 _REST = ScriptedSkill("", GRIPPER, gain=(0.0, 0.0, 0.0))  # stands in for a plan step without a scripted skill
-_RULER = 1e-3  # action per metre, so small that no distance is clipped
+_RULER = 1e-3  # gain (action per meter) to measure distances, so small that no action is clipped
 
 
 class Perception:
