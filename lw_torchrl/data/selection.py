@@ -20,7 +20,7 @@ from lw_torchrl.data.rewards import REWARDS, RewardName, episode_returns
 @typed_fields
 @dataclass(frozen=True)
 class EpisodeFilter:
-    """A filter that keeps the episodes that satisfy every condition which is not None.
+    """A filter that keeps the episodes that satisfy all given conditions (None stands for no condition).
 
     An episode's return is the sum of the buffer's ``("next", "reward")`` over the episode's selected rows.
 
@@ -185,7 +185,7 @@ def select(
     after: int | None,
     check: bool,
 ) -> tuple[list[Demonstrations], list[Demonstrations]]:
-    """Return the descriptions of the datasets, with all and with only the selected episodes.
+    """Return two descriptions of each dataset: with all episodes, and with only the selected episodes.
 
     See :func:`load_demonstrations` for the arguments.
     """

@@ -303,7 +303,7 @@ class Training:
         return read["loss"]
 
     def save(self) -> None:
-        """Write the checkpoint, atomically replacing existing files; do nothing without ``checkpoint``."""
+        """Check that all weights are finite, and write the checkpoint, if any, atomically replacing existing files."""
         try:
             check_finite(self.parameters())
         except ValueError as error:

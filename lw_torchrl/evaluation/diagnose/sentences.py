@@ -115,12 +115,12 @@ def finding_text(finding: Finding) -> str:
             wrong = f"entry {number} was off by up to {error:.2g}"
             return f"the policy's observation differed from the true one: {wrong}"
         case Difference(part, at, given, again, size):
-            differ = f"from step {at} on, there by {size or 0:.2g}: noise or a random policy"
+            differ = f"from step {at} on, by {size or 0:.2g} at that step, due to noise or a random policy"
             texts = {
                 "length": f"the length: the rollout has {given} steps, the re-run {again}",
                 "actions": f"the executed actions, {differ}",
                 "environment": f"the environment: the same action in state {at - 1} leads to a different state",
-                "states": f"the states, from {at} on; record the actions to find out more",
+                "states": f"the states, from {at} on; the rollout holds no actions, so record them to find out more",
                 "nothing": "in data that were not recorded",
             }
             return f"the first difference is {texts[part]}"

@@ -50,7 +50,7 @@ class ScriptComparison(NamedTuple):
         return ScriptComparison(self.done[:, numbers], self.wanted[:, numbers], self.active)
 
     def differ_by(self, size: float) -> Tensor:
-        """Return (T,) bool: whether the actions differ by more than ``size`` on any axis; False without a step."""
+        """Return (T,) bool: whether actions differ by more than ``size`` on any axis; False if no step is active."""
         return (self.done - self.wanted).abs().amax(-1).masked_fill(self.active < 0, 0.0) > size
 
     def unlike(self) -> Tensor:
