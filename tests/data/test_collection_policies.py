@@ -194,7 +194,7 @@ def test_the_column_behaviour_is_the_labels_rank(datasets):
 def test_one_label_for_two_behaviours_is_an_error(tmp_path, datasets):
     first = collect(tmp_path / "one", policy=trained(), behaviour="tiny")
     second = collect(tmp_path / "other", policy=trained(seed=1), behaviour="tiny")
-    with pytest.raises(ValueError, match="'tiny' names different behaviours"):
+    with pytest.raises(ValueError, match="the label 'tiny' stands for different behaviours"):
         lw.LanguageWorldExperienceReplay([first.root, second.root], label="executed")
     metadata = json.loads((second.root / "metadata.json").read_text())
     metadata["config"]["policy"]["name"] = "second"
@@ -307,14 +307,14 @@ RANDOM = lw.ScriptedSkillActor(PLANS, "random")
 @pytest.mark.parametrize(
     ("policy", "options", "error", "message"),
     [
-        (trained(), dict(behaviour=None), ValueError, "behaviour must name the policy"),
+        (trained(), dict(behaviour=None), ValueError, "behaviour must be a label for the policy"),
         (trained(), dict(behaviour="noisy"), ValueError, "'noisy' is reserved"),
         ("random", dict(behaviour="expert"), ValueError, "'expert' is reserved"),
         (Behaviour("wrong", right=0.9), dict(behaviour=None), ValueError, "'wrong' is reserved"),
-        (Behaviour("mine", "policy"), {}, ValueError, "give the policy itself"),
+        (Behaviour("mine", "policy"), {}, ValueError, "pass the policy itself"),
         ("raondm", {}, ValueError, "policy must be one of 'expert'.*did you mean 'random'"),
         (lambda state: state, {}, ValueError, "must write 'action'"),
-        (lambda state: state, dict(behaviour=None), ValueError, "behaviour must name the policy"),
+        (lambda state: state, dict(behaviour=None), ValueError, "behaviour must be a label for the policy"),
         (trained("description"), dict(tasks=("push", "drawer-open")), ValueError, "tasks must be .* drawer-open"),
         (Odd("value"), {}, ValueError, "NaN"),
         (Odd("key"), {}, ValueError, "must write 'action'"),
