@@ -23,7 +23,7 @@ from lw_torchrl.modules import transform_of
 from lw_torchrl.modules.query_evaluator import evaluators_of
 
 RECIPE = DemoConfig(demonstrations_per_task=10)
-WHO = ("expert", "scripted", "spoilt-30", "random")
+WHO = ("expert", "scripted", "noisy-30", "random")
 
 
 @dataclass(frozen=True)

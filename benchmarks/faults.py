@@ -82,7 +82,7 @@ def in_skill(change: Callable[[torch.Tensor], torch.Tensor]) -> Plant:
 def offset_skill(cast: Cast, step: int) -> None:
     """In the script's table, or, of a network, as much added to its action."""
     if cast.scripted:
-        cast.skills = planted.spoilt_skills(cast.sound, cast.steps(step))
+        cast.skills = planted.perturbed_skills(cast.sound, cast.steps(step))
     else:
         in_skill(lambda action: (action + torch.tensor([1.0, 0.0, 0.0, 0.0])).clamp(-1.0, 1.0))(cast, step)
 

@@ -53,7 +53,7 @@ def with_extra(plan: lw.ConditionalPlan, step: int) -> lw.ConditionalPlan:
     return lw.ConditionalPlan.from_pairs(plan.definition, [extra, *pairs])
 
 
-def spoilt_skills(plans: lw.Plans, steps: Mapping[str, int]) -> Mapping[str, ScriptedSkill]:
+def perturbed_skills(plans: lw.Plans, steps: Mapping[str, int]) -> Mapping[str, ScriptedSkill]:
     """The scripted skills, those of a step of each task's plan with a wrong offset."""
     table = dict(lw.load_skills())
     for plan in plans.values():

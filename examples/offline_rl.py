@@ -19,11 +19,11 @@ TASKS, GAMMA = ["drawer-open", "push"], 0.99
 
 def collect(root: str, episodes: int) -> list[str]:
     """Plans whose every piece of 8 to 24 steps is right with probability 0.3, or never: a folder for each."""
-    for policy in ("spoilt-30", "wrong"):
+    for policy in ("noisy-30", "wrong"):
         lw.collect_demonstrations(
             TASKS, episodes_per_task=episodes, root=f"{root}/{policy}", policy=policy, noise_scale=0.3, noise_hold=10
         )
-    return [f"{root}/spoilt-30", f"{root}/wrong"]
+    return [f"{root}/noisy-30", f"{root}/wrong"]
 
 
 def show(roots: list[str], plans: lw.Plans, **options) -> lw.LanguageWorldExperienceReplay:

@@ -81,7 +81,7 @@ $LW record pick-place push door-open drawer-open peg-insert-side window-open ass
 picture many.rrd rerun-overview 1600x1000
 picture many.rrd rerun-overview-small 1100x700
 
-$LW record drawer-open --policy spoilt-30 --compare scripted --max-steps 200 --out compare.rrd
+$LW record drawer-open --policy noisy-30 --compare scripted --max-steps 200 --out compare.rrd
 picture compare.rrd rerun-compare 1600x1000
 picture compare.rrd rerun-compare-small 1100x700
 

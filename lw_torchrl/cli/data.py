@@ -86,7 +86,7 @@ def _show_dataset(output: Output, dataset: Demonstrations) -> Output:
 class Show:
     """Summarize datasets: collection policy, success rate, return. Several datasets are also summarized together.
 
-    Example: lw-torchrl data show demos/mt10 demos/spoilt --check
+    Example: lw-torchrl data show demos/mt10 demos/noisy --check
     """
 
     folders: Positional[Annotated[tuple[Path, ...], options.REQUIRED, arg(metavar="FOLDERS")]]

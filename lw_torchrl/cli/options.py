@@ -126,8 +126,8 @@ def _print_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[st
 
 PLANS = "MT10 or MT50 (the shipped plans), .plan files, .json files of (condition, skill) pairs, or folders"
 WHO = (
-    "expert (Meta-World's scripts, or the suite's expert), scripted (plans executed by scripted skills), spoilt-60 or "
-    "spoilt-30 (scripted, but correct only 60 or 30 % of the time), wrong (random skills of the plan), random, a "
+    "expert (Meta-World's scripts, or the suite's expert), scripted (plans executed by scripted skills), noisy-60 or "
+    "noisy-30 (scripted, but correct only 60 or 30 % of the time), wrong (random skills of the plan), random, a "
     "policy file, a shipped policy (few-shot-mt50), or a Python object my_module:policy"
 )
 _DEVICE = "device of the networks: cpu, cuda, cuda:1, mps, or auto for a GPU if there is one (the simulation uses CPUs)"

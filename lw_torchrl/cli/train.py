@@ -258,7 +258,7 @@ class TrainEvaluator:
     out: Path  # folder for evaluator.safetensors, report.json and the collected episodes
     data: Annotated[tuple[Path, ...], options.OPTIONAL] = ()
     """datasets written by `lw-torchrl collect`, to use instead of collecting episodes"""
-    behaviours: tuple[str, ...] = ("expert", "scripted", "spoilt-30", "random")
+    behaviours: tuple[str, ...] = ("expert", "scripted", "noisy-30", "random")
     """policies that collect the episodes, as for `collect --policy`"""
     episodes: Count = 5  # number of episodes to collect for each task and policy
     max_steps: Count = 500  # time steps per episode

@@ -1,4 +1,4 @@
-"""Demonstrations: collecting them, reading them as a replay buffer, sampling them in exact proportions."""
+"""Demonstrations: collect datasets, read datasets as a replay buffer, and sample rows in exact proportions."""
 
 import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.data.collect import collect_demonstrations

@@ -1,7 +1,7 @@
-"""collect_demonstrations: write episodes of an expert, or of another policy, to a dataset; resumable after a kill.
+"""collect_demonstrations: run an expert or another policy, and write the episodes to a dataset; resumable when killed.
 
-root/.partial/begun.json    the configuration and the versions of packages
-root/.partial/*.npz         a file for each finished episode, so that a kill loses only running episodes
+root/.partial/begun.json    the config and the package versions
+root/.partial/*.npz         one file per finished episode, so that a killed process loses only the running episodes
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from lw_torchrl.transforms.qaf import QAFTransform
 
 _STORED = [key for key in COLUMNS if key != TRAJECTORY]
 _RECORDED = [key for key in _STORED if not key[-1].startswith("reward")] + [("next", "reward")]
-_FAILED = b"FAILED"  # the content of the file of an episode that failed and is drawn again
-_MAX_ATTEMPTS = 20  # episodes run for each kept one, before redrawing gives up
+_FAILED = b"FAILED"  # the file content that marks a failed episode, which is replaced by another episode
+_MAX_ATTEMPTS = 20  # number of episodes to run per kept episode before redrawing gives up
 
 _Actor = Callable[[TensorDictBase], TensorDictBase]
 
 
 class EpisodeFiles:
-    """The files of finished episodes in a folder, one for each episode."""
+    """A folder with one file for each finished episode."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -56,7 +56,7 @@ class EpisodeFiles:
         return self.folder / f"{task.replace('/', '+')}.{episode}.npz"
 
     def put(self, task: str, episode: int, steps: TensorDictBase | None) -> None:
-        """Write an episode's rows; None for a failure that is drawn again."""
+        """Write an episode's rows, or a mark for a failed episode that is redrawn (None)."""
         with replacing(self._path(task, episode), sync=False) as path, path.open("wb") as file:
             if steps is None:
                 file.write(_FAILED)
@@ -70,18 +70,19 @@ class EpisodeFiles:
         return self._path(task, episode).stat().st_size != len(_FAILED)
 
     def get(self, task: str, episode: int) -> TensorDict:
-        """Return the rows of an episode; DatasetError if its file is damaged."""
+        """Read the rows of an episode; raise DatasetError if the file is corrupted."""
         path = self._path(task, episode)
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 columns = {key: torch.from_numpy(arrays["/".join(key)]) for key in _STORED}
             return TensorDict(columns, [len(columns["episode",])])
-        except Exception as error:  # zipfile and numpy raise many kinds of errors
-            raise DatasetError(f"root: {str(path)!r} is damaged ({error}); delete this file to run it again") from error
+        except Exception as error:  # zipfile and numpy raise many kinds of errors for corrupted files
+            message = f"root: {str(path)!r} is corrupted ({error}); delete this file to run the episode again"
+            raise DatasetError(message) from error
 
 
 def _kept_and_missing(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
-    """Return the kept episodes of each task, and those still to run; ``num_envs`` and interruptions do not matter."""
+    """Return the kept episodes and the missing episodes of each task, independent of ``num_envs`` and interruptions."""
     kept: dict[str, list[int]] = {}
     wanted: dict[str, list[int]] = {}
     for task in config.tasks:
@@ -94,7 +95,7 @@ def _kept_and_missing(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[
         if missing and candidate >= config.episodes_per_task * _MAX_ATTEMPTS:
             raise RuntimeError(
                 f"task {task!r}: only {len(kept[task])} of {candidate} episodes of {config.behaviour!r} succeeded; "
-                "lower the noise_scale or set redraw_failures=False"
+                "lower noise_scale, or set redraw_failures=False"
             )
         ahead = range(candidate, candidate + missing)
         wanted[task] = [episode for episode in ahead if not files.has(task, episode)]
@@ -102,7 +103,7 @@ def _kept_and_missing(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[
 
 
 def _clipped(policy: _Actor, size: int) -> _Actor:
-    """Return ``policy`` with its action clipped, and the action before that as ``unclipped_action``."""
+    """Wrap ``policy`` to clip its action, and to write the action before clipping as ``unclipped_action``."""
 
     def run(tensordict: TensorDictBase) -> TensorDictBase:
         tensordict = policy(tensordict)
@@ -113,7 +114,7 @@ def _clipped(policy: _Actor, size: int) -> _Actor:
 
 
 def _env_and_actor(config: CollectConfig, policy: Any, env: LanguageWorldEnv) -> tuple[EnvBase, _Actor]:
-    """Return the environment with the transform that the policy needs, and the policy."""
+    """Return the environment with the transform that the policy requires, and the policy."""
     if config.policy.kind == "expert":
         policy = suite_expert(env.suite, config.tasks)
         if plans_of(policy) is None:
@@ -129,23 +130,23 @@ def _env_and_actor(config: CollectConfig, policy: Any, env: LanguageWorldEnv) ->
 
 
 def suite_expert(suite: Suite, tasks: Sequence[str]) -> Any:
-    """Return a suite's own expert, or its scripted skills following its plans; ValueError if it has neither."""
+    """Return a suite's expert, or an actor with the suite's scripted skills and plans; ValueError without either."""
     if suite.make_expert is not None:
         return suite.make_expert(tasks)
     if suite.plans is None or suite.skills is None:
-        raise ValueError(f"policy='expert': suite {suite.name!r} has no plans with scripted skills; give a policy")
+        raise ValueError(f"policy='expert': suite {suite.name!r} has no plans with scripted skills; pass a policy")
     return ScriptedSkillActor(segment_plans(tasks, suite), skills=suite.skills)
 
 
 def run_missing_episodes(
     config: CollectConfig, policy: Any, files: EpisodeFiles, num_envs: int | None, suite: Suite, progress: bool
 ) -> dict[str, list[int]]:
-    """Run episodes until the files hold all; return the kept ones of each task."""
+    """Run episodes until all are in the files, and return the indices of the kept episodes of each task."""
     kept, wanted = _kept_and_missing(config, files)
     missing = sum(map(len, wanted.values()))
     if not missing:
         return kept
-    # The dense reward is recorded; the sparse one follows from success.
+    # Record only the dense reward, because the sparse reward follows from success.
     base = LanguageWorldEnv(
         config.tasks,
         suite=suite,
@@ -164,7 +165,7 @@ def run_missing_episodes(
     deterministic = set_exploration_type(ExplorationType.DETERMINISTIC)
     with bar, closing(env), torch.no_grad(), deterministic:
         while missing:
-            bar.set_done((total - missing) * config.max_steps)  # steps back by the failures that are drawn again
+            bar.set_done((total - missing) * config.max_steps)  # moves back by the failures that are redrawn
             episodes = run_episodes(
                 env,
                 actor,
@@ -186,7 +187,7 @@ def run_missing_episodes(
 
 
 def _begin(root: Path, config: CollectConfig) -> dict[str, str]:
-    """Begin or resume a dataset; return the versions of packages with which it was begun."""
+    """Start or resume a dataset, and return the package versions at the start of the collection."""
     path = root / dataset.PARTIAL / "begun.json"
     versions = package_versions()
     if not path.is_file():
@@ -197,7 +198,7 @@ def _begin(root: Path, config: CollectConfig) -> dict[str, str]:
     if changes := version_changes(begun["versions"], SIMULATORS):
         raise DatasetError(
             f"root: {str(root)!r} holds episodes of another simulator ({'; '.join(changes)}); install that version, "
-            "choose another folder, or delete it to start again"
+            "choose another folder, or delete this folder to start again"
         )
     return begun["versions"]
 
@@ -206,18 +207,18 @@ def _check_same(before: CollectConfig, config: CollectConfig, root: Path) -> Non
     if before != config:
         was, now = (each.to_json() | {"policy": each.policy.to_json()} for each in (before, config))
         raise DatasetError(
-            f"root: {str(root)!r} holds a dataset of another configuration ({', '.join(differences(was, now))}); "
-            "choose another folder, or delete it to start again"
+            f"root: {str(root)!r} holds a dataset with another configuration ({', '.join(differences(was, now))}); "
+            "choose another folder, or delete this folder to start again"
         )
 
 
 def _assemble(
     root: Path, config: CollectConfig, versions: dict[str, str], files: EpisodeFiles, kept: dict[str, list[int]]
 ) -> None:
-    """Join the episodes' files to a dataset."""
+    """Combine the episodes' files into a dataset."""
     episodes = ((task, episode, files.get(task, episode)) for task in config.tasks for episode in kept[task])
     building = files.folder / "rows"
-    # The folder of the rows gets its name when it is complete, and the metadata, written last, finish the dataset.
+    # Rename the folder of rows when it is complete; the metadata file, written last, marks the dataset as finished.
     for old in (building, root / dataset.DATA):
         shutil.rmtree(old, ignore_errors=True)
     infos = dataset.write_rows(building, episodes, config.layout)
@@ -229,7 +230,7 @@ def _assemble(
 
 
 def _finished(root: Path, config: CollectConfig) -> Demonstrations | None:
-    """Return the finished dataset in a folder, after comparing it with its checksums; None if there is none."""
+    """Verify and return the finished dataset in a folder; return None if there is none."""
     if not (root / dataset.METADATA).is_file():
         return None
     demonstrations = dataset.read_metadata(root)
@@ -258,46 +259,45 @@ def collect_demonstrations(
 ) -> Demonstrations:
     """Run Meta-World's scripted experts, or other policies, and write their episodes to a dataset.
 
-    Repeat a call that was killed, or ran out of disk, to resume it. For a finished dataset of the same configuration,
-    the call compares all rows with their checksums and returns. The dataset depends neither on ``num_envs`` nor on
-    interruptions.
+    If a call was killed or ran out of disk space, repeat the call to resume. If a finished dataset with the same config
+    exists, the call only verifies its checksums. The dataset depends neither on ``num_envs`` nor on interruptions.
 
-    Each row is a step, in TorchRL's TED layout (R rows):
-        observation, next/observation: (R, 39) float32, metres.
+    Each row is one time step, in TorchRL's TED layout (R rows):
+        observation, next/observation: (R, 39) float32, meters.
         task_id, next/task_id, episode: (R,) int64. collector/traj_ids: (R,) int64, unique per episode.
-        action: (R, 4) float32 in [-1, 1], as executed, noise included.
+        action: (R, 4) float32 in [-1, 1], the executed action, including noise.
         expert_action: (R, 4) float32 in [-1, 1], the policy's action in the same state without noise;
-            unclipped_action: (R, 4) float32, the same before it was clipped.
-        next/reward_sparse, next/reward_dense: (R, 1) float32, the success as 0 and 1, and Meta-World's reward.
+            unclipped_action: (R, 4) float32, the policy's action before clipping.
+        next/reward_sparse, next/reward_dense: (R, 1) float32, the success as 0 or 1, and Meta-World's reward.
         next/success, next/done, next/terminated, next/truncated: (R, 1) bool.
 
     Args:
         tasks: Meta-World tasks, as for :func:`resolve_tasks`, or another suite's; see docs/your-robot.md for your own.
         episodes_per_task: number of episodes of each task to keep.
-        root: the dataset's folder, new or left by an earlier call.
-        suite: the :class:`~lw_torchrl.suites.Suite` of the tasks; None for the suite that their names begin with.
-        policy: the policy of the whole dataset. A name in :data:`BEHAVIOURS`: "expert" (Meta-World's script),
-            "scripted", "spoilt-60", "spoilt-30", "wrong" or "random"; a :class:`Behaviour`; a trained policy, any
-            TensorDictModule or a function, run as :func:`evaluate` runs it. It reads ``observation`` (N, 39) float32,
-            ``task_id`` and ``episode`` (N,) int64, and ``qaf`` if it has ``plans``, and writes ``action`` (N, 4)
-            float32. Its action in a row must depend only on that row. A function is identified only by its label:
-            resume with the same function.
-        behaviour: the label of the episodes, for :class:`EpisodeFilter`; None for the policy's name. Modules and
-            functions need a label.
+        root: the dataset's folder; a new folder, or a folder that an earlier call created.
+        suite: the :class:`~lw_torchrl.suites.Suite` of the tasks; None to derive the suite from the tasks' names.
+        policy: the collection policy: a name in :data:`BEHAVIOURS` ("expert", "scripted", "noisy-60", "noisy-30",
+            "wrong" or "random"); a :class:`Behaviour`; or a trained policy, any TensorDictModule or function, which is
+            run as in :func:`evaluate`. A trained policy reads ``observation`` (N, 39) float32, ``task_id`` and
+            ``episode`` (N,) int64, and ``qaf`` if it has ``plans``, and writes ``action`` (N, 4) float32, whose rows
+            must be computed independently. A function is identified only by its label: resume with the same function.
+        behaviour: the label of the episodes, for :class:`EpisodeFilter`; None for the policy's name. Required for
+            modules and functions.
         seed: random seed (use a different one for evaluation).
-        noise_scale: standard deviation of the noise on the executed action; of a sequence, each episode's in turn.
-        noise_hold: number of steps for which each noise value is held; longer leads further off the expert's path.
+        noise_scale: standard deviation of the noise on the executed action; a sequence is cycled over the episodes.
+        noise_hold: number of time steps for which each noise value is held; larger values lead further off the
+            expert's path.
         gripper_noise_factor: factor on the noise of the gripper.
-        redraw_failures: keep only successful episodes.
-        max_steps: number of steps of an episode; None for the suite's.
-        num_envs: environments stepped together.
-        progress: show a progress bar if it takes longer than a second.
+        redraw_failures: keep only successful episodes, and replace failed ones.
+        max_steps: number of time steps per episode; None for the suite's default.
+        num_envs: number of environments stepped together; None to choose the number automatically.
+        progress: show a progress bar if the collection takes longer than a second.
 
     Raises:
-        DatasetError: (a ValueError) ``root`` holds something else, a damaged dataset, or episodes of another simulator,
-            or another process is collecting there.
-        OSError: the dataset cannot be written, for example because the disk is full; resume when there is room.
-        RuntimeError: redrawing finds too few successes.
+        DatasetError: (a ValueError) ``root`` holds other files, a corrupted dataset or episodes of another simulator,
+            or another process is collecting in ``root``.
+        OSError: the dataset cannot be written, for example because the disk is full; free space and repeat the call.
+        RuntimeError: too few episodes succeed to redraw the failures.
 
     Example:
         >>> import tempfile, lw_torchrl as lw
@@ -312,7 +312,7 @@ def collect_demonstrations(
     actor = None if isinstance(policy, (str, Behaviour)) else policy
     known = tasks_of(actor) or names
     if unknown := [task for task in names if task not in known]:
-        raise ValueError(f"tasks must be among the policy's, which lack {', '.join(unknown)}")
+        raise ValueError(f"tasks must be among the policy's tasks ({', '.join(known)}), got {', '.join(unknown)}")
     config = CollectConfig(
         tasks=names,
         episodes_per_task=episodes_per_task,
@@ -327,15 +327,15 @@ def collect_demonstrations(
     )
     folder, partial = Path(root), Path(root, dataset.PARTIAL)
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"root must be a folder, {str(folder)!r} is a file")
+        raise ValueError(f"root must be a folder, got the file {str(folder)!r}")
     if (demonstrations := _finished(folder, config)) is not None and not partial.is_dir():
         return demonstrations
     is_new = demonstrations is None and folder.is_dir() and not partial.is_dir()
     if is_new and {path.name for path in folder.iterdir()} - {dataset.LOCK}:
-        raise DatasetError(f"root: {str(folder)!r} is not empty and holds no dataset; choose another folder")
+        raise DatasetError(f"root: {str(folder)!r} is not empty, but holds no dataset; choose another folder")
     lock = locked(folder, "root", "collect_demonstrations", folder=True, error=DatasetError)
     with lock, evaluating(actor) if isinstance(actor, nn.Module) else nullcontext():
-        if _finished(folder, config) is None:  # another process may have finished it
+        if _finished(folder, config) is None:  # another process may have finished the dataset in the meantime
             versions, files = _begin(folder, config), EpisodeFiles(partial)
             kept = run_missing_episodes(config, actor, files, num_envs, suite, progress)
             _assemble(folder, config, versions, files, kept)

@@ -1,4 +1,4 @@
-"""Collection policies: Meta-World's experts, plans with scripted skills, the same with wrong pieces, random actions."""
+"""Collection policies: Meta-World's experts, scripted skills that follow plans (possibly perturbed), random actions."""
 
 from __future__ import annotations
 
@@ -29,18 +29,19 @@ from lw_torchrl.suites.suite import Suite, load_suite
 @typed_fields
 @dataclass(frozen=True)
 class Behaviour:
-    """The policy that collects an episode, as a dataset's metadata describe it; equal behaviours act alike.
+    """A collection policy, as described in a dataset's metadata; equal behaviours act identically.
 
-    A behaviour of kind "segments" divides an episode into segments. In each it follows the plan by scripted skills with
-    probability ``right``, and otherwise does something else. Its draws depend only on (task, seed, episode).
+    A behaviour of kind "segments" divides an episode into segments. With probability ``right`` a segment follows the
+    plan with scripted skills; other segments are perturbed. The random draws depend only on (task, seed, episode).
 
     Attributes:
-        name: the label of its episodes.
-        kind: "expert" (Meta-World's script), "segments", "policy" (a trained one) or "imported" (from other datasets).
+        name: the label of the episodes.
+        kind: "expert" (Meta-World's script), "segments", "policy" (a trained policy) or "imported" (another dataset).
         right: for "segments", the probability that a segment follows the plan.
-        otherwise: for "segments", the others: "skill", a random skill of the plan, or "action", a random action.
-        shortest, longest: for "segments", the number of steps of a segment.
-        fingerprint: of the plans of "segments", or of a policy's description and weights; None for a function.
+        otherwise: for "segments", the content of the other segments: "skill" (a random skill of the plan) or "action"
+            (a random action).
+        shortest, longest: for "segments", the minimum and maximum number of time steps in a segment.
+        fingerprint: a digest of the plans of "segments", or of a policy's description and weights; None for a function.
 
     Example:
         >>> Behaviour("half-right", right=0.5).otherwise
@@ -63,7 +64,7 @@ class Behaviour:
 
     @property
     def acts(self) -> Behaviour:
-        """The behaviour without the fingerprint of its plans: two behaviours act alike if these are equal."""
+        """The behaviour without the fingerprint of its plans, to compare behaviours of datasets with other tasks."""
         return replace(self, fingerprint=None) if self.kind == "segments" else self
 
     def to_json(self) -> dict[str, Any]:
@@ -71,32 +72,33 @@ class Behaviour:
 
 
 EXPERT: Behaviour = Behaviour("expert", "expert")
-NOISY = "noisy"  # the label of an expert's episodes that are executed with noise
+NOISY = "noisy"  # the label of expert episodes with action noise
 _SEGMENTS = (
     Behaviour("scripted"),
-    Behaviour("spoilt-60", right=0.6),
-    Behaviour("spoilt-30", right=0.3),
+    Behaviour("noisy-60", right=0.6),
+    Behaviour("noisy-30", right=0.3),
     Behaviour("wrong", right=0.0),
     Behaviour("random", right=0.0, otherwise="action"),
 )
 BEHAVIOURS: Mapping[str, Behaviour] = MappingProxyType(
     {behaviour.name: behaviour for behaviour in (EXPERT, *_SEGMENTS)}
 )
-"""By name: Meta-World's expert; plans with scripted skills; the same in 60 or 30 of 100 segments, and random skills of
-the plan in the others; only random skills of the plan; random actions in [-1, 1]."""
+"""The shipped collection policies by name: "expert" (Meta-World's script), "scripted" (scripted skills that follow the
+plan), "spoilt-60" and "spoilt-30" (scripted skills in 60 % or 30 % of the segments, random skills of the plan in the
+others), "wrong" (only random skills of the plan) and "random" (random actions in [-1, 1])."""
 
 
 def check_own_label(behaviour: Behaviour) -> None:
-    """Raise :class:`ValueError` for a label that is another behaviour's."""
+    """Raise :class:`ValueError` if a behaviour's name is reserved for another behaviour."""
     if behaviour.name == NOISY or behaviour.acts != BEHAVIOURS.get(behaviour.name, behaviour.acts):
         raise ValueError(f"name {behaviour.name!r} is reserved (reserved: {', '.join((*BEHAVIOURS, NOISY))})")
 
 
 def segment_plans(tasks: Iterable[str], suite: str | Suite = "metaworld") -> Plans:
-    """Return the suite's plans for tasks; ValueError for a suite without plans."""
+    """Return the suite's plans for tasks; raise ValueError if the suite has no plans."""
     suite, tasks = load_suite(suite), list(tasks)
     if suite.plans is None:
-        raise ValueError(f"policy: suite {suite.name!r} has no plans for this behaviour to follow; give a policy")
+        raise ValueError(f"policy: suite {suite.name!r} has no plans for this behaviour to follow; pass a policy")
     suite.plans.require(tasks)
     return Plans([suite.plans[task] for task in tasks])
 
@@ -104,16 +106,16 @@ def segment_plans(tasks: Iterable[str], suite: str | Suite = "metaworld") -> Pla
 def behaviour_of(
     policy: Any, tasks: Iterable[str], name: str | None = None, suite: str | Suite = "metaworld"
 ) -> Behaviour:
-    """Return the behaviour that the argument ``policy`` stands for in tasks of ``suite``, with the label ``name``."""
+    """Convert the argument ``policy`` of :func:`collect_demonstrations` to a behaviour with the label ``name``."""
     if not isinstance(policy, (str, Behaviour, type)) and callable(policy):
         if name is None:
-            raise ValueError("behaviour must name the policy, behaviour='my-policy' for example")
+            raise ValueError("behaviour must be a label for the policy, for example behaviour='my-policy'; got None")
         if not isinstance(policy, nn.Module):
             return Behaviour(name, "policy")
         if draws(policy):
             raise ValueError(
-                f"policy: this {type(policy).__name__} draws random numbers in the order of its calls, so its episodes "
-                "would depend on num_envs and on interruptions"
+                f"policy: this {type(policy).__name__} is stochastic and draws random numbers call by call, so the "
+                "episodes would depend on num_envs and on interruptions; use a deterministic policy"
             )
         return Behaviour(name, "policy", fingerprint=policy_fingerprint(policy))
     if isinstance(policy, str):
@@ -121,7 +123,7 @@ def behaviour_of(
     if not isinstance(policy, Behaviour):
         raise TypeError(f"policy must be a name, a Behaviour, a module or a function, got {type(policy).__name__}")
     if policy.kind in ("policy", "imported"):
-        raise ValueError(f"policy: the Behaviour {policy.name!r} only describes a policy; give the policy itself")
+        raise ValueError(f"policy: the Behaviour {policy.name!r} only describes a policy; pass the policy itself")
     behaviour = policy
     if behaviour.kind == "segments":
         behaviour = replace(behaviour, fingerprint=segment_plans(tasks, suite).fingerprint)
@@ -129,16 +131,18 @@ def behaviour_of(
 
 
 def policy_fingerprint(policy: nn.Module) -> str:
-    """Return a digest of a policy's description (of any other module's class), weights and text vectors, which differ
-    for another text encoder."""
+    """Return a digest of a policy's description (or class, if it cannot be described), weights and text vectors.
+
+    The text vectors distinguish policies with different text encoders.
+    """
     try:
         description: object = describe(policy)
-    except TypeError:  # a part that cannot be saved
+    except TypeError:  # some submodule cannot be saved
         description = type(policy).__qualname__
     digest = sha256(json.dumps(description, sort_keys=True).encode())
     parts = policy.named_modules(remove_duplicate=False)
     vectors = ((name, getattr(part, "text_vectors", None)) for name, part in parts)
-    # Only the signs, because normalised vectors may be rounded differently on another machine.
+    # Use only the signs, because normalized vectors may be rounded differently on another machine.
     texts = {name: vector.sign() for name, vector in vectors if vector is not None}
     state = {key: value for key, value in policy.state_dict().items() if isinstance(value, Tensor)}
     for key, value in sorted({**state, **texts}.items()):
@@ -148,14 +152,14 @@ def policy_fingerprint(policy: nn.Module) -> str:
 
 
 class SegmentActor(TensorDictModuleBase):
-    """Act as a :class:`Behaviour` of kind "segments" in episodes of ``max_steps`` steps, from their beginning.
+    """An actor that carries out a :class:`Behaviour` of kind "segments" in episodes of ``max_steps`` time steps.
 
     Reads ``observation`` (N, D) float32, ``task_id`` and ``episode`` (N,) int64, ``qaf`` (N, S) bool and ``_step``
-    (N,) bool, the rows that count; writes ``action`` (N, A) float32 in [-1, 1]. An episode begins in a row whose task
-    or episode differs from the last call's. ``plans`` has a plan for each task.
+    (N,) bool, which marks the running rows; writes ``action`` (N, A) float32 in [-1, 1]. An episode begins when the
+    task or episode of a row differs from the previous call. ``plans`` must have a plan for each task.
     """
 
-    row_by_row = True  # no network: its rows need no blocks of one size
+    row_by_row = True  # without a network, the result does not depend on the number of rows
 
     def __init__(
         self, behaviour: Behaviour, plans: Plans, seed: int, max_steps: int, skills: Skills | None = None
@@ -167,7 +171,7 @@ class SegmentActor(TensorDictModuleBase):
         self.in_keys = ["observation", "task_id", "qaf", "episode", "_step"]
         self.out_keys = ["action"]
         self._task = {task_id(task): plan.definition for task, plan in plans.items()}
-        self._begun = torch.empty(0, 2, dtype=torch.int64)  # the task and the episode of each row
+        self._begun = torch.empty(0, 2, dtype=torch.int64)  # the task id and the episode running in each row
 
     def _begin(self, rows: int) -> None:
         shape = rows, self.max_steps
@@ -176,7 +180,7 @@ class SegmentActor(TensorDictModuleBase):
         self._random_action = torch.zeros(*shape, self.plans.layout.action_size)
 
     def _draw(self, row: int, task: int, episode: int) -> None:
-        """Draw all segments of an episode at once, so that they do not depend on what else runs."""
+        """Draw all segments of an episode at once, so that they do not depend on the other running episodes."""
         behaviour, definition = self.behaviour, self._task[task]
         draws = episode_generator("segments", definition, self.seed, episode)
         length = draws.integers(behaviour.shortest, behaviour.longest + 1, -(-self.max_steps // behaviour.shortest))

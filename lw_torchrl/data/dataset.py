@@ -1,14 +1,14 @@
-"""A demonstration dataset on disk: its metadata, its rows, memory-mapped, and the checksums of its episodes.
+"""The demonstration dataset on disk: metadata, memory-mapped rows, and a checksum for each episode.
 
-root/data/            the rows, one for each step, in TorchRL's TED layout: a file for each column
-root/metadata.json    written last: a folder without it is not a finished dataset
-root/.partial/        while collecting: begun.json and the episodes; see :mod:`.collect`
-root/.lock            held while collecting
+root/data/            the rows (one per time step) in TorchRL's TED layout, with one file per column
+root/metadata.json    written last, so that a folder without this file is not a finished dataset
+root/.partial/        exists during collection: begun.json and the episodes; see :mod:`.collect`
+root/.lock            the lock file, held during collection
 
-The files in data/ are those of ``TensorDict.memmap``, so ``TensorDict.load_memmap`` reads them too. Here their shapes
-come from :func:`columns_of`, and nothing is unpickled. The map is copy-on-write: a write to a column changes it for
-this process, never the file. The files are not written through a map, since a full disk under a map ends the process
-without an error.
+The files in data/ have the format of ``TensorDict.memmap``, so ``TensorDict.load_memmap`` can read them. This module
+takes the shapes from :func:`columns_of` and unpickles nothing. The memory map is copy-on-write: writing to a column
+changes the column in this process only, never the file. Files are written without a memory map, because a full disk
+would kill a process that writes through a map, without an error.
 """
 
 from __future__ import annotations
@@ -41,18 +41,20 @@ from lw_torchrl.language.tasks import resolve_tasks
 DATA, METADATA, PARTIAL, LOCK = "data", "metadata.json", ".partial", ".lock"
 FORMAT, FORMAT_VERSION = "lw_torchrl.demonstrations", 2
 TRAJECTORY, REWARD, DONE = ("collector", "traj_ids"), ("next", "reward"), ("next", "done")
-DATASET = "dataset"  # the column with the index of a row's folder, if several folders are joined
+DATASET = "dataset"  # the column with the index of each row's folder, if several folders are joined
 
 
 class DatasetError(ValueError):
-    """A folder does not hold a finished dataset of this format, or its files are damaged."""
+    """An error for a folder that holds no finished dataset of this format, or whose files are corrupted."""
 
 
 @typed_fields
 @dataclass(frozen=True)
 class CollectConfig:
-    """The arguments of :func:`collect_demonstrations` that decide what it collects: equal ones give equal datasets.
-    ``tasks`` are names, sorted; ``noise_scale`` holds a number for each episode in turn, (0.0,) for none."""
+    """The arguments of :func:`collect_demonstrations` that determine the dataset: equal configs give equal datasets.
+
+    ``tasks`` are sorted names. Episode k has the noise scale ``noise_scale[k % len(noise_scale)]``; (0.0,) is no noise.
+    """
 
     tasks: tuple[str, ...]
     episodes_per_task: Count
@@ -71,17 +73,17 @@ class CollectConfig:
             raise ValueError("noise_scale must hold at least one number, got an empty sequence")
         if self.layout == METAWORLD:
             tasks = resolve_tasks(self.tasks)
-        else:  # another suite's, which need not be installed to read a dataset of its tasks
+        else:  # the tasks of another suite, which need not be installed to read a dataset
             tasks = tuple(sorted(self.tasks))
             if not tasks or not all(task.startswith(f"{self.layout.name}/") for task in tasks):
                 raise ValueError(f"tasks must be named '{self.layout.name}/...', got {short(self.tasks)}")
-        # JSON needs Python's numbers.
+        # JSON supports only Python's own number types.
         noise_scale = tuple(scale.item() if isinstance(scale, np.generic) else scale for scale in self.noise_scale)
         object.__setattr__(self, "tasks", tasks)
         object.__setattr__(self, "noise_scale", noise_scale)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the configuration as JSON, without ``policy`` for the expert and ``layout`` for Meta-World's."""
+        """Return the config as JSON, without ``policy`` if it is the expert and ``layout`` if it is Meta-World's."""
         config = {each.name: getattr(self, each.name) for each in fields(self)}
         config |= {"tasks": list(self.tasks), "noise_scale": list(self.noise_scale)}
         for key, default in (("policy", EXPERT), ("layout", METAWORLD)):
@@ -91,7 +93,7 @@ class CollectConfig:
 
     @classmethod
     def from_json(cls, config: Mapping[str, Any]) -> CollectConfig:
-        """Return the configuration that :meth:`to_json` described."""
+        """Rebuild a config from the result of :meth:`to_json`."""
         options = {**config, "tasks": tuple(config["tasks"]), "noise_scale": tuple(config["noise_scale"])}
         if "policy" in options:
             options["policy"] = Behaviour(**options["policy"])
@@ -101,14 +103,17 @@ class CollectConfig:
 
     @property
     def behaviour(self) -> str:
-        """The label of the episodes: the collecting policy's; "noisy" for an expert executed with noise."""
+        """The label of the episodes: the name of the collection policy, or "noisy" for an expert with action noise."""
         return NOISY if self.policy == EXPERT and any(self.noise_scale) else self.policy.name
 
 
 @dataclass(frozen=True)
 class EpisodeInfo:
-    """One episode of a dataset: ``episode_seed(task, seed, episode)`` is its seed, ``start`` its first row,
-    ``first_success`` the first successful step, from 1, or None, ``checksum`` the CRC-32 of its rows, by columns."""
+    """One episode of a dataset, which was seeded with ``episode_seed(task, seed, episode)``.
+
+    ``start`` is the index of the first row, ``first_success`` the first successful time step (counted from 1, or None),
+    and ``checksum`` the CRC-32 of the rows, column by column.
+    """
 
     task: str
     episode: int
@@ -121,14 +126,14 @@ class EpisodeInfo:
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """The description of a finished dataset; :class:`LanguageWorldExperienceReplay` reads its rows.
+    """The description of a finished dataset; use :class:`LanguageWorldExperienceReplay` to read the rows.
 
     Attributes:
-        root, config: its folder, and how it was collected.
-        versions: package name to the version with which collecting began.
-        task_ids: task name to its number in the files; loaded rows have the present :func:`~lw_torchrl.task_id`.
-        episodes: in the order of the rows.
-        attempts: task name to the number of episodes run, with the failures that were redrawn.
+        root, config: the dataset's folder, and the config with which the dataset was collected.
+        versions: the package versions at the start of the collection, by package name.
+        task_ids: the task ids in the files, by task name; loaded rows have the current :func:`~lw_torchrl.task_id`.
+        episodes: the episodes in the order of the rows.
+        attempts: the number of episodes that were run for each task, including failures that were redrawn.
     """
 
     root: Path
@@ -144,14 +149,14 @@ class Demonstrations:
 
     @property
     def success_rate(self) -> dict[str, float]:
-        """Task name to the fraction of its kept episodes that succeeded."""
+        """The fraction of each task's kept episodes that succeeded."""
         kept = Counter(episode.task for episode in self.episodes)
         succeeded = Counter(episode.task for episode in self.episodes if episode.success)
         return {task: succeeded[task] / number for task, number in kept.items()}
 
 
 def write_metadata(demonstrations: Demonstrations) -> None:
-    """Write the metadata, which finishes the dataset."""
+    """Write the metadata file, which marks the dataset as finished."""
     metadata: dict[str, Any] = {"format": FORMAT, "version": FORMAT_VERSION, "config": demonstrations.config.to_json()}
     metadata |= {key: getattr(demonstrations, key) for key in ("versions", "task_ids", "attempts")}
     names = EpisodeInfo.__dataclass_fields__
@@ -160,37 +165,37 @@ def write_metadata(demonstrations: Demonstrations) -> None:
 
 
 def read_metadata(root: AnyPath) -> Demonstrations:
-    """Describe the dataset in a folder; DatasetError if it is unfinished, damaged, or of another version."""
+    """Read a dataset's description; raise DatasetError if it is unfinished, corrupted or of another version."""
     folder = Path(root)
     path = folder / METADATA
     if not folder.is_dir():
-        raise FileNotFoundError(f"root: no dataset folder {str(folder)!r}; make one with collect_demonstrations")
+        raise FileNotFoundError(f"root: no dataset folder {str(folder)!r}; create it with collect_demonstrations")
     if not path.is_file() and (folder / PARTIAL).is_dir():
         raise DatasetError(
-            f"root: the dataset in {str(folder)!r} is unfinished; the same collect_demonstrations resumes it"
+            f"root: the dataset in {str(folder)!r} is unfinished; repeat the call of collect_demonstrations to resume"
         )
     if not path.is_file():
-        raise DatasetError(f"root: {str(folder)!r} is not a dataset: it has no {METADATA}")
+        raise DatasetError(f"root: {str(folder)!r} is not a dataset, because it has no file {METADATA}")
     try:
         return parse_metadata(read_json(path, "root: the metadata"), folder)
     except DatasetError:
         raise
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise damaged(f"the metadata {str(path)!r} are damaged ({type(error).__name__}: {error})") from error
+        raise damaged(f"the metadata file {str(path)!r} is corrupted ({type(error).__name__}: {error})") from error
 
 
 def damaged(problem: str) -> DatasetError:
-    """The error for a dataset whose files differ from what was written; the caller raises it."""
+    """Return the error to raise for a dataset whose files differ from what was written."""
     return DatasetError(f"root: {problem}; delete the folder and collect the dataset again")
 
 
 def parse_metadata(metadata: Mapping[str, Any], folder: Path) -> Demonstrations:
-    """Return the description in metadata; DatasetError for another version, another error for damaged metadata."""
+    """Parse a dataset's metadata; raise DatasetError for another version, and any error for corrupted metadata."""
     if (metadata["format"], metadata["version"]) != (FORMAT, FORMAT_VERSION):
         version = f"{short(metadata['format'])} version {short(metadata['version'])}"
         raise DatasetError(
-            f"root: {str(folder)!r} has the format {version}, this package reads {FORMAT!r} version {FORMAT_VERSION}; "
-            "collect it again"
+            f"root: {str(folder)!r} has the format {version}, but this package reads {FORMAT!r} version "
+            f"{FORMAT_VERSION}; collect the dataset again"
         )
     config = CollectConfig.from_json(metadata["config"])
     columns = [metadata["episodes"][name] for name in EpisodeInfo.__dataclass_fields__]
@@ -199,7 +204,7 @@ def parse_metadata(metadata: Mapping[str, Any], folder: Path) -> Demonstrations:
     start = 0
     for task, episode in zip(tasks, episodes, strict=True):
         if (episode.task, episode.start) != (task, start) or not 0 < episode.length <= config.max_steps:
-            raise ValueError(f"episode {episode.episode} of {episode.task!r} does not fit the others")
+            raise ValueError(f"episode {episode.episode} of {episode.task!r} has the wrong task, start or length")
         start += episode.length
     task_ids = {task: int(metadata["task_ids"][task]) for task in config.tasks}
     return Demonstrations(folder, config, metadata["versions"], task_ids, episodes, metadata["attempts"])
@@ -210,7 +215,7 @@ Column = tuple[str, ...]
 
 @cache
 def columns_of(layout: Layout) -> Mapping[Column, tuple[tuple[int, ...], torch.dtype]]:
-    """Return the columns of a dataset, with the shape and dtype of a row."""
+    """Return the columns of a dataset, with the shape and dtype of one row."""
     observation, action = ((layout.size,), torch.float32), ((layout.action_size,), torch.float32)
     return MappingProxyType(
         {
@@ -231,7 +236,7 @@ def columns_of(layout: Layout) -> Mapping[Column, tuple[tuple[int, ...], torch.d
 
 
 COLUMNS = columns_of(METAWORLD)
-"""Meta-World's columns; those of other suites have other sizes."""
+"""The columns of a Meta-World dataset; in other suites, observations and actions have other sizes."""
 
 
 def _path(folder: Path, key: Column) -> Path:
@@ -239,7 +244,7 @@ def _path(folder: Path, key: Column) -> Path:
 
 
 def _meta(rows: int, layout: Layout = METAWORLD) -> dict[str, dict[str, Any]]:
-    """Return each folder's meta.json as TensorDict writes it; "" is the folder of the rows."""
+    """Return the content of each folder's meta.json as TensorDict writes it; "" stands for the folder of the rows."""
     folders: dict[str, dict[str, Any]] = {"": {}}
     for (*parents, name), (shape, dtype) in columns_of(layout).items():
         for parent in parents:
@@ -253,7 +258,7 @@ def _meta(rows: int, layout: Layout = METAWORLD) -> dict[str, dict[str, Any]]:
 def write_rows(
     folder: Path, episodes: Iterable[tuple[str, int, TensorDictBase]], layout: Layout
 ) -> tuple[EpisodeInfo, ...]:
-    """Write episodes (task, index, rows) one after another, flush them to the disk, and return their descriptions."""
+    """Write episodes (task, index, rows) in the given order, flush the files, and return the episodes' descriptions."""
     infos: list[EpisodeInfo] = []
     start = 0
     for name in _meta(0):
@@ -275,7 +280,7 @@ def write_rows(
 
 
 def describe_episode(task: str, episode: int, start: int, rows: TensorDictBase) -> EpisodeInfo:
-    """Describe an episode by its rows, whose first has the index ``start`` in the dataset."""
+    """Return the description of an episode with these rows, of which the first is row ``start`` of the dataset."""
     checksum = 0
     for key in COLUMNS:
         checksum = crc32(rows.get(key).contiguous().numpy().data, checksum)
@@ -284,14 +289,14 @@ def describe_episode(task: str, episode: int, start: int, rows: TensorDictBase) 
 
 
 class MappedColumn(Tensor):
-    """A column in its file. A spawned process maps the file again; results of operations are plain tensors."""
+    """A memory-mapped column. Spawned processes map the file again; results of operations are plain tensors."""
 
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
     _source: tuple[Path, tuple[int, ...], torch.dtype]
 
     @staticmethod
     def of(path: Path, shape: tuple[int, ...], dtype: torch.dtype) -> MappedColumn:
-        """Map a file that holds exactly such a column; OSError, ValueError or RuntimeError for another."""
+        """Map a file as a column; raise OSError, ValueError or RuntimeError if shape and dtype do not fit the file."""
         content = torch.from_numpy(np.memmap(path, np.uint8, "c"))
         column = content.view(dtype).view(shape).as_subclass(MappedColumn)
         column._source = (path.absolute(), shape, dtype)
@@ -305,7 +310,7 @@ class MappedColumn(Tensor):
 
 
 def load_rows(demonstrations: Demonstrations) -> TensorDict:
-    """Return all rows of a dataset, memory-mapped; DatasetError if a file is missing or has another size."""
+    """Memory-map all rows of a dataset; raise DatasetError if a file is missing or has the wrong size."""
     folder, number = demonstrations.root / DATA, demonstrations.num_steps
     try:
         columns = {
@@ -313,18 +318,18 @@ def load_rows(demonstrations: Demonstrations) -> TensorDict:
             for key, (shape, dtype) in columns_of(demonstrations.config.layout).items()
         }
     except (OSError, ValueError, RuntimeError) as error:
-        raise damaged(f"the rows in {str(folder)!r} are damaged ({error})") from error
+        raise damaged(f"the rows in {str(folder)!r} are corrupted ({error})") from error
     return TensorDict(columns, [number], device="cpu")
 
 
-# For each folder, the state of its files when this process verified episodes of it, and these episodes.
+# For each folder: the state of the files when this process last verified episodes, and the verified episodes.
 _VERIFIED: dict[Path, tuple[list[Any], set[EpisodeInfo]]] = {}
 
 
 def damaged_episodes(
     demonstrations: Demonstrations, episodes: Sequence[EpisodeInfo], *, progress: bool = False
 ) -> list[EpisodeInfo]:
-    """Return the episodes whose rows differ from their checksums."""
+    """Return the episodes whose rows do not match their checksum."""
     rows, damaged_ones = load_rows(demonstrations), []
     with Progress("checking", len(episodes), "episode", show=progress) as bar:
         for info in episodes:
@@ -336,7 +341,7 @@ def damaged_episodes(
 
 
 def verify(demonstrations: Demonstrations, episodes: Sequence[EpisodeInfo]) -> None:
-    """Raise DatasetError unless episodes match their checksums; each is compared once while the files do not change."""
+    """Raise DatasetError unless episodes match their checksums; skip episodes verified since the files last changed."""
     load_rows(demonstrations)  # raises if a file is missing
     root = demonstrations.root.resolve()
     states = [path.stat() for path in (root / METADATA, *(_path(root / DATA, key) for key in COLUMNS))]
@@ -346,5 +351,5 @@ def verify(demonstrations: Demonstrations, episodes: Sequence[EpisodeInfo]) -> N
         known = set()
     if broken := damaged_episodes(demonstrations, [info for info in episodes if info not in known]):
         episode = f"episode {broken[0].episode} of {broken[0].task!r}"
-        raise damaged(f"the rows in {str(root)!r} are damaged: {episode} differs from its checksum")
+        raise damaged(f"the rows in {str(root)!r} are corrupted: {episode} differs from its checksum")
     _VERIFIED[root] = (files, known | set(episodes))

@@ -1,4 +1,4 @@
-"""load_demonstrations: the rows of demonstration datasets as a TensorDict."""
+"""load_demonstrations: load the rows of demonstration datasets as a TensorDict."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ ROLLOUT: tuple[NestedKey, ...] = (
     "observation", "task_id", "episode", "action", *_FLAGS, ("next", "observation"), ("next", "task_id"),
     ("next", "reward"), ("next", "success"), *(("next", flag) for flag in _FLAGS),
 )  # fmt: skip
-"""The columns of a dataset that rollouts of :class:`LanguageWorldEnv` have too."""
+"""The columns that datasets share with rollouts of :class:`LanguageWorldEnv`."""
 Keys = Literal["rollout"] | Iterable[NestedKey]
 
 
 def _read_part(
     whole: Demonstrations, chosen: Demonstrations, label: Label, reward: RewardName, after: int | None, terminate: bool
 ) -> TensorDict:
-    """Return the rows of a dataset's chosen episodes, memory-mapped where they are the same as in the files."""
+    """Read the rows of a dataset's chosen episodes; columns that equal the files' columns stay memory-mapped."""
     rows = load_rows(whole)
     if label == "executed":
         kind = REWARDS[reward]
@@ -36,9 +36,9 @@ def _read_part(
     else:
         taken, other = ("expert_action", "unclipped_action")[:: 1 if label == "expert" else -1]
         rows = rows.exclude("next", "action", other).rename_key_(taken, "action")
-    # One NaN would spoil the weights of a policy, and the loss shows it only a step later.
+    # A single NaN would ruin the weights of a policy, and the loss would show this only one step later.
     if not finite(rows.get("action")):
-        raise DatasetError(f"root: {str(whole.root)!r} holds an action that is NaN or infinite, for label={label!r}")
+        raise DatasetError(f"root: {str(whole.root)!r} holds an action that is NaN or infinite with label={label!r}")
     if chosen.episodes == whole.episodes and after is None:
         return rows
     kept, lengths = kept_rows(chosen.episodes, after)
@@ -54,7 +54,7 @@ def _read_part(
 
 
 def _choose_keys(rows: TensorDict, keys: Keys) -> TensorDict:
-    """Select columns, after adding the flags that precede each step of a rollout (all false), which no file holds."""
+    """Select columns, after adding the root-level done flags of a rollout (all False), which no file stores."""
     for flag in _FLAGS:
         rows.set(flag, torch.zeros(len(rows), 1, dtype=torch.bool))
     known = list(rows.keys(True, True))
@@ -68,19 +68,19 @@ def _choose_keys(rows: TensorDict, keys: Keys) -> TensorDict:
 def check_options(
     label: Label, after_success: int | None, terminate_on_success: bool, n_steps: int, gamma: float | None, keys: Any
 ) -> None:
-    """Raise :class:`ValueError` for options that exclude or need each other."""
+    """Raise :class:`ValueError` for options that contradict or require each other."""
     if n_steps > 1 and gamma is None:
-        raise ValueError(f"n_steps={n_steps} needs gamma, the loss's discount")
+        raise ValueError(f"n_steps={n_steps} requires gamma, the loss's discount factor")
     if n_steps == 1 and gamma is not None:
-        raise ValueError(f"gamma={gamma!r} needs n_steps of 2 or more, got 1")
+        raise ValueError(f"gamma={gamma!r} requires n_steps of at least 2, got 1")
     if (n_steps > 1 or terminate_on_success or keys == "rollout") and label != "executed":
-        raise ValueError(f"n_steps, terminate_on_success and keys='rollout' need label='executed', got {label!r}")
+        raise ValueError(f"n_steps, terminate_on_success and keys='rollout' require label='executed', got {label!r}")
     if terminate_on_success and after_success is not None:
-        raise ValueError("terminate_on_success ends episodes at success; leave out after_success")
+        raise ValueError("terminate_on_success already ends episodes at success; leave out after_success")
 
 
 def labels_of(datasets: Sequence[Demonstrations]) -> tuple[str, ...]:
-    """Return the labels of the collecting policies, sorted."""
+    """Return the sorted labels of the collection policies."""
     return tuple(sorted({dataset.config.behaviour for dataset in datasets}))
 
 
@@ -105,7 +105,7 @@ def read_rows(
         if len(datasets) > 1:
             rows.set(TRAJECTORY, rows.get(TRAJECTORY) + trajectories)
             rows.set(DATASET, torch.full(rows.batch_size, number))
-        # n-step returns need columns that the choice may leave out.
+        # Select columns later if n-step returns are computed, which may require other columns.
         rows_of_parts.append(rows if keys is None or n_steps > 1 else _choose_keys(rows, keys))
         trajectories += len(dataset.episodes)
     rows = rows_of_parts[0] if len(rows_of_parts) == 1 else torch.cat(rows_of_parts)
@@ -132,41 +132,41 @@ def load_demonstrations(
     device: str | torch.device | None = None,
     check: bool = True,
 ) -> TensorDict:
-    """Load the rows of datasets of :func:`collect_demonstrations`, for a :class:`torchrl.data.TensorStorage`.
+    """Load the rows of datasets written by :func:`collect_demonstrations`, for a :class:`torchrl.data.TensorStorage`.
 
-    The rows of one folder stay in its files, memory-mapped, as long as nothing is selected; changes to them never reach
-    the files. Several folders, or a selection of rows, are copied into memory.
+    The rows of a single folder stay memory-mapped as long as no rows are selected; changes to the rows never reach the
+    files. Several folders, or a selection of rows, are copied into memory.
 
-    Rows (R,) hold observation (R, 39) float32, action (R, 4) float32, task_id and episode (R,) int64, and the columns
-    of ``label``. collector/traj_ids (R,) int64 is unique for each episode of all datasets; behaviour (R,) int64 is the
-    rank of the collecting policy's label among those of all folders. is_demonstration (R,) bool is true. dataset (R,)
-    int64 is the index of the folder, if there are several.
+    The R rows hold observation (R, 39) float32, action (R, 4) float32, task_id and episode (R,) int64, and the columns
+    of ``label``. collector/traj_ids (R,) int64 is unique for each episode across datasets. behaviour (R,) int64 is the
+    index of the collection policy's label in the sorted labels of all folders. is_demonstration (R,) bool is True.
+    dataset (R,) int64 is the index of the folder, if there are several folders.
 
     Args:
         root: the dataset's folder, or a list of folders.
-        episodes: the episodes to use. None: all; a number: the first ones of each task; a mapping: for each task to
-            use, the number of first episodes, or a list of indices. For a list of folders, a list of such choices.
-        keep: selects among these: successes, the best tenth, one behaviour, ...; see :class:`EpisodeFilter`.
-        label: the content of ``action``. "executed": the executed action, with reward and next; required for datasets
-            that were collected by other policies than an expert. "expert": the expert's action, in [-1, 1];
-            "unclipped": the same before it was clipped, up to 25; both without reward and next, which belong to the
+        episodes: the episodes to load: None for all; N for the first N of each task; or a mapping from each task to
+            load to such a number or a list of episode indices. For a list of folders, a list of such choices.
+        keep: a filter on these episodes, for example by success, return or behaviour; see :class:`EpisodeFilter`.
+        label: the content of ``action``. "executed": the executed action, with reward and next; required unless an
+            expert collected the dataset. "expert": the expert's action, in [-1, 1]. "unclipped": the expert's action
+            before clipping, up to 25. "expert" and "unclipped" load neither reward nor next, which belong to the
             executed action.
         reward: the content of ``("next", "reward")`` with label="executed", a name in ``REWARDS``: "sparse" (success as
-            0 and 1), "dense" (Meta-World's), "cost" or "dense_cost".
-        after_success: drop steps more than N steps after an episode's first success.
-        terminate_on_success: end each episode at its first success, with ``("next", "terminated")``, as
-            ``LanguageWorldEnv(terminate_on_success=True)`` does; with label="executed".
-        n_steps, gamma: look N steps ahead with this discount, as :func:`n_step_returns`; with label="executed".
-        keys: the columns to load; "rollout" for those that rollouts of :class:`LanguageWorldEnv` have too, so that
-            TorchRL's ``OfflineToOnlineReplayBuffer`` can join them with ``rollout.select(*sample.keys(True, True))``;
-            None for all.
-        device: memory to copy the rows to: "cuda", "mps" or "auto"; None to leave them where they are.
-        check: compare the episodes with their checksums, once in a process while the files stay the same. It takes one
-            to three seconds a gigabyte.
+            0 or 1), "dense" (Meta-World's reward), "cost" or "dense_cost".
+        after_success: drop rows more than N time steps after the first success of an episode.
+        terminate_on_success: end each episode at the first success, with ``("next", "terminated")``, as
+            ``LanguageWorldEnv(terminate_on_success=True)`` does; requires label="executed".
+        n_steps, gamma: compute n-step returns with this discount, see :func:`n_step_returns`; require label="executed".
+        keys: the columns to load; None for all; "rollout" for the columns that :class:`LanguageWorldEnv` rollouts also
+            have, so that TorchRL's ``OfflineToOnlineReplayBuffer`` can mix these rows with
+            ``rollout.select(*sample.keys(True, True))``.
+        device: the device to copy the rows to: "cuda", "mps" or "auto"; None does not copy the rows.
+        check: verify the checksums of the episodes, once per process while the files do not change. Verification takes
+            one to three seconds per gigabyte.
 
     Raises:
-        ValueError: an episode or a column that the dataset lacks, or options that exclude each other.
-        DatasetError: (a ValueError) the dataset is unfinished, damaged, or of another version.
+        ValueError: the dataset lacks an episode or a column, or options contradict each other.
+        DatasetError: (a ValueError) the dataset is unfinished, corrupted, or of another version.
 
     Example:
         >>> import tempfile, lw_torchrl as lw
@@ -178,7 +178,7 @@ def load_demonstrations(
         ...     replay.sample()["action"].shape
         torch.Size([8, 4])
 
-    Source: the datasets of ``torchrl.data.datasets``, which keep their rows in memory-mapped tensordicts.
+    Source: the datasets in ``torchrl.data.datasets``, which also keep their rows in memory-mapped tensordicts.
     """
     check_options(label, after_success, terminate_on_success, n_steps, gamma, keys)
     after = 0 if terminate_on_success else after_success

@@ -1,6 +1,6 @@
-"""Pictures of a dataset's rows: run its episodes again and render them, to a file of PNGs for each episode.
+"""Pictures of a dataset's rows: re-run and render the episodes, and store a zip file of PNGs for each episode.
 
-root/pictures/<cameras>-<height>x<width>-every<k>/<task>.<episode>.zip    "0.png", "1.png", ... for steps 0, k, 2k, ...
+root/pictures/<cameras>-<height>x<width>-every<k>/<task>.<episode>.zip    "0.png", "1.png", ... of steps 0, k, 2k, ...
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from lw_torchrl.data.replay import LanguageWorldExperienceReplay
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
 from lw_torchrl.transforms.camera import CameraTransform
 
-_TOGETHER = 8  # episodes that run at once
+_TOGETHER = 8  # number of episodes that are re-run in parallel
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """The cameras, size and interval of pictures, and their files."""
+    """The cameras, image size and interval of a set of pictures, which also determine the file names."""
 
     cameras: tuple[str, ...]
     height: int
@@ -53,7 +53,7 @@ class Pictures:
         return -(-episode.length // self.every)
 
     def read(self, root: Path, episode: EpisodeInfo) -> Tensor:
-        """Return an episode's pictures, (n, height, width·C, 3) uint8; DatasetError if the file is damaged."""
+        """Read an episode's pictures (n, height, width·C, 3) uint8; raise DatasetError if the file is corrupted."""
         from PIL import Image
 
         path = self.file(root, episode)
@@ -63,8 +63,9 @@ class Pictures:
                 for number in range(len(pictures)):
                     with Image.open(archive.open(f"{number}.png"), formats=["PNG"]) as picture:
                         pictures[number] = np.asarray(picture)
-        except Exception as error:  # zipfile and PIL raise many kinds of errors
-            raise DatasetError(f"root: {str(path)!r} is damaged ({error}); delete it and call add_pictures") from error
+        except Exception as error:  # zipfile and PIL raise many kinds of errors for corrupted files
+            message = f"root: {str(path)!r} is corrupted ({error}); delete this file and call add_pictures"
+            raise DatasetError(message) from error
         return torch.from_numpy(pictures)
 
 
@@ -78,19 +79,19 @@ def add_pictures(
     every: Count = 1,
     progress: bool = True,
 ) -> None:
-    """Render the rows of a dataset, as :class:`CameraTransform` would have done during collection.
+    """Render pictures of a dataset's rows, as :class:`CameraTransform` would have done during collection.
 
-    Each episode is run again with its actions, and must give the stored observations bit for bit. The pictures are
-    saved in the dataset's folder as PNGs. Repeat a call that was killed to resume it.
+    Each episode is re-run with the stored actions, and the observations must be bit-identical to the stored ones. The
+    pictures are saved as PNGs in the dataset's folder. If a call was interrupted, repeat the call to resume.
 
     Args:
-        root: the dataset's folder, of :func:`collect_demonstrations`.
-        cameras, height, width, every: as for :class:`CameraTransform`.
-        progress: show a progress bar if it takes longer than a second.
+        root: the dataset's folder, written by :func:`collect_demonstrations`.
+        cameras, height, width, every: see :class:`CameraTransform`.
+        progress: show a progress bar if rendering takes longer than a second.
 
     Raises:
-        DatasetError: (a ValueError) there is no dataset, or the installed simulator gives other observations.
-        ImportError: there is no OpenGL; the message names what to install.
+        DatasetError: (a ValueError) there is no dataset, or the installed simulator gives different observations.
+        ImportError: OpenGL is not available; the message names the packages to install.
 
     Example:
         >>> import tempfile, lw_torchrl as lw
@@ -122,7 +123,7 @@ def add_pictures(
 def _render(
     demonstrations: Demonstrations, rows: TensorDictBase, episodes: Sequence[EpisodeInfo], pictures: Pictures
 ) -> list[list[np.ndarray[Any, Any]]]:
-    """Run some episodes of one task again together, and return the pictures of each."""
+    """Re-run some episodes of one task in parallel, and return the pictures of each episode."""
     task, seed, steps = episodes[0].task, demonstrations.config.seed, demonstrations.config.max_steps
     base = LanguageWorldEnv(task, num_envs=len(episodes), seed=seed, max_steps=steps)
     camera = CameraTransform(pictures.cameras, height=pictures.height, width=pictures.width, every=pictures.every)
@@ -137,8 +138,8 @@ def _render(
             if not torch.equal(state.get("observation")[active], stored.get("observation")[active]):
                 versions = ", ".join(f"{name} {version}" for name, version in demonstrations.versions.items())
                 raise DatasetError(
-                    f"root: episodes of {task!r} in {str(demonstrations.root)!r} differ from step {step} on when they "
-                    f"run again; they were collected with {versions}"
+                    f"root: episodes of {task!r} in {str(demonstrations.root)!r} differ from step {step} on when "
+                    f"re-run; install the versions with which they were collected: {versions}"
                 )
             if step % pictures.every == 0:
                 for place in active.nonzero().flatten().tolist():
@@ -155,7 +156,7 @@ def _write(path: Path, pictures: Sequence[np.ndarray[Any, Any]]) -> None:
         for number, picture in enumerate(pictures):
             stream = io.BytesIO()
             Image.fromarray(picture).save(stream, "PNG")
-            # ZipInfo has no date of today, so that equal pictures give equal files.
+            # A ZipInfo without the current date makes equal pictures give equal files.
             archive.writestr(zipfile.ZipInfo(f"{number}.png"), stream.getvalue())
 
 
@@ -168,13 +169,13 @@ def load_pictures(
     width: Count = 64,
     every: Count = 1,
 ) -> Tensor:
-    """Return the pictures of a buffer's rows, for ``replay.add_column("pixels", ...)``: (R, height, width·C, 3) uint8.
+    """Load the pictures (R, height, width·C, 3) uint8 of a buffer's rows, for ``replay.add_column("pixels", ...)``.
 
-    They show ``observation``, in the order of ``replay[:]``; rows between two pictures have the earlier one. Give
-    ``cameras``, ``height``, ``width`` and ``every`` as to :func:`add_pictures`.
+    Row i shows the ``observation`` of ``replay[i]``; rows between two pictures get the earlier picture. ``cameras``,
+    ``height``, ``width`` and ``every`` must be the values passed to :func:`add_pictures`.
 
     Raises:
-        DatasetError: (a ValueError) the pictures are missing or damaged.
+        DatasetError: (a ValueError) the pictures are missing or corrupted.
     """
     pictures = Pictures(check_cameras(cameras, height, width), height, width, every)
     _, lengths = torch.unique_consecutive(replay.storage[:].get(TRAJECTORY), return_counts=True)
@@ -183,7 +184,7 @@ def load_pictures(
     row = 0
     for (root, episode), length in zip(episodes, lengths.tolist(), strict=True):
         if not pictures.file(root, episode).is_file():
-            missing = f"root: {str(root)!r} has no such pictures of episode {episode.episode} of {episode.task!r}"
+            missing = f"root: {str(root)!r} has no such pictures for episode {episode.episode} of {episode.task!r}"
             raise DatasetError(f"{missing}; render them with lw.data.add_pictures({str(root)!r}, ...)")
         images[row : row + length] = pictures.read(root, episode)[torch.arange(length) // every]
         row += length

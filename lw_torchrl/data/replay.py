@@ -1,4 +1,4 @@
-"""LanguageWorldExperienceReplay: demonstration datasets as a TorchRL replay buffer, and its storage."""
+"""LanguageWorldExperienceReplay: a TorchRL replay buffer over demonstration datasets, with a storage class."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ _FILE = "buffer.safetensors"
 
 
 class DatasetStorage(TensorStorage):
-    """A :class:`torchrl.data.TensorStorage` of the rows of datasets, which it neither changes nor saves.
+    """A read-only :class:`torchrl.data.TensorStorage` over the rows of datasets; saved states do not contain the rows.
 
-    Uniform samplers draw on the CPU, so the minibatches are the same on every device.
+    Uniform samplers draw on the CPU, so minibatches are the same on every device.
 
     Args:
-        rows: of :func:`load_demonstrations`, (R,).
-        fingerprint: identifies the rows; it is all that ``state_dict`` holds.
+        rows: the rows (R,) returned by :func:`load_demonstrations`.
+        fingerprint: a digest that identifies the rows; the only content of ``state_dict``.
     """
 
     def __init__(self, rows: TensorDict, fingerprint: str) -> None:
@@ -49,16 +49,16 @@ class DatasetStorage(TensorStorage):
         return to_device_of(self, torch.randint(0, len(self), (batch_size,), generator=self._rng))
 
     def get(self, index: Any) -> TensorDict:
-        """Return the rows at an index: views for a slice, in a TensorDict of their own; copies for anything else."""
+        """Return the rows at an index in a new TensorDict: views for a slice, copies for any other index."""
         rows: TensorDict = super().get(index)
         return rows if isinstance(index, Tensor) and index.dim() else rows.clone(recurse=not isinstance(index, slice))
 
     def add_column(self, name: str, values: Tensor) -> None:
-        """Give each row a value, (R, ...)."""
+        """Add a column with one value (R, ...) per row."""
         self._storage.set(name, values)
 
     def set(self, *args: Any, **kwargs: Any) -> NoReturn:
-        raise RuntimeError("a dataset's rows are read-only; change the samples, or use add_column")
+        raise RuntimeError("a dataset's rows are read-only; modify the samples, or use add_column")
 
     _empty = set
 
@@ -66,49 +66,49 @@ class DatasetStorage(TensorStorage):
         return {"rows": self.fingerprint}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Check that a state belongs to these rows."""
+        """Raise :class:`ValueError` unless a state was saved for the same rows."""
         if state_dict.get("rows") != self.fingerprint:
-            raise ValueError("state_dict belongs to other rows than those of this buffer")
+            raise ValueError("state_dict was saved for other rows; open the buffer with the same datasets and options")
 
 
 def _check_transform(transform: Any) -> None:
-    """Raise for TorchRL's transforms that act only on written rows: they would do nothing to samples."""
+    """Raise ValueError for TorchRL transforms that act only when rows are written, and would not change samples."""
     if isinstance(transform, Compose):
         for part in transform:
             _check_transform(part)
     elif isinstance(transform, MultiStepTransform):
         options = f"n_steps={transform.n_steps}, gamma={transform.gamma}"
-        raise ValueError(f"transform: MultiStepTransform does nothing to samples; use {options}")
+        raise ValueError(f"transform: MultiStepTransform does not change samples; use {options} instead")
     elif isinstance(transform, Reward2GoTransform):
-        raise ValueError("transform: Reward2GoTransform does nothing to samples; compute it once with add_column")
+        raise ValueError("transform: Reward2GoTransform does not change samples; use add_column for reward-to-go")
 
 
 class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
-    """A read-only replay buffer over the rows of :func:`load_demonstrations`, with their description.
+    """A read-only replay buffer over demonstration datasets.
 
     Samples hold the columns of :func:`load_demonstrations`; a :class:`QAFTransform` adds ``qaf`` and ``qaf_plan``. With
-    ``keys``, samples hold no other columns: the sampler's ``index`` and ``is_target`` come with ``return_info=True``.
+    ``keys``, samples hold only these columns; ``return_info=True`` returns the sampler's ``index`` and ``is_target``.
 
     Args:
         root, episodes, keep, label, reward, after_success, terminate_on_success, n_steps, gamma, keys, device, check:
-            as for :func:`load_demonstrations`. Transforms run on the device of the rows, and minibatches are the same
-            on every device.
-        batch_size: rows of a sample.
-        sampler: a TorchRL sampler, or a function that makes one, for example :class:`TaskBalancedSampler`; None for
-            uniform.
+            see :func:`load_demonstrations`. Transforms run on the device of the rows; minibatches are the same on
+            every device.
+        batch_size: number of rows per sample.
+        sampler: a TorchRL sampler, or a function that creates a sampler, such as :class:`TaskBalancedSampler`; None
+            to sample uniformly.
         transform: a TorchRL transform, or any function of a TensorDict, applied to each sample.
-        **kwargs: for :class:`torchrl.data.TensorDictReplayBuffer`: generator, pin_memory, ...; prefetch is at most 1,
-            because several threads would draw in an order that differs from run to run.
+        **kwargs: keyword arguments of :class:`torchrl.data.TensorDictReplayBuffer`, such as generator or pin_memory;
+            prefetch must be 0 or 1, because several threads would draw in an order that differs between runs.
 
     Attributes:
-        demonstrations: the description; a :class:`JoinedDemonstrations` if folders are joined or episodes chosen.
-        parts: the description of each dataset, with the episodes that are shown.
-        roots, behaviours: the folders, and the labels of the collecting policies, sorted.
-        columns: the name of each column of :meth:`add_column`, with a digest of its values.
+        demonstrations: the dataset's description; :class:`JoinedDemonstrations` for several folders or a selection.
+        parts: the description of each dataset, with the selected episodes.
+        roots, behaviours: the folders, and the sorted labels of the collection policies.
+        columns: the names of the columns added by :meth:`add_column`, with a digest of the values.
 
     Raises:
-        ValueError: as for :func:`load_demonstrations`.
-        RuntimeError: rows are written.
+        ValueError: see :func:`load_demonstrations`.
+        RuntimeError: rows are written to the buffer.
 
     Example:
         >>> import tempfile, lw_torchrl as lw
@@ -144,7 +144,7 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
     ) -> None:
         _check_transform(transform)
         if (prefetch := kwargs.get("prefetch") or 0) > 1:
-            raise ValueError(f"prefetch must be 0 or 1, got {prefetch}: several threads draw in no fixed order")
+            raise ValueError(f"prefetch must be 0 or 1, got {prefetch}: several threads would draw in a random order")
         check_options(label, after_success, terminate_on_success, n_steps, gamma, keys)
         is_single = isinstance(root, (str, os.PathLike)) and episodes is None and keep is None
         after = 0 if terminate_on_success else after_success
@@ -171,52 +171,53 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         return (rows, info) if return_info else rows
 
     def set_sampler(self, sampler: Sampler) -> Sampler:
-        """Use another sampler, which draws from the buffer's generator; in a worker, call ``set_rng`` after it."""
+        """Set a sampler, which uses the buffer's generator; in a DataLoader worker, call ``set_rng`` afterwards."""
         before = super().set_sampler(sampler)
-        # In a DataLoader's workers the generators are equal copies, so all workers would draw the same rows.
+        # The workers of a DataLoader have equal copies of the generator, so that all would draw the same rows.
         if get_worker_info() is None:
             self.set_rng(self._rng)
         return before
 
     def add_column(self, name: str, values: Tensor, *, of: LanguageWorldExperienceReplay | None = None) -> None:
-        """Add a column ``name`` to the samples, held in memory: each row's advantage, for example.
+        """Add a column ``name`` to the samples, for example the advantage of each row; the values are kept in memory.
 
         Args:
-            values: (R, ...), for each row in the order of ``replay[:]``; a copy is kept on the device of the rows.
-            of: another buffer that the values were computed from, with n steps for example. It must show the same rows
-                in the same order.
+            values: one value per row, (R, ...), in the order of ``replay[:]``; copied to the device of the rows.
+            of: another buffer from which the values were computed (for example with n steps), which must hold the same
+                rows in the same order.
 
         Raises:
-            ValueError: another number of rows, a name that samples have, values that are not finite, or other rows.
+            ValueError: the number of values is wrong, samples already have the name, a value is not finite, or ``of``
+                holds other rows.
         """
         written = {key for part in self.transform.modules() for key in getattr(part, "out_keys", None) or ()}
         if name in {*self.storage.get(slice(0, 1)).keys(), *written, "index", "is_target"}:
-            raise ValueError(f"name must be new, samples have {name!r} already")
+            raise ValueError(f"name must be new, but samples already have a column {name!r}")
         if values.dim() == 0 or len(values) != len(self):
             raise ValueError(f"values must have {len(self)} rows, got a tensor of shape {tuple(values.shape)}")
         if not finite(values):
             raise ValueError(f"values of {name!r} must be finite, got NaN or infinity")
         if of is not None and not torch.equal(*(each.storage[:].get("observation").cpu() for each in (self, of))):
-            raise ValueError("of must show the rows of this buffer in the same order: use the same episodes and keep")
+            raise ValueError("of must hold the rows of this buffer in the same order; use the same episodes and keep")
         own = values.detach().clone()
         self.columns = {**self.columns, name: sha256(own.cpu().contiguous().numpy().tobytes()).hexdigest()}
         self.storage.add_column(name, own.to(self.storage.device))
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """The names of the tasks that are shown, sorted."""
+        """The sorted names of the tasks of the selected episodes."""
         return tuple(sorted({episode.task for episode in self.demonstrations.episodes}))
 
     @property
     def data_path_root(self) -> Path:
-        """The dataset's folder; :class:`ValueError` if the buffer joins several."""
+        """The dataset's folder; raises :class:`ValueError` if the buffer joins several datasets."""
         if len(self.roots) > 1:
-            raise ValueError(f"this buffer joins {len(self.roots)} datasets; see its roots")
+            raise ValueError(f"this buffer joins {len(self.roots)} datasets; use the attribute roots")
         return self.roots[0]
 
     @property
     def data_path(self) -> Path:
-        """The folder of the rows."""
+        """The folder that contains the dataset's rows."""
         return self.data_path_root / DATA
 
     def _is_downloaded(self) -> bool:
@@ -231,15 +232,15 @@ class LanguageWorldExperienceReplay(BaseDatasetExperienceReplay):
         self.storage.set(index, value)  # raises: the rows are read-only
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore a state, after :meth:`verify`; ValueError if it belongs to other rows."""
+        """Call :meth:`verify` and restore a state; raise ValueError if the state was saved for other rows."""
         self.verify()
         super().load_state_dict(dict(state_dict))
 
     def dumps(self, path: AnyPath) -> None:
-        """Save the state to a folder, as one file, written atomically; the rows stay in the datasets."""
+        """Save the state (without the rows) atomically to one file in a folder."""
         write_tensors(Path(path) / _FILE, {}, {}, self.state_dict())
 
     def loads(self, path: AnyPath) -> None:
-        """Restore the state that :meth:`dumps` saved, after :meth:`verify`; ValueError if it is damaged or foreign."""
+        """Restore the state that :meth:`dumps` saved; raise ValueError if the file is corrupted or fits other rows."""
         with reading(path, "buffer's state"):
             self.load_state_dict(pop_state(*read_tensors(Path(path) / _FILE)))

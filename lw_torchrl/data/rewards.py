@@ -1,4 +1,4 @@
-"""Rewards of a dataset's rows, and the returns of its episodes and of n steps."""
+"""The rewards of a dataset's rows, the returns of episodes, and n-step returns."""
 
 from __future__ import annotations
 
@@ -15,14 +15,17 @@ from lw_torchrl._util.checks import Count, Probability, typed
 from lw_torchrl.data.dataset import DONE, REWARD, TRAJECTORY
 
 RewardName = Literal["sparse", "dense", "cost", "dense_cost"]
-STEPS = "steps_to_next_obs"  # TorchRL's name of the column with the steps from an observation to its "next"
+STEPS = "steps_to_next_obs"  # TorchRL's key for the number of time steps between an observation and its "next"
 
-_MOST = 10.0  # Meta-World's dense reward, which it gives at success
+_MOST = 10.0  # the maximum of Meta-World's dense reward, given at success
 
 
 @dataclass(frozen=True)
 class Reward:
-    """A reward: ``(source + shift) * scale`` of "sparse" or "dense"; ``at_success`` at a success, unless it is None."""
+    """A reward computed from a stored reward ("sparse" or "dense") as ``(source + shift) * scale``.
+
+    ``at_success`` is the reward of a successful time step; None applies the formula there, too.
+    """
 
     source: Literal["sparse", "dense"]
     shift: float = 0.0
@@ -30,9 +33,9 @@ class Reward:
     at_success: float | None = None
 
     def of(self, source: Tensor, success: Tensor) -> Tensor:
-        """Return the reward (R, 1) float32 for the source's (R, 1) float32 and success (R, 1) bool."""
+        """Return the reward (R, 1) float32, given the stored reward (R, 1) float32 and the success (R, 1) bool."""
         if (self.shift, self.scale, self.at_success) == (0.0, 1.0, None):
-            return source  # stays memory-mapped
+            return source  # keeps the column memory-mapped
         reward = (source + self.shift) * self.scale
         return reward if self.at_success is None else torch.where(success, self.at_success, reward)
 
@@ -45,13 +48,13 @@ REWARDS: Mapping[RewardName, Reward] = MappingProxyType(
         "dense_cost": Reward("dense", shift=-_MOST, scale=0.01, at_success=0.0),
     }
 )
-"""By name: the success as 0 and 1; Meta-World's own, at most 10; a cost of 0.01 for each step, none at success; (dense
-reward - 10) / 100, a cost of at most about 0.1 for each step, none at success. Costs need episodes that end at success
-(``terminate_on_success``): then the best return is 0, and staying short of the goal earns nothing."""
+"""The rewards by name: "sparse" (1 at success, otherwise 0); "dense" (Meta-World's reward, at most 10); "cost" (-0.01
+per time step, 0 at success); "dense_cost" ((dense reward - 10) / 100, 0 at success). Use the costs with episodes that
+end at success (``terminate_on_success``), so that the best return is 0 and staying near the goal is not rewarded."""
 
 
 def episode_returns(reward: Tensor, lengths: Sequence[int] | Tensor) -> Tensor:
-    """Return the return and the number of rows of consecutive episodes, (E, 2) float64, for rewards (R, 1) float32."""
+    """Return the return and the number of rows (E, 2) float64 of E consecutive episodes with rewards (R, 1) float32."""
     rows = torch.as_tensor(lengths, dtype=torch.int64)
     total = torch.zeros(len(rows), dtype=torch.float64)
     total.index_add_(0, torch.repeat_interleave(rows), reward.reshape(-1).double())
@@ -60,17 +63,17 @@ def episode_returns(reward: Tensor, lengths: Sequence[int] | Tensor) -> Tensor:
 
 @typed
 def n_step_returns(rollout: TensorDictBase, n_steps: Count, gamma: Probability) -> TensorDictBase:
-    """Look n steps ahead in each row of a rollout, or fewer where its trajectory ends or the rollout is cut.
+    """Compute n-step transitions: replace ``"next"`` of each row by that of the row n - 1 time steps later.
 
-    All entries under ``"next"`` become those of the last of these steps, also the ends of episodes (TorchRL's
-    ``MultiStep`` leaves those of the first step). ``("next", "reward")`` becomes the discounted sum, and
-    ``steps_to_next_obs``, int64 of the rollout's shape, the number of steps, which TorchRL's value estimators read.
+    Fewer time steps are used where a trajectory or the rollout ends. Done flags also come from the later row (TorchRL's
+    ``MultiStep`` keeps the flags of the first). ``("next", "reward")`` becomes the discounted sum of rewards, and
+    ``steps_to_next_obs`` (..., T) int64 the number of time steps, which TorchRL's value estimators read.
 
     Args:
-        rollout: (..., T) with ("next", "reward") and ("next", "done"), (..., T, 1); a trajectory also ends where
-            ("collector", "traj_ids") changes, if it is there.
-        n_steps: at least 1.
-        gamma: the discount, in [0, 1]; the loss must use the same.
+        rollout: a TensorDict (..., T) with ("next", "reward") and ("next", "done") (..., T, 1). If
+            ("collector", "traj_ids") exists, a trajectory also ends where its value changes.
+        n_steps: the number n of time steps, at least 1.
+        gamma: the discount factor in [0, 1]; must equal the loss's discount factor.
 
     Example:
         >>> from tensordict import TensorDict
@@ -91,7 +94,7 @@ def n_step_returns(rollout: TensorDictBase, n_steps: Count, gamma: Probability) 
     last = torch.minimum(row + n_steps - 1, next_end)
     reward = rows.get(REWARD)
     total = reward.clone()
-    for ahead in range(1, n_steps):  # summed in the order of time
+    for ahead in range(1, n_steps):  # sum in temporal order, so that results are reproducible
         inside = (row + ahead <= last).nonzero().flatten()
         total[inside] += gamma**ahead * reward[inside + ahead]
     later = rows.get("next")[last].set("reward", total)

@@ -1,4 +1,4 @@
-"""Samplers of fixed shares: TaskBalancedSampler, CoLearningSampler, and their base class GroupSampler."""
+"""Samplers with a fixed share of rows per group: GroupSampler (base), TaskBalancedSampler and CoLearningSampler."""
 
 from __future__ import annotations
 
@@ -29,50 +29,50 @@ _STATE = ("order", "size", "cursor", "credit", "known", "written", "length", "ra
 
 
 def device_of_rows(storage: Storage) -> torch.device:
-    """Return the device of a storage's rows; the CPU for a storage that names none."""
+    """Return the device of a storage's rows, or the CPU if the storage has no explicit device."""
     device = getattr(storage, "device", None)
     return CPU if device in (None, "auto") else torch.device(device)
 
 
 def to_device_of(storage: Storage, index: Tensor) -> Tensor:
-    """Copy ``index``, drawn on the CPU, to the device of the rows, without blocking."""
+    """Copy ``index`` from the CPU to the device of the rows, without blocking."""
     device = device_of_rows(storage)
     return index if device.type == "cpu" else index.to(device, non_blocking=True)
 
 
 def column(storage: Storage, key: NestedKey, rows: Tensor | None = None) -> Tensor:
-    """Return the value of a column in each row, or in some rows, on the CPU: (R,).
+    """Return the value (R,) of a column in all rows, or in the given rows, on the CPU.
 
-    A row may hold its value in any shape, for example (1,), or (T,) if rows are pieces of trajectories.
+    A row may store its value in any shape, for example (1,), or (T,) with equal entries if rows are trajectory slices.
     """
     data = storage.get(slice(0, len(storage)))
     leaves = [row.get(key, None) for row in data] if isinstance(data, list) else [data.get(key, None)]
     if any(leaf is None for leaf in leaves):
-        raise KeyError(f"the storage has no column {key!r}, by which rows are grouped")
+        raise KeyError(f"the storage has no column {key!r} to group rows by")
     values = (torch.stack(leaves) if isinstance(data, list) else leaves[0]).flatten(0, storage.ndim - 1)
     values = (values if rows is None else values[rows.to(values.device)]).cpu()
     if values.dim() == 1:
         return values
     values = values.flatten(1)
     if not (values == values[:, :1]).all():
-        raise ValueError(f"column {key!r} must have one value in each row; split rows with several")
+        raise ValueError(f"column {key!r} must have one value per row; split the rows that hold several values")
     return values[:, 0]
 
 
 class GroupSampler(Sampler):
-    """Fixed shares of rows from each group; within a group every row comes once before any comes again.
+    """Base class for samplers that draw a fixed share of each batch from each group, without replacement in a group.
 
-    A subclass gives the group of each row (:meth:`_label`) and the share of each group (:meth:`_weights`). A batch
-    holds the groups one after another. If a batch size cannot be divided exactly, the shares are rounded, and later
-    batches make up for it, so that the totals stay within one row of the shares; with ``exact`` such a size is an
-    error. A pass may end within a batch; the next pass has a new order. For a storage of several dimensions
-    (``ndim=2``) an index is a tuple of tensors.
+    A subclass defines the group of each row (:meth:`_label`) and the share of each group (:meth:`_weights`). A batch
+    holds the groups one after another. If the batch size cannot be divided exactly, the shares are rounded, and later
+    batches compensate, so that the totals stay within one row of the exact shares; with ``exact`` such a batch size is
+    an error. A pass over a group may end within a batch; the next pass has a new order. For a storage with several
+    dimensions (``ndim=2``), an index is a tuple of tensors.
 
-    A row that is written takes a random place in the rest of its group's pass. All passes begin again if a group
-    appears or disappears, or if a subclass cannot tell the group of single rows (:meth:`_keys`).
+    A newly written row takes a random position in the rest of its group's pass. All passes start over if a group
+    appears or disappears, or if a subclass cannot determine the group of single rows (:meth:`_keys`).
     """
 
-    ran_out = False  # whether the last batch ended an epoch: a pass over the group that takes the most batches
+    ran_out = False  # whether the last batch ended an epoch, a pass over the group that takes the most batches
 
     @typed
     def __init__(self, exact: bool = False) -> None:
@@ -82,31 +82,31 @@ class GroupSampler(Sampler):
 
     def _empty(self) -> None:
         none = torch.empty(0, dtype=torch.int64)
-        self._length = 0  # number of rows that are grouped; 0 to group again
-        # The rows, group after group, each in the order of its pass; each group's size, and its rows drawn so far.
+        self._length = 0  # number of grouped rows; 0 to group all rows at the next sample
+        # The rows of all groups in the order of their passes; the size of each group; the number of rows drawn so far.
         self._order, self._size, self._cursor = none, none, none
-        # The share of each group as whole numbers, and what rounding owes each group, as a multiple of 1 / their sum.
+        # The integer weight of each group; the rows that rounding owes each group, in units of 1 / (sum of weights).
         self._weight, self._credit = none, none
-        self._known: Tensor | None = None  # the key of each group's rows
-        self._written: list[Tensor] = []  # rows written since the last batch
+        self._known: Tensor | None = None  # the key shared by the rows of each group
+        self._written: list[Tensor] = []  # indices of rows written since the last batch
         self.ran_out = False
         self._restored = False
         self._laid_out: tuple[int, Tensor, Tensor, Tensor] | None = None  # see _layout
 
     @abstractmethod
     def _label(self, storage: Storage) -> Tensor:
-        """Return the group of each row: (R,) int64, 0 to G-1 without a gap, or -1 for a row that is left out."""
+        """Return the group of each row (R,) int64: 0 to G - 1 without gaps, or -1 for a row that is never drawn."""
 
     @abstractmethod
     def _weights(self, groups: int) -> tuple[list[int], str]:
-        """Return the share of each of G groups as whole numbers of at least 1, and the reason for an error message."""
+        """Return an integer weight (at least 1) for each of G groups, and an explanation for error messages."""
 
     def _keys(self, storage: Storage, rows: Tensor) -> Tensor | None:
-        """Return the key of each row's group, (n,) int64; None if this needs all rows."""
+        """Return the key (n,) int64 of the group of each given row; None if grouping requires all rows."""
         return None
 
     def _covered(self, storage: Storage) -> int:
-        """Return the number of rows to group, the first ones."""
+        """Return the number N if the first N rows of the storage are grouped."""
         return len(storage) if storage.ndim == 1 else storage.shape.numel()
 
     def _group(self, storage: Storage) -> None:
@@ -121,11 +121,11 @@ class GroupSampler(Sampler):
             self._shuffle(group)
 
     def _move_written(self, storage: Storage) -> bool:
-        """Move the rows that were written to the passes of their groups; False if all rows must be grouped again."""
+        """Move newly written rows to the passes of their groups; return False if all rows must be grouped again."""
         if self._known is None or not self._written:
             return False
         rows, length = torch.cat(self._written).unique(), self._covered(storage)
-        # Grouping again is the way out if the storage changed by more than the rows that were reported.
+        # Group all rows again if rows of the storage changed that were not reported to the sampler.
         if rows[0] < 0 or rows[-1] >= length or int((rows >= self._length).sum()) != length - self._length:
             return False
         keys = self._keys(storage, rows)
@@ -134,7 +134,7 @@ class GroupSampler(Sampler):
         if not same.any(1).all():
             return False
         label, moved = same.int().argmax(1), torch.zeros(length, dtype=torch.bool)
-        moved[rows] = True  # they leave the pass that they were in
+        moved[rows] = True  # overwritten rows leave their previous pass
         passes, cursors = [], []
         orders = self._order.split(self._size.tolist())
         for group, (order, cursor) in enumerate(zip(orders, self._cursor.tolist(), strict=True)):
@@ -162,7 +162,7 @@ class GroupSampler(Sampler):
         self._cursor[group] = 0
 
     def _take(self, group: int, count: int) -> tuple[Tensor, bool]:
-        """Return ``count`` rows of a group, across the end of its pass, and whether a pass ended."""
+        """Draw ``count`` rows of a group, starting new passes as needed; also return whether a pass ended."""
         parts, ended = [], False
         start, size = int(self._start()[group]), int(self._size[group])
         while count:
@@ -177,7 +177,7 @@ class GroupSampler(Sampler):
         return torch.cat(parts), ended
 
     def _layout(self, batch_size: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return each group's share (G,), the group of each row of a batch (B,), and its place in the group's (B,)."""
+        """Return each group's number of rows (G,), and for each batch row (B,) the group and the index in the group."""
         if self._laid_out is None or self._laid_out[0] != batch_size:
             weights, reason = self._weights(len(self._size))
             divisor = reduce(gcd, weights)
@@ -196,7 +196,7 @@ class GroupSampler(Sampler):
         return self._laid_out[1:]
 
     def _rounded(self, batch_size: int, unit: int) -> Tensor:
-        """Return each group's share of a batch that cannot be divided exactly, with what earlier batches owe."""
+        """Return the rounded number of rows of each group (G,), compensating for the rounding of earlier batches."""
         due = self._credit + self._weight * batch_size
         shares = due.div(unit, rounding_mode="floor").clamp(min=0)
         while rest := batch_size - int(shares.sum()):
@@ -218,7 +218,7 @@ class GroupSampler(Sampler):
                 "buffer anew, or replay.set_sampler(...) and replay.set_rng(...); see docs/data.md"
             )
         if not len(storage):
-            raise ValueError("storage must hold at least one row, it is empty")
+            raise ValueError("storage must hold at least one row, but it is empty")
         if self._restored and self._length:
             self._check_restored(storage)
         if (self._written or self._covered(storage) != self._length) and not self._move_written(storage):
@@ -227,7 +227,7 @@ class GroupSampler(Sampler):
         at = (self._start() + self._cursor)[group].add_(place).clamp_(max=len(self._order) - 1)
         index = self._order[at]
         self.ran_out = False
-        # Most batches end no pass, and one gather draws them; the rows of groups whose pass ends are replaced below.
+        # Most batches end no pass, so one gather draws them. Rows of groups whose pass ends are replaced below.
         ending = self._cursor + shares >= self._size
         self._cursor += torch.where(ending, 0, shares)
         if ending.any():
@@ -242,13 +242,13 @@ class GroupSampler(Sampler):
         return (index if storage.ndim == 1 else torch.unravel_index(index, storage.shape)), {}
 
     def add(self, index: Any, *, storage: Storage | None = None) -> None:
-        """Note that rows were written, perhaps by another buffer of the same storage."""
+        """Register rows that were written, possibly through another buffer with the same storage."""
         self._written.append(torch.as_tensor(index, device="cpu").reshape(-1))
 
     extend = mark_update = add
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the rows in the order of their passes, each pass's position, and rows written since the last batch."""
+        """Return the order and position of each group's pass, and the rows written since the last batch."""
         none = torch.empty(0, dtype=torch.int64)
         if self._length == 0 or (self._written and self._known is None):  # the next sample groups all rows again
             passes = [none] * 6
@@ -261,20 +261,20 @@ class GroupSampler(Sampler):
         return dict(zip(_STATE, values, strict=True))
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore a state; ValueError if it is not a sampler's, or at the next sample if it belongs to other rows."""
+        """Restore a state; raise ValueError if it is invalid, or at the next sample if it was saved for other rows."""
         if missing := [name for name in _STATE if not isinstance(state_dict.get(name), Tensor)]:
-            raise ValueError(f"state_dict must hold {', '.join(_STATE)}; it lacks {', '.join(missing)}")
+            raise ValueError(f"state_dict must hold {', '.join(_STATE)}, but {', '.join(missing)} are missing")
         order, size, cursor, credit, known, written, length, ran_out = (state_dict[n].cpu().clone() for n in _STATE)
         fits = len(order) == int(size.sum()) and size.shape == cursor.shape == credit.shape
         if not fits or bool((cursor >= size).any()):
-            raise ValueError("state_dict: the rows and positions of the passes do not fit together")
+            raise ValueError("state_dict: the order, sizes and positions of the passes are inconsistent")
         self._order, self._size, self._cursor, self._credit = order, size, cursor, credit
         self._known, self._written = known if len(known) else None, [written] if len(written) else []
         self._length, self.ran_out = int(length), bool(ran_out)
         self._laid_out, self._restored = None, True
 
     def _check_restored(self, storage: Storage) -> None:
-        """Raise unless a restored state belongs to the storage's rows; rows written since may need a new grouping."""
+        """Raise ValueError unless a restored state fits the storage's rows, except rows written after saving."""
         groups, length = torch.repeat_interleave(self._size), self._covered(storage)
         if self._written:
             old = ~torch.isin(self._order, torch.cat(self._written)) & (self._order < length)
@@ -282,40 +282,40 @@ class GroupSampler(Sampler):
             if keys is None or self._known is None or not torch.equal(keys.reshape(-1).cpu(), self._known[groups[old]]):
                 self._length, self._written = 0, []
         elif length != self._length:
-            raise ValueError(f"state_dict must be of the storage's {length} rows, got one of {self._length}")
+            raise ValueError(f"state_dict must fit the storage's {length} rows, got a state for {self._length} rows")
         else:
             label = self._label(storage).cpu()
             rows = (label >= 0).nonzero().flatten()
             if not torch.equal(self._order.sort().values, rows) or not torch.equal(label[self._order], groups):
-                raise ValueError("state_dict must be of the storage's rows, got one whose groups differ")
+                raise ValueError("state_dict must fit the storage's rows, got a state whose groups differ")
         self._restored = False
 
     def dumps(self, path: AnyPath) -> None:
-        """Write the state to a folder, as one file, atomically."""
+        """Save the state atomically to one file in a folder."""
         write_tensors(Path(path) / _FILE, {}, {}, self.state_dict())
 
     def loads(self, path: AnyPath) -> None:
-        """Read the state that :meth:`dumps` wrote; ValueError if it is damaged or not a sampler's."""
+        """Restore the state that :meth:`dumps` saved; raise ValueError if the file is corrupted or no sampler state."""
         with reading(path, "sampler's state"):
             self.load_state_dict(pop_state(*read_tensors(Path(path) / _FILE)))
 
 
 class TaskBalancedSampler(GroupSampler):
-    """Draw equally many rows of every task; within a task every row comes once before any comes again.
+    """A sampler that draws equally many rows of every task; within a task, rows are drawn without replacement.
 
-    It works in any :class:`torchrl.data.ReplayBuffer`. The buffer may grow: a new row takes a random place in the rest
-    of its task's pass, and an overwritten row leaves it. When a task appears or disappears, all passes begin again. The
-    sampler draws from the replay buffer's generator, so ``ReplayBuffer(..., generator=...)`` fixes the batches; its
-    state is saved with the buffer's. An epoch is a pass over the largest task. TorchRL does not report ``replay[i] =
-    rows`` to samplers: add rows of other tasks by ``extend``.
+    The sampler works in any :class:`torchrl.data.ReplayBuffer`. The buffer may grow: a new row takes a random position
+    in the rest of its task's pass, and an overwritten row leaves its pass. When a task appears or disappears, all
+    passes start over. The sampler draws from the replay buffer's generator, so ``ReplayBuffer(..., generator=...)``
+    determines the batches, and its state is saved with the buffer's state. An epoch is a pass over the largest task.
+    TorchRL does not report ``replay[i] = rows`` to samplers, so use ``extend`` to add rows of other tasks.
 
     Args:
-        task_key: the entry of the storage that holds the task: one number in each row, of any shape.
-        exact: raise an error for a batch size that the number of tasks does not divide. Otherwise some tasks get one
-            more row, in turn.
+        task_key: the key of the storage that holds the task: one number per row, of any shape.
+        exact: raise an error if the batch size is not a multiple of the number of tasks. Otherwise the tasks take turns
+            in getting one row more.
 
     Raises:
-        ValueError: at sampling, a row with several tasks; with ``exact``, a size that cannot be divided exactly.
+        ValueError: when sampling, if a row has several tasks, or with ``exact``, if the tasks do not divide the batch.
 
     Example:
         >>> import torch
@@ -326,7 +326,7 @@ class TaskBalancedSampler(GroupSampler):
         >>> replay.sample()["task_id"].bincount(minlength=8).tolist()
         [0, 0, 0, 2, 0, 0, 0, 2]
 
-    Source: paper section 'Cross-Task Co-Learning via 1:1 Data Mixing', its minibatches of equal numbers.
+    Source: paper section 'Cross-Task Co-Learning via 1:1 Data Mixing' (minibatches with equally many rows per task).
     """
 
     @typed
@@ -345,26 +345,26 @@ class TaskBalancedSampler(GroupSampler):
 
 
 class CoLearningSampler(GroupSampler):
-    """Draw half of every minibatch from a target task's demonstrations, half in equal numbers from the base tasks.
+    """A sampler that draws half of every minibatch from a target task, and half in equal parts from the base tasks.
 
-    It works in any :class:`torchrl.data.ReplayBuffer`. Target and base tasks are drawn without replacement, each in its
-    own passes. ``ran_out`` is true at the end of an epoch, which is the pass that takes the most batches. The sampler
-    draws from the replay buffer's generator; a restored state continues with the same batches.
+    The sampler works in any :class:`torchrl.data.ReplayBuffer`. Each task is drawn without replacement, in its own
+    passes. ``ran_out`` is True at the end of an epoch, the pass that takes the most batches. The sampler draws from the
+    replay buffer's generator; a restored state continues with the same batches.
 
-    If the rows have a column ``dataset``, as :func:`load_demonstrations` writes for several folders, the target's rows
-    come from the last dataset that has any; the target's rows in other datasets are left out. A batch holds the
-    target's rows, then those of the base tasks in the order of their ids, and the column ``is_target`` (B,) bool.
+    If the rows have a column ``dataset``, which :func:`load_demonstrations` writes for several folders, target rows are
+    drawn only from the last dataset that contains the target. A batch holds the target's rows, followed by the rows of
+    the base tasks in the order of the task ids; the column ``is_target`` (B,) bool marks the target's rows.
 
     Args:
-        target: a task's name, a :class:`Task`, or a task's id.
-        target_fraction: the target's share of a minibatch, between 0 and 1, such as 0.5, 1/3 or Fraction(2, 7).
-        task_key: the entry of the storage that holds the task: one number in each row, of any shape.
-        exact: raise an error for a batch size that cannot be split exactly. Otherwise the shares are rounded, and later
-            batches make up for it.
+        target: the target task: a name, a :class:`Task` or a task id.
+        target_fraction: the target's fraction of a minibatch, between 0 and 1, such as 0.5, 1/3 or Fraction(2, 7).
+        task_key: the key of the storage that holds the task: one number per row, of any shape.
+        exact: raise an error if the batch size cannot be split exactly. Otherwise the shares are rounded, and later
+            batches compensate.
 
     Raises:
-        ValueError: at sampling, no row of the target or of a base task; with ``exact``, a batch size that cannot be
-            split exactly (the message gives the nearest that can).
+        ValueError: when sampling, if the target or the base tasks have no rows, or with ``exact``, if the batch size
+            cannot be split exactly (the message gives the nearest valid batch sizes).
 
     Example:
         >>> import torch
@@ -390,10 +390,10 @@ class CoLearningSampler(GroupSampler):
         task_key: NestedKey = "task_id",
         exact: bool = False,
     ) -> None:
-        # 1/3 as a float is not a third: the shares of a batch are computed with the fraction that was meant.
+        # The float 1/3 is not exactly a third, so the shares are computed with the nearest simple fraction.
         self.target_fraction = Fraction(target_fraction).limit_denominator(10_000)
         if not 0 < target_fraction < 1 or not isclose(self.target_fraction, target_fraction, rel_tol=1e-9):
-            ratio = "must be between 0 and 1, a ratio of integers up to 10000"
+            ratio = "must be between 0 and 1, and a ratio of integers up to 10000"
             raise ValueError(f"target_fraction {ratio}, got {target_fraction}; the nearest is {self.target_fraction}")
         self.target, self.task_key = target, task_key
         name = target.name if isinstance(target, Task) else target
@@ -407,10 +407,10 @@ class CoLearningSampler(GroupSampler):
             tasks = ", ".join(MT50[i] if 0 <= i < len(MT50) else str(i) for i in task.unique().tolist())
             raise ValueError(f"target: the storage has no row of {self.target!r}; its tasks are {tasks}")
         if not is_base.any():
-            raise ValueError("target: the storage has no row of any other task, so there are no base tasks")
+            raise ValueError("target: the storage has rows of the target only; add rows of base tasks")
         try:
             dataset = column(storage, DATASET)
-        except KeyError:  # rows of one dataset
+        except KeyError:  # the rows come from one dataset
             pass
         else:
             is_target &= dataset == dataset[is_target].max()
@@ -419,7 +419,7 @@ class CoLearningSampler(GroupSampler):
         return label
 
     def row_weights(self, storage: Storage) -> Tensor:
-        """Return each row's mean share of a minibatch: (R,) float32, 0 for a row that is left out."""
+        """Return the mean fraction of a minibatch that each row makes up, (R,) float32; 0 for rows never drawn."""
         label = self._label(storage)
         sizes = label[label >= 0].bincount()
         share = torch.tensor(self._weights(len(sizes))[0], dtype=torch.float32)
@@ -427,7 +427,7 @@ class CoLearningSampler(GroupSampler):
 
     def _weights(self, groups: int) -> tuple[list[int], str]:
         base, (part, whole) = groups - 1, self.target_fraction.as_integer_ratio()
-        reason = f"so that {self.target_fraction} of it is the target's and {base} base tasks share the rest equally"
+        reason = f"so that {self.target_fraction} of it is from the target and {base} base tasks share the rest equally"
         return [part * base] + [whole - part] * base, reason
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
@@ -441,13 +441,13 @@ class CoLearningSampler(GroupSampler):
         return {"target": torch.tensor(self._target_id), "target_fraction": fraction}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the sampler's state with the target and the ratio."""
+        """Return the sampler's state, including the target and the target fraction."""
         return super().state_dict() | self._identity()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore a state; ValueError if it is not a sampler's, or has another target or ratio."""
+        """Restore a state; raise ValueError if it is invalid or has another target or target fraction."""
         for name, own in self._identity().items():
             stored = state_dict.get(name)
             if not isinstance(stored, Tensor) or not torch.equal(stored.cpu(), own):
-                raise ValueError(f"state_dict has another {name}, this sampler has {getattr(self, name)}")
+                raise ValueError(f"state_dict has another {name} than this sampler ({name}={getattr(self, name)!r})")
         super().load_state_dict(state_dict)

@@ -1,4 +1,4 @@
-"""Selection of the episodes and rows that a replay buffer shows."""
+"""Select the episodes and rows that a replay buffer exposes."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from lw_torchrl.data.rewards import REWARDS, RewardName, episode_returns
 @typed_fields
 @dataclass(frozen=True)
 class EpisodeFilter:
-    """A filter that keeps the episodes that meet every given condition.
+    """A filter that keeps the episodes that satisfy all given conditions (None stands for no condition).
 
-    An episode's return is the sum of the buffer's ``("next", "reward")`` over those of its rows that are shown.
+    An episode's return is the sum of the buffer's ``("next", "reward")`` over the episode's selected rows.
 
     Attributes:
-        success: keep episodes that succeeded at some step, or, if False, those that did not.
-        least_return: keep episodes of at least this return.
-        behaviours: keep episodes with these labels, "spoilt-30" for example.
-        best: the fraction of each task's remaining episodes to keep, at least one: those of the highest return, the
-            shorter at a tie.
-        else_best: for a task without an episode that meets the conditions, the fraction of all its episodes to keep,
-            chosen as for ``best``; None for an error.
+        success: True to keep episodes that succeeded at any time step, False to keep failed episodes.
+        least_return: the minimum return of an episode.
+        behaviours: labels of the episodes to keep, for example "noisy-30".
+        best: the fraction of each task's remaining episodes to keep (at least one), by highest return and then by
+            fewest rows.
+        else_best: the fraction of all episodes of a task to keep, ranked as for ``best``, if none of the task's
+            episodes satisfies the conditions; None to raise an error.
 
     Example:
         >>> EpisodeFilter(success=True, behaviours=("expert", "noisy")).best is None
@@ -49,7 +49,7 @@ class EpisodeFilter:
             raise ValueError("behaviours must hold at least one label, got none")
 
     def choose(self, parts: Sequence[Demonstrations], returns: Sequence[Tensor]) -> list[Demonstrations]:
-        """Return the parts with the kept episodes, given each episode's return and rows, (E, 2) float64 a part."""
+        """Return the parts with only the kept episodes, given the return and length (E, 2) of each part's episodes."""
         labels = {part.config.behaviour for part in parts}
         for label in self.behaviours or ():
             if label not in labels:
@@ -66,13 +66,13 @@ class EpisodeFilter:
             left, share = [row for row in of_task if self._keeps(parts[row[0]], *row[1:3])], self.best
             if not left and self.else_best is not None:
                 left, share = of_task, self.else_best
-            if share is not None:  # the highest returns, and the shorter at a tie
+            if share is not None:  # keep the highest returns, and the shorter episodes at a tie
                 left = sorted(left, key=lambda row: (-row[2], row[3]))[: max(1, round(share * len(left)))]
             chosen |= {row[:2] for row in left}
             if not left:
                 empty.append(task)
         if empty:
-            raise ValueError(f"keep: {self} leaves no episode of {', '.join(empty)}")
+            raise ValueError(f"keep: {self} leaves no episode of {', '.join(empty)}; relax the filter or set else_best")
         return [
             replace(part, episodes=tuple(episode for episode in part.episodes if (place, episode) in chosen))
             for place, part in enumerate(parts)
@@ -88,11 +88,12 @@ class EpisodeFilter:
 
 Label = Literal["expert", "unclipped", "executed"]
 EpisodeChoice = int | Mapping[str, int | Sequence[int]] | None
-"""None for all; the number of first episodes of each task; or, for each task to use, such a number or the indices."""
+"""A choice of episodes: None for all, a number N for the first N of each task, or a mapping from the tasks to use to
+such a number or to a list of episode indices."""
 
 
 def choose_episodes(dataset: Demonstrations, choice: EpisodeChoice, argument: str = "episodes") -> Demonstrations:
-    """Return a dataset's description with only the chosen episodes, in the dataset's order."""
+    """Return a dataset's description with only the chosen episodes, in the order of the dataset."""
     if choice is None:
         return dataset
     existing: dict[str, list[int]] = {}
@@ -109,63 +110,65 @@ def choose_episodes(dataset: Demonstrations, choice: EpisodeChoice, argument: st
         if isinstance(wanted, Sequence):
             numbers = list(wanted)
         elif check_value(place, wanted, Count) > len(of_task):
-            raise ValueError(f"{place}: the dataset has {len(of_task)} episodes of {task!r}, got {wanted}")
+            raise ValueError(f"{place}: the dataset has only {len(of_task)} episodes of {task!r}, got {wanted}")
         else:
             numbers = of_task[:wanted]
         if missing := sorted(set(numbers) - set(of_task)):
             raise ValueError(f"{place}: the dataset holds the episodes {shown(of_task)}, got {shown(missing)}")
         if not numbers or len(set(numbers)) < len(numbers):
-            raise ValueError(f"{place} must name at least one episode, each once, got {shown(numbers)}")
+            raise ValueError(f"{place} must list at least one episode and no duplicates, got {shown(numbers)}")
         keep |= {(task, number) for number in numbers}
     return replace(dataset, episodes=tuple(e for e in dataset.episodes if (e.task, e.episode) in keep))
 
 
 def kept_rows(episodes: Sequence[EpisodeInfo], after: int | None) -> tuple[Tensor, Tensor]:
-    """Return the rows up to ``after`` steps past each episode's first success, and their number in each episode."""
+    """Return the indices of the rows up to ``after`` steps after each first success, and their number per episode."""
     cuts = [e.length if after is None or e.first_success is None else e.first_success + after for e in episodes]
     starts = torch.tensor([e.start for e in episodes], dtype=torch.int64)
     lengths = torch.tensor([min(e.length, cut) for e, cut in zip(episodes, cuts, strict=True)], dtype=torch.int64)
-    # Each kept row's index is its place among the kept rows, moved by its episode's start.
+    # The index of a kept row is its position among the kept rows plus an offset that depends on its episode.
     moved = torch.repeat_interleave(starts - lengths.cumsum(0) + lengths, lengths)
     return torch.arange(len(moved)) + moved, lengths
 
 
 def returns_of(whole: Demonstrations, chosen: Demonstrations, reward: RewardName, after: int | None) -> Tensor:
-    """Return the return and the number of rows, (E, 2) float64, of the chosen episodes, up to ``after`` steps past
-    their first success."""
+    """Return the episode return and the number of rows, (E, 2) float64, of each chosen episode.
+
+    Only the rows up to ``after`` time steps after the first success count (None for all rows).
+    """
     rows, (kept, lengths) = load_rows(whole).get("next"), kept_rows(chosen.episodes, after)
     kind = REWARDS[reward]
     return episode_returns(kind.of(rows.get(f"reward_{kind.source}")[kept], rows.get("success")[kept]), lengths)
 
 
 def check_label(label: str, parts: Sequence[Demonstrations]) -> None:
-    """Raise :class:`ValueError` if the label needs an expert's actions and another policy acted."""
+    """Raise :class:`ValueError` if the label requires expert actions, but another policy collected a dataset."""
     others = sorted({part.config.behaviour for part in parts if part.config.policy.kind != "expert"})
     if others and label != "executed":
-        needs = f"label={label!r} needs an expert's actions, but this dataset was collected by {', '.join(others)!r}"
+        needs = f"label={label!r} requires expert actions, but this dataset was collected by {', '.join(others)!r}"
         raise ValueError(f"{needs}; use label='executed'")
 
 
 def check_behaviours(parts: Sequence[Demonstrations]) -> None:
-    """Raise :class:`ValueError` if two behaviours have the same label."""
+    """Raise :class:`ValueError` if datasets use the same label for different behaviours."""
     first: dict[str, Demonstrations] = {}
     for part in parts:
         before = first.setdefault(part.config.behaviour, part)
         if before.config.policy.acts != part.config.policy.acts:
             folders = f"{str(before.root)!r} and {str(part.root)!r}"
-            raise ValueError(f"root: {part.config.behaviour!r} names different behaviours in {folders}")
+            raise ValueError(f"root: the label {part.config.behaviour!r} stands for different behaviours in {folders}")
 
 
 def _folders_and_choices(
     root: AnyPath | Iterable[AnyPath], episodes: EpisodeChoice | Sequence[EpisodeChoice]
 ) -> tuple[list[AnyPath], list[Any]]:
-    """Return the folders, and the choice of episodes in each."""
+    """Return the list of folders, and the choice of episodes for each folder."""
     if isinstance(root, (str, os.PathLike)):
         return [root], [episodes]
     folders = list(root)
     is_repeated = episodes is None and len({Path(folder).resolve() for folder in folders}) < len(folders)
     if not folders or is_repeated:
-        raise ValueError(f"root must be a folder, or a list that names each folder once, got {folders}")
+        raise ValueError(f"root must be a folder, or a list of distinct folders, got {folders}")
     if episodes is None:
         return folders, [None] * len(folders)
     if not isinstance(episodes, Sequence) or len(episodes) != len(folders):
@@ -182,14 +185,17 @@ def select(
     after: int | None,
     check: bool,
 ) -> tuple[list[Demonstrations], list[Demonstrations]]:
-    """Return the descriptions of datasets, and the same with only the selected episodes; see load_demonstrations."""
+    """Return two descriptions of each dataset: with all episodes, and with only the selected episodes.
+
+    See :func:`load_demonstrations` for the arguments.
+    """
     folders, choices = _folders_and_choices(root, episodes)
     datasets = [read_metadata(folder) for folder in folders]
     check_label(label, datasets)
     check_behaviours(datasets)
     sizes = {(dataset.config.layout.size, dataset.config.layout.action_size) for dataset in datasets}
     if len(sizes) > 1:
-        raise ValueError(f"root: the folders must have rows of one layout, got observation and action sizes {sizes}")
+        raise ValueError(f"root: all folders must have the same layout, got observation and action sizes {sizes}")
     is_single = isinstance(root, (str, os.PathLike))
     parts = [
         choose_episodes(dataset, choice, "episodes" if is_single else f"episodes[{number}]")
@@ -205,7 +211,7 @@ def select(
 
 @dataclass(frozen=True)
 class JoinedConfig:
-    """How the ``parts`` of joined demonstrations were collected; and for each, task name to chosen ``episodes``."""
+    """The configs of joined datasets (``parts``), and for each dataset the chosen ``episodes`` by task name."""
 
     parts: tuple[CollectConfig, ...]
     episodes: tuple[dict[str, list[int]], ...]
@@ -216,18 +222,18 @@ class JoinedConfig:
 
 @dataclass(frozen=True)
 class JoinedDemonstrations:
-    """Chosen episodes of one or more datasets, as a replay buffer joins them; ``parts`` describe the datasets."""
+    """The chosen episodes of one or more datasets in a replay buffer; ``parts`` are the datasets' descriptions."""
 
     parts: tuple[Demonstrations, ...]
 
     @property
     def episodes(self) -> tuple[EpisodeInfo, ...]:
-        """The episodes in the order of the rows; ``start`` and ``length`` are as in their own dataset."""
+        """The episodes in the order of the rows; ``start`` and ``length`` refer to the dataset of each episode."""
         return tuple(episode for part in self.parts for episode in part.episodes)
 
     @property
     def num_steps(self) -> int:
-        """The number of rows of these episodes, before any are dropped."""
+        """The number of rows in these episodes, before rows after a success are dropped."""
         return sum(part.num_steps for part in self.parts)
 
     @property

@@ -1,4 +1,4 @@
-"""Evaluation: exactly k episodes of each task, their results, why they failed, and figures."""
+"""Evaluation: run a fixed number of episodes per task, report and plot results, and find out why episodes failed."""
 
 import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.evaluation.diagnose.attribution import attribute_failures

@@ -1,4 +1,4 @@
-"""Score a learned query evaluator: how often it answers held-out conditions correctly."""
+"""Score a learned query evaluator: measure how often the evaluator answers held-out conditions correctly."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _ROWS = 256
 
 @dataclass(frozen=True)
 class PartScore:
-    """Counts of answers to one held-out part of :class:`LabelledQueries`, by predicate, negated or not."""
+    """The numbers of correct and of all answers on one held-out split of :class:`LabelledQueries`, by predicate."""
 
-    correct: dict[str, tuple[int, int]]  # correct answers where the clause is false, and where it is true
-    total: dict[str, tuple[int, int]]  # all answers where the clause is false, and where it is true
+    correct: dict[str, tuple[int, int]]  # number of correct answers where the clause is false, and where it is true
+    total: dict[str, tuple[int, int]]  # number of all answers where the clause is false, and where it is true
 
     @property
     def answers(self) -> int:
@@ -35,12 +35,12 @@ class PartScore:
         return sum(map(sum, self.total.values()))
 
     def accuracy(self, predicate: str | None = None) -> float:
-        """Return the fraction of correct answers, for one predicate or all."""
+        """Return the fraction of correct answers, for one predicate or for all predicates (None)."""
         names = self.total if predicate is None else [predicate]
         return sum(sum(self.correct[name]) for name in names) / sum(sum(self.total[name]) for name in names)
 
     def balanced_accuracy(self, predicate: str | None = None) -> float:
-        """Return the mean of the accuracies where the predicate is false and where it is true, as far as both occur."""
+        """Return the mean of the accuracies on false and on true clauses, leaving out a truth value without answers."""
         names = self.total if predicate is None else [predicate]
         tables = self.correct, self.total
         counts = [[sum(table[name][truth] for name in names) for table in tables] for truth in (0, 1)]
@@ -53,7 +53,7 @@ class PartScore:
         return sorted(self.total, key=lambda name: (self.balanced_accuracy(name), name))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the rates and counts as JSON."""
+        """Return the accuracies and the numbers of answers as JSON."""
         predicates = {
             name: self._rates(name) | {"false_and_true": list(self.total[name]), "right": list(self.correct[name])}
             for name in self.worst
@@ -68,11 +68,11 @@ class PartScore:
 class EvaluatorScore:
     """The score of an evaluator on held-out data."""
 
-    parts: dict[str, PartScore]  # of "states", "queries" and "tasks", where the data hold out any
-    about: dict[str, Any]  # the data and the split, as JSON
+    parts: dict[str, PartScore]  # scores of the held-out splits "states", "queries" and "tasks", without empty splits
+    about: dict[str, Any]  # a JSON description of the data and the splits
 
     def table(self, most: int = 4) -> str:
-        """Return the rates as text, with the N worst predicates of each part."""
+        """Return a text table of the accuracies, with the ``most`` worst predicates of each held-out split."""
         lines = [f"{'':36}{'answers':>10}{'accuracy':>10}{'balanced':>10}"]
         for part, score in self.parts.items():
             rows: list[tuple[str, int, str | None]] = [(PARTS[part], score.answers, None)]
@@ -83,13 +83,13 @@ class EvaluatorScore:
         return "\n".join(lines)
 
     def save(self, path: AnyPath) -> None:
-        """Write the score as JSON."""
+        """Write the score to a JSON file."""
         write_json(path, {"about": self.about, "parts": {name: part.to_json() for name, part in self.parts.items()}})
 
 
 @typed
 def score_evaluator(evaluator: ClauseEvaluator, data: LabelledQueries) -> EvaluatorScore:
-    """Score an evaluator on the held-out parts of the data; its plans do not matter.
+    """Score an evaluator on the held-out splits of the data. The evaluator's plans do not affect the score.
 
     Raises:
         ValueError: no data are held out.
@@ -124,7 +124,7 @@ def _score(evaluator: ClauseEvaluator, part: list[TaskQueries]) -> PartScore:
 
 
 def clause_logits(evaluator: ClauseEvaluator, queries: TaskQueries) -> tuple[Tensor, Tensor]:
-    """Return logits (R, Q) that the clauses hold, and their truth (R, Q)."""
+    """Return the evaluator's logits (R, Q) for Q clauses in R states, and the true answers (R, Q)."""
     coded = evaluator.code([(queries.task, clause) for clause in queries.clauses])
     chunks = [
         evaluator.network(rows, coded.pick(torch.arange(len(coded.predicate)).expand(len(rows), -1)))

@@ -1,4 +1,4 @@
-"""Figures of results: success rates and causes of failures."""
+"""Figures of evaluation results: success rates and failure causes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lw_torchrl.evaluation.result import EvaluationResult, wilson_interval
 
 _FORMATS = (".png", ".svg", ".pdf", ".jpg", ".jpeg")
 COLORS = ("#4c78a8", "#f58518", "#54a24b", "#b279a2", "#9d755d", "#e45756")
-_LONG_LABEL = 50  # letters of a legend label that does not fit into two columns
+_LONG_LABEL = 50  # longest legend label, in characters, that still fits into two columns
 _CAUSE_COLORS: dict[str, str] = {
     **{"query": "#4c78a8", "plan": "#f58518", "skill": "#54a24b", "out of time": "#b279a2", "undecided": "#bab0ac"},
     **{"not reproducible": "#d5cec9", "perception": "#72b7b2", "gripper": "#eeca3b", "actuation": "#9d755d"},
@@ -23,20 +23,20 @@ _CAUSE_COLORS: dict[str, str] = {
 
 
 def check_image(path: AnyPath | None) -> None:
-    """Raise :class:`ValueError` unless the file's suffix is that of an image format."""
+    """Raise :class:`ValueError` unless the file's suffix denotes a supported image format."""
     if path is not None and (suffix := Path(path).suffix.lower()) not in _FORMATS:
-        raise ValueError(f"path must end in {', '.join(_FORMATS)}, got {suffix!r} of {str(path)!r}")
+        raise ValueError(f"path must end in {', '.join(_FORMATS)}, got suffix {suffix!r} in {str(path)!r}")
 
 
 def new_figure(width: float, height: float) -> Any:
-    """Return an empty ``matplotlib.figure.Figure``, in inches; it opens no window and needs no backend."""
+    """Return an empty ``matplotlib.figure.Figure`` (sizes in inches), which needs neither a window nor a backend."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def saved(figure: Any, path: AnyPath | None) -> Any:
-    """Write a figure to a file, if there is a path, and return the figure."""
+    """Write a figure to ``path`` unless it is None, and return the figure."""
     if path is not None:
         with replacing(path) as temporary:
             figure.savefig(temporary, dpi=140)
@@ -44,7 +44,7 @@ def saved(figure: Any, path: AnyPath | None) -> Any:
 
 
 def trim(axes: Any, grid: Literal["x", "y"] | None = None) -> None:
-    """Remove the upper and right spines, and draw lines across ``grid`` behind everything else."""
+    """Remove the top and right spines, and draw grid lines for the axis ``grid`` behind everything else."""
     axes.spines[["top", "right"]].set_visible(False)
     if grid is not None:
         axes.grid(axis=grid, color="#dddddd", linewidth=0.6)
@@ -53,9 +53,9 @@ def trim(axes: Any, grid: Literal["x", "y"] | None = None) -> None:
 
 @typed
 def plot_success(result: EvaluationResult, path: AnyPath | None = None, *, title: str = "") -> Any:
-    """Return a ``matplotlib`` figure of each task's success rate at any step, best first, with 95 % intervals.
+    """Plot each task's success rate at any time step, best first, with 95 % intervals.
 
-    It is written to ``path``, a .png, .svg, .pdf or .jpg file, if one is given.
+    Return the ``matplotlib`` figure, and also write it to ``path`` (.png, .svg, .pdf or .jpg) unless it is None.
 
     Example:
         >>> import lw_torchrl as lw
@@ -85,10 +85,10 @@ def plot_success(result: EvaluationResult, path: AnyPath | None = None, *, title
 
 @typed
 def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, title: str = "") -> Any:
-    """Return a ``matplotlib`` figure of each task's failed episodes by cause, most failures on top.
+    """Plot the number of each task's failed episodes by cause, with the most failures on top.
 
-    The result is one of ``evaluate(..., attribute=True)``. The figure is written to ``path`` as by
-    :func:`plot_success`.
+    ``result`` comes from ``evaluate(..., attribute=True)``. Return the ``matplotlib`` figure, and also write it to
+    ``path`` (.png, .svg, .pdf or .jpg) unless it is None.
 
     Example:
         >>> from lw_torchrl.evaluation import EpisodeResult, Failure
@@ -118,7 +118,7 @@ def plot_failures(result: EvaluationResult, path: AnyPath | None = None, *, titl
     axes.set_xlim(0, trials * 1.02)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.margins(y=0.5 / max(1, len(tasks)))
-    axes.set_xlabel(f"failed episodes (of {trials}; tasks without any are left out)")
+    axes.set_xlabel(f"failed episodes (of {trials}; tasks without failures are omitted)")
     episodes = counted(trials * len(counts), "episode")
     axes.set_title(f"{title}\n{failures} of {episodes} failed".strip())
     trim(axes)

@@ -1,4 +1,4 @@
-"""Model cards of policies, and policies with their cards in folders and on the Hugging Face Hub."""
+"""Model cards of policies; save and load policies with their cards, in folders and on the Hugging Face Hub."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ _TAGS = ["robotics", "imitation-learning", "reinforcement-learning", "torchrl", 
 
 
 def hub() -> Any:
-    """Import huggingface_hub, or raise :class:`ImportError` with the name of the extra."""
+    """Import huggingface_hub, or raise an :class:`ImportError` that names the missing extra."""
     try:
         import huggingface_hub
     except ImportError as error:
-        raise ImportError("model cards and the Hub need the extra [hub]: pip install 'lw_torchrl[hub]'") from error
+        raise ImportError("model cards and the Hub require the extra [hub]: pip install 'lw_torchrl[hub]'") from error
     return huggingface_hub
 
 
 @typed
 def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo: str = "") -> Any:
-    """Make a model card of a policy: training data, success rates, limits, how to load and cite it.
+    """Make a policy's model card: training data, success rates, limits, and how to load and cite the policy.
 
     Args:
-        policy: its file, or the name of a shipped policy.
-        result: an evaluation of the policy; None for no success rates, or a shipped policy's own evaluation.
-        repo: the Hub repository to load it from, such as "me/my-policy"; "" for a file.
+        policy: the policy's file, or the name of a shipped policy.
+        result: an evaluation of the policy; None for the stored result of a shipped policy, otherwise no success rates.
+        repo: the Hub repository that the card loads the policy from, such as "me/my-policy"; "" to load from the file.
 
     Returns:
-        ``huggingface_hub.ModelCard``; ``str(card)`` is Markdown, and ``card.save("README.md")`` writes it.
+        A ``huggingface_hub.ModelCard``; ``str(card)`` is Markdown, and ``card.save("README.md")`` writes a file.
 
     Raises:
-        ValueError: the result has tasks that the policy does not know.
+        ValueError: the result contains tasks that are unknown to the policy.
         ImportError: the extra ``[hub]`` is not installed.
 
     Example:
@@ -67,14 +67,14 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
 
 
 def _own_result(policy: AnyPath, result: EvaluationResult | None) -> EvaluationResult | None:
-    """Return the given result, or else a shipped policy's own."""
+    """Return ``result``; if it is None, return the stored result of a shipped policy, or None for any other policy."""
     shipped = shipped_policy(policy)
     return EvaluationResult.load(shipped.with_suffix(".json")) if result is None and shipped is not None else result
 
 
 @typed
 def describe_policy(policy: AnyPath, result: EvaluationResult | None = None, *, repo: str = "") -> str:
-    """Return the text of :func:`policy_card` as Markdown. It has the same arguments, but needs no extra.
+    """Return the text of :func:`policy_card` as Markdown. The arguments are the same, but no extra is required.
 
     Example:
         >>> describe_policy("few-shot-mt50").splitlines()[0]
@@ -84,7 +84,7 @@ def describe_policy(policy: AnyPath, result: EvaluationResult | None = None, *, 
     description, demonstrated = read_description(policy), demonstrated_tasks(policy)
     tasks = _tasks(description["actor"])
     if result is not None and tasks and (unknown := set(result.config["tasks"]) - tasks):
-        raise ValueError(f"result must only have tasks that the policy knows, not {', '.join(sorted(unknown))}")
+        raise ValueError(f"result contains tasks that the policy does not know: {', '.join(sorted(unknown))}")
     limits = [f"- {counted(len(tasks - demonstrated), 'task')} had no demonstrations."] * bool(tasks - demonstrated)
     rates = {} if result is None else result.success_once
     if weak := [f"{task} ({rate:.2f})" for task, rate in rates.items() if rate is not None and rate < 0.8]:
@@ -104,7 +104,7 @@ def describe_policy(policy: AnyPath, result: EvaluationResult | None = None, *, 
 
 
 def _tasks(node: Any) -> set[str]:
-    """Return the tasks in a module's description: those of its plans, and of the options of its parts."""
+    """Return the tasks that a module's description names in its plans or in its submodules' options."""
     if isinstance(node, list):
         return set().union(*map(_tasks, node))
     if not isinstance(node, dict):
@@ -146,7 +146,7 @@ def _success(result: EvaluationResult) -> str:
     rows = "".join(f"| {task} | {rate:.2f} |\n" for task, rate in result.success_once.items() if rate is not None)
     return (
         f"{counted(config['episodes_per_task'], 'episode')} of each task, seed {config['seed']}, action noise "
-        f"{config['noise_scale']}, success at any step; one policy of one training seed: {solved} of {runs} episodes, "
+        f"{config['noise_scale']}, success at any step, one training seed: {solved} of {runs} episodes succeeded, "
         f"95 % interval {low:.3f} to {high:.3f} (Wilson).\n\n"
         f"| task | success |\n|---|---|\n{rows}| **mean** | **{result.mean_success:.3f}** |"
     )
@@ -156,9 +156,9 @@ def _success(result: EvaluationResult) -> str:
 def save_pretrained(
     policy: AnyPath, folder: AnyPath, result: EvaluationResult | None = None, *, repo: str = ""
 ) -> None:
-    """Write a policy and its card to a folder, as ``policy.safetensors`` and ``README.md``; earlier ones are replaced.
+    """Write a policy and its model card to a folder as ``policy.safetensors`` and ``README.md``, replacing both files.
 
-    The other arguments and the errors are those of :func:`policy_card`.
+    See :func:`policy_card` for the other arguments and the errors.
 
     Example:
         >>> import os, tempfile
@@ -182,18 +182,19 @@ def push_to_hub(
     private: bool = False,
     token: str | None = None,
 ) -> str:
-    """Upload a policy and its card, see :func:`policy_card`, to the Hugging Face Hub; return the URL of the commit.
+    """Upload a policy and its model card to the Hugging Face Hub, and return the URL of the commit.
 
     Args:
-        repo: the repository, such as "me/my-policy"; it is created if necessary.
-        private: create it as a private repository.
-        token: an access token; None for the one that ``hf auth login`` stored.
+        policy, result: see :func:`policy_card`.
+        repo: the repository, such as "me/my-policy"; created if it does not exist.
+        private: make a newly created repository private.
+        token: an access token; None for the token stored by ``hf auth login``.
     """
     api = hub().HfApi(token=token)
     with TemporaryDirectory() as folder:
         save_pretrained(policy, folder, result, repo=repo)
         api.create_repo(repo, private=private, exist_ok=True)
-        return str(api.upload_folder(repo_id=repo, folder_path=folder, commit_message="Add a policy of lw_torchrl"))
+        return str(api.upload_folder(repo_id=repo, folder_path=folder, commit_message="Add a lw_torchrl policy"))
 
 
 @typed
@@ -203,11 +204,12 @@ def from_pretrained(source: AnyPath, *, revision: str | None = None, text_encode
     Args:
         source: a folder that :func:`save_pretrained` wrote, or a repository such as "me/my-policy".
         revision: the repository's branch, tag or commit.
-        text_encoder: as for :func:`~lw_torchrl.load_actor`, whose errors it raises too.
+        text_encoder: see :func:`~lw_torchrl.load_actor`.
 
     Raises:
-        FileNotFoundError: the folder holds no policy; or there is no such folder and no such repository.
+        FileNotFoundError: the folder contains no policy, or neither a folder nor a repository of that name exists.
         ImportError: the extra ``[hub]`` is not installed.
+        ValueError: ``source`` is a file; or see :func:`~lw_torchrl.load_actor`.
     """
     if Path(source).is_dir():
         return load_actor(Path(source) / POLICY_FILE, text_encoder=text_encoder)
@@ -216,6 +218,6 @@ def from_pretrained(source: AnyPath, *, revision: str | None = None, text_encode
     try:
         path = hub().hf_hub_download(str(source), POLICY_FILE, revision=revision)
     except (OSError, ValueError) as error:
-        message = f"source: there is no folder {str(source)!r}, and no such policy on the Hub: {error}"
+        message = f"source: neither a folder nor a Hub repository {str(source)!r} with a policy exists: {error}"
         raise FileNotFoundError(message) from error
     return load_actor(path, text_encoder=text_encoder)

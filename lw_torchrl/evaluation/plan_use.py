@@ -1,4 +1,4 @@
-"""PlanUse: which steps of a plan are true and chosen in which states, and where failed episodes get stuck."""
+"""PlanUse: measure how often each plan step's condition holds and is chosen, and where failed episodes get stuck."""
 
 from __future__ import annotations
 
@@ -19,23 +19,26 @@ from lw_torchrl.language.plans import AnyPlans, as_plans
 from lw_torchrl.language.tasks import resolve_tasks
 from lw_torchrl.suites.metaworld.experts import ExpertActor
 
-_AFTER = 20  # steps after the first success that still count, as in training data
-_A_WHILE = 5  # number of states in which a step must be active to count as reached
-_LATE = 50  # the last steps of a failed episode, in which it makes no progress
+_AFTER = 20  # time steps after the first success that still count, as in training data
+_A_WHILE = 5  # number of states in which a plan step must be active to count as reached
+_LATE = 50  # number of last states of a failed episode, in which the episode makes no progress
 
 
 @dataclass
 class TaskUse:
-    """The use of one task's plan in all its episodes, each up to 20 steps after its first success."""
+    """Statistics of one task's plan over all episodes of the task, each up to 20 time steps after the first success.
+
+    If no skill weights were recorded, ``chosen`` is empty; ``stuck`` and ``furthest`` then count true conditions.
+    """
 
     states: int  # number of states
-    true: list[float]  # per step of the plan, the share of states in which its condition held
-    chosen: list[float]  # per step, the share of states in which it had the largest weight; empty without weights
-    covered: float  # the share of states before the first success in which a condition held
-    gaps: list[tuple[int, int, int]]  # stretches in which no condition held: episode, first and last step
+    true: list[float]  # for each plan step, the fraction of states in which the condition held
+    chosen: list[float]  # for each plan step, the fraction of states in which its skill weight was the largest
+    covered: float  # the fraction of states before the first success in which some condition held
+    gaps: list[tuple[int, int, int]]  # intervals in which no condition held: episode, first and last time step
     num_true: float  # the median number of conditions that held before the first success
-    stuck: list[int]  # per step, the failed episodes in which it was chosen (or true) most in the last 50 steps
-    furthest: list[int]  # per step, the failed episodes in which it was the last one chosen (or true) in 5 states
+    stuck: list[int]  # for each plan step, the number of failed episodes that chose it most in the last 50 states
+    furthest: list[int]  # for each plan step, the number of failed episodes in which it was the last chosen 5 times
     failed: int  # number of failed episodes
 
     def to_json(self) -> dict[str, Any]:
@@ -46,12 +49,12 @@ class _Episode(NamedTuple):
     number: int
     qaf: Tensor
     chosen: Tensor | None
-    before: int  # states before the first success
+    before: int  # number of states before the first success
     success: bool
 
 
 class PlanUse:
-    """Collect how plans are used in finished episodes: pass it to :func:`evaluate` as ``on_episode``."""
+    """A collector of statistics on how plans are used; pass an instance to :func:`evaluate` as ``on_episode``."""
 
     def __init__(self, plans: AnyPlans) -> None:
         self.plans = as_plans(plans)
@@ -67,12 +70,15 @@ class PlanUse:
         self._episodes.setdefault(episode.task, []).append(kept)
 
     def tasks(self) -> dict[str, TaskUse]:
-        """Return the use of each task's plan."""
+        """Return the statistics of each task's plan."""
         return {task: _sum(episodes) for task, episodes in sorted(self._episodes.items())}
 
 
 def where_stuck(active: Tensor, window: int) -> tuple[int, int]:
-    """Return the step that was active most often in the last ``window`` states, and the last one active for a while."""
+    """Return the plan step active most often in the last ``window`` states, and the last plan step active for 5 states.
+
+    ``active`` (T, S) is 1 where a plan step is active.
+    """
     states = active[-window:].sum(0)
     reached = (states >= states.max().clamp(1, _A_WHILE)).nonzero()
     return int(states.argmax()), int(reached[-1]) if len(reached) else 0
@@ -109,7 +115,7 @@ def _sum(episodes: list[_Episode]) -> TaskUse:
 def expert_use(
     plans: AnyPlans, tasks: str | Iterable[str] | None = None, *, episodes_per_task: int = 10, seed: int = 0
 ) -> dict[str, TaskUse]:
-    """Return how often the plans' conditions hold in the states that Meta-World's experts visit, without action noise.
+    """Measure how often the plans' conditions hold in the states that Meta-World's experts visit without action noise.
 
     Example:
         >>> import lw_torchrl as lw

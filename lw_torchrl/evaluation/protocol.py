@@ -49,39 +49,40 @@ def evaluate(
 ) -> EvaluationResult:
     """Run episodes 0 to k - 1 of each task and return their results.
 
-    The actor runs in eval mode with deterministic exploration. The executed action is its action plus
-    N(0, noise_scale²) on each of its entries, clipped. The result depends neither on ``num_envs`` nor on the other
+    The actor runs in eval mode with deterministic exploration. The executed action is the actor's action plus
+    N(0, noise_scale²) noise on each entry, clipped. A task's results depend neither on ``num_envs`` nor on the other
     tasks: the actor runs on blocks of a fixed number of rows, and all randomness comes from (task, seed, episode).
 
     Args:
-        actor: reads ``observation``, ``task_id`` and, if it has plans, ``qaf``; writes ``action`` (N, 4) float32.
-        tasks: as for :func:`resolve_tasks`; for an actor that knows its tasks, some of them.
-        plans: the plans whose conditions are answered; None for the actor's own.
-        episodes_per_task: k.
+        actor: a policy that reads ``observation``, ``task_id`` and, if it has plans, ``qaf``, and writes ``action``
+            (N, 4) float32.
+        tasks: see :func:`resolve_tasks`; if the actor lists its tasks, a subset of that list.
+        plans: the plans whose conditions are evaluated into ``qaf``; None for the actor's plans.
+        episodes_per_task: the number k of episodes.
         seed: random seed (use a different one than for the demonstrations).
         noise_scale: standard deviation of the action noise.
-        num_envs: environments stepped together, at least the number of tasks; by default about 256.
-        stop_at_success: end an episode at its first success; success at the end and return are then None.
-        record_actions: keep each episode's executed actions, (T, 4) float32.
-        reward: "sparse" or "dense", summed in the return.
-        max_steps, suite, engine, num_threads: as for :class:`LanguageWorldEnv`.
-        progress: show a progress bar if it takes longer than a second.
-        also_record: more keys to pass to ``on_episode``: "qaf", "skill_weights".
-        on_episode: called with each finished episode, a named tuple of ``task``, ``episode`` (its index) and ``steps``,
-            a TensorDict of batch (T,): ``action``, ``("next", "success")``, ``("next", "reward")``, ``also_record``.
-        device: the actor's device, to which it is moved: "cpu", "cuda", "cuda:1", "mps" or "auto"; None leaves it where
-            it is. The environment and its queries are always on the CPU.
-        evaluator: a module, function or transform in front of the actor that answers the conditions, such as
-            :class:`~lw_torchrl.transforms.CorruptQAF`; None for exact answers at every step.
-        attribute: find the causes of failed episodes, see :func:`attribute_failures`: ``.failures`` of the result.
+        num_envs: number of environments stepped together (at least the number of tasks); None for about 256.
+        stop_at_success: end an episode at its first success; ``success_at_end`` and ``episode_return`` are then None.
+        record_actions: keep the executed actions of each episode, (T, 4) float32.
+        reward: the reward summed in the return, "sparse" or "dense".
+        max_steps, suite, engine, num_threads: see :class:`LanguageWorldEnv`.
+        progress: show a progress bar if the evaluation takes longer than a second.
+        also_record: more keys to pass to ``on_episode``, for example "qaf" or "skill_weights".
+        on_episode: called with each finished episode, a named tuple of ``task``, ``episode`` (index) and ``steps``, a
+            TensorDict of batch (T,): ``action``, ``("next", "success")``, ``("next", "reward")``, ``also_record``.
+        device: device to move the actor to: "cpu", "cuda", "cuda:1", "mps" or "auto"; None does not move the actor.
+            The environment and its queries always run on the CPU.
+        evaluator: a module, function or transform that runs before the actor and answers the conditions, such as
+            :class:`~lw_torchrl.transforms.CorruptQAF`; None for exact answers at every time step.
+        attribute: find the causes of failed episodes with :func:`attribute_failures`, and store them in ``failures``.
         reference: trusted plans for the same tasks, with which failed episodes are re-run.
 
     Warns:
-        UserWarning: a simulation became unstable, which ends its episode; the actor cannot follow the reference.
+        UserWarning: a simulation became unstable, which ends the episode; or the actor cannot follow the reference.
 
     Raises:
-        ValueError: the plans differ from the actor's, a task has no plan or is not among the actor's, nothing writes a
-            key in ``also_record``, or an action is NaN.
+        ValueError: the plans differ from the actor's plans, a task has no plan or is unknown to the actor, neither
+            environment nor policy writes a key in ``also_record``, or an action is NaN.
 
     Example:
         >>> import lw_torchrl as lw
@@ -98,11 +99,11 @@ def evaluate(
         answered.require(names)
     known = tasks_of(actor)
     if known is not None and (other := ", ".join(task for task in names if task not in known)):
-        raise ValueError(f"tasks must be among the actor's, {', '.join(known)}; the actor does not know {other}")
+        raise ValueError(f"tasks must be among the actor's tasks ({', '.join(known)}), got {other}")
     if attribute and answered is None:
-        raise ValueError("attribute=True needs plans: pass plans, or an actor that has plans")
+        raise ValueError("attribute=True requires plans: pass plans, or an actor that has plans")
     if reference is not None and not attribute:
-        raise ValueError("reference is only used with attribute=True, which re-runs failed episodes with it")
+        raise ValueError("reference requires attribute=True, which re-runs failed episodes with the reference plans")
     if isinstance(also_record, str):
         raise TypeError(f"also_record must be a list of keys, got the string {also_record!r}")
     for key in also_record:
@@ -142,7 +143,7 @@ def evaluate(
     config |= {"stop_at_success": stop_at_success, "reward": reward}
     failures = None
     if attribute and answered is not None:
-        # Episodes finish in an order that depends on the number of environments.
+        # Sort the episodes, because the order in which they finish depends on the number of environments.
         failed.sort(key=lambda episode: episode[:2])
         parts: dict[str, Any] = {"actor": actor, "reference": reference, "evaluator": evaluator}
         failures = tuple(attribute_failures(failed, answered, **parts, **env_options, **run))

@@ -1,4 +1,4 @@
-"""EvaluationResult: the outcome of an evaluation, episode by episode, as JSON."""
+"""EvaluationResult: the outcome of each episode of an evaluation, saved as JSON."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ _CONFIG = {"episodes_per_task": Count, "max_steps": Count, "seed": int, "noise_s
 @typed_fields
 @dataclass(frozen=True)
 class EpisodeResult:
-    """One evaluated episode; ``episode_seed(task, seed, episode)`` is its seed."""
+    """The outcome of one episode, which was seeded with ``episode_seed(task, seed, episode)``."""
 
     task: str
     episode: Natural
-    success: bool  # at any step
-    first_success: Count | None  # the first successful step, from 1
-    success_at_end: bool | None  # at the last step; None if the episode was stopped at its success
-    episode_return: Finite | None  # the sum of the rewards; None if the episode was stopped
-    actions: Tensor | None = field(default=None, compare=False, repr=False)  # (T, 4) as executed; not saved
+    success: bool  # whether any time step was successful
+    first_success: Count | None  # the first successful time step, counted from 1
+    success_at_end: bool | None  # whether the last time step was successful; None if stopped at the first success
+    episode_return: Finite | None  # the sum of the rewards; None if the episode was stopped at the first success
+    actions: Tensor | None = field(default=None, compare=False, repr=False)  # executed actions (T, 4); not saved
 
 
 @dataclass(frozen=True)
@@ -44,8 +44,8 @@ class EvaluationResult:
 
     config: dict[str, Any]  # tasks, episodes_per_task, seed, noise_scale, stop_at_success, max_steps
     episodes: tuple[EpisodeResult, ...]
-    origin: dict[str, Any] = field(default_factory=dict, compare=False)  # provenance, as recorded by save
-    failures: tuple[Failure, ...] | None = None  # why each failed episode failed; None unless they were attributed
+    origin: dict[str, Any] = field(default_factory=dict, compare=False)  # provenance, recorded by save
+    failures: tuple[Failure, ...] | None = None  # why each failed episode failed; None without attribution
 
     def _by_task(self, value: Callable[[list[EpisodeResult]], float | None]) -> dict[str, float | None]:
         episodes: dict[str, list[EpisodeResult]] = {}
@@ -55,22 +55,22 @@ class EvaluationResult:
 
     @cached_property
     def success_once(self) -> dict[str, float | None]:
-        """Task to the fraction of its episodes that succeeded at any step: the main success rate."""
+        """The fraction of each task's episodes that succeeded at any time step: the main success rate."""
         return self._by_task(lambda episodes: sum(e.success for e in episodes) / len(episodes))
 
     @cached_property
     def success_at_end(self) -> dict[str, float | None]:
-        """Task to the fraction of its episodes that were successful at the last step; None if stopped early."""
+        """The fraction of each task's episodes that were successful at the last time step; None if stopped early."""
         return self._by_task(lambda episodes: _mean([e.success_at_end for e in episodes]))
 
     @cached_property
     def first_success(self) -> dict[str, float | None]:
-        """Task to the mean first successful step over its successful episodes; None if it has none."""
+        """The mean first successful time step over each task's successful episodes; None if there are none."""
         return self._by_task(lambda episodes: _mean([e.first_success for e in episodes if e.success]))
 
     @cached_property
     def mean_return(self) -> dict[str, float | None]:
-        """Task to the mean return; None if episodes were stopped early."""
+        """The mean return of each task's episodes; None if episodes were stopped early."""
         return self._by_task(lambda episodes: _mean([e.episode_return for e in episodes]))
 
     @property
@@ -87,12 +87,12 @@ class EvaluationResult:
         plans: str | None = None,
         evaluator: AnyPath | None = None,
     ) -> None:
-        """Write the result as JSON, with date and versions; an earlier file is replaced whole.
+        """Write the result as JSON with the date and package versions, atomically replacing an existing file.
 
         Args:
-            path: the file.
-            checkpoint, evaluator: the files of the actor and its evaluator, to record their paths and SHA-256.
-            plans: the fingerprint of the plans.
+            path: the file to write.
+            checkpoint, evaluator: the files of the actor and the evaluator, whose paths and SHA-256 are recorded.
+            plans: the fingerprint of the plans, which is recorded.
         """
         now = {"date": datetime.now(UTC).isoformat(timespec="seconds"), "versions": package_versions()}
         origin: dict[str, Any] = dict(self.origin) or now
@@ -111,7 +111,7 @@ class EvaluationResult:
 
     @classmethod
     def load(cls, path: AnyPath) -> EvaluationResult:
-        """Read a result; raise :class:`ValueError` if the file is damaged or not a result of this version."""
+        """Read a result file; raise :class:`ValueError` if the file is corrupted or not a result of this version."""
         try:
             content = read_json(path, "the result")
             if (content["format"], content["version"]) != (FORMAT, FORMAT_VERSION) or content["version"] is True:
@@ -127,10 +127,11 @@ class EvaluationResult:
             result = cls(config, episodes, check_value("origin", content.get("origin", {}), dict), failures)
             result._check()
             if set(content["success_once"]) != {*tasks}:
-                raise ValueError("the tasks of success_once must be those of config")
+                raise ValueError("success_once and config must have the same tasks")
             return result
         except FileNotFoundError:
-            raise FileNotFoundError(f"path: no result file {str(path)!r}; evaluate(...).save(path) writes it") from None
+            hint = "write a result with evaluate(...).save(path)"
+            raise FileNotFoundError(f"path: no result file {str(path)!r}; {hint}") from None
         except (ValueError, KeyError, TypeError) as error:
             expected = f"result of {FORMAT} version {FORMAT_VERSION}"
             reason = f"{type(error).__name__}: {str(error)[:500]}"
@@ -145,18 +146,19 @@ class EvaluationResult:
                 raise ValueError(f"episodes: success, first_success and success_at_end must agree, got {episode}")
         counts = Counter(task for task, _ in {(episode.task, episode.episode) for episode in self.episodes})
         if not tasks or counts != dict.fromkeys(tasks, number) or len(self.episodes) != number * len(tasks):
-            raise ValueError(f"episodes must be {number} different ones of each task, as in config")
+            expected = f"{number} distinct episodes of each task in config"
+            raise ValueError(f"episodes must hold {expected}, got {dict(counts)}")
         if self.failures is None:
             return
         failed = sorted((episode.task, episode.episode) for episode in self.episodes if not episode.success)
         if failed != sorted((failure.task, failure.episode) for failure in self.failures):
-            raise ValueError("failures must be one for each episode without success")
+            raise ValueError("failures must hold exactly one Failure for each episode without success")
         for failure in self.failures:
             if failure.seed != self.config["seed"] or failure.at >= last:
-                raise ValueError(f"failures: seed and at must fit config, got {failure.seed} and {failure.at}")
+                raise ValueError(f"failures: seed and at must agree with config, got {failure.seed} and {failure.at}")
 
     def table(self) -> str:
-        """Return the rates per task as text in columns."""
+        """Return a text table of each task's success rates and mean first successful time step."""
         lines = [f"{'task':28} {'any step':>8} {'at end':>8} {'first step':>10}"]
         ends, firsts = self.success_at_end, self.first_success
         rows = [(task, once, ends[task], firsts[task]) for task, once in self.success_once.items()]
@@ -166,14 +168,14 @@ class EvaluationResult:
         return "\n".join(lines)
 
     def failure_counts(self) -> dict[str, Counter[str]]:
-        """Return the number of failures of each cause, by task; raise :class:`ValueError` if none were attributed."""
+        """Return, for each task, the number of failures with each cause; raise ValueError without attribution."""
         if self.failures is None:
-            raise ValueError("the result has no failures: they are attributed by evaluate(..., attribute=True)")
+            raise ValueError("the result has no failures; run evaluate(..., attribute=True) to attribute failures")
         tasks = self.config["tasks"]
         return {task: Counter(failure.cause for failure in self.failures if failure.task == task) for task in tasks}
 
     def failure_table(self) -> str:
-        """Return the numbers of failed episodes as text: a row for each task, a column for each cause."""
+        """Return a text table of the number of failed episodes, with one row per task and one column per cause."""
         counts, number = self.failure_counts(), self.config["episodes_per_task"]
         rows = [(task, causes, number) for task, causes in counts.items()]
         if len(rows) > 1:
@@ -188,7 +190,7 @@ class EvaluationResult:
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Return the 95 % Wilson score interval of a success rate over the episodes of one policy."""
+    """Return the 95 % Wilson score interval for a success rate over the episodes of one policy."""
     rate, z = successes / trials, 1.96
     center = (rate + z**2 / (2 * trials)) / (1 + z**2 / trials)
     half = z / (1 + z**2 / trials) * math.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2))

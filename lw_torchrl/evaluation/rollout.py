@@ -1,4 +1,4 @@
-"""The episode runner: exactly the requested episodes of an actor, for evaluation, re-runs and recordings."""
+"""The episode runner: run exactly the requested episodes with an actor, for evaluation, re-runs and recordings."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, nullcontext
@@ -22,7 +22,7 @@ from lw_torchrl.modules.policy import plans_of, transform_of
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
-ROWS = 256  # environments stepped together; more are hardly cheaper per row, and cost memory
+ROWS = 256  # environments stepped together; more would hardly reduce the cost per row, and need more memory
 Acts = Callable[[TensorDictBase], TensorDictBase]
 
 
@@ -47,23 +47,23 @@ def rollout(
     device: str | torch.device | None = None,
     progress: bool = False,
 ) -> None:
-    """Run each listed episode once, in eval mode and without exploration, and pass it to ``on_episode`` as it finishes.
+    """Run each listed episode once, in eval mode and without exploration, and pass each one to ``on_episode``.
 
-    Arguments without a description are those of :func:`evaluate`, which also describes what an episode depends on.
+    See :func:`evaluate` for the arguments that are not listed here, and for the seeding of episodes.
 
     Args:
         label: title of the progress bar.
-        tasks: name to task.
-        episodes: name of a task to indices of its episodes.
-        env_options: further arguments of :class:`LanguageWorldEnv`: ``seed``, ``suite``, ``max_steps``.
-        keys: keys to record in each step; :class:`ValueError` if neither environment nor policy writes one.
-        optional: more keys, or a function from the environment to them, recorded if they are written.
-        after_success: end an episode N steps after its first success; None for never.
-        place: a key for the index of each row's episode in its task's list.
+        tasks: a mapping from names to tasks.
+        episodes: a mapping from task names to episode indices.
+        env_options: further arguments of :class:`LanguageWorldEnv`, such as ``seed``, ``suite`` and ``max_steps``.
+        keys: keys to record in each time step; :class:`ValueError` if neither environment nor policy writes a key.
+        optional: keys to record if they are written, or a function that maps the environment to such keys.
+        after_success: end an episode N time steps after its first success; None to run every episode to the end.
+        place: a key under which to write the position of each row's episode in ``episodes[task]``.
         first: a transform that runs before all others.
-        wrap: called with the actor; returns the policy that acts instead.
+        wrap: a function that maps the actor to the policy that acts instead.
     """
-    most = len(tasks) * max(map(len, episodes.values()))  # more rows would be idle
+    most = len(tasks) * max(map(len, episodes.values()))  # additional rows would be idle
     rows = min(most, len(tasks) * max(1, ROWS // len(tasks))) if num_envs is None else min(num_envs, most)
     base = LanguageWorldEnv(list(tasks.values()), num_envs=rows, strict=True, **env_options)
     env = _with_transforms(base, first, transform_of(actor, plans), _transform_of_evaluator(evaluator))
@@ -96,21 +96,21 @@ def _with_transforms(base: EnvBase, *transforms: Transform | None) -> EnvBase:
 
 
 def _transform_of_evaluator(evaluator: Any) -> Transform | None:
-    """Return the transform to run after the exact answers: the evaluator itself, or the transform that it needs."""
+    """Return the transform that runs after the exact answers: the evaluator, or a transform that it requires."""
     if isinstance(evaluator, Transform):
-        return evaluator.clone()  # a transform belongs to one environment
+        return evaluator.clone()  # TorchRL does not allow two environments to share a transform
     return evaluator.transform() if isinstance(evaluator, QueryEvaluator) else None
 
 
 def _written(env: EnvBase) -> set[NestedKey]:
-    """Return the keys that an environment writes, before a step and after it."""
+    """Return the keys that an environment writes, at the root and under "next"."""
     specs = env.full_observation_spec, env.full_reward_spec, env.full_done_spec
     names = {unravel_key(key) for spec in specs for key in spec.keys(True, True)}
     return names | {unravel_key(("next", key)) for key in names}
 
 
 def _checked(policy: Acts, env: EnvBase, keys: Iterable[NestedKey]) -> Acts:
-    """Return ``policy`` with its action checked, and at the first call that it and the environment write ``keys``."""
+    """Wrap ``policy`` to check every action and, at the first call, that policy or environment writes each key."""
     by_env, size = _written(env), env.action_spec.shape[-1]
     unseen = [key for key in keys if key not in by_env]
 
@@ -127,7 +127,7 @@ def _checked(policy: Acts, env: EnvBase, keys: Iterable[NestedKey]) -> Acts:
 
 
 class EvaluatorInFront(nn.Module):
-    """A policy after an evaluator, whose answers replace ``qaf``."""
+    """A policy that runs an evaluator first, so that the evaluator's answers replace ``qaf``."""
 
     def __init__(self, evaluator: Acts, actor: Acts) -> None:
         super().__init__()
@@ -138,21 +138,21 @@ class EvaluatorInFront(nn.Module):
 
 
 def actor_plans(actor: Any, plans: AnyPlans | None) -> Plans | None:
-    """Return the plans whose conditions are answered: ``plans``, or the actor's own; different ones are an error."""
+    """Return the plans whose conditions are evaluated: ``plans`` or the actor's; raise ValueError if both differ."""
     own = plans_of(actor)
     if plans is None:
         return own
     answered = as_plans(plans)
     if own is not None and (different := answered.differences(own)):
         how = "pass plans=None, or evaluate actor.with_plans(plans)"
-        raise ValueError(f"plans differ from the actor's own for {', '.join(different)}; {how}")
+        raise ValueError(f"plans differ from the actor's plans for {', '.join(different)}; {how}")
     return own or answered
 
 
 def suite_tasks(
     tasks: TaskList, plans: Plans | None, suite: str | Suite | None = None
 ) -> tuple[Suite, dict[str, Task]]:
-    """Return the suite, and the tasks by name; a name that the suite lacks stands for the task of the plan."""
+    """Return the suite and a dict of tasks by name; a name that is not in the suite maps to the plan's own task."""
     tasks = listed_tasks(tasks)
     chosen = find_suite(tasks, suite)
     own = {} if plans is None else {plan.task: plan.definition for plan in plans.values()}

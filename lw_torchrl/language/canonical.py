@@ -1,4 +1,4 @@
-"""canonical_plan: parse a free-form plan into verbs, objects and targets, and complete it if it says too little."""
+"""Canonical plans: parse a free-form plan into verbs, objects and targets, and complete an underspecified plan."""
 
 from __future__ import annotations
 
@@ -32,31 +32,31 @@ from lw_torchrl.language.tasks import (
 )
 
 MIN_CONFIDENCE = 0.75
-"""The confidence from which a plan keeps its own conditions."""
+"""The minimum confidence at which a plan keeps its own conditions."""
 Source = Literal["plan", "completed", "fallback"]
 _SOURCES = {"plan": "its own steps", "completed": "completed", "fallback": "replaced by the fallback plan"}
 
 
 @dataclass(frozen=True)
 class CanonicalReport:
-    """How :func:`canonical_plan` reads a plan.
+    """A report on how :func:`canonical_plan` parses a plan.
 
-    The source is "plan" if the plan keeps its own steps. It is "completed" if they do not cover the typical states: the
-    plan keeps its motion, objects and direction, with standard conditions. It is "fallback" if the plan has no motion
-    and becomes the fallback plan.
+    ``source`` is "plan" if the plan keeps its own steps. ``source`` is "completed" if these steps do not cover the
+    typical states: the plan keeps its motion, objects and direction, but gets standard conditions. ``source`` is
+    "fallback" if the plan has no motion and is replaced by the fallback plan.
     """
 
     written: ConditionalPlan
     plan: ConditionalPlan  # the canonical form
     source: Source
-    read: tuple[PlanStep, ...]  # the plan's own steps as parsed, even if ``plan`` has others
+    read: tuple[PlanStep, ...]  # the plan's own steps as parsed, even if ``plan`` has different steps
     left_out: tuple[str, ...]  # the skills that could not be parsed
 
     def notes(self) -> list[dict[str, Any]]:
-        """Return the result for each written step, then the steps that replace them, if any, as JSON.
+        """Return a JSON row for each parsed step, each step that replaces the plan's own, and each step left out.
 
-        The keys are ``written``, None for an added step; ``skill``, ``verb``, ``moved``, ``target`` and ``condition``,
-        None for a step that was left out; ``confidence``; and ``seen``, whether policies see the step.
+        The keys are ``written`` (None for an added step); ``skill``, ``verb``, ``moved``, ``target`` and ``condition``
+        (None for a step that was left out); ``confidence``; and ``seen``, whether policies see the step.
         """
 
         def note(step: PlanStep, seen: bool) -> dict[str, Any]:
@@ -75,18 +75,18 @@ class CanonicalReport:
 
 @typed
 def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> ConditionalPlan:
-    """Parse a free-form plan and return it with a role for each step, completed if it says too little.
+    """Convert a free-form plan to a plan with a role for each step, and complete an underspecified plan.
 
-    Each step gets a verb, an object that moves, a target and a direction (:class:`StepRole`), from its words, its
-    condition and the task's objects alone. Where the hand acts on an object with a named point, the point replaces the
-    object. A plan whose conditions miss typical states, or that closes the gripper around nothing, keeps its motion,
-    objects and direction, and gets standard conditions. A plan without any motion becomes :func:`fallback_plan`. A plan
-    with roles is not parsed again.
+    Each step gets a verb, an object that moves, a target and a direction (:class:`StepRole`), which are inferred from
+    the step's words, its condition and the task's objects only. Where the hand touches an object with a named point,
+    the point replaces the object. A plan whose conditions miss typical states, or that moves an object without grasping
+    it first, keeps its motion, objects and direction, but gets standard conditions. A plan without any motion is
+    replaced by :func:`fallback_plan`. A plan that already has roles is not parsed again.
 
     Args:
-        plan: a plan in any words.
-        fallback: append the steps of the fallback plan, whose roles have ``fallback=True``. Policies try them when the
-            plan makes no progress. Nothing is appended to a plan that has a fallback, or that is the fallback plan.
+        plan: a plan in free-form English.
+        fallback: append the steps of the fallback plan, with ``fallback=True`` in their roles. Policies try these steps
+            when the plan makes no progress. A plan that has a fallback, or is the fallback plan, is unchanged.
 
     Example:
         >>> import lw_torchrl as lw
@@ -96,7 +96,7 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
         >>> [step.role.verb for step in plan.steps]
         ['approach', 'descend', 'close', 'carry']
 
-    Source: ours; the paper encodes the words of a skill as they are.
+    Source: ours; the paper encodes each skill text without parsing it.
     """
     if any(step.role is None for step in plan.steps):
         plan = explain_canonical(plan).plan
@@ -111,13 +111,13 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
 
 @typed
 def canonical_plans(plans: AnyPlans, fallback: bool = False) -> Plans:
-    """Apply :func:`canonical_plan` to each of ``plans``."""
+    """Apply :func:`canonical_plan` to each plan in ``plans``."""
     return Plans([canonical_plan(plan, fallback) for plan in as_plans(plans).values()])
 
 
 @typed
 def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
-    """Report how :func:`canonical_plan` reads a plan, step by step.
+    """Report step by step how :func:`canonical_plan` parses a plan.
 
     Example:
         >>> import lw_torchrl as lw
@@ -148,9 +148,9 @@ def explain_canonical(plan: ConditionalPlan) -> CanonicalReport:
 
 
 def fallback_plan(task: str | Task) -> ConditionalPlan:
-    """Return the generic plan for a task: grasp the first object and move it to the goal.
+    """Build the generic plan for a task: grasp the first object and move that object to the goal.
 
-    In a task without an object the gripper moves to the goal.
+    In a task without objects, the plan moves the gripper to the goal.
     """
     task = get_task(task)
     held = first_object(task)
@@ -159,7 +159,7 @@ def fallback_plan(task: str | Task) -> ConditionalPlan:
         return ConditionalPlan(task.name, steps, task)
     names = whole_objects(task)
     goal = next((name for name in names if is_goal(task, name)), None)
-    # Without an object and without a named goal, the first place is the target.
+    # Without an object and without a named goal, the first named place is the target.
     near, target = _gripper_is("near", goal or names[0]), GOAL if goal else names[0]
     approach = _step(_negated(near), StepRole("reach", GRIPPER, target, "reach"))
     return ConditionalPlan(task.name, (approach, _step(near, StepRole("hold", GRIPPER, target, "reach"))), task)
@@ -183,7 +183,7 @@ def _negated(query: Query) -> Query:
 
 
 def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> tuple[PlanStep, ...]:
-    """Return the steps that could be parsed, with their roles in the plan."""
+    """Return the steps that could be parsed, each with its role."""
     task = plan.definition
     pairs = [(step, each) for step, each in zip(plan.steps, parsed, strict=True) if each and each.moved and each.target]
     read = [each for _, each in pairs]
@@ -192,7 +192,7 @@ def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> t
     steps = []
     for number, (step, each) in enumerate(pairs):
         verb, manner, direction = each.verb, _manner(each), each.direction
-        # The purpose is the next step that moves something, or this one; else the last one before it.
+        # The purpose is the next step (or this one) that moves an object; otherwise the last such step before.
         purpose = next((other for other in (*read[number:], *read[:number][::-1]) if other.verb not in BY_HAND), None)
         if verb in BY_HAND:
             verb, manner, direction = _approach(each, purpose if not grasping else None)
@@ -206,7 +206,7 @@ def _with_roles(plan: ConditionalPlan, parsed: Sequence[ParsedStep | None]) -> t
 
 
 def _approach(each: ParsedStep, purpose: ParsedStep | None) -> tuple[Verb, Manner, Direction | None]:
-    """Return the verb, manner and direction of a hand that approaches for a ``purpose``; None stands for a grasp."""
+    """Return (verb, manner, direction) of a step that prepares for the step ``purpose``; None stands for a grasp."""
     verb = "descend" if each.verb == "beside" else each.verb
     if purpose is None:
         return verb, "grasp", None
@@ -219,20 +219,21 @@ def _approach(each: ParsedStep, purpose: ParsedStep | None) -> tuple[Verb, Manne
 
 
 def _compared_point(step: PlanStep, task: Task, name: str) -> str | None:
-    """Return the point on an object that a step's condition compares with the gripper; None if there is none."""
+    """Return the point on an object that a step's condition compares with the gripper, if any."""
     near = sorted(compared_with_gripper(step), key=task.object_names.index)
     points = (other for other in near if any(role_object(task, other).offset) and same_object(task, other, name))
     return next(points, None)
 
 
 def _manner(each: ParsedStep) -> Manner:
+    """Return the manner of a step that moves an object or reaches a place; "grasp" for any other verb."""
     if each.verb in ("push", "pull"):
         return "press" if each.verb == "push" and each.direction == "down" else each.verb
     return "reach" if each.verb in ("reach", "hold") else "grasp"
 
 
 def _at_points(condition: Query, task: Task) -> Query:
-    """Replace the first object by the point where it is touched, in clauses about the gripper."""
+    """Replace the task's first object with the point to touch, in clauses about the gripper."""
     first = first_object(task)
 
     def at(name: str) -> str:
@@ -247,7 +248,7 @@ def _at_points(condition: Query, task: Task) -> Query:
 
 
 def _over_walls(steps: Sequence[PlanStep], task: Task) -> list[PlanStep]:
-    """Send "lift the puck over the wall" straight to the target of a later "move it to the goal"."""
+    """Redirect "lift the puck over the wall" to the target of a later step such as "move the puck to the goal"."""
     direct = list(steps)
     for number, step in enumerate(steps):
         role = _role(step)
@@ -262,19 +263,19 @@ def _over_walls(steps: Sequence[PlanStep], task: Task) -> list[PlanStep]:
 
 
 def _is_complete(steps: Sequence[PlanStep]) -> bool:
-    """Return whether a plan moves something and, if it grasps, approaches the object and closes the gripper first."""
+    """Return whether a plan has a motion and, if the motion needs a grasp, first approaches and grasps the object."""
     roles = [_role(step) for step in steps]
     verbs = [role.verb for role in roles]
     moving = next((number for number, verb in enumerate(verbs) if verb in ("carry", "move")), None)
     if any(role.verb == "pull" and "handle" not in role.target.split() for role in roles):
-        return False  # a handle can be hooked; anything else must be held
+        return False  # a handle can be hooked; any other object must be grasped before pulling
     if moving is None:
         return motion_of(roles) is not None
     return "close" in verbs[:moving] and not {"approach", "descend"}.isdisjoint(verbs[: verbs.index("close")])
 
 
 def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple[PlanStep, ...]:
-    """Return a plan with the given motion, at the object that the steps touch, with standard conditions."""
+    """Build the steps with standard conditions that carry out ``motion`` on the object that the given steps touch."""
     roles = [_role(step) for step in steps]
     if motion.manner == "reach":
         return tuple(steps)
@@ -288,7 +289,7 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
         both = Query(tuple(clause for query in conditions for clause in query.clauses))
         return _step(both, StepRole(verb, GRIPPER, point, manner, way, confidence=0.0))
 
-    # A pull is completed as a grasp, which also holds what the fingers cannot hook.
+    # Complete a pull as a grasp, which also holds objects that the fingers cannot hook.
     if motion.manner in ("grasp", "pull"):
         held = object_of(task, point)
         if motion.verb == "pull":
@@ -314,7 +315,7 @@ def _completed(task: Task, steps: Sequence[PlanStep], motion: StepRole) -> tuple
 
 
 def _touched(task: Task, roles: Sequence[StepRole]) -> str:
-    """Return where the hand acts: the first place that it comes down to, else the first that it goes over."""
+    """Return the point that the hand touches: the target of the first step other than "approach", else of any step."""
     hands = [role for role in roles if role.moved == GRIPPER != role.target and not is_goal(task, role.target)]
     hand = min(hands, key=lambda role: role.verb == "approach", default=None)
     name = first_object(task) if hand is None else hand.target
@@ -323,25 +324,25 @@ def _touched(task: Task, roles: Sequence[StepRole]) -> str:
 
 
 def _has_sides(roles: Sequence[StepRole]) -> bool:
-    """Return whether a plan pushes an object from several sides, and describes the approach to each."""
+    """Return whether a plan has pushes from several sides, each with an approach to that side."""
     sides = {role.target for role in roles if role.verb == "push"}
     return len(sides) > 1 and all(any(role.target == side and role.verb in BY_HAND for role in roles) for side in sides)
 
 
 def _confidence(task: Task, steps: Sequence[PlanStep]) -> float:
-    """Return the fraction of typical states of the plan's motion in which its steps do what the motion needs."""
+    """Return the fraction of typical states of the plan's motion in which the active steps do what the motion needs."""
     roles = [_role(step) for step in steps]
     motion = motion_of(roles)
     if motion is None:
         return 0.0
-    # These have no typical states: reaching touches nothing, and each side has its own approach.
+    # Reaching and pushing from several sides have no typical states.
     if motion.manner == "reach" or _has_sides(roles):
         return 1.0
     manner = "pull" if motion.verb == "pull" else motion.manner
     return _coverage(task, _touched(task, roles), manner, [(step.condition, _role(step).verb) for step in steps])
 
 
-# The typical states are synthetic: objects and a goal at fixed places, and the hand at offsets from the touched point.
+# The typical states are synthetic: objects and goal at fixed positions, and the hand at offsets from the touched point.
 _Floats = NDArray[np.float32]
 _OBJECTS = ((0.0, 0.6, 0.02), (0.2, 0.7, 0.02), (-0.2, 0.7, 0.02), (0.0, 0.8, 0.02))
 _GOAL = (0.1, 0.8, 0.2)
@@ -354,7 +355,7 @@ _TYPICAL = {
 
 
 def _coverage(task: Task, point: str, motion: str, steps: Sequence[tuple[Query, Verb]]) -> float:
-    """Return the fraction of a motion's typical states in which some step is active and every active step is right."""
+    """Return the fraction of typical states in which at least one step is active and every active step is right."""
     good = 0
     for offset, opening, lift, verbs in _TYPICAL[motion]:
         state = _state(task, point, offset, opening, lift)
@@ -364,6 +365,7 @@ def _coverage(task: Task, point: str, motion: str, steps: Sequence[tuple[Query, 
 
 
 def _state(task: Task, point: str, offset: Sequence[float], opening: float, lift: float) -> _Floats:
+    """Build an observation with the hand at ``offset`` from ``point`` and the touched object raised by ``lift`` (m)."""
     touched, layout = role_object(task, point), task.layout
     state = np.zeros(layout.size, np.float32)
     for place, xyz in zip(layout.positions[1:-1], _OBJECTS, strict=False):
@@ -382,11 +384,12 @@ def _floats(numbers: Sequence[float]) -> _Floats:
 
 
 def _position(position: Sequence[Coordinate], state: _Floats) -> _Floats:
+    """Return a position (3,) in a state, in metres."""
     return _floats([state[at] if isinstance(at, int) else at for at in position])
 
 
 def _is_true(clause: Clause, task: Task, state: _Floats) -> bool:
-    """Return the truth of a clause, with the precision and the order of operations of QueryProgram, but no torch."""
+    """Evaluate a clause without torch, in the precision and the order of operations of QueryProgram."""
     second, shift = _floats((0.0, 0.0, 0.0)), np.zeros(3)
     if clause.predicate in STATES:
         first = _floats((0.0, 0.0, state[task.openings[clause.subject]]))
@@ -406,19 +409,19 @@ def _is_true(clause: Clause, task: Task, state: _Floats) -> bool:
 
 
 def worth(plan: ConditionalPlan) -> tuple[bool, float, float]:
-    """Return a key that ranks plans for a task: has a motion, confidence, mean confidence of its steps."""
+    """Return a sort key for plans of a task: (has a motion, confidence of the plan, mean confidence of the steps)."""
     report = explain_canonical(plan)
     steps = sum(_role(step).confidence for step in report.read) / (len(report.read) + len(report.left_out))
     return report.source != "fallback", report.plan.confidence or 0.0, steps
 
 
 def most_confident(plans: Iterable[ConditionalPlan]) -> ConditionalPlan:
-    """Return the first plan with the largest :func:`worth`."""
+    """Return the plan with the largest :func:`worth`; the first such plan if several tie."""
     return max(plans, key=worth)
 
 
 def canonical_like(plans: Plans, reference: Plans | None) -> Plans:
-    """Return plans in the form of ``reference``: canonical, with or without fallback, if the reference is."""
+    """Convert plans to canonical form if ``reference`` is canonical, with fallback steps if the reference has them."""
     if reference is None or not reference.has_roles or plans.has_roles:
         return plans
     roles = [step.role for plan in reference.values() for step in plan.steps]

@@ -1,4 +1,4 @@
-"""Layout: the meaning of the numbers in a suite's observations and actions."""
+"""Layouts: the meaning of each number in a suite's observations and actions."""
 
 from __future__ import annotations
 
@@ -16,51 +16,52 @@ from lw_torchrl._util.registry import ReadOnlyDict
 class Slot:
     """The numbers of an observation that describe one object."""
 
-    position: Natural  # index of its x; y and z follow
-    quaternion: Natural | None = None  # index of the first of its four numbers; None without an orientation
+    position: Natural  # index of the x coordinate; y and z follow
+    quaternion: Natural | None = None  # index of the first of four numbers; None without an orientation
 
     @property
     def xyz(self) -> slice:
-        """The numbers of the position."""
+        """The slice of the position (x, y, z)."""
         return slice(self.position, self.position + 3)
 
     @property
     def numbers(self) -> tuple[slice, ...]:
-        """The numbers of the position and, if there is one, of the orientation."""
+        """The slices of the position and, if the object has one, of the orientation."""
         return (self.xyz,) if self.quaternion is None else (self.xyz, slice(self.quaternion, self.quaternion + 4))
 
 
 @typed_fields
 @dataclass(frozen=True)
 class Layout:
-    """The meaning of the numbers of observations and actions, for all tasks of a suite.
+    """The meaning of each number in observations and actions, shared by all tasks of a suite.
 
-    Positions are in metres: x to the right, y away from the robot, z above the table. An index of an x stands for x, y
-    and z. Scripted skills, ``RandomYaw`` and ``TransferredActor`` need a layout with a ``displacement`` of the hand.
-    In scripted skills an effort of 1 closes the gripper; in actions and data, ``closes`` is the sign that closes it.
+    Positions are in metres (x to the right, y away from the robot, z up from the table); y and z follow the index of x.
+    Scripted skills, ``RandomYaw`` and ``TransferredActor`` need a layout with a ``displacement`` of the hand. In
+    scripted skills an effort of 1 closes the gripper; in actions and data, ``closes`` is the sign of the closing
+    effort.
 
     Example:
         >>> METAWORLD.positions
         (slice(0, 3, None), slice(4, 7, None), slice(11, 14, None), slice(36, 39, None))
 
-    Source: ours; Meta-World's numbers are those of ``SawyerXYZEnv._get_obs``.
+    Source: ours; Meta-World's layout follows ``SawyerXYZEnv._get_obs``.
     """
 
     name: str
-    size: Count  # D, the length of an observation
+    size: Count  # the length D of an observation
     hand: Natural  # index of the gripper's x
     opening: Natural  # index of the gripper's opening, from 0 (closed) to 1 (open)
-    things: tuple[Slot, ...]  # the objects of a task, in its order; zeros for those that a task lacks
-    goal: Natural  # index of the x of the task's target, which has no past
-    past: Natural | None = None  # offset from a number's index to its value in the previous step
-    action_size: Count = 4  # A, the length of an action; each number is in [-1, 1]
-    displacement: Natural | None = 0  # index of the x of the hand's displacement; None if actions have none
-    reach: Positive = 0.01  # metres that the moving hand travels in a step at a displacement of 1
-    gripper: Natural | None = 3  # index of the gripper's effort
+    things: tuple[Slot, ...]  # a task's objects in order; an object that a task lacks is zeros
+    goal: Natural  # index of the x of the task's target, which has no value in the previous step
+    past: Natural | None = None  # offset from a number's index to its value in the previous time step
+    action_size: Count = 4  # the length A of an action; each number is in [-1, 1]
+    displacement: Natural | None = 0  # index of the hand's displacement along x; None without a displacement
+    reach: Positive = 0.01  # metres that the moving hand travels per time step at a displacement of 1
+    gripper: Natural | None = 3  # index of the gripper's effort; None without a gripper
     closes: Literal[1, -1] = 1  # sign of the effort that closes the gripper
-    binary_gripper: bool = False  # whether the gripper can only open or close fully, within a few steps
+    binary_gripper: bool = False  # whether the gripper only opens or closes fully, within a few time steps
     closes_above: float = 0.3  # effort above which a binary gripper closes
-    thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)  # relation to this suite's metres
+    thresholds: Mapping[str, float] = field(default_factory=dict, hash=False)  # relation to the suite's threshold (m)
 
     def __post_init__(self) -> None:
         layout = f"layout {self.name!r}"
@@ -71,73 +72,73 @@ class Layout:
             raise ValueError(f"{layout} has an index outside the {self.size} numbers of an observation")
         used = [number for part in present for number in places(part)]
         if twice := sorted(number for number in used if used.count(number) > 1):
-            raise ValueError(f"{layout} uses number {twice[0]} of an observation for two purposes")
+            raise ValueError(f"{layout} uses index {twice[0]} of the observation more than once")
         for name, index, width in (("displacement", self.displacement, 3), ("gripper", self.gripper, 1)):
             if index is not None and index + width > self.action_size:
-                raise ValueError(f"{name} of {layout} must be within {self.action_size} numbers, got {index}")
+                raise ValueError(f"{name} of {layout} must fit {self.action_size} action numbers, got index {index}")
         if self.displacement is not None and self.gripper in range(self.displacement, self.displacement + 3):
             raise ValueError(f"gripper of {layout} must not be an index of the displacement, got {self.gripper}")
         object.__setattr__(self, "thresholds", ReadOnlyDict(dict(self.thresholds)))
         for name in ("present", "positions", "all_positions", "parts"):
-            getattr(self, name)  # computed here: torch.compile cannot trace the lock of a cached_property
+            getattr(self, name)  # computed eagerly, since torch.compile cannot trace the lock of a cached_property
 
     @cached_property
     def present(self) -> tuple[slice, ...]:
-        """The numbers that describe this step: hand, opening, objects. The goal is not among them."""
+        """The slices for the current time step: hand, opening and objects, without the goal."""
         opening = slice(self.opening, self.opening + 1)
         return (slice(self.hand, self.hand + 3), opening, *(part for thing in self.things for part in thing.numbers))
 
     @cached_property
     def positions(self) -> tuple[slice, ...]:
-        """The positions in this step: hand, objects, goal."""
+        """The slices of the current positions: hand, objects, goal."""
         starts = (self.hand, *(thing.position for thing in self.things), self.goal)
         return tuple(slice(start, start + 3) for start in starts)
 
     @cached_property
     def all_positions(self) -> tuple[slice, ...]:
-        """All positions, including those of the previous step."""
+        """The slices of all positions, in the current and the previous time step."""
         return (*self.positions, *self._past(self.positions[:-1]))
 
     @cached_property
     def parts(self) -> tuple[tuple[slice, ...], ...]:
-        """The numbers of each object, in this and the previous step, then those of the goal."""
+        """The slices of each object in the current and the previous time step, then the slice of the goal."""
         things = [(*thing.numbers, *self._past(thing.numbers)) for thing in self.things]
         return (*things, (self.positions[-1],))
 
     @property
     def effort(self) -> slice:
-        """The gripper's effort among the numbers of an action; empty without a gripper."""
+        """The slice of the gripper's effort in an action; empty without a gripper."""
         return slice(0, 0) if self.gripper is None else slice(self.gripper, self.gripper + 1)
 
     def displaced(self, user: str) -> slice:
-        """Return the hand's displacement in an action; raise :class:`ValueError` for the ``user`` if there is none."""
+        """Return the slice of the hand's displacement in an action, or raise a ValueError that names the ``user``."""
         if self.displacement is None:
-            lacks = f"an action of layout {self.name!r} has no displacement of the hand, which it needs"
-            raise ValueError(f"{user}: {lacks}")
+            needed = "actions must have a displacement of the hand"
+            raise ValueError(f"{user}: {needed}, got layout {self.name!r}")
         return slice(self.displacement, self.displacement + 3)
 
     def a_step_before(self, part: slice) -> slice:
-        """Return the indices of the same numbers in the previous step."""
+        """Return the slice of the same numbers in the previous time step."""
         if self.past is None:
-            raise ValueError(f"layout {self.name!r} has no numbers of the step before")
+            raise ValueError(f"layout {self.name!r} has no values of the previous time step")
         return slice(part.start + self.past, part.stop + self.past)
 
     def _past(self, parts: tuple[slice, ...]) -> tuple[slice, ...]:
-        """Return the same parts of the previous step; empty in a layout without a past."""
+        """Return the slices of the same numbers in the previous time step; empty without a ``past``."""
         return () if self.past is None else tuple(map(self.a_step_before, parts))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the layout as JSON."""
+        """Convert the layout to JSON."""
         things = [[thing.position, thing.quaternion] for thing in self.things]
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         return {**values, "things": things, "thresholds": dict(self.thresholds)}
 
     @classmethod
     def from_json(cls, row: Any) -> Layout:
-        """Rebuild the layout from :meth:`to_json`; raise :class:`ValueError` for any other value."""
+        """Rebuild the layout from :meth:`to_json`; raise a ValueError if ``row`` is not such JSON."""
         names = [each.name for each in fields(cls)]
         if not isinstance(row, Mapping) or set(row) != set(names):
-            raise ValueError(f"layout must be a table of {', '.join(names)}, got {shown(row)}")
+            raise ValueError(f"layout must have exactly the keys {', '.join(names)}, got {shown(row)}")
         try:
             return cls(**{**row, "things": tuple(Slot(*pair) for pair in row["things"])})
         except TypeError as error:
@@ -145,9 +146,9 @@ class Layout:
 
 
 def places(part: slice) -> tuple[int, ...]:
-    """Return the indices of a slice: (36, 37, 38) for Meta-World's goal."""
+    """Convert a slice to indices, such as (36, 37, 38) for Meta-World's goal."""
     return tuple(range(part.start, part.stop))
 
 
 METAWORLD = Layout("metaworld", 39, hand=0, opening=3, things=(Slot(4, 7), Slot(11, 14)), goal=36, past=18, reach=0.01)
-"""Meta-World's 39 numbers. In a task with one object, the second object's numbers are zeros."""
+"""The layout of Meta-World's 39-number observations; in a task with one object, the second object is zeros."""

@@ -1,4 +1,4 @@
-"""The nearest query and the nearest scripted skill to free-form text."""
+"""Search for the query or the scripted skill that is nearest to a free-form text."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _NEGATIONS = frozenset(("not", "no", "never", "without", "cannot"))
-# Words without meaning for the choice of a query.
+# Words that do not affect the choice of a query.
 _EMPTY = frozenset(("the", "a", "an", "is", "are", "be", "does", "do", "did", "has", "have", "robot's", "robot"))
-_LONGEST = 400  # characters of a text that is mapped
-_MOST_CLAUSES = 8  # of a condition that is mapped
-_MOST_COMPARED = 64  # mapped conditions and goals of an answer, a limit to the time of decoding
-LIMIT, SKILL_LIMIT = 0.4, 0.7  # largest distances of a mapped condition and a mapped skill; docs/language-models.md
+_LONGEST = 400  # maximum length (characters) of a text to map
+_MOST_CLAUSES = 8  # maximum number of clauses of a condition to map
+_MOST_COMPARED = 64  # maximum number of texts to map per answer, which bounds the decoding time
+LIMIT, SKILL_LIMIT = 0.4, 0.7  # maximum distance of a condition and of a skill; see docs/language-models.md
 _TARGETS = ("target location", "reach target")
 _TARGET = re.compile(
     r"\b(?:the\s)?(?:reach\s)?(?:goal|target)(?:\s(?:location|position|area|place|point|destination))?\b"
@@ -37,7 +37,7 @@ _TARGET = re.compile(
 
 
 class QueryPart(NamedTuple):
-    """A clause of a text, its nearest query, and their similarity in [0, 1]."""
+    """A clause of a text, the nearest query, and the similarity of the two in [0, 1]."""
 
     text: str
     query: Query
@@ -46,23 +46,23 @@ class QueryPart(NamedTuple):
 
 @dataclass(frozen=True)
 class QueryMatch:
-    """The nearest query to a text."""
+    """The query that is nearest to a text."""
 
     query: Query
-    score: float  # mean of the parts' scores, in [0, 1]; 1 if the text is a query
+    score: float  # mean score of the parts, in [0, 1]; 1 if the text is a query
     parts: tuple[QueryPart, ...]  # the match of each clause of the text
 
 
 @typed
 def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] = "edit") -> QueryMatch:
-    """Return the query of a task that is nearest to a text.
+    """Find the query of a task that is nearest to a text.
 
-    A query matches itself. Any other text is split at "and" and "but", and each part matches its nearest base query. A
-    part without a subject has the subject of the previous part. A part with "not", "doesn't" or "never" matches the
-    negation of the base query nearest to its other words, so that a match never inverts the meaning.
+    A query matches itself. Any other text is split at "and" and "but", and each part matches the nearest base query. A
+    part without a subject inherits the subject of the previous part. A part with "not", "doesn't" or "never" matches
+    the negation of the base query nearest to the remaining words, so that a match never inverts the meaning.
 
     Args:
-        text: any text, of at most 64 parts.
+        text: any text with at most 64 parts.
         by: "edit" compares spelling; "embedding" compares meaning and needs the extra ``[text]``.
 
     Raises:
@@ -73,7 +73,7 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
         >>> str(nearest_query("gripper open and over the target locaton", "push").query)
         "the robot's gripper is open and the robot's gripper is above the target location"
 
-    Source: paper section 'Query Answering Function': the nearest by sentence embedding or by edit distance.
+    Source: paper section 'Query Answering Function' (nearest query by sentence embedding or edit distance).
     """
     owner = get_task(task)
     if (query := read_query(text, owner)) is not None:
@@ -81,7 +81,7 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
     split = [" ".join(part.split()) for part in re.split(r"\b(?:and|but)\b", text, flags=re.IGNORECASE)]
     split = [part for part in split if _content(_affirmed(part)[0])] or [" ".join(text.split())]
     check_length(text, split)
-    known: dict[tuple[str, str], QueryPart] = {}  # parts are often repeated
+    known: dict[tuple[str, str], QueryPart] = {}  # a cache, since parts often repeat
     parts: list[QueryPart] = []
     subject = ""
     for part in split:
@@ -98,6 +98,7 @@ def nearest_query(text: str, task: str | Task, by: Literal["edit", "embedding"] 
 
 
 def _nearest_part(part: str, task: Task, by: str) -> QueryPart:
+    """Match one part of a text to the nearest base query or negated base query."""
     if (query := read_query(part, task)) is not None:
         return QueryPart(part, query, 1.0)
     words, negated = _affirmed(part)
@@ -113,7 +114,7 @@ def _nearest_part(part: str, task: Task, by: str) -> QueryPart:
 
 
 def _affirmed(text: str) -> tuple[list[str], bool]:
-    """Return the words of a text without its negations, and whether it is negated."""
+    """Return the words of a text without negations, and whether the number of negations is odd."""
     plain = re.sub(r"(\w)n't\b", r"\1 not", text.replace("’", "'").casefold())
     words = re.sub(r"[^\w\s'-]", " ", plain).split()
     kept = [word for word in words if word not in _NEGATIONS]
@@ -121,12 +122,13 @@ def _affirmed(text: str) -> tuple[list[str], bool]:
 
 
 def _content(words: list[str]) -> str:
+    """Join the words that affect the choice of a query."""
     return " ".join(word for word in words if word not in _EMPTY)
 
 
 @lru_cache(maxsize=256)
 def _choices(task: Task, predicates: tuple[str, ...]) -> tuple[tuple[Clause, ...], tuple[str, ...]]:
-    """Return the affirmed base clauses of a task, and the words of each that count."""
+    """Return the affirmative base clauses of a task, and the content words of each clause."""
     clauses = tuple(clause for clause in base_clauses(task, predicates) if not clause.negated)
     return clauses, tuple(_content(str(clause).split()) for clause in clauses)
 
@@ -140,20 +142,20 @@ def _vectors(texts: tuple[str, ...]) -> NDArray[np.float32]:
 def nearest_skill(
     text: str, task: str | Task | None = None, skills: Skills | Iterable[str] | None = None
 ) -> tuple[ScriptedSkill, float]:
-    """Return the scripted skill with the most similar text, by edit distance, and the similarity in [0, 1].
+    """Return the scripted skill whose text is nearest by edit distance, and the similarity in [0, 1].
 
     Args:
-        task: consider only skills whose objects this task has.
-        skills: the skills to choose from; None for the shipped ones.
+        task: consider only skills whose objects this task has; None for all skills.
+        skills: the skills to choose from; None for the shipped skills.
 
     Raises:
-        SkillError: no skill suits the task.
+        SkillError: every skill needs an object that the task lacks.
 
     Example:
         >>> nearest_skill("put gripper above puck", task="push")[0].text
         'place the gripper above the puck'
 
-    Source: paper section 'Conditional Plan Generation', which takes the nearest description.
+    Source: paper section 'Conditional Plan Generation', which uses the nearest description.
     """
     shipped = load_skills()
     table = shipped if skills is None else skills
@@ -161,26 +163,26 @@ def nearest_skill(
         table = {check_choice("skills", name, shipped): shipped[name] for name in table}
     allowed = tuple(name for name, skill in table.items() if task is None or skill.suits(task))
     if not allowed:
-        raise SkillError(f"no scripted skill suits task {task!r}")
+        raise SkillError(f"every scripted skill needs an object that task {task!r} lacks; pass other skills=")
     words = " ".join(text.lower().replace("_", " ").split())
     name, similarity, _ = process.extractOne(words, allowed, scorer=fuzz.ratio)
     return table[name], similarity / 100
 
 
 class MappedQuery(NamedTuple):
-    """The query that a text was mapped to."""
+    """The query that a text was mapped to, with the distance between text and query."""
 
-    query: Query | None  # None if no query is near enough
-    distance: float  # of its furthest clause
+    query: Query | None  # None if no query is within the limit
+    distance: float  # largest distance of a clause, in [0, 1]
     exact: bool = False  # whether the text is a query itself
 
 
 class StepMapper:
-    """A map from the words of an answer to queries and skills, with distances of 1 minus the similarity.
+    """A mapper from a language model's texts to queries and scripted skills; a distance is 1 minus the similarity.
 
-    Phrases of data/words.toml are replaced first.
+    The phrases in data/words.toml are replaced before the search.
 
-    Source: paper section 'LLM Experiments', which takes the nearest by string edit distance.
+    Source: paper section 'LLM Experiments', which uses the nearest text by edit distance.
     """
 
     def __init__(self, task: Task, skills: Skills | None) -> None:
@@ -198,7 +200,7 @@ class StepMapper:
         return MappedQuery(query if distance <= LIMIT else None, distance)
 
     def skill(self, text: str) -> tuple[str | None, float]:
-        """Return the text of the nearest scripted skill, None if it is beyond the limit, and its distance."""
+        """Return the nearest scripted skill's text (None if beyond the limit) and distance."""
         if text in self.skills:
             return text, 0.0
         if not self.skills or len(text) > _LONGEST:
@@ -212,6 +214,7 @@ class StepMapper:
 
 @lru_cache(maxsize=4096)
 def _nearest_condition(text: str, task: Task) -> tuple[Query | None, float]:
+    """Return the query nearest to a condition (None if the condition has too many clauses) and the distance."""
     words = _phrases("conditions").sub(lambda match: WORDS["conditions"][match[0]], _with_target(text, task))
     with suppress(QueryError):
         match = nearest_query(words, task)
@@ -221,7 +224,7 @@ def _nearest_condition(text: str, task: Task) -> tuple[Query | None, float]:
 
 
 def _with_target(text: str, task: Task) -> str:
-    """Return the text in lower case, with the task's own name for "goal", "target position" and the like."""
+    """Convert a text to lower case, with the task's name for the goal in place of "goal", "target position", etc."""
     name = next((name for name in _TARGETS if name in task.object_names), None)
 
     def named(goal: re.Match[str]) -> str:
@@ -232,6 +235,6 @@ def _with_target(text: str, task: Task) -> str:
 
 @cache
 def _phrases(kind: str) -> re.Pattern[str]:
-    """Return a pattern of the phrases in a table of words.toml, the longest first."""
+    """Compile a pattern that matches the phrases in a table of words.toml, the longest first."""
     longest = sorted(WORDS[kind], key=len, reverse=True)
     return re.compile(rf"\b(?:{'|'.join(map(re.escape, longest))})\b")

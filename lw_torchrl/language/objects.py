@@ -1,4 +1,4 @@
-"""Objects and points that queries name, and the numbers of the observation that hold their positions."""
+"""Objects and points that queries name, and where their positions are in the observation."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ WORDS: Mapping[str, Any] = read_toml(files("lw_torchrl.language") / "data" / "wo
 
 GRIPPER = "robot's gripper"
 GOAL = "target location"
-"""The goal, which every observation has, whatever a task calls it."""
+"""The name of the goal in step roles; every observation has a goal, which tasks may name differently."""
 Coordinate = int | Finite
-"""An int is an index into the observation, a float a fixed number of metres."""
+"""A coordinate: an int is an index into the observation, a float a fixed value in metres."""
 TypedPosition = tuple[tuple[bool, Coordinate], ...]
 
 _SLICE = re.compile(r"obs\[([0-9]{1,4}):([0-9]{1,4})\]")
@@ -27,12 +27,12 @@ _INDEX = re.compile(r"obs\[([0-9]{1,4})\]")
 
 
 def typed_position(position: Sequence[Coordinate]) -> TypedPosition:
-    """Return a position that distinguishes the index 1 from 1.0 metres, which are equal numbers in Python."""
+    """Tag each coordinate as index or metres, since the index 1 and 1.0 metres are equal in Python."""
     return tuple((isinstance(coordinate, int), coordinate) for coordinate in position)
 
 
 def coordinate_indices(position: Sequence[Coordinate], constants: list[float], size: int) -> list[int]:
-    """Return the index of each coordinate in an observation (of ``size``) followed by ``constants``, which grow."""
+    """Index each coordinate in an observation (of ``size``) followed by ``constants``, and append new constants."""
     fixed = dict.fromkeys(c for c in position if not isinstance(c, int))
     constants += [c for c in fixed if c not in constants]
     return [c if isinstance(c, int) else size + constants.index(c) for c in position]
@@ -41,21 +41,21 @@ def coordinate_indices(position: Sequence[Coordinate], constants: list[float], s
 @typed_fields
 @dataclass(frozen=True)
 class NamedObject:
-    """An object that queries can name, or a point on one."""
+    """An object that queries can name, or a point on an object."""
 
     name: str  # "drawer handle": lower-case words without an article
     position: tuple[Coordinate, Coordinate, Coordinate]  # x, y and z
-    offset: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # metres, added to the position of an object: a point on it
-    ours: bool = False  # whether it is a point that we named, which the published object list lacks
-    opening: Natural | None = None  # index of its opening, from 0 (closed) to 1 (open); None if it cannot open
+    offset: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # metres from the object's position to this point
+    ours: bool = False  # whether this is our added point, which the published object list lacks
+    opening: Natural | None = None  # index of the opening, from 0 (closed) to 1 (open); None if the object cannot open
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[a-z][a-z0-9'-]*( [a-z0-9][a-z0-9'-]*)*", self.name):
             raise ValueError(f"name must be lower-case words like 'drawer handle', got {shown(self.name)}")
         if {"and", "is", "not", "the"} & set(self.name.split()):
-            raise ValueError(f"name may not contain 'and', 'is', 'not' or 'the', got {shown(self.name)}")
+            raise ValueError(f"name must not contain 'and', 'is', 'not' or 'the', got {shown(self.name)}")
         if self.opening is not None and (self.ours or self.name == GRIPPER):
-            raise ValueError(f"opening of {self.name!r} must be None: the layout has the gripper's, points have none")
+            raise ValueError(f"opening of {self.name!r} must be None: points have none, the gripper's is in the layout")
 
 
 def _read_coordinate(value: Any) -> Coordinate:
@@ -67,7 +67,7 @@ def _read_coordinate(value: Any) -> Coordinate:
 
 
 def _read_position(value: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
-    """Return the position that "obs[4:7]" or [0.1, "obs[37]", 0.0] means in tasks.toml."""
+    """Parse a position of tasks.toml, such as "obs[4:7]" or [0.1, "obs[37]", 0.0]."""
     if isinstance(value, str) and (match := _SLICE.fullmatch(value)):
         start, stop = map(int, match.groups())
         if stop - start == 3:
@@ -79,44 +79,44 @@ def _read_position(value: Any) -> tuple[Coordinate, Coordinate, Coordinate]:
 
 
 def _read_object(name: str, row: Any) -> NamedObject:
-    """Read an object: a position, or {position = ..., opening = "obs[92]"}."""
+    """Parse an object of tasks.toml: a position, or {position = ..., opening = "obs[92]"}."""
     if not isinstance(row, Mapping):
         return NamedObject(name, _read_position(row))
     for key in row:
         check_choice("key", key, ("position", "opening"))
     opening = row.get("opening")
     if "position" not in row or not isinstance(opening, str) or not (match := _INDEX.fullmatch(opening)):
-        raise ValueError(f"a position and an opening like 'obs[92]' are needed, got {shown(row)}")
+        raise ValueError(f"must have a position and an opening like 'obs[92]', got {shown(row)}")
     return NamedObject(name, _read_position(row["position"]), opening=int(match[1]))
 
 
 def _read_point(name: str, row: Any, objects: Mapping[str, NamedObject]) -> NamedObject:
-    """Read a point: a position, or {object = ..., offset = [x, y, z]}."""
+    """Parse a point of tasks.toml: a position, or {object = ..., offset = [x, y, z]}."""
     if not isinstance(row, Mapping):
         return NamedObject(name, _read_position(row), ours=True)
     for key in row:
         check_choice("key", key, ("object", "offset"))
     if len(row) != 2 or not isinstance(row["offset"], list):
-        raise ValueError(f"object and offset = [x, y, z] are needed, got {shown(row)}")
+        raise ValueError(f"must have an object and an offset = [x, y, z], got {shown(row)}")
     owner = objects[check_choice("object", row["object"], [*objects])]
     return NamedObject(name, owner.position, tuple(row["offset"]), ours=True)
 
 
 def read_objects(row: Mapping[str, Any], layout: Layout = METAWORLD) -> tuple[NamedObject, ...]:
-    """Return the gripper, then the objects and the points of a row of tasks.toml."""
+    """Parse the objects and points of a row of tasks.toml; return the gripper, the objects, then the points."""
     x, y, z = places(layout.positions[0])
     objects = {GRIPPER: NamedObject(GRIPPER, (x, y, z))}
     points = []
     for key in ("objects", "points"):
         table = row.get(key, {})
         if not isinstance(table, Mapping) or not all(isinstance(name, str) for name in table):
-            raise ValueError(f"{key} must be a table of names and positions, got {shown(table)}")
+            raise ValueError(f"{key} must be a table that maps names to positions, got {shown(table)}")
         for name, value in table.items():
             try:
                 if key == "points":
                     points.append(_read_point(name, value, objects))
                 elif name == GRIPPER:
-                    raise ValueError("every task has it; leave it out")
+                    raise ValueError("every task has the gripper; leave out this row")
                 else:
                     objects[name] = _read_object(name, value)
             except (TypeError, ValueError) as error:
@@ -125,7 +125,7 @@ def read_objects(row: Mapping[str, Any], layout: Layout = METAWORLD) -> tuple[Na
 
 
 def write_objects(objects: Sequence[NamedObject]) -> dict[str, dict[str, Any]]:
-    """Return the objects and points for a row of tasks.toml; :func:`read_objects` reads them back if a row can."""
+    """Convert objects and points to a row of tasks.toml, as far as such a row can express them."""
     row: dict[str, dict[str, Any]] = {"objects": {}, "points": {}}
     published = {typed_position(named.position): named.name for named in reversed(objects) if not named.ours}
     for named in objects[1:]:

@@ -1,4 +1,4 @@
-"""decode_plan: from a language model's text to a plan of one task, with notes on what was left out or changed."""
+"""Decode a language model's text into a plan for one task, with notes on omissions and changes."""
 
 from __future__ import annotations
 
@@ -20,62 +20,63 @@ from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
 
 @dataclass(frozen=True)
 class DecodedStep:
-    """A clause of a text and how it was read. Distances are from 0, a text that is a query or a skill, to 1."""
+    """A clause of a text and the result of parsing it. Distances are from 0 (an exact query or skill) to 1."""
 
-    line: int  # of the text, from 1
-    written_condition: str  # in the text's words
-    written_skill: str  # in the text's words: ``robot.put("gripper above mug")`` is "put gripper above mug"
-    condition: Query | None  # the nearest query; None if none is near enough
-    condition_distance: float  # the largest of its clauses
-    scripted: str | None  # the text of the nearest scripted skill; None if none is near enough
+    line: int  # line number in the text, from 1
+    written_condition: str  # the condition as written
+    written_skill: str  # the skill as written: "put gripper above mug" for ``robot.put("gripper above mug")``
+    condition: Query | None  # the nearest query; None if no query is within the limit
+    condition_distance: float  # the largest distance of a clause
+    scripted: str | None  # the text of the nearest scripted skill; None if no skill is within the limit
     skill_distance: float
-    written_goal: str = ""  # the state to reach in the text's words; "" if there is none
-    goal: Query | None = None  # the nearest query; None if none is near enough
+    written_goal: str = ""  # the state to reach, as written; "" without a goal
+    goal: Query | None = None  # the query nearest to the goal; None if no query is within the limit
     goal_distance: float = 0.0
-    dropped: str = ""  # why the clause is not a step of the plan; "" if it is one
+    dropped: str = ""  # why the clause is not a step of the plan; "" if the clause is a step
 
 
 @dataclass(frozen=True)
 class DecodedPlan:
-    """The plan that :func:`decode_plan` read from a text.
+    """The plan that :func:`decode_plan` found in a text.
 
     Attributes:
-        plan: the plan with queries as conditions and skills in the text's words; None if there is none.
+        plan: the plan, with queries as conditions and skills as written; None if the text has no plan.
         scripted: the plan with the nearest scripted skills, without steps that have none; None if no step is left.
     """
 
     plan: ConditionalPlan | None
     scripted: ConditionalPlan | None
-    reason: str  # why there is no plan; "" if there is one
-    notes: tuple[Note, ...]  # what was left out or changed, in the order of the lines
-    steps: tuple[DecodedStep, ...]  # the clauses for the task, including the dropped ones
+    reason: str  # why the text has no plan; "" if it has a plan
+    notes: tuple[Note, ...]  # remarks on omissions and changes, in the order of the lines
+    steps: tuple[DecodedStep, ...]  # all clauses for the task, including dropped clauses
 
     @property
     def all_scripted(self) -> bool:
-        """Whether there is a plan, and each of its steps has a scripted skill."""
+        """Whether the text has a plan whose steps all have a scripted skill."""
         return self.plan is not None and self.scripted is not None and len(self.scripted.steps) == len(self.plan.steps)
 
 
-_LONGEST = 65_536  # characters of a text that are read
+_LONGEST = 65_536  # maximum number of characters to parse
 
 
 @typed
 def decode_plan(
     text: str, task: str | Task, format: str, *, skills: Skills | None = None, tasks: Tasks = TASKS
 ) -> DecodedPlan:
-    """Read a plan from any text that a language model wrote. The text is never executed, and no text raises an error.
+    """Decode any text from a language model into a plan. The text is never executed, and no text raises an error.
 
-    Only clauses for ``task`` are read: those in functions and headings with its name, and those before any name, which
-    continue the prompt. Of several versions the longest is taken, of equal ones the first. Thoughts, marked by
-    ``</think>`` or in other models' ways, are left out. Python instead of prose, or the reverse, is read too.
+    Only clauses for ``task`` are used: clauses under a function or heading with the task's name, and clauses before any
+    name, which continue the prompt. If the text has several versions of the plan, the first longest version is used.
+    Thoughts, marked by ``</think>`` or the tags of other models, are ignored. Python instead of prose, or prose instead
+    of Python, is accepted.
 
-    A condition outside the query language is replaced by the nearest query by edit distance, clause by clause. If none
-    is near, the step is dropped. Skills stay as written in ``plan``; ``scripted`` has the nearest scripted ones.
+    Each clause of a condition outside the query language is replaced by the nearest query by edit distance; without a
+    near query the step is dropped. ``plan`` keeps the skills as written; ``scripted`` has the nearest scripted skills.
 
     Args:
-        text: the answer, up to 65,536 characters and 1,000 steps; the rest is left out.
+        text: the model's answer; only the first 65,536 characters and 1,000 steps are used.
         format: the requested format, a name in :data:`~lw_torchrl.PLAN_FORMATS`.
-        skills: the scripted skills to choose from; None for the shipped ones.
+        skills: the scripted skills to choose from; None for the shipped skills.
         tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
 
     Example:
@@ -92,12 +93,12 @@ def decode_plan(
 
 
 def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> DecodedPlan:
-    """Decode a plan like :func:`decode_plan`, with a format's reader and a mapper."""
+    """Decode a plan like :func:`decode_plan`, with the format's reader ``read`` and a mapper."""
     owner, notes = mapper.task, list[Note]()
     text = without_thoughts(text, notes)
     if len(text) > _LONGEST:
         notes.append(Note(text.count("\n", 0, _LONGEST) + 1, f"the rest of {len(text)} characters is not read"))
-    # Models sometimes answer in another format, so the other readers are tried too.
+    # Models sometimes answer in a format that was not requested, so _read tries every reader.
     reading, section = _read(text[:_LONGEST], owner, read)
     if further := section.clauses[MOST_STEPS:]:
         reading.note(further[0].line, f"the plan has more than {MOST_STEPS} steps; {len(further)} are left out")
@@ -124,11 +125,12 @@ def decode_as(text: str, read: Callable[[str], Reading], mapper: StepMapper) -> 
 
 
 def _same(name: str, task: Task) -> bool:
+    """Return whether a name is the task's name, up to case and punctuation."""
     return re.sub(r"[^a-z0-9]", "", name.lower()) == re.sub(r"[-/]", "", task.name)
 
 
 def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Reading, Section]:
-    """Return the reading of the first reader that finds clauses for the task, and the section with the most."""
+    """Return the result of the first reader that finds clauses for the task, and its section with the most clauses."""
     empty: list[tuple[Reading, Section]] = []
     for reader in dict.fromkeys((read, PythonReading, ProseReading)):
         reading = reader(text)
@@ -143,7 +145,7 @@ def _read(text: str, task: Task, read: Callable[[str], Reading]) -> tuple[Readin
 
 
 def _as_skill(goal: str) -> str:
-    """Return a goal as a skill: "move gripper above mug" for "the robot's gripper is above mug"."""
+    """Convert a goal to a skill: "the robot's gripper is above mug" gives "move gripper above mug"."""
     skills = []
     for state in re.split(r"\s+and\s+", goal):
         match = re.match(r"(?:the\s+)?(?:robot's\s+)?(.+?)\s+is\s+(.+)", state)
@@ -154,6 +156,8 @@ def _as_skill(goal: str) -> str:
 
 
 def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedStep:
+    """Map a clause to a query and a scripted skill, and append notes on changes."""
+
     def note(text: str) -> None:
         notes.append(Note(clause.line, text))
 
@@ -186,7 +190,7 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
 
 
 def _section_notes(reading: Reading, section: Section, task: Task) -> list[Note]:
-    """Return the reader's notes on the section that was taken, and one note for each other section."""
+    """Return the reader's notes on the chosen section, and one note for each other section with clauses."""
     ends = [later.line for later in reading.sections[1:]]
     notes = []
     for other, end in zip(reading.sections, [*ends, float("inf")], strict=True):
@@ -200,14 +204,14 @@ def _section_notes(reading: Reading, section: Section, task: Task) -> list[Note]
 
 
 def _why_none(reading: Reading, steps: list[DecodedStep], task: Task, text: str) -> str:
+    """Return the reason why a text has no plan."""
     if steps:
-        kept = f"none of its {counted(len(steps), 'step')} for {task.name} could be kept"
-        return f"{kept}; for the first: {steps[0].dropped}"
+        return f"all steps for {task.name} were dropped ({len(steps)}), the first because {steps[0].dropped}"
     if not text.strip():
         return "the text is empty"
     if others := sorted({other.task for other in reading.sections if other.clauses}):
-        return f"it has no steps for {task.name}, but some for {', '.join(map(shown, others))}"
-    return f"it has no steps, neither for {task.name} nor for another task"
+        return f"the text has no steps for {task.name}, only for {', '.join(map(shown, others))}"
+    return f"the text has no steps for {task.name} or any other task"
 
 
 _OPENS = r"<think(?:ing)?>|\[think\]|<\|channel\|>(?:analysis|commentary)"
@@ -219,12 +223,13 @@ _IS_JSON = re.compile(r"\s*(?:```\w*\s*)?\{")
 
 
 def without_thoughts(text: str, notes: list[Note]) -> str:
-    """Return an answer without the model's thoughts, which may hold drafts; add a note. Lines keep their numbers.
+    """Remove the model's thoughts, which may hold drafts, from an answer, and add a note. Line numbers do not change.
 
-    A closing tag without an opening one ends a thought that began before the text, if the tag ends its line and is not
-    in a comment. An opening tag in a comment or a string is ignored. gpt-oss's tags always count. JSON has no thoughts.
+    A closing tag without an opening tag ends a thought that began before the text, if the closing tag ends its line and
+    is not in a comment. An opening tag in a comment or a string is ignored. The tags of gpt-oss are never ignored. An
+    answer in JSON has no thoughts.
     """
-    # comment and quotes: whether the current line is inside a comment, and its quotes so far.
+    # comment: whether the current position is in a comment; quotes: the number of quotes in the line so far.
     spans, opened, at, comment, quotes = list[tuple[int, int]](), None, 0, False, 0
     for tag in _TAG.finditer("" if _IS_JSON.match(text) else text):
         *lines, before = text[at : tag.start()].split("\n")

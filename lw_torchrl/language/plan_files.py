@@ -1,6 +1,6 @@
-"""Plans as text and on disk: the chain_py format of .plan files, folders of them, and JSON of (condition, skill) pairs.
+"""Plan files: loading and saving .plan files in the chain_py format, and loading (condition, skill) pairs from JSON.
 
-Reading is strict here. :func:`~lw_torchrl.decode_plan` reads what language models write.
+This parser is strict. :func:`~lw_torchrl.decode_plan` is the tolerant parser for text from language models.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lw_torchrl.language.plans import AnyPlans, ConditionalPlan, PlanError, Plan
 from lw_torchrl.language.queries import Query, QueryError, check_query
 from lw_torchrl.language.tasks import MT10, TASKS, Tasks
 
-PLAN_LIMIT = 2**18  # characters of a plan's text, and bytes of a file of plans; a limit to the time of reading
+PLAN_LIMIT = 2**18  # characters of a plan's text, and bytes of a plan file; this bounds the parsing time
 _TEXT = r'"((?:[^"\\]|\\.)*)"|\'((?:[^\'\\]|\\.)*)\''
 _DEF = re.compile(r"def\s+([A-Za-z]\w*)\s*\(\s*robot\s*\)\s*:")
 _CHECK = re.compile(rf"if\s+check\s*\(\s*(?:{_TEXT})\s*\)\s*:")
@@ -26,19 +26,19 @@ _SKILL = re.compile(rf"robot\.([A-Za-z]\w*)\s*\(\s*+(?:{_TEXT})?\s*+(?:,?\s*+goa
 
 
 def parse_plan(text: str, task: str | None = None, source: str = "plan", tasks: Tasks = TASKS) -> ConditionalPlan:
-    """Parse a plan in the chain_py format. It is never executed: every line is matched against a few forms::
+    """Parse a plan in the chain_py format. The text is never executed; each line must have one of these forms::
 
         def drawer_open(robot):
             # The gripper has to come from above.
             if check("the robot's gripper is not vertically aligned with the drawer handle"):
                 robot.place("the gripper above the drawer handle")
 
-    A goal other than the skill's usual one follows the skill: ``robot.place("...", goal="the gripper is open")``.
+    A goal other than the skill's usual goal follows the skill: ``robot.place("...", goal="the gripper is open")``.
 
     Args:
         text: the plan.
-        task: the expected task; None accepts the one that its ``def`` line names.
-        source: the text's name in errors.
+        task: the name of the expected task; None accepts the task that the ``def`` line names.
+        source: the name of the text in error messages, such as a file name.
         tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
 
     Raises:
@@ -56,12 +56,12 @@ def parse_plan(text: str, task: str | None = None, source: str = "plan", tasks: 
 def check_plan(
     text: str, task: str | None = None, source: str = "plan", tasks: Tasks = TASKS
 ) -> tuple[ConditionalPlan | None, list[str]]:
-    """Parse a plan like :func:`parse_plan`, but return all its faults in the order of the lines, with None as plan."""
+    """Parse a plan like :func:`parse_plan`; return (plan, []), or (None, all faults in the order of the lines)."""
     if len(text) > PLAN_LIMIT:
         return None, [f"{source}: a plan's text must have at most {PLAN_LIMIT} characters, got {len(text)}"]
     name: str | None = None
     condition: Query | None = None
-    is_open = False  # a condition, faulty or not, waits for its skill
+    is_open = False  # whether the last condition, valid or not, still has no skill
     faults: list[str] = []
     steps: list[PlanStep] = []
     reason: list[str] = []
@@ -74,17 +74,17 @@ def check_plan(
                 reason.append(line.lstrip("# "))
         elif match := _DEF.fullmatch(line):
             if name is not None:
-                return None, [*faults, f"{where}: a second plan begins; a plan file holds one"]
+                return None, [*faults, f"{where}: a second plan begins, but a plan file holds one plan"]
             name = match[1].replace("__", "/").replace("_", "-")
             if name not in tasks:
                 return None, [*faults, f"{where}: {shown(name)} is not a task{did_you_mean(name, tasks)}"]
             if task is not None and name != task:
-                return None, [*faults, f"{where}: this is a plan for {name!r}, expected one for {task!r}"]
+                return None, [*faults, f"{where}: expected a plan for {task!r}, got a plan for {name!r}"]
         elif name is None:
             fault = f"expected 'def task_name(robot):' before {shown(line)}"
         elif match := _CHECK.fullmatch(line):
             if is_open:
-                fault = 'the condition above has no skill; expected robot.verb("details")'
+                fault = 'expected robot.verb("details") for the condition above, got a second condition'
             is_open, condition = True, None
             try:
                 condition = check_query(_unquote(match, 1), tasks[name])
@@ -92,7 +92,7 @@ def check_plan(
                 fault = fault or str(error)
         elif match := _SKILL.fullmatch(line):
             if not is_open:
-                fault = 'the skill has no condition; expected if check("condition"): above it'
+                fault = 'the skill has no condition; expected if check("condition"): above the skill'
             elif condition is not None:
                 goal = _unquote(match, 4)
                 try:
@@ -126,22 +126,22 @@ def _unquote(match: re.Match[str], group: int) -> str:
 
 @typed
 def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks: Tasks = TASKS) -> Plans:
-    """Load plans.
+    """Load the shipped plans, or plans from files.
 
-    A .json file maps task names to lists of (condition, skill) pairs, at its top or under the key "plans". A condition
-    outside the query language is replaced by the nearest query (:func:`nearest_query`), and kept as the step's
-    ``reason``.
+    A .json file maps task names to lists of (condition, skill) pairs, at the top level or under the key "plans". A
+    condition outside the query language is replaced by the nearest query (:func:`nearest_query`); the step's ``reason``
+    then quotes the original condition.
 
     Args:
         source: "MT10" or "MT50" for the shipped plans; or the path of a .plan or .json file, or of a folder of .plan
-            files. A .plan file may have any name except another task's.
-        skills: which shipped plans: "own", where every step has a scripted skill; "MT10", where every step is worded as
-            in the plans of MT10, for policies that have only seen these.
+            files. A .plan file may have any name except the name of a task other than its own.
+        skills: the wording of the shipped plans. With "own" every step has a scripted skill; with "MT10" every step is
+            worded as in the MT10 plans, for policies that were trained on those plans only.
         tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
 
     Raises:
-        FileNotFoundError: there is no such file, or no plan in the folder.
-        PlanError: (a ValueError) a file is not a valid plan, or is for another task than its name says.
+        FileNotFoundError: the path does not exist, or the folder has no .plan files.
+        PlanError: (a ValueError) a file is not a valid plan, or its name is the name of another task.
 
     Example:
         >>> load_plans("MT10")["reach"].task
@@ -153,16 +153,16 @@ def load_plans(source: AnyPath, *, skills: Literal["own", "MT10"] = "own", tasks
         names = MT10 if source == "MT10" else tuple(TASKS)
         return _read_all([data / ("plans" if task in MT10 else folder) / f"{task}.plan" for task in names], tasks)
     if skills != "own":
-        raise ValueError(f"skills={skills!r} is for the shipped plans, 'MT10' and 'MT50', got source {str(source)!r}")
+        raise ValueError(f"skills={skills!r} only applies to source 'MT10' or 'MT50', got source {str(source)!r}")
     path = Path(source)
     if not path.exists():
-        raise FileNotFoundError(f"no plan file or folder {str(path)!r}; 'MT10' and 'MT50' name the shipped plans")
+        raise FileNotFoundError(f"no plan file or folder {str(path)!r}; 'MT10' and 'MT50' load the shipped plans")
     if path.suffix == ".json":
         return _read_pairs(path, tasks)
-    # A killed save_plans leaves files whose names start with a dot.
+    # Skip the temporary files of an interrupted save_plans, whose names start with a dot.
     paths = [path] if path.is_file() else sorted(p for p in path.glob("*.plan") if p.name[0] != ".")
     if not paths:
-        hint = "lw.decode_plan reads a language model's answer, lw.save_plans writes .plan files"
+        hint = "use lw.decode_plan for a language model's answer, and lw.save_plans to write .plan files"
         raise FileNotFoundError(f"the folder {str(path)!r} holds no .plan files; {hint}")
     return _read_all(list[Traversable](paths), tasks)
 
@@ -175,7 +175,7 @@ def _read_all(paths: list[Traversable], tasks: Tasks) -> Plans:
         text = read_text(path, PlanError, limit=PLAN_LIMIT)
         plan = parse_plan(text, stem if stem in tasks else None, path.name, tasks)
         if plan.task in plans:
-            raise PlanError(f"{path.name}: a second plan for {plan.task!r}; {names[plan.task]} holds one, too")
+            raise PlanError(f"{path.name}: a second plan for {plan.task!r}; {names[plan.task]} also holds one")
         plans[plan.task], names[plan.task] = plan, path.name
     return Plans(plans)
 
@@ -184,10 +184,10 @@ def _read_pairs(path: Path, tasks: Tasks) -> Plans:
     try:
         content = parse_json(read_text(path, PlanError, limit=PLAN_LIMIT).encode())
     except ValueError as error:
-        raise PlanError(f"{path.name}: expected JSON, task names with lists of pairs: {error}") from error
+        raise PlanError(f"{path.name}: expected JSON that maps task names to lists of pairs: {error}") from error
     rows = content.get("plans", content)
     if not isinstance(rows, dict):
-        raise PlanError(f"{path.name}: expected task names with lists of (condition, skill) pairs, got {shown(rows)}")
+        raise PlanError(f"{path.name}: expected task names mapped to (condition, skill) pairs, got {shown(rows)}")
     plans = []
     for name, pairs in rows.items():
         if name not in tasks:
@@ -196,7 +196,7 @@ def _read_pairs(path: Path, tasks: Tasks) -> Plans:
         for number, pair in enumerate(pairs if isinstance(pairs, list) else [pairs], 1):
             where = f"{path.name}, {name}, step {number}"
             if not (isinstance(pair, list) and len(pair) == 2 and all(isinstance(text, str) for text in pair)):
-                raise PlanError(f"{where}: expected a condition and a skill, two strings, got {shown(pair)}")
+                raise PlanError(f"{where}: expected a pair of strings (condition, skill), got {shown(pair)}")
             try:
                 match = nearest_query(pair[0], tasks[name])
             except QueryError as error:
@@ -208,7 +208,7 @@ def _read_pairs(path: Path, tasks: Tasks) -> Plans:
 
 @typed
 def save_plans(plans: AnyPlans, folder: AnyPath) -> list[Path]:
-    """Write each plan to ``folder``/<task>.plan, with "__" for a slash, whole or not at all; return the paths."""
+    """Write each plan atomically to ``folder``/<task>.plan, with "__" for a slash; return the paths."""
     texts = {Path(folder) / f"{task.replace('/', '__')}.plan": str(plan) for task, plan in as_plans(plans).items()}
     Path(folder).mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():

@@ -1,4 +1,4 @@
-"""Conditional plans: (condition, skill) pairs in English. :mod:`lw_torchrl.language.formats` writes and reads them."""
+"""Conditional plans: (condition, skill) pairs in English. :mod:`lw_torchrl.language.formats` has their text formats."""
 
 from __future__ import annotations
 
@@ -18,31 +18,32 @@ from lw_torchrl.language.roles import StepRole
 from lw_torchrl.language.skills import canonical_skill, load_skills
 from lw_torchrl.language.tasks import TASKS, Task, check_task, get_task, one_layout, role_object, task_ids
 
-MOST_STEPS = 1_000  # of a plan; the longest shipped one has 6
+MOST_STEPS = 1_000  # maximum number of steps of a plan; the longest shipped plan has 6
 
 
 class PlanError(ValueError):
-    """A text or a list of steps that is not a conditional plan."""
+    """The error for a text or a list of steps that is not a valid conditional plan."""
 
 
 def one_line(text: str) -> str:
-    """Return a description or a reason with spaces instead of line ends."""
+    """Join the lines of a text with spaces."""
     return " ".join(text.split())
 
 
 def quote(text: str) -> str:
+    """Put a text in double quotes, with its quotes and backslashes escaped."""
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
 def function_head(task: Task) -> str:
-    """Return the first lines of a task's function: a comment with its description, and ``def``."""
+    """Return the first lines of a task's function: a comment with the task's description, and the ``def`` line."""
     name = task.name.replace("/", "__").replace("-", "_")
     return f"# {task.name}: {one_line(task.description)}\ndef {name}(robot):\n"
 
 
 @lru_cache(maxsize=1024)
 def usual_goal(skill: str, task: Task) -> Query | None:
-    """Return the state that a scripted skill steers to; None if it has none, or if the task lacks its objects."""
+    """Return the state that a scripted skill steers to; None for other skills, or if no query expresses that state."""
     scripted = load_skills().get(skill)
     return None if scripted is None else read_query(scripted.variants.get(task.name, scripted).goal, task)
 
@@ -50,18 +51,18 @@ def usual_goal(skill: str, task: Task) -> Query | None:
 @typed_fields
 @dataclass(frozen=True)
 class PlanStep:
-    """A step of a plan: while ``condition`` is true, carry out ``skill``. Its queries are of the plan's task."""
+    """A step of a plan: while ``condition`` is true, carry out ``skill``. Queries name objects of the plan's task."""
 
     condition: Query
     skill: str  # plain English, "place the gripper above the puck"
-    reason: str = field(default="", compare=False)  # a comment for the reader, without effect on the plan
-    goal: Query | None = None  # the state to reach, if it is not the skill's usual one; see ConditionalPlan.goals
+    reason: str = field(default="", compare=False)  # a comment for human readers, without effect on policies
+    goal: Query | None = None  # the state to reach; None for the skill's usual goal, see ConditionalPlan.goals
     role: StepRole | None = None  # the action and its objects, in plans of :func:`~lw_torchrl.canonical_plan`
 
     def mentions(self, task: Task) -> set[str]:
         """Return the names of the objects that the condition or the skill mentions; the goal may be "target location".
 
-        The role tells the objects of the skill. Without a role, they are searched for in its text.
+        The skill's objects are taken from the step's role or, without a role, found by name in the skill's text.
         """
         clauses = self.condition.clauses
         names = {name for clause in clauses for name in (clause.subject, clause.object) if name is not None}
@@ -76,13 +77,13 @@ class PlanStep:
 class ConditionalPlan:
     """A plan for one task: 1 to 1,000 steps, as in the paper's section 'Conditional Plan Generation'.
 
-    Its conditions and skills are kept in canonical spelling (``str(query)``, "the" before nouns), so that its text
-    reads back as the same plan. Two plans are equal if their conditions, skills and goals are. In a plan of
-    :func:`~lw_torchrl.canonical_plan`, ``confidence`` is the fraction of typical states in which the plan, as written,
-    does what its motion needs.
+    Conditions and skills are stored in canonical spelling (``str(query)``, "the" before nouns), so that parsing the
+    plan's text returns an equal plan. Two plans are equal if their conditions, skills and goals are equal. In a plan
+    from :func:`~lw_torchrl.canonical_plan`, ``confidence`` is the fraction of typical states in which the plan, as
+    written, does what its motion needs.
 
     Raises:
-        PlanError: a condition, a skill or a role does not suit the task; the message names the step.
+        PlanError: a condition, a skill or a role is not valid for the task; the message names the step.
 
     Example:
         >>> plan = ConditionalPlan.from_pairs("reach", [("gripper is open", "move the gripper to the target")])
@@ -92,7 +93,7 @@ class ConditionalPlan:
 
     task: str
     steps: tuple[PlanStep, ...]
-    # The task whose objects the conditions name; by default the shipped task of that name.
+    # The task whose objects the conditions name; None for the shipped task with the name ``task``.
     definition: Task = field(default=None, compare=False, repr=False)  # type: ignore[assignment]
     confidence: Probability | None = None
 
@@ -101,7 +102,7 @@ class ConditionalPlan:
         if not 1 <= len(self.steps) <= MOST_STEPS:
             raise PlanError(f"{plan} must have 1 to {MOST_STEPS} steps, got {len(self.steps)}")
         if task.name != self.task:
-            raise PlanError(f"definition of {plan} is of another task, {task.name!r}")
+            raise PlanError(f"definition of {plan} must be the task {self.task!r}, got {task.name!r}")
         steps = []
         for number, step in enumerate(self.steps, 1):
             try:
@@ -111,7 +112,7 @@ class ConditionalPlan:
                     role_object(task, name)
             except ValueError as error:
                 raise PlanError(f"step {number} of {plan}: {error}") from error
-            # A usual goal is stored as None, so that plans with and without it are equal.
+            # Store the usual goal as None, so that a plan that states this goal equals a plan that omits it.
             goal = None if goal == usual_goal(skill, task) else goal
             steps.append(replace(step, condition=condition, skill=skill, goal=goal))
         object.__setattr__(self, "definition", task)
@@ -119,18 +120,18 @@ class ConditionalPlan:
 
     @classmethod
     def from_pairs(cls, task: str | Task, pairs: Iterable[tuple[str | Query, str]]) -> ConditionalPlan:
-        """Return a plan of (condition, skill) pairs; conditions may be texts in any accepted spelling."""
+        """Build a plan from (condition, skill) pairs; a condition may be a text that :func:`parse_query` accepts."""
         definition = get_task(task)
         steps = tuple(PlanStep(check_query(query, definition), skill) for query, skill in pairs)
         return cls(definition.name, steps, definition)
 
     @property
     def goals(self) -> tuple[Query | None, ...]:
-        """The state to reach in each step: the step's goal, else the skill's usual one, else None."""
+        """The state to reach in each step: the step's goal, else the skill's usual goal, else None."""
         return tuple(step.goal or usual_goal(step.skill, self.definition) for step in self.steps)
 
     def __str__(self) -> str:
-        """Return the plan as text in the chain_py format, which :func:`parse_plan` reads."""
+        """Convert the plan to text in the chain_py format, which :func:`parse_plan` parses."""
         lines = []
         for step in self.steps:
             if reason := one_line(step.reason).lstrip("# "):
@@ -141,7 +142,7 @@ class ConditionalPlan:
         return function_head(self.definition) + "".join(f"{line}\n" for line in lines)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the plan as JSON: its text, and its task (unless it is shipped), roles and confidence, if any."""
+        """Convert the plan to JSON: its text, its task if not shipped, and its roles and confidence, if any."""
         row: dict[str, Any] = {"plan": str(self)}
         if self.definition != TASKS.get(self.task):
             row["task"] = self.definition.to_json()
@@ -151,18 +152,18 @@ class ConditionalPlan:
 
     @classmethod
     def from_json(cls, name: str, row: Any) -> ConditionalPlan:
-        """Rebuild the plan of the task ``name`` from :meth:`to_json`; raise :class:`PlanError` for any other value."""
+        """Rebuild the plan for task ``name`` from :meth:`to_json`; raise a PlanError if ``row`` is not such JSON."""
         from lw_torchrl.language.plan_files import parse_plan  # here, because plan_files imports this module
 
         where, keys = f"plan of {shown(name)}", ("plan", "task", "roles", "confidence")
         if not isinstance(row, dict) or not isinstance(row.get("plan"), str) or set(row) - {*keys}:
-            raise PlanError(f'{where} must be like {{"plan": text, "task": table}}, got {shown(row)}')
+            raise PlanError(f'{where} must be an object {{"plan": text, "task": object}}, got {shown(row)}')
         try:
             task = Task.from_json(name, row["task"]) if "task" in row else TASKS[check_task(name)]
             plan = parse_plan(row["plan"], name, where, {name: task})
             roles = row.get("roles", [None] * len(plan.steps))
             if not isinstance(roles, list) or len(roles) != len(plan.steps):
-                raise ValueError(f"roles must be a list with one entry for each of its {len(plan.steps)} steps")
+                raise ValueError(f"roles must be a list with one entry per step ({len(plan.steps)})")
             steps = [
                 replace(step, role=None if role is None else StepRole.from_json(role))
                 for step, role in zip(plan.steps, roles, strict=True)
@@ -175,16 +176,16 @@ class ConditionalPlan:
 
 
 class Plans(Mapping[str, ConditionalPlan]):
-    """An immutable mapping from task names, sorted, to their plans. ``layout`` is the layout of the tasks."""
+    """An immutable mapping from sorted task names to plans. ``layout`` is the layout that all the tasks share."""
 
     @typed
     def __init__(self, plans: Mapping[str, ConditionalPlan] | Iterable[ConditionalPlan]) -> None:
         listed = list(plans.values() if isinstance(plans, Mapping) else plans)
         for name, plan in plans.items() if isinstance(plans, Mapping) else ():
             if name != plan.task:
-                raise PlanError(f"plans[{name!r}] is a plan for another task, {plan.task!r}")
+                raise PlanError(f"plans[{name!r}] must be a plan for {name!r}, got a plan for {plan.task!r}")
         if not listed or len({plan.task for plan in listed}) != len(listed):
-            raise PlanError(f"plans must hold at least one plan, and one for each task, got {len(listed)}")
+            raise PlanError(f"plans must hold at least one plan, and at most one per task, got {len(listed)} plans")
         self._plans = {plan.task: plan for plan in sorted(listed, key=lambda p: p.task)}
         try:
             self.layout: Layout = one_layout(plan.definition for plan in listed)
@@ -205,36 +206,36 @@ class Plans(Mapping[str, ConditionalPlan]):
 
     @cached_property
     def num_steps(self) -> int:
-        """S, the number of steps of the longest plan."""
+        """The number of steps S in the longest plan."""
         return max(len(plan.steps) for plan in self.values())
 
     @cached_property
     def skills(self) -> tuple[str, ...]:
-        """Every skill text once, sorted."""
+        """The distinct skill texts of all plans, sorted."""
         return tuple(sorted({step.skill for plan in self.values() for step in plan.steps}))
 
     @property
     def task_ids(self) -> dict[str, int]:
-        """The id of each task, see :func:`~lw_torchrl.task_id`."""
+        """The id of each task by name; see :func:`~lw_torchrl.task_id`."""
         return task_ids(self)
 
     @cached_property
     def has_roles(self) -> bool:
-        """Whether every step has a role, as in the plans of :func:`~lw_torchrl.canonical_plans`."""
+        """Whether every step has a role, as in the plans that :func:`~lw_torchrl.canonical_plans` returns."""
         return all(step.role is not None for plan in self.values() for step in plan.steps)
 
     @property
     def numbers(self) -> dict[str, int]:
-        """A number below 2**60 for each task's plan, derived from its :attr:`fingerprint`."""
+        """An integer below 2**60 for each task, derived from the :attr:`fingerprint` of the task's plan."""
         return {task: int(Plans([plan]).fingerprint[:15], 16) for task, plan in self.items()}
 
     @property
     def fingerprint(self) -> str:
-        """A hash, 32 hex digits, of everything that queries and attention depend on.
+        """A hash (32 hex digits) of everything that queries and attention depend on.
 
-        That is each step's condition and skill, the number of steps, the objects of each task with their positions and
-        offsets, and the current meaning of the used relations, but not reasons and descriptions. Plans with the same
-        fingerprint give the same ``qaf``.
+        The hash covers each step's condition and skill, the number of steps, the objects of each task with their
+        positions and offsets, and the current definitions of the relations that the conditions use. Reasons and
+        descriptions do not affect the hash. Plans with the same fingerprint give the same ``qaf``.
         """
         used = {clause.predicate for plan in self.values() for step in plan.steps for clause in step.condition.clauses}
 
@@ -254,34 +255,34 @@ class Plans(Mapping[str, ConditionalPlan]):
         return sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32]
 
     def to_json(self) -> dict[str, Any]:
-        """Return each task's :meth:`ConditionalPlan.to_json`."""
+        """Convert the plans to JSON: task name to :meth:`ConditionalPlan.to_json`."""
         return {task: plan.to_json() for task, plan in self.items()}
 
     @classmethod
     def from_json(cls, row: Any) -> Plans:
-        """Rebuild the plans from :meth:`to_json`; raise :class:`PlanError` for any other value."""
+        """Rebuild the plans from :meth:`to_json`; raise a PlanError if ``row`` is not such JSON."""
         if not isinstance(row, dict):
-            raise PlanError(f"plans must be an object of task names and plans, got {shown(row)}")
+            raise PlanError(f"plans must be an object that maps task names to plans, got {shown(row)}")
         return cls([ConditionalPlan.from_json(name, plan) for name, plan in row.items()])
 
     def differences(self, other: Plans) -> list[str]:
-        """Return the common tasks whose plans have different fingerprints."""
+        """Return the tasks that have a plan in both collections, but with different fingerprints."""
         theirs = other.numbers
         return [task for task, number in self.numbers.items() if number != theirs.get(task, number)]
 
     def require(self, tasks: Iterable[str]) -> None:
-        """Raise :class:`PlanError` if one of ``tasks`` has no plan here."""
+        """Raise a PlanError if a task in ``tasks`` has no plan in this collection."""
         if missing := [task for task in tasks if task not in self]:
-            what = f"plans lack {', '.join(missing)}; they cover {', '.join(self)}"
+            what = f"plans have no plan for {', '.join(missing)}; they cover {', '.join(self)}"
             raise PlanError(f"{what}. Load or write a plan for each task, or leave the task out.")
 
 
 AnyPlans = Plans | Mapping[str, ConditionalPlan]
-"""The type of arguments ``plans``: :class:`Plans`, or a mapping from task names to plans."""
+"""The type of a ``plans`` argument: :class:`Plans`, or a mapping from task names to plans."""
 
 
 def as_plans(plans: AnyPlans, argument: str = "plans") -> Plans:
-    """Return ``plans`` as :class:`Plans`, a mapping checked and copied. Errors name the argument."""
+    """Convert a mapping to :class:`Plans`, and return Plans unchanged. Errors name the ``argument``."""
     if isinstance(plans, Plans):
         return plans
     if not isinstance(plans, Mapping):

@@ -1,4 +1,4 @@
-"""The query language: English conditions on a state, "the robot's gripper is not above the puck"."""
+"""The query language: English conditions on a state, such as "the robot's gripper is not above the puck"."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lw_torchrl.language.tasks import Task, get_task
 
 ARTICLES = ("the", "a", "an")
 _ALIASES = {"gripper": GRIPPER, "robot gripper": GRIPPER}
-_MOST_CLAUSES = 64  # the tables have room for as many in every step
+_MOST_CLAUSES = 64  # per query; the query tables are padded to the longest query
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Clause:
 
 @dataclass(frozen=True)
 class Query:
-    """A conjunction of clauses, which is true if all of them are. ``str`` gives the canonical spelling.
+    """A conjunction of clauses, which is true if every clause is true. ``str(query)`` is the canonical spelling.
 
     Example:
         >>> str(parse_query("Is the gripper open and not above the puck?", task="pick-place"))
@@ -51,18 +51,18 @@ class Query:
 
 
 class QueryError(ValueError):
-    """A text that is not a query of its task."""
+    """The error for a text that is not a query about the objects of its task."""
 
 
 def check_length(text: str, parts: Sequence[str]) -> None:
-    """Raise :class:`QueryError` if a text has more clauses than a query may have."""
+    """Raise a QueryError if a text has more clauses than a query may have."""
     if len(parts) > _MOST_CLAUSES:
         raise QueryError(f"query {_cut(text)!r} must have at most {_MOST_CLAUSES} clauses, got {len(parts)}")
 
 
 @lru_cache(maxsize=256)
 def base_clauses(task: Task, predicates: tuple[str, ...]) -> tuple[Clause, ...]:
-    """Return the clauses of :func:`supported_queries` with the given relations and states."""
+    """Return the clauses of :func:`supported_queries` that use the given relations and states."""
     relations, states = ([name for name in predicates if name in table] for table in (RELATIONS, STATES))
     clauses = []
     for first, second in permutations(task.object_names, 2):
@@ -81,11 +81,11 @@ def base_clauses(task: Task, predicates: tuple[str, ...]) -> tuple[Clause, ...]:
 def supported_queries(task: str | Task, published_only: bool = False) -> tuple[str, ...]:
     """Return the base queries of a task, in canonical spelling.
 
-    :func:`parse_query` accepts more: any relation between two different objects, "touching the table" for any object,
-    negated states, and conjunctions of all these.
+    :func:`parse_query` also accepts any relation between two distinct objects, "touching the table" for any object,
+    negated states, and conjunctions of clauses.
 
     Args:
-        published_only: return only the paper's queries, without our points and your relations.
+        published_only: return only the paper's queries, without our added points and without custom relations.
 
     Example:
         >>> len(supported_queries("reach")), supported_queries("reach")[0]
@@ -97,11 +97,12 @@ def supported_queries(task: str | Task, published_only: bool = False) -> tuple[s
 
 
 def _cut(text: str, most: int = 80) -> str:
+    """Shorten a text to at most ``most`` characters by cutting out its middle."""
     return text if len(text) <= most else f"{text[: most - 25]} ... {text[-20:]}"
 
 
 class _ClauseParser:
-    """A parser of one clause, from left to right, whose errors point at a word."""
+    """A left-to-right parser for one clause, whose errors point at a word."""
 
     def __init__(self, words: Sequence[str], task: Task, text: str, explain: bool) -> None:
         self.words, self.task, self.text, self.explain, self.at = words, task, text, explain, 0
@@ -110,9 +111,9 @@ class _ClauseParser:
         self.names.update({alias: name for alias, name in _ALIASES.items() if alias not in self.names})
 
     def error(self, expected: str) -> QueryError:
-        if not self.explain:  # finding the nearest query takes most of an error's time
+        if not self.explain:  # building the full error is slow, because of the search for the nearest query
             return QueryError("not a query")
-        word = f"{_cut(self.words[self.at], 40)!r} (word {self.at + 1})" if self.at < len(self.words) else "its end"
+        word = f"{_cut(self.words[self.at], 40)!r} (word {self.at + 1})" if self.at < len(self.words) else "the end"
         context = " ".join(self.words[max(0, self.at - 8) : self.at + 8])
         close = process.extractOne((self.inferred + context)[:300], supported_queries(self.task), scorer=fuzz.ratio)
         return QueryError(
@@ -121,7 +122,7 @@ class _ClauseParser:
         )
 
     def take(self, phrase: str) -> bool:
-        """Consume a phrase if it comes next; return whether it did."""
+        """Consume a phrase if the phrase comes next, and return whether it did."""
         words = phrase.split()
         if list(self.words[self.at : self.at + len(words)]) != words:
             return False
@@ -129,7 +130,7 @@ class _ClauseParser:
         return True
 
     def name(self) -> str | None:
-        """Consume an object's name and return it; None if none comes next."""
+        """Consume and return an object's name; return None if no name comes next."""
         start = self.at
         self.at += self.at_article()
         for name in sorted(self.names, key=len, reverse=True):
@@ -139,7 +140,7 @@ class _ClauseParser:
         return None
 
     def name_error(self, expected: str = "") -> QueryError:
-        self.at += self.at_article()  # the noun is wrong, not its article
+        self.at += self.at_article()  # point at the noun, not at the article
         return self.error(expected or "one of " + ", ".join(repr(f"the {name}") for name in self.task.object_names))
 
     def at_article(self) -> bool:
@@ -164,8 +165,8 @@ class _ClauseParser:
             raise self.error("one of " + ", ".join(map(repr, PREDICATES)))
         if predicate in STATES and subject not in self.task.openings:
             self.at -= len(predicate.split())
-            those = " and ".join(f"the {name}" for name in self.task.openings).replace(GRIPPER, "gripper")
-            raise self.error(f"a predicate of the {subject}; only {those} can be {' or '.join(STATES)}")
+            openable = " and ".join(f"the {name}" for name in self.task.openings).replace(GRIPPER, "gripper")
+            raise self.error(f"a predicate of the {subject}; only {openable} can be {' or '.join(STATES)}")
         start, other = self.at, None if predicate in UNARY else self.name()
         if other is None and predicate not in UNARY:
             raise self.name_error()
@@ -181,14 +182,14 @@ class _ClauseParser:
 def parse_query(text: str, task: str | Task) -> Query:
     """Parse an English condition on a state of ``task``.
 
-    It may be a question, in capitals, without articles, with "the gripper" or "isn't". A clause may leave out the
-    subject of the previous one ("... is open and not above the puck").
+    The text may be a question, use capitals, omit articles, and contain "the gripper" or "isn't". A clause may omit its
+    subject if the previous clause has the same subject ("... is open and not above the puck").
 
     Args:
-        text: "Is the gripper open and not above the puck?", of at most 64 clauses.
+        text: a condition of at most 64 clauses, such as "Is the gripper open and not above the puck?".
 
     Raises:
-        QueryError: the text is not a query; the message points at the word and names the nearest query.
+        QueryError: the text is not a query; the message points at the wrong word and suggests the nearest query.
 
     Example:
         >>> str(parse_query("the gripper above the puck", task="push"))
@@ -200,7 +201,7 @@ def parse_query(text: str, task: str | Task) -> Query:
 
 
 def read_query(text: str, task: Task) -> Query | None:
-    """Parse a condition like :func:`parse_query`, but return None quickly if the text is not a query."""
+    """Parse a condition like :func:`parse_query`, but return None (quickly) if the text is not a query."""
     try:
         return _parse(text, task, explain=False)
     except QueryError:
@@ -219,13 +220,13 @@ def _parse(text: str, task: Task, explain: bool) -> Query:
 
 
 def check_query(query: str | Query, task: str | Task) -> Query:
-    """Return ``query`` as a :class:`Query` of ``task``: parse a text, check a Query against the task's objects."""
+    """Parse a text, or check that a :class:`Query` is valid for ``task``; return the Query."""
     if not isinstance(query, Query):
         return parse_query(query, task)
     owner = get_task(task)
     if 0 < len(query.clauses) <= _MOST_CLAUSES and all(_is_of(clause, owner) for clause in query.clauses):
         return query
-    return parse_query(str(query), owner)  # resolves aliases, or explains the fault
+    return parse_query(str(query), owner)  # resolves aliases, or raises an error that explains the fault
 
 
 def _is_of(clause: Clause, task: Task) -> bool:

@@ -1,4 +1,4 @@
-"""The compiled path of :class:`~lw_torchrl.QueryProgram`: one pass over a batch; needs Numba, ``lw_torchrl[fast]``."""
+"""The Numba kernel of :class:`~lw_torchrl.QueryProgram`, which needs the extra ``lw_torchrl[fast]``."""
 
 from math import sqrt
 from typing import Any
@@ -12,10 +12,10 @@ def answer(
     observation: Any, task_id: Any, ids: Any, row_of: Any, ends: Any, places: Any, metres: Any, bit: Any, flipped: Any,
     conjunction: Any, care: Any, want: Any, constants: Any, truth: Any,
 ) -> bool:  # fmt: skip
-    """Write the truth (B, S) bool of each row's queries, by the same operations as the tables and in the same order.
+    """Write each row's query results to ``truth`` (B, S) bool, with QueryProgram's operations in the same order.
 
-    ``observation`` is (B, D) float32 or float64, metres; ``task_id`` is (B,) int64; ``ids`` to ``constants`` are the
-    tables of :class:`QueryFacts`. Return False for a task without queries, and for NaN or infinity.
+    ``observation`` is (B, D) float32 or float64, in metres; ``task_id`` is (B,) int64; ``ids`` to ``constants`` are the
+    fields of :class:`QueryFacts`. Return False if a task has no queries or a number is NaN or infinite.
     """
     size = observation.shape[1]
     numbers = np.empty(size + constants.shape[0], observation.dtype)
@@ -36,7 +36,7 @@ def answer(
                 row = nearest
         if row < 0:
             return False
-        # Unsigned throughout: Numba turns a mix of int64 and uint64 into float64.
+        # All integers are unsigned, since Numba promotes a mix of int64 and uint64 to float64.
         t = np.uint64(row)
         facts = np.uint64(0)
         for a in range(ends[t, 0], ends[t, 1]):

@@ -1,4 +1,4 @@
-"""QueryProgram: the queries of many tasks as index tensors, evaluated for a mixed batch in one call."""
+"""Compiled queries: the queries of many tasks as index tensors, evaluated for a mixed batch in one call."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from lw_torchrl.language.query_tables import QueryTables, compile_facts, compile
 from lw_torchrl.language.task_index import TaskIndex, TaskTables
 from lw_torchrl.language.tasks import TASKS, Task, one_layout, task_ids
 
-_LEAST, _MOST = 1e-6, 1e4  # limits of a logit's size, and of metres where a length has a gradient
+_LEAST, _MOST = 1e-6, 1e4  # bounds on the magnitude of a logit, and on differentiated lengths (metres)
 _COMPILED = {torch.float32: np.float32, torch.float64: np.float64}
 
 
 @cache
 def find_kernel() -> Callable[..., bool] | None:
-    """Return the compiled kernel; None if Numba is not installed or cannot compile."""
+    """Return the Numba kernel, or None if Numba is not installed or cannot compile the kernel."""
     try:
         from lw_torchrl.language.query_kernel import answer
-    except (ImportError, RuntimeError):  # RuntimeError: there is no folder for Numba's cache
+    except (ImportError, RuntimeError):  # RuntimeError: Numba finds no writable cache folder
         return None
     return answer
 
 
 class QueryProgram(nn.Module):
-    """Queries compiled once and answered for any batch of mixed tasks in one call.
+    """A module that compiles queries once and answers them for any batch of mixed tasks in one call.
 
-    Its tables are buffers that are not saved and keep their precision. With Numba (``lw_torchrl[fast]``) a compiled
-    loop answers batches on the CPU, with the same bits; its first call takes about a second to compile.
+    The compiled tables are buffers that are not saved and keep their precision. With Numba (``lw_torchrl[fast]``) a
+    compiled loop answers batches on the CPU, with identical results; the first call compiles for about a second.
 
     Args:
-        queries: task name (or :class:`Task`) to its queries, each a :class:`Query` or a text.
+        queries: a mapping from task names (or :class:`Task`) to lists of queries, each a :class:`Query` or a text.
 
     Attributes:
         tasks: the names of the tasks, sorted.
-        num_queries: S, the length of the longest list.
+        num_queries: the number of queries S in the longest list.
         layout: the layout of the tasks' observations.
 
     Example:
@@ -56,12 +56,12 @@ class QueryProgram(nn.Module):
 
     def __init__(self, queries: Mapping[str | Task, Sequence[str | Query]]) -> None:
         if not check_value("queries", queries, Mapping):
-            raise ValueError("queries must name at least one task, got an empty mapping")
+            raise ValueError("queries must contain at least one task, got an empty mapping")
         compiled: dict[Task, tuple[Query, ...]] = {}
         for key, listed in queries.items():
             task = key if isinstance(key, Task) else TASKS[check_choice("queries", key, TASKS)]
             if any(task.name == other.name for other in compiled):
-                raise ValueError(f"queries must name each task once, got {task.name!r} twice")
+                raise ValueError(f"queries must contain each task once, got {task.name!r} twice")
             if isinstance(listed, (str, Query)) or not isinstance(listed, Iterable) or not listed:
                 raise ValueError(f"queries[{task.name!r}] must be a list of at least one query, got {shown(listed)}")
             where = f"queries[{task.name!r}]"
@@ -86,14 +86,14 @@ class QueryProgram(nn.Module):
         """Answer the queries.
 
         Args:
-            observation: (..., D) float, in the tasks' layout; for Meta-World 39 numbers, metres.
-            task_id: (...) int64, of tasks with queries.
+            observation: (..., D) float, in the tasks' layout (39 numbers in metres for Meta-World).
+            task_id: (...) int64, ids of tasks with queries.
 
         Returns:
-            (..., S) bool on the observation's device, in the order of the task's list; padding is false.
+            (..., S) bool on the observation's device, in the order of the task's list of queries; padding is false.
 
         Raises:
-            ValueError: a wrong shape or dtype, NaN or infinity, or a task without queries.
+            ValueError: the inputs have a wrong shape or dtype, a NaN or an infinity, or a task without queries.
         """
         _check_batch(observation, task_id, self.layout.size)
         if (kernel := self._kernel(observation, task_id)) is not None:
@@ -101,26 +101,26 @@ class QueryProgram(nn.Module):
         check_finite("observation", observation)
         tables = self._tables.select(task_id.reshape(-1), observation)
         atoms = (self._values(observation, tables) < tables.threshold) ^ tables.flipped
-        # & of a few tensors is far faster than all() over a short axis.
+        # A logical AND of a few tensors is far faster than all() over a short axis.
         clauses = reduce(torch.logical_and, self._parts(atoms, tables)) ^ tables.negated
         return reduce(torch.logical_and, clauses.unbind(1)).reshape(*task_id.shape, self.num_queries)
 
     def logits(self, observation: Tensor, task_id: Tensor, *, temperature: float = 1.0) -> Tensor:
-        """Return soft truth: how far each query is from changing its truth, differentiable in the observation.
+        """Return soft truth values: each query's margin as a logit, differentiable in the observation.
 
         A comparison's margin is its distance to the threshold, divided by its temperature (see
-        :class:`~lw_torchrl.language.relations.Comparison`). A conjunction has the smallest margin of its parts, a
-        negation the negative margin. The sign is the hard truth and never zero. The gradient is finite, and is that of
-        the comparison that decides.
+        :class:`~lw_torchrl.language.relations.Comparison`). A conjunction has the smallest margin of its operands, a
+        negation the negative margin. The logit is positive if the query is true, otherwise negative, and never zero.
+        The gradient is finite, and equals the gradient of the comparison with the smallest margin.
 
         Args:
             observation, task_id: as for :meth:`forward`.
-            temperature: factor on every comparison's temperature, between 1e-6 and 1e6.
+            temperature: a factor on every comparison's temperature, between 1e-6 and 1e6.
 
         Returns:
-            (..., S) float32 logits on the observation's device, of size 1e-6 to 1e4; padding is -1e4.
+            (..., S) float32 logits on the observation's device, with magnitudes from 1e-6 to 1e4; padding is -1e4.
         """
-        if not isinstance(temperature, Real) or not 1e-6 <= temperature <= 1e6:  # torch.compile can trace this
+        if not isinstance(temperature, Real) or not 1e-6 <= temperature <= 1e6:  # a check that torch.compile can trace
             raise ValueError(f"temperature must be between 1e-6 and 1e6, got {temperature!r}")
         truth = self(observation.detach(), task_id)
         state = observation if observation.dtype in _COMPILED else observation.float()
@@ -130,32 +130,32 @@ class QueryProgram(nn.Module):
         clause = reduce(torch.minimum, self._parts(torch.where(tables.flipped, -margin, margin), tables))
         soft = torch.where(tables.negated, -clause, clause).amin(1).float().reshape(truth.shape)
         size = torch.where(truth, soft, -soft).detach().clamp(_LEAST, _MOST)
-        # The value has the sign of the hard truth, also on a threshold; the gradient is that of soft everywhere.
+        # The value has the sign of the hard truth, even exactly on a threshold; the gradient is the gradient of soft.
         return soft - soft.detach() + torch.where(truth, size, -size)
 
     def _kernel(self, observation: Tensor, task_id: Tensor) -> Callable[..., bool] | None:
-        """Return the kernel if it can read the tensors."""
+        """Return the kernel if it supports these tensors; else None."""
         on_cpu = observation.dtype in self._facts and observation.is_cpu and task_id.is_cpu
         fits = on_cpu and self._tables.plain(observation, task_id) and not observation.is_neg()
         return find_kernel() if fits else None
 
     def _answer(self, kernel: Callable[..., bool], observation: Tensor, task_id: Tensor) -> Tensor:
-        """Answer with the kernel. Each PyTorch operation is slow here: physics has just emptied the CPU's caches."""
+        """Answer with the kernel. PyTorch operations are slow here, since physics has just evicted the CPU's caches."""
         states = observation.numpy(force=observation.requires_grad).reshape(-1, self.layout.size)
         ids = task_id.numpy().reshape(-1)
         truth = np.empty((len(ids), self.num_queries), dtype=bool)
         batch = np.ascontiguousarray(states), np.ascontiguousarray(ids, dtype=np.int64)
         if not kernel(*batch, *self._facts[observation.dtype], truth):
             check_finite("observation", observation)
-            self._tables.select(task_id.reshape(-1), observation)  # one of the two raises
+            self._tables.select(task_id.reshape(-1), observation)  # either this call or the one above raises
         return torch.from_numpy(truth.reshape(*task_id.shape, self.num_queries))
 
     def _parts(self, atoms: Tensor, tables: QueryTables) -> tuple[Tensor, ...]:
-        """Return the J atoms of each clause, each (B, K, S), from all atoms (B, A)."""
+        """Gather the J atoms of each clause, J tensors (B, K, S), from all atoms (B, A)."""
         return atoms.gather(1, tables.atoms).unflatten(1, (-1, *tables.negated.shape[1:])).unbind(1)
 
     def _values(self, observation: Tensor, tables: QueryTables, floor: float = 0.0) -> Tensor:
-        """Return each atom's value, (B, A) metres. A length of 0 has no gradient, so ``floor`` is its minimum."""
+        """Return each atom's value (B, A) in metres; ``floor`` is the minimum length, since 0 has no gradient."""
         numbers = torch.cat((observation.reshape(-1, self.layout.size), tables.constants), 1)
         d = (numbers.gather(1, tables.first) - numbers.gather(1, tables.second)).unflatten(1, (3, -1)) + tables.shift
         x, y, z = d.unbind(1)
@@ -169,7 +169,7 @@ class QueryProgram(nn.Module):
 def _check_batch(observation: Tensor, task_id: Tensor, size: int) -> None:
     for name, value in (("observation", observation), ("task_id", task_id)):
         if not isinstance(value, Tensor):
-            raise TypeError(f"{name} must be a tensor, got {type(value).__name__}; torch.as_tensor makes one")
+            raise TypeError(f"{name} must be a tensor, got {type(value).__name__}; convert it with torch.as_tensor")
     shape, ids = tuple(observation.shape), tuple(task_id.shape)
     if shape[-1:] != (size,) or not observation.is_floating_point():
         raise ValueError(f"observation must be float of shape (..., {size}), got {observation.dtype} of shape {shape}")

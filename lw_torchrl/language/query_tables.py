@@ -1,4 +1,4 @@
-"""The tables of :class:`~lw_torchrl.QueryProgram`: queries compiled to tensors, and to bits for its kernel."""
+"""Tables for :class:`~lw_torchrl.QueryProgram`: queries compiled to tensors, and to bits for the Numba kernel."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from lw_torchrl.language.tasks import MT50, Task, one_layout, task_id
 
 
 class Atom(NamedTuple):
-    """A comparison of two positions, brought to the form "value < threshold".
+    """A comparison of two positions in the form "value < threshold".
 
-    For the senses ">" and "<=" the positions are swapped, which negates the value, and so is the threshold's sign.
+    For the senses ">" and "<=" the positions are swapped, which negates the value, and the threshold is negated too.
     """
 
     first: TypedPosition
@@ -28,26 +28,26 @@ class Atom(NamedTuple):
     part: Comparison
 
     def coordinates(self, side: int, constants: list[float], size: int) -> list[int]:
-        """Return the index of each coordinate of one position; the index of 0.0 for unused axes."""
+        """Return the index of each coordinate of position ``side`` (0 or 1); an unused axis has the index of 0.0."""
         position = (self.first, self.second)[side if self.part.sense == "<" else 1 - side]
         used = [c if axis in self.part.axes else 0.0 for axis, (_, c) in zip("xyz", position, strict=True)]
         return coordinate_indices(used, constants, size)
 
     @property
     def offset(self) -> list[float]:
-        """The metres that are added to the difference of the positions."""
+        """The shift (metres along x, y and z) that is added to the difference of the positions."""
         x, y, z = self.shift
         axes, sign = zip("xyz", (x, y, z + self.part.raise_z), strict=True), 1 if self.part.sense == "<" else -1
         return [sign * metres if axis in self.part.axes else 0.0 for axis, metres in axes]
 
     @property
     def threshold(self) -> float:
-        """Metres; the value is below it if the atom is true (or false, if it is :attr:`flipped`)."""
+        """The threshold in metres; the atom is true if its value is below (not below, if :attr:`flipped`)."""
         return self.part.threshold if self.part.sense == "<" else -self.part.threshold
 
     @property
     def far(self) -> bool:
-        """Whether the length must be negated: swapping the positions does not change a length."""
+        """Whether the value is a length that must be negated, since swapping the positions does not negate a length."""
         return self.part.length and self.part.sense != "<"
 
     @property
@@ -58,13 +58,13 @@ class Atom(NamedTuple):
 
 _ORIGIN = typed_position((0.0, 0.0, 0.0))
 _NO_SHIFT = (0.0, 0.0, 0.0)
-# The padding of the tables compares the origin with itself: far from changing its truth at any temperature.
+# Padding atoms compare the origin with itself; their truth never changes, and their margins are extreme.
 _ALWAYS = Atom(_ORIGIN, _ORIGIN, _NO_SHIFT, Comparison("xyz", "<", 1e4, temperature=1e-6))
 _NEVER = Atom(_ORIGIN, _ORIGIN, _NO_SHIFT, Comparison("xyz", "<", -1e4, temperature=1e-6))
 
 
 def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
-    """Return the atoms that must all be true for a clause, without its "not"."""
+    """Return the atoms that must all be true for a clause to be true, ignoring its negation."""
     second, shift = _ORIGIN, _NO_SHIFT
     if clause.predicate in STATES:
         first = typed_position((0.0, 0.0, task.openings[clause.subject]))
@@ -80,26 +80,26 @@ def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
 
 
 class QueryTables(NamedTuple):
-    """The atoms (A) of each task, and which J of them make up each clause (K) of each query (S).
+    """The atoms (A) of each task, and the J atoms of each clause (K) of each query (S).
 
-    The first dimension is tasks (T) as compiled, and rows of a batch as selected.
+    The first dimension is the tasks (T), or the rows of the batch (B) in tables that were selected for a batch.
     """
 
-    first: Tensor  # (T, 3*A) int64, index of each coordinate of the first position; of 0.0 for unused axes
-    second: Tensor  # (T, 3*A) int64
-    shift: Tensor  # (T, 3, A) float64, metres, added to the difference
-    length: Tensor  # (T, A) bool, compare the length of the difference; otherwise its one coordinate
+    first: Tensor  # (T, 3*A) int64, index of each coordinate of the first position; an unused axis has the index of 0.0
+    second: Tensor  # (T, 3*A) int64, the same for the second position
+    shift: Tensor  # (T, 3, A) float64, metres added to the difference
+    length: Tensor  # (T, A) bool, compare the length of the difference; otherwise one coordinate
     far: Tensor  # (T, A) bool, negate the length
-    threshold: Tensor  # (T, A) float64, metres; the value is below it where the atom is true
+    threshold: Tensor  # (T, A) float64, metres; an atom is true where its value is below
     flipped: Tensor  # (T, A) bool, negate the atom
-    temperature: Tensor  # (T, A) float64, metres to one logit
-    atoms: Tensor  # (T, J*K*S) int64
+    temperature: Tensor  # (T, A) float64, metres per logit
+    atoms: Tensor  # (T, J*K*S) int64, indices into the atoms
     negated: Tensor  # (T, K, S) bool, negate the clause
     constants: Tensor  # (T, C) float64, indexed as if they followed the observation
 
 
 def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> QueryTables:
-    """Compile the queries of tasks to tables with a row for each task, in the mapping's order."""
+    """Compile the queries of tasks to tables with one row per task, in the order of the mapping."""
     steps = max(map(len, queries.values()))
     width = max(len(query.clauses) for listed in queries.values() for query in listed)
     compiled = [_task_atoms(task, listed, steps, width) for task, listed in queries.items()]
@@ -129,7 +129,7 @@ def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> QueryTables:
 
 
 def _task_atoms(task: Task, queries: Sequence[Query], steps: int, width: int) -> tuple[list[Atom], list, list]:
-    """Return a task's atoms, each once; the atoms of each clause (steps, width, J); and whether it is negated."""
+    """Return a task's distinct atoms, the atom indices of each clause (steps, width, J), and each clause's negation."""
     clauses = [[(clause_atoms(clause, task), clause.negated) for clause in query.clauses] for query in queries]
     clauses += [[([_NEVER], False)]] * (steps - len(queries))
     padded = [[*listed, *[([], False)] * (width - len(listed))] for listed in clauses]
@@ -139,7 +139,7 @@ def _task_atoms(task: Task, queries: Sequence[Query], steps: int, width: int) ->
     return list(atoms), places, [[negated for _, negated in row] for row in padded]
 
 
-MOST_FACTS = 63  # of a task; the last of 64 bits is never true
+MOST_FACTS = 63  # maximum number of facts of a task; the last of the 64 bits is never set
 _FALSE = 1 << MOST_FACTS
 Bits = NDArray[np.uint64]
 
@@ -147,34 +147,35 @@ Bits = NDArray[np.uint64]
 class QueryFacts(NamedTuple):
     """The facts (F) of all tasks as bits, one task after another.
 
-    The facts of a task are its comparisons of lengths, its comparisons of one coordinate, and its conjunctions (D). A
-    query is true if those of the facts' bits that it cares for are the wanted ones.
+    A task's facts are its comparisons of lengths, its comparisons of one coordinate, and its conjunctions (D). A query
+    is true if ``facts & care == want``, where ``care`` masks the bits that the query depends on.
     """
 
     ids: NDArray[np.int64]  # (T,), task ids, ascending
-    row_of: NDArray[np.int64]  # (50,), the row of each of the 50 tasks, -1 for one without
-    ends: Bits  # (T, 5): a task's lengths begin and end, its coordinates end, its conjunctions begin and end
-    places: Bits  # (F, 6), x, y and z of both positions in turn; for a coordinate only the first two are used
+    row_of: NDArray[np.int64]  # (50,), the row of each Meta-World task; -1 for a task without queries
+    ends: Bits  # (T, 5): first length, first coordinate, end of coordinates, first conjunction, end of conjunctions
+    places: Bits  # (F, 6), indices of x, x, y, y, z, z of the two positions; a coordinate uses only the first two
     metres: NDArray[np.floating[Any]]  # (F, 5): the shift along x, y and z, the length's sign, the threshold
-    bit: Bits  # (F,)
-    flipped: Bits  # (T,)
-    conjunction: Bits  # (D, 2): bits that must all be true, and the bit that is then true
-    care: Bits  # (T, S)
-    want: Bits  # (T, S)
+    bit: Bits  # (F,), the bit number of each fact
+    flipped: Bits  # (T,), the bits to negate
+    conjunction: Bits  # (D, 2): the bits that must all be set, and the bit that is then set
+    care: Bits  # (T, S), the bits that each query depends on
+    want: Bits  # (T, S), the required values of these bits
     constants: NDArray[np.floating[Any]]  # (C,), indexed as if they followed the observation
 
     def of(self, dtype: Any) -> QueryFacts:
+        """Return the facts with all metres and constants cast to ``dtype``."""
         return self._replace(metres=self.metres.astype(dtype), constants=self.constants.astype(dtype))
 
 
 def _task_facts(task: Task, queries: Sequence[Query]) -> tuple[dict[Atom, int], dict[int, int], list[tuple[int, int]]]:
-    """Return the bit number of each atom, the bit of each conjunction, and the cared-for and wanted bits of queries."""
+    """Return the bit number of each atom, the bit of each conjunction, and each query's (care, want) bits."""
     places: dict[Atom, int] = {}
 
     def bits(clause: Clause) -> int:
         return sum({1 << places.setdefault(atom, len(places)) for atom in clause_atoms(clause, task)})
 
-    # All atoms first: the conjunctions' bits follow them.
+    # Number all atoms first, since the bits of conjunctions follow the bits of atoms.
     listed = [[(bits(clause), clause.negated) for clause in query.clauses] for query in queries]
     conjunctions: dict[int, int] = {}
     literals = []
@@ -192,7 +193,7 @@ def _task_facts(task: Task, queries: Sequence[Query]) -> tuple[dict[Atom, int], 
 
 
 def compile_facts(queries: Mapping[Task, Sequence[Query]]) -> QueryFacts | None:
-    """Compile the queries of tasks, in the order of their ids, to facts; None if a task has too many for 64 bits."""
+    """Compile queries of tasks in the order of their ids to facts; return None if a task has more than 63 facts."""
     ids = [task_id(task.name) for task in queries]
     row_of = np.full(len(MT50), -1)
     for row, number in enumerate(ids):

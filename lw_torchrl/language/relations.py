@@ -1,4 +1,4 @@
-"""Relations and states: comparisons of d = first position - second position, in metres, of data/relations.toml."""
+"""Relations and states: comparisons of d = first position - second position (m), from data/relations.toml."""
 
 import re
 from collections import ChainMap
@@ -17,14 +17,14 @@ from lw_torchrl.language.layout import Layout
 @typed_fields
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison of a length or a coordinate of d with a threshold."""
+    """A comparison of the length or one coordinate of d (first position - second position) with a threshold."""
 
-    axes: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]  # the axes of d that count
+    axes: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]  # the axes of d to compare
     sense: Literal["<", ">", "<="]
     threshold: Finite  # metres, or a fraction of an opening
-    length: bool = True  # compare the Euclidean length over the axes; False for the signed coordinate of one axis
-    raise_z: Finite = 0.0  # metres, added to dz first
-    temperature: Positive = 0.01  # of the soft truth: metres (or a fraction of an opening) for one logit
+    length: bool = True  # compare the Euclidean length over the axes; False: one signed coordinate
+    raise_z: Finite = 0.0  # metres added to dz before the comparison
+    temperature: Positive = 0.01  # metres (or fraction of an opening) per logit of the soft truth
 
     def __post_init__(self) -> None:
         if not self.length and len(self.axes) != 1:
@@ -40,19 +40,19 @@ def _predicates(kind: str) -> dict[str, tuple[Comparison, ...]]:
 
 TOUCHING = "touching the table"
 PREDICATES = ChainMap[str, tuple[Comparison, ...]]()
-"""All predicates of clauses: the relations, including yours, then the predicates of one object."""
+"""All predicates of clauses: the states, the other predicates of one object, and the relations."""
 
 
 def _check_predicate(name: str, parts: Any, others: Iterable[str]) -> tuple[Comparison, ...]:
-    """Return the comparisons of a predicate; raise :class:`ValueError` if a query cannot contain its name."""
+    """Check a predicate's comparisons and return them; raise a ValueError if a query cannot contain the name."""
     if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z'-]*( [a-z'-]+)*", name):
-        raise ValueError(f"name of a predicate must be lower-case words, like 'left of', got {shown(name)}")
+        raise ValueError(f"name of a predicate must be lower-case words like 'left of', got {shown(name)}")
     first, *_ = words = name.split()
     reserved = [name] * (name in others) + [first] * (first in ("is", "isn't", "not"))
     if reserved := reserved + [word for word in words if word in ("and", "the", "a", "an")]:
-        raise ValueError(f"name {name!r} may not be used: {reserved[0]!r} has its own meaning in a query")
+        raise ValueError(f"name {name!r} must not contain {reserved[0]!r}, which is reserved in queries")
     if not isinstance(parts, (tuple, list)) or not parts or not all(isinstance(part, Comparison) for part in parts):
-        raise ValueError(f"{name!r} must be a tuple of Comparison, at least one, got {shown(parts)}")
+        raise ValueError(f"{name!r} must be a tuple of at least one Comparison, got {shown(parts)}")
     return tuple(parts)
 
 
@@ -70,16 +70,16 @@ def _check_state(name: str, parts: Any) -> tuple[Comparison, ...]:
 
 _OF_POSITION: Mapping[str, tuple[Comparison, ...]] = MappingProxyType(_predicates("unary"))
 STATES = Registry("state", "lw_torchrl.states", _predicates("states"), _check_state)
-"""The states of an opening, a number from 0 (closed) to 1 (open), which takes the role of z in their comparisons.
+"""The states of an opening, from 0 (closed) to 1 (open); their comparisons use the opening as z.
 
-They are "open", "closed", and those that you add: ``STATES["on"] = STATES["open"]``.
+The shipped states are "open" and "closed"; add a state with ``STATES["on"] = STATES["open"]``.
 """
 UNARY = ChainMap[str, tuple[Comparison, ...]](STATES, _OF_POSITION)  # type: ignore[arg-type]
-"""The predicates of one object: "touching the table", which compares its z, and the states of its opening."""
+"""The predicates of one object: "touching the table" (compares the object's z) and the states of its opening."""
 RELATIONS = Registry("relation", "lw_torchrl.relations", _predicates("relations"), _check_relation)
-"""The relations between two objects: the 13 published ones, and those that you add (docs/custom-networks.md shows how).
+"""The relations between two objects: the paper's 13 relations, and those that you add (see docs/custom-networks.md).
 
-Source: paper section 'Query Answering Function'; the thresholds are the published ones.
+Source: paper section 'Query Answering Function', with the published thresholds.
 """
 PUBLISHED: tuple[str, ...] = tuple(_TABLE["published"])
 """The names of the paper's 13 relations."""
@@ -87,10 +87,10 @@ PREDICATES.maps = [STATES, _OF_POSITION, RELATIONS]  # type: ignore[list-item]
 
 
 def comparisons(predicate: str, layout: Layout) -> tuple[Comparison, ...]:
-    """Return the comparisons of a predicate in a suite, whose layout may set another threshold."""
+    """Return the comparisons of a predicate, with the threshold that ``layout`` sets, if any."""
     parts = PREDICATES[predicate]
     if (threshold := layout.thresholds.get(predicate)) is None:
         return parts
     if len(parts) != 1:
-        raise ValueError(f"thresholds of layout {layout.name!r}: {predicate!r} has {len(parts)} comparisons, not one")
+        raise ValueError(f"thresholds of layout {layout.name!r}: {predicate!r} needs one comparison, got {len(parts)}")
     return (replace(parts[0], threshold=threshold),)

@@ -1,4 +1,4 @@
-"""StepRole: the verb, objects and direction of a plan's step; and the rewriting of free-form steps."""
+"""Step roles (the verb, objects and direction of a plan step), and the rewriting of free-form steps."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ _WORDS = WORDS["canonical"]
 _HANDS: dict[str, str] = dict.fromkeys([GRIPPER, *_WORDS["hands"]], GRIPPER)  # names of the gripper
 _NO_NAME = {"location", "target", "reach", "other", "side", "top", "edge"}  # words that do not identify an object
 _GOAL = r"(?:the )?(?:reach |reacher )?(?:goal|target|destination)(?: (?:location|position|area|place|point|bin|spot))?"
-_LONGEST = 500  # characters; no real step is longer, and the time of rewriting grows with the square
+_LONGEST = 500  # characters; no real step is longer, and the rewriting time grows quadratically
 
 
 def _any(words: Iterable[str]) -> str:
+    """Return a regular expression for any of the words, the longest first."""
     return "(?:" + "|".join(map(re.escape, sorted(words, key=len, reverse=True))) + r")(?![\w'-])"
 
 
@@ -33,7 +34,7 @@ _PATTERNS = {
 
 
 def _compiled(text: str) -> re.Pattern[str]:
-    """Compile a regular expression of words.toml, in which words in capitals stand for patterns."""
+    """Compile a regular expression from words.toml, in which words in capitals stand for patterns."""
     for name, pattern in _PATTERNS.items():
         text = text.replace(name, pattern)
     return re.compile(text)
@@ -48,7 +49,7 @@ _SYNONYMS = {word: verb for verb, words in _WORDS["synonyms"].items() for word i
 
 
 def simplify(text: str) -> str:
-    """Rewrite a text with marked objects: "hover over <mug>" becomes "move <robot's gripper> over <mug>"."""
+    """Rewrite a step with marked objects: "hover over <mug>" becomes "move <robot's gripper> over <mug>"."""
     if len(text) > _LONGEST:
         return text
     for pattern, simple in _REWRITINGS:
@@ -59,7 +60,7 @@ def simplify(text: str) -> str:
 
 @lru_cache(maxsize=256)
 def _names(task: Task) -> dict[str, str]:
-    """Return regular expressions and the name of the object that each matches, the longest first."""
+    """Map regular expressions to the name of the object that each matches, the longest first."""
     names = _HANDS | {name: name for name in task.object_names}
     words: dict[str, str] = {}
     for name in whole_objects(task):
@@ -75,7 +76,7 @@ def _names(task: Task) -> dict[str, str]:
 
 
 def mark_objects(text: str, task: Task) -> str:
-    """Put each object that a text names in <>: "put <robot's gripper> above <mug>"."""
+    """Put each object that a text mentions in <>: "put <robot's gripper> above <mug>"."""
     text = text.lower()
     for pattern, name in _names(task).items():
         text = re.sub(rf"(?<![\w<'-])(?:the )?(?:{pattern})(?![\w-])(?![^<]*>)", f"<{name}>", text)
@@ -84,14 +85,14 @@ def mark_objects(text: str, task: Task) -> str:
 
 
 Verb = Literal["approach", "beside", "descend", "close", "open", "push", "pull", "carry", "move", "reach", "hold"]
-"""The action of a step. "carry" lifts an object through the air, "move" moves it in a straight line."""
+"""The action of a step. "carry" lifts an object through the air; "move" moves an object in a straight line."""
 Manner = Literal["grasp", "push", "press", "pull", "reach"]
 """The purpose of a step, which determines how the hand approaches: from above to grasp, from the side to push."""
 Direction = Literal["left", "right", "away", "toward", "up", "down", "goal"]
 VECTORS: dict[str, tuple[float, float, float]] = {way: tuple(xyz) for way, xyz in WORDS["roles"]["vectors"].items()}
-"""Unit vectors of directions in the suites' frame; "left" and "right" are as in the query language."""
+"""Unit vectors of the directions in the suites' frame; "left" and "right" are as in the query language."""
 BY_HAND = ("approach", "descend", "beside", "open")
-"""The verbs of steps that only bring the gripper into position."""
+"""The verbs of steps that only position the gripper."""
 _OWN_MOTIONS: list[list[str]] = WORDS["canonical"]["own"]
 _SAME_MOTION: dict[str, Verb] = {"carry": "move", "open": "descend", "hold": "reach"}
 _VERBS = [verb for verb in get_args(Verb) if verb not in _SAME_MOTION]
@@ -101,20 +102,20 @@ _SKILLS, _WAYS = WORDS["roles"]["skills"], WORDS["roles"]["ways"]
 @typed_fields
 @dataclass(frozen=True)
 class StepRole:
-    """The meaning of one step of a plan, as read by :func:`~lw_torchrl.canonical_plan`.
+    """The meaning of one plan step, as parsed by :func:`~lw_torchrl.canonical_plan`.
 
-    Objects are named as in the task, and the goal is "target location".
+    Objects have their names in the task; the goal is "target location".
     """
 
     verb: Verb
     moved: str  # the object that moves
-    target: str  # the object or point to go to
+    target: str  # the object or point to move to
     manner: Manner
-    direction: Direction | None = None  # direction in which an object is moved, also while the hand approaches it
-    toward: str | None = None  # the object that the direction "goal" leads to; None for the task's goal
+    direction: Direction | None = None  # direction of the object's motion, also set while the hand approaches
+    toward: str | None = None  # the object in the direction "goal"; None for the task's goal
     written: str = ""  # the skill as written in the plan; "" for an added step
-    confidence: Probability = 1.0  # from 0, a guess, to 1, stated in the plan's words
-    fallback: bool = False  # whether the step belongs to the fallback plan, tried when the plan makes no progress
+    confidence: Probability = 1.0  # from 0 (a guess) to 1 (stated in the plan)
+    fallback: bool = False  # whether this is a fallback step, tried when the plan makes no progress
 
     @property
     def skill(self) -> str:
@@ -132,20 +133,20 @@ class StepRole:
 
     @property
     def objects(self) -> tuple[str, ...]:
-        """The names of the objects that the step mentions, "target location" for the goal."""
+        """The names of the objects that the step mentions; the goal is "target location"."""
         goal = (self.toward or GOAL,) if self.direction == "goal" else ()
         return tuple(dict.fromkeys((self.moved, self.target, *goal)))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the fields that differ from their defaults."""
+        """Convert the role to JSON: the fields that differ from their defaults."""
         return {each.name: value for each in fields(self) if (value := getattr(self, each.name)) != each.default}
 
     @classmethod
     def from_json(cls, row: Any) -> StepRole:
-        """Rebuild a role from :meth:`to_json`; raise :class:`ValueError` for any other value."""
+        """Rebuild a role from :meth:`to_json`; raise a ValueError if ``row`` is not such JSON."""
         names = [each.name for each in fields(cls)]
         if not isinstance(row, dict) or set(row) - {*names} or not {*names[:4]} <= set(row):
-            raise ValueError(f"role must be a table of {', '.join(names)}, got {shown(row)}")
+            raise ValueError(f"role must be an object with the keys {', '.join(names)}, got {shown(row)}")
         try:
             return cls(**row)
         except TypeError as error:
@@ -153,16 +154,16 @@ class StepRole:
 
 
 def motion_of(roles: Sequence[StepRole]) -> StepRole | None:
-    """Return the last step that moves an object, else the last that reaches a place; None if there is neither."""
+    """Return the last role that moves an object, else the last that reaches a place, else None."""
     moving = [role for role in roles if role.verb in ("carry", "move", "push", "pull")]
     return next(reversed(moving or [role for role in roles if role.verb == "reach"]), None)
 
 
 def role_vectors(roles: Sequence[StepRole]) -> list[list[float]]:
-    """Return a vector for each step of a plan, which describes the action without the objects.
+    """Return a vector for each step of a plan that encodes the step's action without its objects.
 
-    It is one-hot for the verb, one-hot for the manner, and has a one if MT10 demonstrates the plan's motion in a way of
-    its own. Verbs of the same motion share a number. The steps of the fallback plan have their own motion.
+    The vector is a one-hot verb, a one-hot manner, and flags for the motions that MT10 demonstrates in a special way.
+    Verbs with the same motion share a number. The flags of fallback steps describe the fallback plan's motion.
     """
     vectors = []
     motions = {fallback: motion_of([role for role in roles if role.fallback is fallback]) for fallback in (False, True)}

@@ -1,4 +1,4 @@
-"""SkillProgram: the scripted skills of many tasks as index tensors, run for a mixed batch in one call."""
+"""Compiled scripted skills: the skills of many tasks as index tensors, evaluated for a mixed batch in one call."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -14,22 +14,22 @@ from lw_torchrl.language.tasks import Task, get_task, one_layout, task_ids
 
 
 class _Tables(NamedTuple):
-    """The skills (S) of each task. The first dimension is tasks (T) as compiled, and rows of a batch as selected."""
+    """The skills (S) of each task; the first dimension is the tasks (T), or the rows of a batch after selection."""
 
     target: Tensor  # (T, 3*S) int64, index of each coordinate of the target
     moved: Tensor  # (T, 3*S) int64, index of each coordinate of the moved object
     gain: Tensor  # (T, 3*S) float64
     shift: Tensor  # (T, 3*S) float64, gain times offset
-    effort: Tensor  # (T, S, A) float64, the gripper's effort, zeros elsewhere
+    effort: Tensor  # (T, S, A) float64, actions with only the gripper's effort set
     constants: Tensor  # (T, C) float64, indexed as if they followed the observation
 
 
 class SkillProgram(nn.Module):
-    """Scripted skills compiled once; one call gives the action of every skill of every row.
+    """A module that compiles scripted skills once and returns the action of every skill for every row of a batch.
 
     Args:
-        skills: task name (or :class:`Task`) to its skills, each a :class:`ScriptedSkill` or the text of one.
-        table: the skills by their text; None for the shipped ones.
+        skills: a mapping from task names (or :class:`Task`) to lists of skills (:class:`ScriptedSkill` or texts).
+        table: the known skills by text; None for the shipped skills.
 
     Example:
         >>> from lw_torchrl.language.tasks import task_id
@@ -43,7 +43,7 @@ class SkillProgram(nn.Module):
     def __init__(self, skills: Mapping[str | Task, Sequence[str | ScriptedSkill]], table: Skills | None = None) -> None:
         known = load_skills() if table is None else table
         if not skills:
-            raise ValueError("skills must name at least one task, got an empty mapping")
+            raise ValueError("skills must contain at least one task, got an empty mapping")
         compiled: dict[Task, list[ScriptedSkill]] = {}
         for name, listed in skills.items():
             task = get_task(name)
@@ -56,7 +56,7 @@ class SkillProgram(nn.Module):
         super().__init__()
         self.layout = layout = one_layout(compiled)
         self._displaced = layout.displaced("scripted skills")
-        self.num_skills = max(map(len, compiled.values()))  # S, the length of the longest list
+        self.num_skills = max(map(len, compiled.values()))  # the number of skills S in the longest list
         index = TaskIndex(task_ids(task.name for task in compiled))
         constants = [0.0]
         place = torch.full((len(compiled), 2, self.num_skills, 3), layout.size)
@@ -77,23 +77,23 @@ class SkillProgram(nn.Module):
         self._tables = TaskTables(index, _Tables(target, moved, gain, shift, effort, fixed), "tasks without skills")
 
     def forward(self, observation: Tensor, task_id: Tensor) -> Tensor:
-        """Return the action of each skill.
+        """Compute the action of each skill of each row's task.
 
         Args:
             observation: (..., D) float, in the tasks' layout.
-            task_id: (...) int64, of tasks with skills.
+            task_id: (...) int64, ids of tasks with skills.
 
         Returns:
-            (..., S, A) of the observation's dtype: actions of the layout, each number in [-1, 1]; in Meta-World the
-            displacement xyz and the gripper's effort. Zeros follow the task's last skill.
+            (..., S, A) actions in the observation's dtype, each number in [-1, 1]; in Meta-World an action is the
+            displacement (x, y, z) and the gripper's effort. Padding after the task's last skill is zero.
 
         Raises:
-            ValueError: a wrong shape, or a task without skills.
+            ValueError: the inputs have a wrong shape, or a task has no skills.
         """
         size, ids = self.layout.size, tuple(task_id.shape)
         if observation.shape[-1:] != (size,) or ids != observation.shape[:-1]:
             shapes = f"{tuple(observation.shape)} and {ids}"
-            raise ValueError(f"observation must be of shape (..., {size}) and task_id of (...), got {shapes}")
+            raise ValueError(f"observation must have shape (..., {size}) and task_id shape (...), got {shapes}")
         tables = self._tables.select(task_id.reshape(-1), observation)
         state = torch.cat((observation.reshape(-1, size), tables.constants), 1)
         error = state.gather(1, tables.target) - state.gather(1, tables.moved)

@@ -1,4 +1,4 @@
-"""Scripted skills, the stateless linear controllers of data/skills.toml, and the spelling of skills in any words."""
+"""Scripted skills (the stateless linear controllers in data/skills.toml), and the canonical spelling of skill texts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lw_torchrl.language.tasks import TASKS, Task, Tasks, check_task, get_task
 
 
 class SkillError(ValueError):
-    """A skill that cannot be read, or that does not suit a task."""
+    """The error for a skill that cannot be parsed, or that a task cannot use."""
 
 
 @typed_fields
@@ -27,7 +27,7 @@ class SkillError(ValueError):
 class ScriptedSkill:
     """A linear controller: action xyz = clip(gain · (target + offset - moved), -1, 1), with a constant gripper effort.
 
-    The target is an object or point. If it is the robot's gripper, the offset is relative to the hand.
+    The target is an object or a point. If the target is the robot's gripper, the offset is relative to the hand.
 
     Example:
         >>> skill = ScriptedSkill("place the gripper above the puck", "puck", offset=(0.0, 0.0, 0.1), gripper=-1.0)
@@ -39,11 +39,11 @@ class ScriptedSkill:
 
     text: str
     target: str
-    moved: str = GRIPPER  # what moves to the target: the robot's gripper, or an object that it holds or pushes
+    moved: str = GRIPPER  # what moves to the target: the robot's gripper, or an object that the gripper holds or pushes
     offset: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # metres, added to the target: x right, y away, z up
-    gain: tuple[Scale, Scale, Scale] = (10.0, 10.0, 10.0)  # action per metre along each axis; 0 leaves an axis alone
-    gripper: float = 0.0  # effort from -1, which opens, to 1, which closes
-    goal: str = ""  # the state that it steers to, as a query; "" if no query expresses it
+    gain: tuple[Scale, Scale, Scale] = (10.0, 10.0, 10.0)  # action per metre along each axis; 0 disables an axis
+    gripper: float = 0.0  # effort from -1 (open) to 1 (close)
+    goal: str = ""  # the state that the skill steers to, as a query; "" if no query expresses that state
     variants: Mapping[str, ScriptedSkill] = field(default_factory=dict, hash=False, repr=False)  # by task name
 
     def __post_init__(self) -> None:
@@ -51,17 +51,17 @@ class ScriptedSkill:
             raise SkillError(f"gripper must be an effort from -1 to 1, got {self.gripper}")
 
     def for_task(self, task: str | Task) -> ScriptedSkill:
-        """Return the task's variant of the skill; raise :class:`SkillError` if the task lacks one of its objects."""
+        """Return the skill's variant for a task; raise a SkillError if the task lacks an object of the skill."""
         owner = get_task(task)
         skill = self.variants.get(owner.name, self)
         for name in (skill.target, skill.moved):
             if name not in owner.object_names:
-                lacks = f"needs {name!r}, which task {owner.name!r} lacks; it has {', '.join(owner.object_names)}"
+                lacks = f"needs {name!r}, which task {owner.name!r} lacks (objects: {', '.join(owner.object_names)})"
                 raise SkillError(f"skill {self.text!r} {lacks}{did_you_mean(name, owner.object_names)}")
         return skill
 
     def suits(self, task: str | Task) -> bool:
-        """Return whether the task has the objects that the skill names."""
+        """Return whether the task has the skill's target and moved object."""
         owner = get_task(task)
         skill = self.variants.get(owner.name, self)
         return {skill.target, skill.moved} <= set(owner.object_names)
@@ -73,7 +73,7 @@ _KEYS = tuple(f.name for f in fields(ScriptedSkill) if f.name not in ("text", "v
 
 def _skill(text: str, row: Any, tasks: Tasks) -> ScriptedSkill:
     if not isinstance(row, Mapping):
-        raise SkillError(f"must be a table, got {shown(row)}")
+        raise SkillError(f"the skill must be a table, got {shown(row)}")
     values = dict(row)
     changes = values.pop("for", {})
     if not isinstance(changes, Mapping) or not all(isinstance(change, Mapping) for change in changes.values()):
@@ -106,12 +106,12 @@ def _read(file: Path | Traversable, tasks: Tasks) -> dict[str, ScriptedSkill]:
 
 @typed
 def load_skills(path: AnyPath | None = None, *, tasks: Tasks = TASKS) -> Skills:
-    """Return the scripted skills by their text.
+    """Load the scripted skills, keyed by their texts.
 
     Args:
-        path: a file like data/skills.toml. Its skills are added to ours and replace those with the same text. None
-            returns only ours.
-        tasks: the tasks that its ``for`` tables may name, as from :func:`~lw_torchrl.load_tasks`.
+        path: a file in the format of data/skills.toml, whose skills are added to the shipped skills and replace those
+            with the same text; None for the shipped skills only.
+        tasks: the tasks that the file's ``for`` tables may name, as from :func:`~lw_torchrl.load_tasks`.
 
     Raises:
         SkillError: the file is malformed; the message names the skill.
@@ -125,16 +125,16 @@ def load_skills(path: AnyPath | None = None, *, tasks: Tasks = TASKS) -> Skills:
 
 @lru_cache(maxsize=256)
 def _foreign_words(task: Task) -> frozenset[str]:
-    """Return the words for objects of the 50 tasks that this task lacks, without words for points ("front")."""
+    """Return the last words of the objects in the 50 tasks that are not words of this task's objects."""
     own = {word for name in task.object_names for word in name.split()}
     return frozenset(named.name.split()[-1] for each in TASKS.values() for named in each.published.objects) - own
 
 
 def skills_for(task: Task, skills: Skills | None = None) -> Skills:
-    """Return the skills that suit a task, out of the shipped ones by default.
+    """Return the skills that a task can use, chosen from ``skills`` (None for the shipped skills).
 
-    The task has the objects that such a skill names, and its text mentions no object that only other tasks have, unless
-    the skill has a variant for the task.
+    A task can use a skill if the task has the skill's objects and the skill's text mentions no object that only other
+    tasks have. A skill with a variant for the task may mention any object.
     """
     if skills is None:
         return _shipped_for(task)
@@ -156,9 +156,9 @@ _LONGEST_BEFORE = max(map(len, _BEFORE_NOUN))
 
 
 def canonical_skill(skill: str, task: Task) -> str:
-    """Return a skill in canonical spelling, with articles as in the paper.
+    """Convert a skill to canonical spelling, with articles as in the paper.
 
-    A noun gets "the" at the beginning and after a word like "above". Others ("the coffee mug") stay as they are.
+    "the" is inserted before an object's name that follows the verb or a word like "above". All other text is unchanged.
     """
     first, _, details = " ".join(skill.split()).partition(" ")
     verb, *rest = first.replace("_", " ").split() or [""]
@@ -171,7 +171,7 @@ def canonical_skill(skill: str, task: Task) -> str:
 def _with_articles(details: str, task: Task) -> str:
     def article(match: re.Match[str]) -> str:
         end = match.start() - (details[match.start() - 1 : match.start()] == " ")
-        start = max(0, end - _LONGEST_BEFORE - 1)  # a short look back, so that time stays linear in a text of nouns
+        start = max(0, end - _LONGEST_BEFORE - 1)  # look back a bounded distance, so that the time stays linear
         before = details[start:end].rpartition(" ")[2]
         return f"the {match[0]}" if not before or before in _BEFORE_NOUN else match[0]
 

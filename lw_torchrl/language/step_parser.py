@@ -1,4 +1,4 @@
-"""parse_steps: the verb, moved object, target and direction of each step of a free-form plan."""
+"""A parser that finds the verb, moved object, target and direction of each step in a free-form plan."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ _DIRECTIONS: dict[str, Direction] = {
 }
 _PLACES = {name: frozenset(words) for name, words in WORDS["canonical"]["places"].items()}
 _KNOWN = frozenset().union(*_VERBS.values()) | {"align", "slide", "sweep"}
-# In "put the gripper above the dial to turn it left" the purpose is left to a later step.
+# The purpose in "put the gripper above the dial to turn it left", which a later step of the plan carries out.
 _PURPOSE = re.compile(r"(?<=>) (?:in order )?to \w+ it\b.*")
 _TOOL = re.compile(r"(?<!line )(?<!level )(?<!aligned )\bwith <([^>]*)>")
 
 
 @dataclass(frozen=True)
 class ParsedStep:
-    """The meaning of one step."""
+    """The parsed meaning of one plan step."""
 
     verb: Verb
-    moved: str | None  # what moves to the target: the robot's gripper, or an object that it holds; None if unknown
-    target: str | None  # the object or point to go to; None if unknown
-    direction: Direction | None = None  # direction in which an object is moved; "goal" leads to ``toward``
+    moved: str | None  # what moves: the robot's gripper, or an object that the gripper holds; None if unknown
+    target: str | None  # the object or point to move to; None if unknown
+    direction: Direction | None = None  # direction of the object's motion; "goal" means toward ``toward``
     confidence: float = 1.0  # lower if the meaning is inferred from the condition or from common usage
-    toward: str | None = None  # an object; None for the task's goal
+    toward: str | None = None  # the object in the direction "goal"; None for the task's goal
 
 
 def compared_with_gripper(step: PlanStep) -> tuple[str, ...]:
-    """Return the objects that a step's condition compares with the gripper, in the order of the condition."""
+    """Return the objects that a step's condition compares with the gripper, in the condition's order."""
     pairs = [(clause.subject, clause.object) for clause in step.condition.clauses if clause.object is not None]
     return tuple(second if first == GRIPPER else first for first, second in pairs if GRIPPER in (first, second))
 
 
 @dataclass(frozen=True)
 class _Facts:
-    """The facts about the gripper in a condition."""
+    """The facts that a condition states about the gripper."""
 
-    at: bool  # near or around an object
+    at: bool  # "near" or "around" an object
     not_at: bool
     aligned: bool  # in any other relation to an object
     not_aligned: bool
@@ -65,24 +65,24 @@ class _Facts:
 
 
 def parse_steps(plan: ConditionalPlan) -> tuple[ParsedStep | None, ...]:
-    """Parse each step of a plan; return None for a step that cannot be parsed."""
+    """Parse each step of a plan; a step that cannot be parsed becomes None."""
     task = plan.definition
     facts = [_Facts.of(step) for step in plan.steps]
     marked = [mark_objects(step.skill, task) for step in plan.steps]
     parsed = _parse(plan, _resolve_it([simplify(text) for text in marked], facts, task), facts)
-    # A plan without a motion may have it in the second half of a step: "grab it and pull".
+    # If no step has a motion, a motion may be in the second half of a step: "grab it and pull".
     if all(each is None or each.verb in _NO_MOTION for each in parsed):
         parsed = _parse(plan, _resolve_it([_last_clause(text) for text in marked], facts, task), facts)
     return parsed
 
 
-# "it" right after the verb; elsewhere ("close around it") the object is clear from the condition.
+# "it" right after the verb; elsewhere ("close around it") the condition identifies the object.
 _IT = re.compile(r"^(\w+) (?:it|them|her|him)\b")
 _NO_MOTION = {"approach", "beside", "descend", "close", "open"}
 
 
 def _last_clause(text: str) -> str:
-    """Return the last clause of a step, with its object: "pull <mug> back" for "grab <mug> and pull it back"."""
+    """Return the last clause of a step, with "it" resolved: "grab <mug> and pull it back" gives "pull <mug> back"."""
     first, _, second = text.rpartition(" and ")
     name = next((name for name in re.findall(r"<[^>]*>", first) if name != f"<{GRIPPER}>"), "it")
     return simplify(re.sub(r"\b(?:it|them)\b", name, second, count=1)) if first else simplify(text)
@@ -98,12 +98,12 @@ def _parse(plan: ConditionalPlan, texts: list[str], facts: list[_Facts]) -> tupl
 
 
 def _resolve_it(texts: Iterable[str], facts: Iterable[_Facts], task: Task) -> list[str]:
-    """Replace "it" in "pull it" by the object of the previous step, else by the first object."""
+    """Replace "it" in "pull it" with the object of the previous step, or with the task's first object."""
     resolved, previous = [], first_object(task)
     for text, fact in zip(texts, facts, strict=True):
         referent = previous or (fact.near[-1] if fact.near else None)
         if referent is not None and (start := _IT.match(text)):
-            # In "park it over <mug>" after a step with the mug, "it" is the gripper.
+            # In "park it over <mug>" after a step about the mug, "it" is the gripper.
             referent = GRIPPER if f"<{referent}>" in text else referent
             text = f"{start[1]} <{referent}>{text[start.end() :]}"
         resolved.append(text)
@@ -113,13 +113,13 @@ def _resolve_it(texts: Iterable[str], facts: Iterable[_Facts], task: Task) -> li
 
 
 def _only_sent(step: ParsedStep | None, text: str) -> ParsedStep | None:
-    """Read "move the gripper to the block" as reaching, in a plan that does nothing else."""
+    """Parse "move the gripper to the block" as reaching, in a plan whose steps only move the gripper."""
     goes_to = step and step.verb == "descend" and re.match(rf"\w+ <{GRIPPER}> (?:to|at|toward|onto) <", text)
     return replace(step, verb="reach") if step and goes_to else step
 
 
 def _grasps(text: str, facts: _Facts) -> bool:
-    """Return whether a step closes the gripper around an object, carries one, or has a closed gripper at it."""
+    """Return whether a step grasps or carries an object, or has the condition of a closed gripper at an object."""
     verb, *rest = text.split()
     if verb in _VERBS["held"] and rest and rest[0].startswith("<") and not text.startswith(f"{verb} <{GRIPPER}>"):
         return True
@@ -127,7 +127,7 @@ def _grasps(text: str, facts: _Facts) -> bool:
 
 
 def _pushed_or_pulled(parsed: Sequence[ParsedStep | None]) -> list[ParsedStep | None]:
-    """Decide between push and pull if the words do not: a hand that came down around an object pulls it."""
+    """Choose between push and pull for ambiguous steps: a hand that descends onto an object pulls that object."""
     verbs = {step.verb for step in parsed if step is not None}
 
     def decided(step: ParsedStep) -> ParsedStep:
@@ -140,7 +140,7 @@ def _pushed_or_pulled(parsed: Sequence[ParsedStep | None]) -> list[ParsedStep | 
 
 
 class _StepParser:
-    """A parser of one step."""
+    """A parser for one plan step."""
 
     def __init__(self, step: PlanStep, task: Task, text: str, facts: _Facts, grasping: bool) -> None:
         self.step, self.task, self.text, self.facts, self.grasping = step, task, text, facts, grasping
@@ -176,7 +176,7 @@ class _StepParser:
         if is_goal(self.task, noun) and not self.by_hand and self.verb not in _VERBS["go"]:
             at_goal = self.near is None or is_goal(self.task, self.near)
             noun = self.first if at_goal else object_of(self.task, str(self.near))
-        # "open the gripper around the mug" descends; it does not let go.
+        # "open the gripper around the mug" is a descent, not a release.
         opens = self.verb in _VERBS["open"] and GRIPPER in self.text and not self.words & {"around", "onto", "on"}
         if opens or self.verb == "release":
             return ParsedStep("open", GRIPPER, noun)
@@ -185,7 +185,7 @@ class _StepParser:
         return self._by_hand() if self.by_hand else self._object_moved(noun)
 
     def _closed(self, noun: str) -> ParsedStep:
-        """Parse "grab the mug": descend if the hand is not there yet, lift if the hand holds the mug, else close."""
+        """Parse "grab the mug": descend if the hand is not at the mug, lift if the hand holds the mug, else close."""
         if self.facts.not_at and not self.facts.at and not self.facts.closed:
             return ParsedStep("descend", GRIPPER, noun)
         if self.verb == "pick" and self.facts.closed and not self.facts.open:
@@ -193,7 +193,7 @@ class _StepParser:
         return ParsedStep("close", GRIPPER, noun)
 
     def _by_hand(self) -> ParsedStep | None:
-        """Parse a step that moves the gripper, and with it the object that it holds."""
+        """Parse a step that moves the gripper and the object that the gripper holds, if any."""
         target = self.named[-1] if self.named else self.near
         if target is None:
             return None
@@ -228,7 +228,7 @@ class _StepParser:
         direction: Direction | None = self.direction
         if direction == "down" and (self.grasping or self.verb not in ("push", "press")):
             direction = None
-        # A plan that grasps moves the held object; any other pushes or pulls with the gripper.
+        # A plan that grasps moves the held object; any other plan pushes or pulls with the gripper.
         if self.grasping:
             if target is not None:
                 return ParsedStep("carry" if carries or self.words & _PLACES["above"] else "move", moved, target)
@@ -246,7 +246,7 @@ class _StepParser:
         return ParsedStep("push", GRIPPER, moved, direction or "goal", confidence=1.0 if pushed else 0.5, toward=toward)
 
     def _target(self, noun: str) -> str | None:
-        """Return the target of an object that is moved: from the words, else from the condition's comparisons."""
+        """Return the target of a moved object: from the step's words, else from the condition's comparisons."""
         if goals := [name for name in self.named if is_goal(self.task, name)]:
             return goals[-1]
         for name in reversed(self.named[1:] if self.tool is None else self.named):
@@ -260,12 +260,12 @@ class _StepParser:
         return target
 
     def _pairs(self) -> list[tuple[str, str]]:
-        """Return the pairs of objects that the condition compares, except those that are already at each other."""
+        """Return the pairs of objects that the condition compares, except pairs that are near or around each other."""
         clauses = [c for c in self.step.condition.clauses if c.negated or c.predicate not in ("near", "around")]
         return [(c.subject, c.object) for c in clauses if c.object is not None and GRIPPER not in (c.subject, c.object)]
 
     def _compared_point(self, moved: str, target: str) -> str:
-        """Return the point on the moved object that the condition compares with the target, such as a wrench's ring."""
+        """Return the point on the moved object (a wrench's ring) that the condition compares with the target."""
         for pair in self._pairs():
             for point, other in (pair, pair[::-1]):
                 if same_object(self.task, other, target) and same_object(self.task, point, moved):

@@ -1,4 +1,4 @@
-"""Tasks: names, descriptions, and the objects that queries name. data/tasks.toml holds the 50 tasks of Meta-World."""
+"""Tasks: names, descriptions and the objects that queries name. data/tasks.toml holds the 50 Meta-World tasks."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _NAME = re.compile(r"([a-z][a-z0-9]*(-[a-z0-9]+)*/)?[a-z][a-z0-9]*(-[a-z0-9]+)*")
-_OWN_IDS = 2**31 - 50  # keeps every id within int32
-_MOST_OBJECTS = 64  # a limit, since the number of base queries grows with its square
+_OWN_IDS = 2**31 - 50  # number of ids for custom tasks, which keeps every id within int32
+_MOST_OBJECTS = 64  # the number of base queries grows quadratically
 
 
 class TaskError(ValueError):
-    """A task, or a file of tasks, that cannot be read or written."""
+    """The error for a task or a task file that cannot be read or written."""
 
 
 @typed_fields
@@ -35,40 +35,40 @@ class TaskError(ValueError):
 class Task:
     """A manipulation task: its name, its description and its objects.
 
-    A name is Meta-World's without the version, "drawer-open", or your own: lower-case words joined by hyphens. The name
-    of a suite and a slash may come first: "fetch/push".
+    The name is Meta-World's name without the version ("drawer-open"), or a custom name of lower-case words joined by
+    hyphens. A suite's name and a slash may come first ("fetch/push").
     """
 
     name: str
     description: str  # one sentence
-    objects: tuple[NamedObject, ...]  # at most 64: the robot's gripper first, the points that we named last
+    objects: tuple[NamedObject, ...]  # at most 64: the robot's gripper first, our added points last
     layout: Layout = METAWORLD
 
     def __post_init__(self) -> None:
         _check_name(self.name)
         what, size = f"objects of task {self.name!r}", self.layout.size
         if len(self.objects) > _MOST_OBJECTS:
-            raise ValueError(f"{what} must be at most {_MOST_OBJECTS}, the gripper included, got {len(self.objects)}")
+            raise ValueError(f"{what} must be at most {_MOST_OBJECTS}, including the gripper, got {len(self.objects)}")
         for named in self.objects:
             for index in (*named.position, named.opening):
                 if isinstance(index, int) and not 0 <= index < size:
-                    raise ValueError(f"position of {named.name!r}: obs[{index}] is not among obs[0] to obs[{size - 1}]")
+                    raise ValueError(f"position of {named.name!r} must use obs[0] to obs[{size - 1}], got obs[{index}]")
         names = [named.name for named in self.objects]
         if names[:1] != [GRIPPER] or len({*names}) != len(names):
-            raise ValueError(f"{what} must begin with {GRIPPER!r} and have different names, got {names}")
+            raise ValueError(f"{what} must begin with {GRIPPER!r} and have distinct names, got {names}")
 
     @cached_property
     def object_names(self) -> tuple[str, ...]:
-        """The names of the objects, in their order."""
+        """The names of the objects, in the order of ``objects``."""
         return tuple(named.name for named in self.objects)
 
     @cached_property
     def published(self) -> Task:
-        """The task as in the paper: without the points that we named, and without the openings of objects."""
+        """The task as in the paper: without our added points, and without the openings of objects."""
         return replace(self, objects=tuple(replace(named, opening=None) for named in self.objects if not named.ours))
 
     def object(self, name: str) -> NamedObject:
-        """Return the object called ``name``; raise :class:`ValueError` with the nearest name if there is none."""
+        """Return the object called ``name``; raise a ValueError that suggests the nearest name if there is none."""
         for named in self.objects:
             if named.name == name:
                 return named
@@ -76,12 +76,12 @@ class Task:
 
     @cached_property
     def openings(self) -> dict[str, int]:
-        """The index of the opening of each object that has one, the gripper first."""
+        """The observation index of each opening, by the name of the object that can open; the gripper comes first."""
         openings = {named.name: named.opening for named in self.objects if named.opening is not None}
         return {GRIPPER: self.layout.opening, **openings}
 
     def positions(self, observation: Tensor) -> dict[str, Tensor]:
-        """Return the position of each object by name, (..., 3) metres, for observations (..., D) of the same dtype."""
+        """Return each object's position (..., 3) in metres by name, in the dtype of the observation (..., D)."""
 
         def position(named: NamedObject) -> Tensor:
             xyz = observation[..., [at if isinstance(at, int) else 0 for at in named.position]]
@@ -94,21 +94,21 @@ class Task:
         return {named.name: position(named) for named in self.objects}
 
     def to_json(self) -> dict[str, Any]:
-        """Return the task as a row of tasks.toml; raise :class:`TaskError` if a row cannot hold it."""
+        """Convert the task to a row of tasks.toml; raise a TaskError if such a row cannot express the task."""
         row = {"description": self.description, **write_objects(self.objects)}
         if self.layout != METAWORLD:
             row["layout"] = self.layout.to_json()
         with suppress(TaskError):
             if Task.from_json(self.name, row) == self:
                 return {key: value for key, value in row.items() if value}
-        raise TaskError(f"task {self.name!r} cannot be written as a row of tasks.toml, it holds {self.objects!r}")
+        raise TaskError(f"task {self.name!r} cannot be written as a row of tasks.toml, got objects {self.objects!r}")
 
     @classmethod
     def from_json(cls, name: str, row: Any, layout: Layout = METAWORLD) -> Task:
-        """Rebuild a task from a row of tasks.toml, whose default is ``layout``; else raise :class:`TaskError`."""
+        """Build a task from a row of tasks.toml (default ``layout``); raise a TaskError for any other value."""
         try:
             if not isinstance(row, Mapping):
-                raise ValueError(f"must be a table, got {shown(row)}")
+                raise ValueError(f"the task must be a table, got {shown(row)}")
             for key in row:
                 check_choice("key", key, ("description", "objects", "points", "layout", "mt10"))
             description = row.get("description")
@@ -121,7 +121,7 @@ class Task:
 
 
 def role_object(task: Task, name: str) -> NamedObject:
-    """Return an object by the name that a role uses: the task's name for it, or "target location" for the goal."""
+    """Return the object that a role names; "target location" is the goal in every task."""
     if name == GOAL and name not in task.object_names:
         x, y, z = places(task.layout.positions[-1])
         return NamedObject(GOAL, (x, y, z))
@@ -129,33 +129,34 @@ def role_object(task: Task, name: str) -> NamedObject:
 
 
 def same_object(task: Task, first: str, second: str) -> bool:
-    """Return whether two names stand for one object, or for points on it."""
+    """Return whether two names refer to the same object or to points on the same object."""
     return typed_position(role_object(task, first).position) == typed_position(role_object(task, second).position)
 
 
 def is_goal(task: Task, name: str) -> bool:
+    """Return whether a name refers to the goal of a task."""
     return same_object(task, name, GOAL)
 
 
 @lru_cache(maxsize=256)
 def whole_objects(task: Task) -> tuple[str, ...]:
-    """Return the names of the objects, without the gripper and without points on objects."""
+    """Return the names of a task's objects, without the gripper and without points on objects."""
     return tuple(named.name for named in task.objects if named.name != GRIPPER and not any(named.offset))
 
 
 def first_object(task: Task) -> str | None:
-    """Return the object that a task is about, the first of its layout; None for a task with only a goal, like reach."""
+    """Return the first object of a task's layout; None for a task with only a goal, such as reach."""
     first = typed_position(places(task.layout.positions[1]))
     return next((name for name in whole_objects(task) if typed_position(task.object(name).position) == first), None)
 
 
 def object_of(task: Task, name: str) -> str:
-    """Return the object that a point is on, or the name itself."""
+    """Return the name of the object that a point belongs to; any other name is returned unchanged."""
     return next((whole for whole in whole_objects(task) if same_object(task, whole, name)), name)
 
 
 def point_on(task: Task, name: str) -> str:
-    """Return the point where an object is touched: the first that the task names on it, else the object itself."""
+    """Return the point where the gripper touches an object: the object's first named point, else the object itself."""
     if any(role_object(task, name).offset):
         return name
     points = (named.name for named in task.objects if any(named.offset) and same_object(task, named.name, name))
@@ -174,38 +175,38 @@ TaskList = str | Task | Iterable[str | Task]
 
 
 class _Shipped(dict[str, Task]):
-    """A dictionary with a short ``repr``, since ``help`` prints it as the default of arguments."""
+    """A dictionary with a short ``repr``, which ``help`` prints as the default of arguments."""
 
     def __repr__(self) -> str:
         return f"lw.TASKS, the {len(self)} tasks from {min(self)} to {max(self)}"
 
 
 TASKS: Tasks = ReadOnlyDict(_Shipped((name, Task.from_json(name, row)) for name, row in _TABLE.items()))
-"""The 50 tasks of Meta-World by name, sorted."""
+"""The 50 Meta-World tasks by name, sorted."""
 MT10: tuple[str, ...] = tuple(name for name, row in _TABLE.items() if row.get("mt10"))
-"""The names of the ten tasks of the MT10 set."""
+"""The names of the ten MT10 tasks."""
 MT50: tuple[str, ...] = tuple(TASKS)
 _SETS = {"MT10": MT10, "MT50": MT50}
 _RANK = {name: rank for rank, name in enumerate(MT50)}
 
 
 def check_task(name: object, tasks: Tasks = TASKS) -> str:
-    """Return ``name`` if it names one of ``tasks``, else raise :class:`ValueError` with the nearest name."""
+    """Return ``name`` if ``tasks`` has this task; else raise a ValueError that suggests the nearest name."""
     if not isinstance(name, str):
-        raise TypeError(f"task must be a task's name, got {shown(name)} ({type(name).__name__})")
+        raise TypeError(f"task must be the name of a task, got {shown(name)} ({type(name).__name__})")
     if name not in tasks:
         raise _unknown_task("task", name, tasks)
     return name
 
 
 def _unknown_task(argument: str, name: str, tasks: Tasks) -> ValueError:
-    """Return the error for an unknown name, with advice on custom tasks if only the 50 are known."""
+    """Build the error for an unknown task name, with a hint about custom tasks if only the 50 tasks are known."""
     error = unknown_name(argument, name, tasks if argument == "task" else (*_SETS, *tasks))
     if tasks is not TASKS:
         return error
     message = str(error) if str(error).endswith("?") else f"{error}."
     return ValueError(
-        f"{message} Other tasks are Task objects with an engine=, see docs/your-robot.md#a-task-of-your-own"
+        f"{message} For a custom task, pass a Task and an engine=; see docs/your-robot.md#a-task-of-your-own"
     )
 
 
@@ -213,8 +214,8 @@ def _unknown_task(argument: str, name: str, tasks: Tasks) -> ValueError:
 def task_id(name: str) -> int:
     """Return a task's integer id.
 
-    The ids of the 50 are their ranks among the sorted names, from 0. Any other name has an id from 50 to 2³¹ - 1 that
-    depends only on the name, so a misspelt name has an id too.
+    The ids of the 50 Meta-World tasks are their ranks (from 0) among the sorted names. Any other name has an id from 50
+    to 2³¹ - 1 that depends only on the name, so a misspelled name has an id too.
 
     Example:
         >>> task_id("assembly"), task_id("window-open"), task_id("stack-blocks")
@@ -227,15 +228,15 @@ def task_id(name: str) -> int:
 
 
 def task_ids(names: Iterable[str]) -> dict[str, int]:
-    """Return the id of each task by its name."""
+    """Map each task name to the task's id."""
     return {name: task_id(name) for name in names}
 
 
 def resolve_tasks(names: str | Iterable[str], *, tasks: Tasks = TASKS) -> tuple[str, ...]:
-    """Return the sorted names of a set of tasks.
+    """Return the sorted names of the tasks that ``names`` selects.
 
     Args:
-        names: "MT10", "MT50", one task's name, or an iterable of names.
+        names: "MT10", "MT50", a task's name, or an iterable of names.
         tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
 
     Example:
@@ -252,18 +253,18 @@ def resolve_tasks(names: str | Iterable[str], *, tasks: Tasks = TASKS) -> tuple[
         raise TypeError(f"tasks must be 'MT10', 'MT50', a task's name or a list of names, got {shown(names)}")
     checked = [check_task(name, tasks) for name in names]
     if not checked:
-        raise ValueError("tasks must name at least one task, got an empty list")
+        raise ValueError("tasks must contain at least one task, got an empty list")
     if repeated := sorted({name for name in checked if checked.count(name) > 1}):
-        raise ValueError(f"tasks must name each task once, got {', '.join(repeated)} more than once")
+        raise ValueError(f"tasks must not contain duplicates, got {', '.join(repeated)} more than once")
     return tuple(sorted(checked))
 
 
 def named_tasks(tasks: TaskList, *, known: Tasks = TASKS) -> dict[str, Task]:
-    """Return the tasks of a set, a name, a Task, or a list of names and Tasks, by name, sorted.
+    """Map the sorted names of the tasks that ``tasks`` selects to :class:`Task` objects.
 
     Args:
-        tasks: as for :func:`resolve_tasks`, and :class:`Task` objects, which replace the known tasks of the same name.
-            Plans stand for their tasks.
+        tasks: names as for :func:`resolve_tasks`, or :class:`Task` objects, which replace known tasks with the same
+            name. A mapping of plans selects the tasks of the plans.
         known: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
     """
     names: Any = [tasks] if isinstance(tasks, Task) else tasks
@@ -277,28 +278,28 @@ def named_tasks(tasks: TaskList, *, known: Tasks = TASKS) -> dict[str, Task]:
 
 
 def get_task(task: str | Task, tasks: Tasks = TASKS) -> Task:
-    """Return the :class:`Task` of a name among ``tasks``; return a Task as it is."""
+    """Return the :class:`Task` with a given name in ``tasks``; return a Task unchanged."""
     return task if isinstance(task, Task) else tasks[check_task(task, tasks)]
 
 
 def one_layout(tasks: Iterable[Task]) -> Layout:
-    """Return the layout of tasks that are used together; raise :class:`ValueError` if they have different ones."""
+    """Return the layout that all tasks share; raise a ValueError if their layouts differ."""
     layouts = {task.layout: task.name for task in tasks}
     if len(layouts) != 1:
         listed = ", ".join(f"{layout.name!r} ({name})" for layout, name in layouts.items())
-        raise ValueError(f"tasks must be of one layout, got {listed}; use a program, buffer or policy for each suite")
+        raise ValueError(f"tasks must share one layout, got {listed}; use one program, buffer or policy per suite")
     return next(iter(layouts))
 
 
 @typed
 def load_tasks(path: AnyPath) -> Tasks:
-    """Return all 50 tasks and those of your file, by name. Your tasks replace those of the same name.
+    """Load tasks from a file and add them to the 50 Meta-World tasks, replacing those with the same name.
 
-    Pass one wherever a task is accepted, or all of them to :func:`~lw_torchrl.load_plans` and
-    :func:`~lw_torchrl.resolve_tasks`.
+    Pass one of the returned tasks wherever a task is accepted, or the whole mapping as the ``tasks`` of
+    :func:`~lw_torchrl.load_plans` and :func:`~lw_torchrl.resolve_tasks`.
 
     Args:
-        path: a file in the format of data/tasks.toml. A new task must name its objects.
+        path: a file in the format of data/tasks.toml. A new task must list its objects.
 
     Raises:
         TaskError: the file is malformed; the message names the task.
@@ -316,7 +317,7 @@ def load_tasks(path: AnyPath) -> Tasks:
             tasks[name] = Task.from_json(name, row)
             if name not in TASKS and len(tasks[name].objects) == 1:
                 hint = did_you_mean(name, TASKS)
-                raise TaskError(f"task {name!r}: it is not one of the 50, so it must name its objects{hint}")
+                raise TaskError(f"task {name!r} is not a Meta-World task, so its row must list objects{hint}")
         except TaskError as error:
             raise TaskError(f"{file}, {error}") from error
     return ReadOnlyDict(dict(sorted(tasks.items())))

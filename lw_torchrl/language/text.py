@@ -1,4 +1,4 @@
-"""Text encoders: English to vectors. The vectors of shipped texts come with the package; other texts need [text]."""
+"""Text encoders, which map English to vectors. Encoding a text that is not shipped needs the extra ``[text]``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:  # torch is imported where it is used, since nearest_query needs only NumPy's vectors
+if TYPE_CHECKING:  # torch is imported lazily, since nearest_query needs only NumPy
     from torch import Tensor
 
 TEXT_DIMENSION = 384
@@ -20,7 +20,7 @@ TABLE = "embeddings.npz"
 
 @runtime_checkable
 class TextEncoder(Protocol):
-    """A function from n texts to (n, E) float32; modules accept one as ``text_encoder``."""
+    """The type of a ``text_encoder`` argument: a function from n texts to embeddings (n, E) float32."""
 
     def __call__(self, texts: Sequence[str]) -> Tensor: ...
 
@@ -33,7 +33,7 @@ def _sentence_transformer() -> Any:
     from transformers.utils import logging
 
     is_shown = logging.is_progress_bar_enabled()
-    logging.disable_progress_bar()  # loading takes a second
+    logging.disable_progress_bar()  # loading takes only a second
     try:
         return SentenceTransformer(str(get_model_path()), device="cpu")
     finally:
@@ -42,11 +42,11 @@ def _sentence_transformer() -> Any:
 
 
 def sentence_vectors(texts: Sequence[str]) -> NDArray[np.float32]:
-    """Encode texts with all-MiniLM-L6-v2, (n, 384) float32 of length 1; needs the extra ``[text]``."""
+    """Encode texts with all-MiniLM-L6-v2 as unit vectors (n, 384) float32; this needs the extra ``[text]``."""
     try:
         model = _sentence_transformer()
     except ImportError as error:
-        what = f"the text {texts[0]!r} is not among the shipped ones, and encoding it needs the text model"
+        what = f"the text {texts[0]!r} has no shipped embedding, so encoding this text needs the text model"
         raise ImportError(f"{what}: pip install 'lw_torchrl[text]'") from error
     return model.encode(list(texts), convert_to_numpy=True, normalize_embeddings=True).astype("float32")
 
@@ -63,17 +63,17 @@ def _shipped() -> dict[str, Tensor]:
 
 
 def sentence_encoder(texts: Sequence[str]) -> Tensor:
-    """Return :func:`sentence_vectors` as a tensor."""
+    """Encode texts like :func:`sentence_vectors`, but return a tensor."""
     import torch
 
     return torch.from_numpy(sentence_vectors(texts))
 
 
 def encode_texts(texts: Sequence[str]) -> Tensor:
-    """Encode texts by default: n texts to (n, 384) float32, each of length 1.
+    """Encode n texts as unit vectors (n, 384) float32, with the shipped embeddings where they exist.
 
     Raises:
-        ImportError: a text is not shipped, and the extra ``[text]`` is not installed.
+        ImportError: a text has no shipped embedding, and the extra ``[text]`` is not installed.
     """
     import torch
 
@@ -84,16 +84,16 @@ def encode_texts(texts: Sequence[str]) -> Tensor:
 
 
 def encoded(texts: Sequence[str], encoder: TextEncoder | None) -> Tensor:
-    """Encode texts with a custom encoder, or the default one if it is None, and check the vectors: (n, E) float32."""
+    """Encode texts with ``encoder`` (None for :func:`encode_texts`), check the vectors and return (n, E) float32."""
     import torch
 
     if not callable(encoder or encode_texts):
-        raise TypeError(f"text_encoder must be a function of texts, got {encoder!r:.80}")
+        raise TypeError(f"text_encoder must be a function from texts to a tensor, got {encoder!r:.80}")
     vectors = (encoder or encode_texts)(texts)
     if not isinstance(vectors, torch.Tensor) or not vectors.is_floating_point():
         raise TypeError(f"text_encoder must return a tensor of floats, got {vectors!r:.80}")
     if vectors.ndim != 2 or len(vectors) != len(texts):
-        raise ValueError(f"text_encoder must return ({len(texts)}, E), got shape {tuple(vectors.shape)}")
+        raise ValueError(f"text_encoder must return shape ({len(texts)}, E), got {tuple(vectors.shape)}")
     if not vectors.isfinite().all():
         wrong = texts[int((~vectors.isfinite()).any(-1).nonzero()[0])]
         raise ValueError(f"text_encoder must return finite numbers, got NaN or infinity for {wrong!r}")

@@ -1,6 +1,6 @@
-"""Plans from language models: prompts, questions to a server, and answers.
+"""Plans from language models: prompts, requests to a server, and answers.
 
-:mod:`~lw_torchrl.planners.repairing` checks plans in the simulator and asks for better ones.
+:mod:`~lw_torchrl.planners.repairing` checks plans in the simulator and requests revised plans.
 """
 
 from lw_torchrl.planners.answer_files import (

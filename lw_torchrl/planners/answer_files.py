@@ -1,4 +1,4 @@
-"""Answers of language models: the plans in them, their files, and the planner that reads these."""
+"""Answers from language models: parsing, answer files, and a planner that replays recorded answers."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from lw_torchrl.language.skills import Skills
 from lw_torchrl.language.tasks import Task, TaskList, named_tasks
 from lw_torchrl.planners.prompts import passes, read_structured
 
-CUT_OFF = "it was cut off at max_tokens"
-_CUT_OFF = {"length": CUT_OFF, "content_filter": "the server's content filter cut it off"}
-_ROW = {"llm": str, "format": str, "task": str, "attempt": int, "completion": str}  # of a .jsonl file
-_Place = tuple[str, str, int]  # format, task, attempt
+CUT_OFF = "the answer was cut off at max_tokens"
+_CUT_OFF = {"length": CUT_OFF, "content_filter": "the server's content filter cut off the answer"}
+_ROW = {"llm": str, "format": str, "task": str, "attempt": int, "completion": str}  # fields of a .jsonl row
+_Place = tuple[str, str, int]  # (format, task, attempt)
 
 
 class PlannerError(RuntimeError):
-    """A planner could not answer a question; the message names the model, the question, the cause and a remedy.
+    """The error for a failed request to a planner; the message names the model, the task, the cause and a remedy.
 
-    After a ``fatal`` error, every other question to the same planner would fail in the same way.
+    If ``fatal`` is true, every other request to the same planner would fail in the same way.
     """
 
     def __init__(self, message: str, *, fatal: bool = False) -> None:
@@ -39,13 +39,14 @@ class PlannerError(RuntimeError):
 
 @dataclass(frozen=True)
 class Tokens:
-    """The number of tokens of prompts and of answers, as counted by the server; 0 if it does not count."""
+    """The numbers of prompt tokens and completion tokens as reported by the server, or 0 if not reported."""
 
     prompt: int = 0
     completion: int = 0
 
     @property
     def total(self) -> int:
+        """The sum of prompt tokens and completion tokens."""
         return self.prompt + self.completion
 
     def __add__(self, other: Tokens) -> Tokens:
@@ -54,39 +55,39 @@ class Tokens:
 
 @dataclass(frozen=True)
 class Reply:
-    """A server's reply to a question."""
+    """A server's reply to a request."""
 
-    text: str  # the answer; "" if there is none
+    text: str  # the answer; "" if the reply has no answer
     finish: str = ""  # the server's finish_reason: "stop", "length", "content_filter", ""
-    refusal: str = ""  # the model's refusal
+    refusal: str = ""  # the model's refusal; "" if the model answered
     tokens: Tokens = field(default_factory=Tokens)
     notes: tuple[str, ...] = ()  # remarks about the server
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A planner's answer to one question."""
+    """A planner's answer to one request for a plan."""
 
     task: str
     format: str  # the requested format
-    attempt: int  # the index of this answer among several to the same question
+    attempt: int  # the index of this answer among the answers to the same request
     text: str  # the answer in the format, for :func:`~lw_torchrl.decode_plan`
-    raw: str  # the answer as the server sent it: JSON if the model was constrained, otherwise equal to ``text``
-    decoded: DecodedPlan  # the plan that was read from it
+    raw: str  # the answer as the server sent it: JSON if the model was constrained, else equal to ``text``
+    decoded: DecodedPlan  # the plan decoded from the answer
     tokens: Tokens = field(default_factory=Tokens)
-    cached: bool = False  # read from a file, without a request
-    notes: tuple[str, ...] = ()  # remarks, such as that the answer was cut off
+    cached: bool = False  # whether the answer was read from a file, without a request
+    notes: tuple[str, ...] = ()  # remarks, for example that the answer was cut off
 
 
 class Answers(tuple[Answer, ...]):
-    """Answers, sorted by format, task and attempt."""
+    """A tuple of answers, sorted by format, task and attempt."""
 
     def __new__(cls, answers: Iterable[Answer]) -> Answers:
         return super().__new__(cls, sorted(answers, key=lambda answer: (answer.format, answer.task, answer.attempt)))
 
     @property
     def tokens(self) -> Tokens:
-        """The tokens of all answers, including cached ones."""
+        """The token counts summed over all answers, including cached answers."""
         return sum((answer.tokens for answer in self), Tokens())
 
     def __repr__(self) -> str:
@@ -102,7 +103,7 @@ def read_reply(
     skills: Skills | None = None,
     schema: Mapping[str, Any] | None = None,
 ) -> Answer:
-    """Read the plan in a reply. With a ``schema`` the reply should be JSON, which is rewritten in the format."""
+    """Decode the plan in a reply. With a ``schema`` the reply should be JSON, which is converted to ``format``."""
     read = PLAN_FORMATS[format].read if schema is None else read_structured
     raw = _storable(reply.text)
     decoded = decode_as(raw, read, StepMapper(task, skills))
@@ -111,36 +112,36 @@ def read_reply(
     if reply.refusal:
         notes.append(f"the model refused: {shown(reply.refusal)}")
     elif not raw.strip():
-        notes.append("it is empty")
+        notes.append("the answer is empty")
     elif schema and reply.finish != "length":
         valid = False
         with suppress(ValueError, RecursionError):
             valid = passes(json.loads(raw), schema)
-        notes += [] if valid else ["the server did not keep to the schema"]
+        notes += [] if valid else ["the answer does not follow the schema"]
     return Answer(task.name, format, attempt, _storable(text), raw, decoded, reply.tokens, notes=(*notes, *reply.notes))
 
 
 def _storable(text: str) -> str:
-    r"""Return a text as a file gives it back: no lone surrogates or byte order mark, and "\n" as line end."""
+    r"""Normalize a text for storage in a file: no lone surrogates, no byte order mark, and "\n" as line end."""
     text = text.encode("utf-8", "replace").decode()
     return text.replace("\r\n", "\n").replace("\r", "\n").lstrip("\ufeff")
 
 
 @typed
 def folder_name(model: str) -> str:
-    """Turn a model's name into a folder's: "meta-llama_Llama-3.1-8B"."""
+    """Convert a model's name to a folder name, such as "meta-llama_Llama-3.1-8B"."""
     return re.sub(r"[^\w .+-]+", "_", model).strip(" ._")[:100].rstrip(" .") or "model"
 
 
 @typed
 def answer_path(folder: AnyPath, model: str, format: str, task: str, attempt: int) -> Path:
-    """Return the path of a model's answer."""
+    """Return the path of the file for a model's answer."""
     return Path(folder) / folder_name(model) / format / f"{task}-{attempt}.{PLAN_FORMATS[format].extension}"
 
 
 @typed
 def write_answer(folder: AnyPath, model: str, answer: Answer) -> Path:
-    """Write an answer to its path; if the server sent JSON, also write that, as .json."""
+    """Write an answer (and the server's JSON, if any) to the folder, and return the answer's :func:`answer_path`."""
     path = answer_path(folder, model, answer.format, answer.task, answer.attempt)
     if answer.raw != answer.text:
         write_text(path.with_suffix(".json"), answer.raw)
@@ -149,35 +150,36 @@ def write_answer(folder: AnyPath, model: str, answer: Answer) -> Path:
 
 
 def write_settings(folder: Path, settings: dict[str, Any]) -> None:
-    """Write ``folder/settings.json``; raise :class:`ValueError` if the folder holds answers with other settings."""
+    """Write ``folder/settings.json``; raise a ValueError if the folder holds answers with different settings."""
     file = folder / "settings.json"
     before = read_json(file, "out: the settings") if file.is_file() else settings
     if before != settings:
         difference = ", ".join(differences(before, settings))
-        advice = "use these settings again, or give the new answers another name (--name) or out"
-        raise ValueError(f"out: {str(folder)!r} holds answers of other settings: {difference}; {advice}")
+        advice = "use the earlier settings, or choose a new name (--name) or out folder for the new answers"
+        raise ValueError(f"out: {str(folder)!r} holds answers with different settings ({difference}); {advice}")
     write_json(file, settings)
 
 
 def recorded_answers(source: AnyPath) -> dict[str, dict[_Place, str | Path]]:
-    """Return each model's answers, or their files, by format, task and attempt; see :class:`FilePlanner`."""
+    """Map each model to its recorded answers (texts or files) by (format, task, attempt); see :class:`FilePlanner`."""
     path = Path(source)
     if not path.exists():
-        raise FileNotFoundError(f"source: there is no file or folder {str(path)!r}")
+        raise FileNotFoundError(f"source: no file or folder {str(path)!r}")
     answers = defaultdict[str, dict[_Place, str | Path]](dict)
     for model, place, answer in _answers_in_folder(path) if path.is_dir() else _answers_in_lines(path):
         answers[model][place] = answer
     if not answers:
-        raise ValueError(f"source: {str(path)!r} holds no answers, <model>/<format>/<task>-<attempt>.<ext>")
+        raise ValueError(f"source: {str(path)!r} holds no answer files <model>/<format>/<task>-<attempt>.<ext>")
     return dict(answers)
 
 
 def answer_text(answer: str | Path) -> str:
-    """Return the text of an answer that :func:`recorded_answers` gives."""
+    """Return the text of an answer (a text or a file) from :func:`recorded_answers`."""
     return _storable(read_text(answer, ValueError) if isinstance(answer, Path) else answer)
 
 
 def _answers_in_folder(root: Path) -> Iterator[tuple[str, _Place, Path]]:
+    """Yield (model, place, path) for each answer file in a folder."""
     for name, format in PLAN_FORMATS.items():
         for path in root.glob(f"*/{name}/*.{format.extension}"):
             match = re.fullmatch(r"([a-z][a-z0-9-]*)-(\d{1,9})", path.stem)
@@ -186,6 +188,7 @@ def _answers_in_folder(root: Path) -> Iterator[tuple[str, _Place, Path]]:
 
 
 def _answers_in_lines(file: Path) -> Iterator[tuple[str, _Place, str]]:
+    """Yield (model, place, text) for each line of a .jsonl file."""
     models: dict[str, str] = {}
     for number, line in enumerate(read_text(file, ValueError).split("\n"), 1):
         if not line.strip():
@@ -194,51 +197,51 @@ def _answers_in_lines(file: Path) -> Iterator[tuple[str, _Place, str]]:
         try:
             row = json.loads(line)
         except (ValueError, RecursionError) as error:
-            raise ValueError(f"{where}: it is not JSON: {error}") from error
+            raise ValueError(f"{where}: the line is not JSON: {error}") from error
         if not isinstance(row, dict) or any(type(row.get(name)) is not kind for name, kind in _ROW.items()):
-            raise ValueError(f"{where}: an answer needs {', '.join(_ROW)}, got {shown(row)}")
+            raise ValueError(f"{where}: an answer needs the fields {', '.join(_ROW)}, got {shown(row)}")
         check_choice(f"{where}: format", row["format"], PLAN_FORMATS)
         name = folder_name(row["llm"])
         if models.setdefault(name, row["llm"]) != row["llm"]:
-            raise ValueError(f"{where}: the folders of {models[name]!r} and {row['llm']!r} would both be {name!r}")
+            raise ValueError(f"{where}: models {models[name]!r} and {row['llm']!r} have the same folder name {name!r}")
         yield name, (row["format"], row["task"], row["attempt"]), row["completion"]
 
 
 @runtime_checkable
 class Planner(Protocol):
-    """The interface of everything that writes plans, such as :class:`~lw_torchrl.OpenAIPlanner`."""
+    """The interface of planners, which write plans; for example, :class:`~lw_torchrl.OpenAIPlanner`."""
 
     @property
     def name(self) -> str:
-        """The model's name, as a folder's name."""
+        """The name of the model, in the form of a folder name."""
         ...
 
     def plans(
         self, tasks: TaskList, *, format: str = "chain_py", attempts: int = 1, out: AnyPath | None = None
     ) -> Answers:
-        """Write plans of tasks: one answer for each task and attempt.
+        """Write plans for tasks: one answer for each task and attempt.
 
         Args:
             tasks: "MT10", "MT50", a task's name, a :class:`~lw_torchrl.Task`, or a list of names and tasks.
             format: a name in :data:`~lw_torchrl.PLAN_FORMATS`.
-            attempts: answers to each question.
-            out: a folder; each answer is written to ``out/<name>/<format>/<task>-<attempt>.<ext>`` as it arrives.
+            attempts: number of answers for each task.
+            out: a folder; each answer is written to ``out/<name>/<format>/<task>-<attempt>.<ext>`` on arrival.
 
         Raises:
-            PlannerError: an answer is missing; the others are kept.
+            PlannerError: an answer is missing; all other answers are kept.
         """
         ...
 
 
 class FilePlanner:
-    """The recorded answers of one model.
+    """A planner that replays the recorded answers of one model.
 
     Args:
-        source: a folder ``<model>/<format>/<task>-<attempt>.<ext>``, as planners write it; or a .jsonl file with an
-            object of "llm", "format", "task", "attempt" and "completion" on each line.
-        model: the model whose answers to read; None if there is only one.
+        source: a folder with files ``<model>/<format>/<task>-<attempt>.<ext>``, as planners write them; or a .jsonl
+            file with the keys "llm", "format", "task", "attempt" and "completion" on each line.
+        model: the name of the model whose answers to load; None if the source has only one model.
 
-    ``name`` is the model's name, as a folder's name; ``recorded`` has (format, task, attempt) of each answer, sorted.
+    ``name`` is the model's name as a folder name; ``recorded`` is a sorted tuple with each (format, task, attempt).
 
     Example:
         >>> import json, pathlib, lw_torchrl as lw
@@ -253,7 +256,7 @@ class FilePlanner:
     def __init__(self, source: AnyPath, model: str | None = None) -> None:
         answers = recorded_answers(source)
         if model is None and len(answers) > 1:
-            raise ValueError(f"model must be given, since {str(source)!r} has answers of {', '.join(sorted(answers))}")
+            raise ValueError(f"model is required, since {str(source)!r} has several: {', '.join(sorted(answers))}")
         name = next(iter(answers)) if model is None else folder_name(model)
         if name not in answers:
             raise unknown_name("model", model, sorted(answers))
@@ -266,7 +269,7 @@ class FilePlanner:
     def plans(
         self, tasks: TaskList, *, format: str = "chain_py", attempts: int = 1, out: AnyPath | None = None
     ) -> Answers:
-        """Return the recorded answers; see :meth:`Planner.plans`."""
+        """Return the recorded answers for tasks; see :meth:`Planner.plans`."""
         check_choice("format", format, PLAN_FORMATS)
         count = check_value("attempts", attempts, Count)
         answers = []
@@ -275,7 +278,7 @@ class FilePlanner:
                 if (format, name, attempt) not in self._answers:
                     recorded = [str(place[2]) for place in self.recorded if place[:2] == (format, name)]
                     what = f"no answer of {self.name!r} is recorded for {name} in {format}, attempt {attempt}"
-                    raise PlannerError(f"{what}; there are attempts: {', '.join(recorded) or 'none'}")
+                    raise PlannerError(f"{what}; recorded attempts: {', '.join(recorded) or 'none'}")
                 text = answer_text(self._answers[format, name, attempt])
                 decoded = decode_plan(text, task, format)
                 answers.append(Answer(name, format, attempt, text, text, decoded, cached=True))

@@ -1,4 +1,4 @@
-"""OpenAIPlanner: plans of a model behind an OpenAI-compatible server."""
+"""A planner that requests plans from a model behind an OpenAI-compatible server."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ from lw_torchrl.planners.answer_files import (
 from lw_torchrl.planners.prompts import Question, chat_messages, example_plans, plan_schema
 
 OPENAI = "https://api.openai.com/v1"
-REPLY_LIMIT = 4 * 2**20  # bytes
+REPLY_LIMIT = 4 * 2**20  # maximum size of a reply in bytes
 _KEY = "OPENAI_API_KEY"
-# What to send to a server that refuses a field, and how its error names the field.
+# Fallbacks for servers that reject a field, each with a pattern of the server's error message.
 _FALLBACKS = {
     "max_completion_tokens": "max_completion_tokens",  # instead of max_tokens
     "json_object": "response_format|json_schema",  # as the type of response_format, instead of json_schema
-    "no system message": "system role|role.{0,20}system",  # its text begins the user's message
+    "no system message": "system role|role.{0,20}system",  # prepend the system message to the user's message
 }
 _OWN_FIELDS = {"max_completion_tokens", "max_tokens", "messages", "model", "n", "response_format", "seed", "stream"}
 _OWN_FIELDS |= {"temperature"}
@@ -52,27 +52,27 @@ _CACHE_VERSION = 1
 
 
 class OpenAIPlanner:
-    """A planner that asks a model behind an OpenAI-compatible server: OpenAI's, vLLM, Ollama, llama.cpp's.
+    """A planner that requests plans from an OpenAI-compatible server: OpenAI, vLLM, Ollama or llama.cpp.
 
-    The key is read from the environment variable OPENAI_API_KEY; your own server needs none. Each answer is cached
-    under everything that determines it (:meth:`request`), and is not requested again.
+    The API key is read from the environment variable OPENAI_API_KEY; a local server needs no key. Each answer is cached
+    under a hash of everything that determines the answer (:meth:`request`), and is not requested again.
 
     Args:
-        model: the model's name at the server.
-        base_url: the server's address, "http://127.0.0.1:8000/v1"; None for OPENAI_BASE_URL, or OpenAI's server.
-        constrain: restrict the model to a JSON Schema of the task's plans (:func:`plan_schema`); it answers in JSON.
-        free_skills: with ``constrain``, allow skills in any words, not only the scripted ones.
-        skills: the scripted skills to choose from; None for the shipped ones.
+        model: the name of the model on the server.
+        base_url: the server's address, such as "http://127.0.0.1:8000/v1"; None for OPENAI_BASE_URL or OpenAI's server.
+        constrain: constrain the model's answers to JSON that follows the task's :func:`plan_schema`.
+        free_skills: with ``constrain``, allow free-form skills, not only scripted skills.
+        skills: the scripted skills to choose from; None for the shipped skills.
         plans, vocabulary: see :func:`plan_prompt`.
-        temperature: None for the server's default.
-        max_tokens: maximum tokens of an answer; reasoning models need more.
-        seed: attempt k is sent ``seed + k``; None sends none.
-        options: further fields of the request, ``{"top_p": 0.9}``.
-        name: the folder for the answers; None for the model's name, with "-constrained" if it is constrained.
-        cache: the folder of cached answers.
-        concurrency: number of simultaneous questions.
-        retries: retries after a rate limit, or an error of the server or the connection; ``openai`` chooses the wait.
-        timeout: seconds for one try, from the request to the end of the answer.
+        temperature: the sampling temperature; None for the server's default.
+        max_tokens: maximum number of tokens per answer; reasoning models need more.
+        seed: the seed; attempt k is requested with ``seed + k``; None sends no seed.
+        options: further fields of the request, such as ``{"top_p": 0.9}``.
+        name: the name of the answers' folder; None for the model's name, plus "-constrained" with ``constrain``.
+        cache: the folder for cached answers.
+        concurrency: maximum number of simultaneous requests.
+        retries: maximum retries after a rate limit, a server error or a connection error; ``openai`` sets the delays.
+        timeout: maximum seconds per try, from the request to the end of the answer.
 
     Example:
         >>> OpenAIPlanner("meta-llama/Llama-3.1-8B", base_url="http://127.0.0.1:8000/v1", constrain=True).name
@@ -103,18 +103,18 @@ class OpenAIPlanner:
         timeout: Positive = 300.0,
     ) -> None:
         if not model.strip():
-            raise ValueError(f"model must be a model's name, got {shown(model)}")
+            raise ValueError(f"model must be the name of a model, got {shown(model)}")
         if free_skills and not constrain:
-            raise ValueError("free_skills needs constrain; without it, skills are in any words")
+            raise ValueError("free_skills=True needs constrain=True; without constrain, skills are always free-form")
         self.model, self.base_url, self.address = model, base_url, server_address(base_url)
         self.constrain, self.free_skills, self.skills, self.vocabulary = constrain, free_skills, skills, vocabulary
         self.examples = None if plans is None else as_plans(plans)
-        self.temperature = None if temperature is None else float(temperature)  # 1 and 1.0 are one request
+        self.temperature = None if temperature is None else float(temperature)  # 1 and 1.0 must give the same request
         self.max_tokens, self.seed = max_tokens, seed
         try:
             self.options = json.loads(json.dumps(dict(options or {}), allow_nan=False)) or None
         except (TypeError, ValueError, RecursionError) as error:
-            raise TypeError(f"options must be fields of a request in JSON, got {shown(options)}") from error
+            raise TypeError(f"options must be a mapping of JSON values, got {shown(options)}") from error
         if own := sorted(_OWN_FIELDS & set(self.options or ())):
             others = ", ".join(sorted(_OWN_FIELDS))
             raise ValueError(f"options must not set {', '.join(own)} (reserved: {others})")
@@ -126,7 +126,7 @@ class OpenAIPlanner:
         return f"OpenAIPlanner({self.model!r}, base_url={self.address!r}, constrain={self.constrain})"
 
     def request(self, task: Task, format: str, attempt: int = 0) -> dict[str, Any]:
-        """Return everything that determines an answer, as JSON."""
+        """Return everything that determines an answer, as a JSON object."""
         schema = plan_schema(task, format, skills=self.skills, free_skills=self.free_skills) if self.constrain else None
         return {
             "server": self.address,
@@ -141,7 +141,7 @@ class OpenAIPlanner:
         }
 
     def settings(self) -> dict[str, Any]:
-        """Return everything but the question that determines the answers, as JSON."""
+        """Return the settings that determine the answers, apart from tasks and format, as a JSON object."""
         skills = None if self.skills is None else sha256("\n".join(sorted(self.skills)).encode()).hexdigest()[:32]
         settings = {"server": self.address, "skills": skills, "plans": example_plans(self.examples).fingerprint}
         return settings | {name: getattr(self, name) for name in _SETTINGS}
@@ -155,17 +155,17 @@ class OpenAIPlanner:
         out: AnyPath | None = None,
         progress: bool = True,
     ) -> Answers:
-        """Ask for plans, several at a time.
+        """Request plans for tasks, with several simultaneous requests.
 
         Args:
-            tasks, format, attempts, out: see :meth:`Planner.plans`. The JSON of a constrained model is written next to
-                its answer, and the settings to ``out/<name>/settings.json``.
+            tasks, format, attempts, out: see :meth:`Planner.plans`. A constrained model's JSON is written next to the
+                answer, and the settings to ``out/<name>/settings.json``.
             progress: show a progress bar.
 
         Raises:
-            PlannerError: an answer is missing. The others are cached; the same call asks for the missing ones.
-            ImportError: the extra ``[llm]`` is needed, and not installed.
-            ValueError: no scripted skill suits a task, or the folder has answers with other settings.
+            PlannerError: an answer is missing. All other answers are cached; repeat the call for the missing answers.
+            ImportError: a request needs the extra ``[llm]``, which is not installed.
+            ValueError: a task has no scripted skill, or the folder has answers with different settings.
         """
         check_choice("format", format, PLAN_FORMATS)
         count = check_value("attempts", attempts, Count)
@@ -183,20 +183,21 @@ class OpenAIPlanner:
         out: AnyPath | None = None,
         progress: bool = True,
     ) -> Answers:
-        """Report to the model how its plans performed, and ask for a better answer to each.
+        """Report to the model how its plans performed, and request a revised answer for each plan.
 
         Args:
-            answers: answers in one format.
-            facts: a report on each, as :func:`~lw_torchrl.planners.repairing.plan_facts` writes it.
+            answers: the answers to revise, all in one format.
+            facts: a report on each answer, as written by :func:`~lw_torchrl.planners.repairing.plan_facts`.
+            round: the number of the round, from 1.
             tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
-            out: as for :meth:`plans`; the folder's name ends in ``-round<round>``.
+            out: as for :meth:`plans`, but with ``-round<round>`` appended to the folder's name.
             progress: show a progress bar.
         """
         before, reports = list(answers), list(facts)
         formats = {answer.format for answer in before}
         if len(formats) != 1 or len(reports) != len(before):
-            what = f"{counted(len(before), 'answer')} of {', '.join(sorted(formats)) or 'none'}"
-            raise ValueError(f"answers must be of one format, each with its facts, got {what} and {len(reports)} facts")
+            what = f"{counted(len(before), 'answer')} in {', '.join(sorted(formats)) or 'no format'}"
+            raise ValueError(f"answers must have one format and one report each, got {what} and {len(reports)} facts")
         (format,) = formats
         questions = []
         for answer, report in zip(before, reports, strict=True):
@@ -210,7 +211,7 @@ class OpenAIPlanner:
     def _answers(
         self, questions: list[Question], format: str, name: str, out: AnyPath | None, progress: bool
     ) -> Answers:
-        """Answer questions from the cache, else from the server."""
+        """Answer questions from the cache, or from the server if not cached."""
         answers: list[Answer] = []
         missing: list[Question] = []
         for question in questions:
@@ -234,9 +235,9 @@ class OpenAIPlanner:
                     write_answer(out, name, answers[-1])
                 bar.update()
         if errors:
-            others = f" {counted(len(errors) - 1, 'other question')} failed, too." if len(errors) > 1 else ""
+            others = f" {counted(len(errors) - 1, 'other request')} also failed." if len(errors) > 1 else ""
             kept = f"{len(answers)} of {counted(len(questions), 'answer')} are kept in {str(self.cache)!r}"
-            message = f"{errors[0]}{others} {kept}; repeat the call to ask for the others."
+            message = f"{errors[0]}{others} {kept}; repeat the call to request the missing answers."
             raise PlannerError(message, fatal=errors[0].fatal)
         return Answers(answers)
 
@@ -244,19 +245,19 @@ class OpenAIPlanner:
         return read_reply(reply, question.task, format, question.attempt, self.skills, question.request["schema"])
 
     def cache_path(self, request: Mapping[str, Any]) -> Path:
-        """Return the file of the cached reply to a request, named by a hash of everything that determines it."""
+        """Return the path of the cached reply to a request, which contains a hash of the request."""
         key = sha256(json.dumps([_CACHE_VERSION, request], sort_keys=True).encode()).hexdigest()
         return self.cache / key[:2] / f"{key}.json"
 
     def _cached(self, request: Mapping[str, Any]) -> Reply | None:
-        """Return the cached reply; None if there is none, or if its file is damaged: then the question is repeated."""
+        """Return the cached reply to a request; None if the file is missing or corrupted."""
         with suppress(FileNotFoundError, ValueError, KeyError, TypeError):
             answer = read_json(self.cache_path(request), "the cached answer")["answer"]
             return Reply(**{**answer, "tokens": Tokens(**answer["tokens"]), "notes": tuple(answer["notes"])})
         return None
 
     def _ask(self, questions: list[Question]) -> Generator[tuple[Question, Reply | PlannerError], None, None]:
-        """Yield each question with its reply or error, in the order in which they arrive; stop at a fatal error."""
+        """Yield each question with its reply or error, in order of arrival; stop at a fatal error."""
         if not questions:
             return
         stopped = Event()
@@ -275,7 +276,7 @@ class OpenAIPlanner:
 
         with (
             closing(_ChatClient(self.model, self.base_url, self.timeout, self.retries)) as client,
-            ThreadPool(min(self.concurrency, len(questions))) as pool,  # daemons, which Ctrl-C does not wait for
+            ThreadPool(min(self.concurrency, len(questions))) as pool,  # daemon threads, so that Ctrl-C does not wait
         ):
             try:
                 yield from ((question, result) for question, result in pool.imap_unordered(ask, questions) if result)
@@ -284,7 +285,7 @@ class OpenAIPlanner:
 
 
 def server_address(base_url: str | None) -> str:
-    """Return the address of a server, without a user name, password or query."""
+    """Check a server's address, and return the address without user name, password and query."""
     try:
         url = urlsplit(base_url or os.environ.get("OPENAI_BASE_URL") or OPENAI)
         valid = bool(url.hostname) and url.scheme in ("http", "https") and url.port != 0
@@ -296,21 +297,21 @@ def server_address(base_url: str | None) -> str:
 
 
 class _ChatClient:
-    """A client of one model, for any number of threads; the arguments are those of :class:`OpenAIPlanner`."""
+    """A thread-safe client for one model; the arguments are as for :class:`OpenAIPlanner`."""
 
     def __init__(self, model: str, base_url: str | None, timeout: float, retries: int) -> None:
         try:
             import openai
         except ImportError as error:
-            needs = "asking a model needs the extra [llm]: pip install 'lw_torchrl[llm]'"
+            needs = "requests to a model need the extra [llm]: pip install 'lw_torchrl[llm]'"
             raise ImportError(f"{needs} ({error})") from error
         self._openai, self.model, self.address, self._timeout = openai, model, server_address(base_url), timeout
         self._key = key = os.environ.get(_KEY, "").strip()
         if self.address == OPENAI and not key:
-            advice = f"set the environment variable {_KEY}, or give the base_url of a server that needs none"
+            advice = f"set the environment variable {_KEY}, or pass the base_url of a server that needs no key"
             raise PlannerError(f"{model!r} at {self.address} needs a key: {advice}", fatal=True)
         if not (key.isascii() and key.isprintable()):
-            raise PlannerError(f"the key in {_KEY} has characters that no key has; set it again", fatal=True)
+            raise PlannerError(f"the key in {_KEY} has invalid characters; set {_KEY} again", fatal=True)
         self._fallbacks = frozenset({"max_completion_tokens"} if self.address == OPENAI else ())
         options: Any = {"timeout": openai.Timeout(timeout, connect=min(timeout, 10.0))}
         try:
@@ -318,14 +319,14 @@ class _ChatClient:
             self._client = openai.OpenAI(api_key=key or "none", base_url=base_url, **options)
         except (ValueError, ImportError, OSError) as error:
             advice = "check the environment variables of proxies (ALL_PROXY) and certificates (SSL_CERT_FILE)"
-            what = f"the HTTP client cannot be made ({_excerpt(str(error))})"
+            what = f"the HTTP client cannot be created ({_excerpt(str(error))})"
             raise PlannerError(f"{what}; {advice}", fatal=True) from None
 
     def close(self) -> None:
         self._client.close()
 
     def ask(self, request: Mapping[str, Any], question: str) -> Reply:
-        """Return the reply to a request, or raise a :class:`PlannerError` that names the ``question``."""
+        """Send a request and return the reply, or raise a PlannerError that names the ``question``."""
         try:
             content, fallbacks = self._complete(request)
             reply, answering = _read_completion(self._without_key(content))
@@ -336,16 +337,16 @@ class _ChatClient:
         else:
             notes = list(reply.notes)
             if request["schema"] and "json_object" in fallbacks:
-                notes.insert(0, "the schema was sent as json_object, since the server takes no json_schema")
-            if not (answering.startswith(self.model) or self.model.startswith(answering)):  # servers append a date
-                notes.insert(0, f"the server says that the model {answering!r} answered, not {self.model!r}")
+                notes.insert(0, "the schema was sent as json_object, since the server rejects json_schema")
+            if not (answering.startswith(self.model) or self.model.startswith(answering)):  # some servers append a date
+                notes.insert(0, f"the server reports that model {answering!r} answered instead of {self.model!r}")
             clean = {name: self._without_key(getattr(reply, name)) for name in ("text", "refusal")}
             return replace(reply, notes=tuple(notes), **clean)
         raise PlannerError(f"{self.model!r} at {self.address}, {question}: {self._without_key(what)}.", fatal=fatal)
 
     def _complete(self, request: Mapping[str, Any]) -> tuple[bytes, frozenset[str]]:
-        """Return the body of a reply, and the fallbacks with which the server accepted the request."""
-        while True:  # at most once for each fallback, since a refusal of an active fallback is raised
+        """Send a request; return the reply's body and the fallbacks with which the server accepted the request."""
+        while True:  # at most one iteration per fallback, since rejecting an active fallback raises
             fallbacks = self._fallbacks
             try:
                 fields = _request_fields(self.model, request, fallbacks)
@@ -358,36 +359,36 @@ class _ChatClient:
                 self._fallbacks |= refused
 
     def _explain(self, error: Any) -> tuple[str, bool]:
-        """Return the cause of a client's error, with a remedy, and whether it is fatal."""
-        tried = f"asked {counted(int(error.request.headers.get('x-stainless-retry-count', 0)) + 1, 'time')}"
+        """Return a description of a client's error (the cause and a remedy), and whether the error is fatal."""
+        tried = f"tried {counted(int(error.request.headers.get('x-stainless-retry-count', 0)) + 1, 'time')}"
         status, message = getattr(error, "status_code", None), _excerpt(self._without_key(_error_text(error)))
         fatal = True
         if any(isinstance(cause, self._openai.APITimeoutError) for cause in (error, error.__cause__)):
-            cause, fatal = f"no whole answer within {self._timeout:g} s, {tried}", False
-            advice = "Give a longer timeout, or a lower concurrency"
+            cause, fatal = f"no complete answer within {self._timeout:g} s, {tried}", False
+            advice = "Use a longer timeout or a lower concurrency"
         elif status is None:
             reason = _excerpt(self._without_key(str(error.__cause__ or error))) or type(error.__cause__).__name__
-            cause = f"the connection failed or broke off, {tried}: {reason}"
-            advice = "Check that the server runs, and that base_url is its address"
+            cause = f"the connection failed or was interrupted, {tried}: {reason}"
+            advice = "Check that the server is running and that base_url is correct"
         elif status in (401, 403):
-            cause = f"the key in {_KEY} is not accepted" if self._key else f"the server needs a key, in {_KEY}"
-            advice = "Give the key of this server"
+            cause = f"the server rejects the key in {_KEY}" if self._key else f"the server needs a key in {_KEY}"
+            advice = "Set the key for this server"
         elif status == 404:
-            cause, advice = "no such model or address", f"`GET {self.address}/models` lists its models"
+            cause, advice = "no such model or address", f"`GET {self.address}/models` lists the server's models"
         elif status == 429:
-            cause, advice = f"too many requests, {tried}", "Continue later, or with a lower concurrency"
+            cause, advice = f"too many requests, {tried}", "Retry later or with a lower concurrency"
         elif status >= 500:
-            cause, advice, fatal = f"the server failed, {tried}", "Its log may say why; ask again", False
+            cause, advice, fatal = f"the server failed, {tried}", "Check the server's log, and retry", False
         elif re.search(r"context|too long|max_tokens|maximum.{0,20}length", message, re.IGNORECASE):
-            cause, fatal = "the question does not fit", False
-            advice = "Give fewer max_tokens, a shorter format (basic_py), or the server a longer context"
+            cause, fatal = "the request exceeds the model's context", False
+            advice = "Use fewer max_tokens, a shorter format (basic_py) or a longer context on the server"
         else:
-            cause, fatal = "the request is refused", False
-            advice = "Leave out the options that the server does not know"
+            cause, fatal = "the server rejects the request", False
+            advice = "Remove options that the server does not support"
         return f"{cause}{f' ({message})' if status else ''}. {advice}", fatal
 
     def _without_key(self, text: Any) -> Any:
-        """Replace copies of the key in a text or in bytes; a shorter key, such as "none", may be an ordinary word."""
+        """Redact the API key in a text or in bytes. A key of under 8 characters may be an ordinary word, so is kept."""
         key, hidden = self._key, "(the key)"
         if len(key) < 8:
             return text
@@ -395,9 +396,9 @@ class _ChatClient:
 
 
 def _limited(openai: Any, timeout: float) -> Any:
-    """Return a subclass of the ``openai`` package's HTTP client that bounds the time and the size of each reply.
+    """Return a subclass of the ``openai`` package's HTTP client that limits the time and the size of each reply.
 
-    Its own timeout bounds each read, so that a server that sends a byte now and then would never time out.
+    The client's own timeout limits only each read, so a server that sends a byte now and then would never time out.
     """
 
     class LimitedClient(openai.DefaultHttpxClient):
@@ -410,7 +411,7 @@ def _limited(openai: Any, timeout: float) -> Any:
                     content += part
                     if monotonic() > end:
                         raise openai.APITimeoutError(request)
-                    if len(content) > REPLY_LIMIT:  # _read_completion reports it
+                    if len(content) > REPLY_LIMIT:  # _read_completion raises the error
                         break
             headers = {name: value for name, value in response.headers.items() if name.lower() != "content-encoding"}
             status = _status(response.status_code, bytes(content))
@@ -420,10 +421,10 @@ def _limited(openai: Any, timeout: float) -> Any:
 
 
 def _status(status: int, content: bytes) -> int:
-    """Return the status that a reply should have had, for the client to decide whether to ask again."""
-    if status == 500 and b"response_format" in content:  # llama-cpp-python refuses a kind of schema
+    """Correct the HTTP status of a reply, from which the client decides whether to retry."""
+    if status == 500 and b"response_format" in content:  # llama-cpp-python rejects a type of schema
         return 400
-    with suppress(ValueError):  # some gateways send an error with status 200, and its code in the body
+    with suppress(ValueError):  # some gateways send status 200 with an error code in the body
         if status == 200 and (error := parse_json(content).get("error")):
             code = error.get("code") if isinstance(error, dict) else None
             return code if type(code) is int and 400 <= code < 600 else 502
@@ -431,6 +432,7 @@ def _status(status: int, content: bytes) -> int:
 
 
 def _request_fields(model: str, request: Mapping[str, Any], fallbacks: frozenset[str]) -> dict[str, Any]:
+    """Build the fields of a chat completion request, with the given fallbacks."""
     messages, schema = request["messages"], request["schema"]
     if "no system message" in fallbacks:
         system, user, *others = messages
@@ -446,20 +448,20 @@ def _request_fields(model: str, request: Mapping[str, Any], fallbacks: frozenset
 
 
 def _error_text(error: Any) -> str:
-    """Return the message of an error, and what the server sent if the client does not understand it."""
+    """Return an error's message, with the server's text if the message lacks it."""
     text = error.response.text.strip() if hasattr(error, "response") else ""
     return str(error) if text in str(error) or " - " in str(error) else f"{error} - {text}"
 
 
 def _read_completion(content: bytes) -> tuple[Reply, str]:
-    """Read a chat completion; return the reply, and the name of the model that answered.
+    """Parse a chat completion; return the reply and the name of the model that answered.
 
     Raises:
-        PlannerError: it is too large, not JSON, or not a chat completion.
+        PlannerError: the content is too large, not JSON, or not a chat completion.
     """
     if len(content) > REPLY_LIMIT:
         size = f"the reply is larger than {REPLY_LIMIT // 2**20} MiB"
-        raise PlannerError(f"{size}. Give fewer max_tokens, and no options that make it long")
+        raise PlannerError(f"{size}. Use fewer max_tokens, and remove options that lengthen replies")
     try:
         body = parse_json(content)
         choice = body["choices"][0]
@@ -467,12 +469,12 @@ def _read_completion(content: bytes) -> tuple[Reply, str]:
         answer = message["content"]
     except (ValueError, KeyError, IndexError, TypeError) as error:
         if isinstance(error, ValueError) and content.strip()[:1] in (b"", b"{"):
-            raise PlannerError(f"the reply was cut off or is not JSON: {_excerpt(str(error))}. Ask again") from None
-        advice = "Check that base_url is the address of an OpenAI-compatible server; it usually ends in /v1"
+            raise PlannerError(f"the reply was cut off or is not JSON: {_excerpt(str(error))}. Retry") from None
+        advice = "Check that base_url is the address of an OpenAI-compatible server, usually ending in /v1"
         text = _excerpt(content.decode("utf-8", "replace"))
         raise PlannerError(f"the reply is not a chat completion: {text}. {advice}", fatal=True) from None
     notes: tuple[str, ...] = ()
-    if isinstance(answer, list):  # parts: thoughts, and texts
+    if isinstance(answer, list):  # the parts are thoughts and texts
         answer = "".join(_text(part.get("text")) for part in answer if isinstance(part, dict))
     elif not answer:
         others = [name for name in ("reasoning_content", "reasoning", "tool_calls") if message.get(name)]
@@ -485,12 +487,12 @@ def _read_completion(content: bytes) -> tuple[Reply, str]:
 
 
 def _text(value: Any) -> str:
-    """Return a text without lone surrogates, which no file can hold; "" for other values."""
+    """Remove lone surrogates, which cannot be written to a file, from a text; return "" for any other type."""
     return value.encode("utf-8", "replace").decode() if isinstance(value, str) else ""
 
 
 def _excerpt(text: str) -> str:
-    """Shorten a server's text to one printable line without HTML tags."""
+    """Shorten a server's text to one printable line (300 characters) without HTML tags."""
     text = " ".join(re.sub(r"<(style|script)\b.*?</\1>|<[^<>]*>", " ", text[:20_000], flags=re.DOTALL).split())
     text = "".join(character if character.isprintable() else "?" for character in text)
     return text if len(text) <= 300 else f"{text[:300]} ..."

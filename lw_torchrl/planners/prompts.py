@@ -1,4 +1,4 @@
-"""Prompts for plans, plans as JSON, and the JSON Schema that constrains a model to plans of one task."""
+"""Prompts for plans, plans as JSON, and the JSON Schema that constrains a model to plans for one task."""
 
 from __future__ import annotations
 
@@ -21,18 +21,19 @@ from lw_torchrl.language.relations import PREDICATES, RELATIONS, STATES
 from lw_torchrl.language.skills import SkillError, Skills, skills_for
 from lw_torchrl.language.tasks import TASKS, Task, Tasks, get_task
 
-_ALWAYS = "pick-place"  # it has skills that many tasks need
+_ALWAYS = "pick-place"  # always an example, since many tasks need its skills
 _EXAMPLES = 3
 
 
 @typed
 def prompt_examples(task: str | Task, plans: AnyPlans | None = None) -> tuple[ConditionalPlan, ...]:
-    """Return the plans that a prompt shows: pick-place's, and those of the tasks with the most similar descriptions.
+    """Return the example plans for a prompt: the pick-place plan, and those for tasks with similar descriptions.
 
-    They are up to three, without the task's own. The nearest by edit distance comes last, next to the question.
+    There are up to three examples, never the task's own plan. The task whose description is nearest by edit distance
+    comes last, right before the request.
 
     Args:
-        plans: the plans to choose from; None for the hand-written ones of MT10.
+        plans: the plans to choose from; None for the hand-written MT10 plans.
 
     Example:
         >>> [plan.task for plan in prompt_examples("coffee-push")]
@@ -43,7 +44,7 @@ def prompt_examples(task: str | Task, plans: AnyPlans | None = None) -> tuple[Co
     owner = get_task(task)
     others = [plan for name, plan in example_plans(plans).items() if name != owner.name]
     if not others:
-        raise ValueError(f"plans must hold one of another task than {owner.name!r}, got none")
+        raise ValueError(f"plans must hold a plan for a task other than {owner.name!r}, got only a plan for this task")
 
     def distance(plan: ConditionalPlan) -> tuple[bool, int]:
         return plan.task != _ALWAYS, Levenshtein.distance(plan.definition.description, owner.description)
@@ -58,7 +59,7 @@ def _shipped() -> Plans:
 
 
 def example_plans(plans: AnyPlans | None) -> Plans:
-    """Return the plans that examples are chosen from."""
+    """Return the plans from which examples are chosen; None stands for the shipped MT10 plans."""
     return _shipped() if plans is None else as_plans(plans)
 
 
@@ -66,11 +67,12 @@ def example_plans(plans: AnyPlans | None) -> Plans:
 def plan_prompt(
     task: str | Task, format: str, *, plans: AnyPlans | None = None, vocabulary: bool = False, tasks: Tasks = TASKS
 ) -> str:
-    """Return the text that asks a language model for a plan, whose answer :func:`~lw_torchrl.decode_plan` reads.
+    """Build the prompt that requests a plan from a language model; :func:`~lw_torchrl.decode_plan` parses the answer.
 
-    It shows the plans of :func:`prompt_examples`, and ends with the task's name and description, in the format.
+    The prompt shows the plans from :func:`prompt_examples` in the format, then the task's name and description.
 
     Args:
+        format: a name in :data:`~lw_torchrl.PLAN_FORMATS`.
         plans: see :func:`prompt_examples`.
         vocabulary: also list the task's objects and the relations between them.
         tasks: the known tasks by name, as from :func:`~lw_torchrl.load_tasks`.
@@ -91,11 +93,11 @@ def plan_prompt(
 
 
 class Question(NamedTuple):
-    """A question to a model."""
+    """A request for a plan, with the task and the attempt."""
 
     task: Task
-    attempt: int  # the index of this answer among several to the same question
-    request: dict[str, Any]  # everything that determines the answer
+    attempt: int  # the index of the answer among the answers to the same request
+    request: dict[str, Any]  # see OpenAIPlanner.request
 
     def __str__(self) -> str:
         return f"{self.task.name}, attempt {self.attempt}"
@@ -104,9 +106,9 @@ class Question(NamedTuple):
 def chat_messages(
     task: Task, format: str, plans: AnyPlans | None, vocabulary: bool, constrain: bool
 ) -> list[dict[str, str]]:
-    """Return a system message that asks for nothing but the plan, and the prompt as the user's message.
+    """Build the system message, which requests only the plan, and the user's message with the prompt.
 
-    For a model that is constrained to a schema, the system message shows the last example as JSON.
+    For a constrained model, the system message also shows the last example as JSON.
     """
     how = (
         "the whole of it, in the form of the plans that you are shown: no other tasks, and nothing before or after it."
@@ -125,15 +127,15 @@ _BETWEEN = re.compile(r"\s*,?\s*")
 
 
 def write_structured(plan: ConditionalPlan, style: Style) -> str:
-    """Write a plan as JSON in one line, which :func:`read_structured` reads back::
+    """Convert a plan to one line of JSON, which :func:`read_structured` parses::
 
         {"steps": [{"because": "It has to come from above.",
                     "condition": [{"first": "the robot's gripper", "is": "not above", "second": "the puck"}],
                     "goal": [{"first": "the robot's gripper", "is": "above", "second": "the puck"}],
                     "skill": "place the gripper above the puck"}]}
 
-    Styles that explain have "because", the goal style has "goal". The keys are in alphabetical order, in which some
-    servers write them.
+    Only styles with reasons have the key "because", and only the goal style has "goal". The keys are in alphabetical
+    order, since some servers sort keys.
     """
     steps = []
     for step, goal in zip(plan.steps, plan.goals, strict=True):
@@ -146,6 +148,7 @@ def write_structured(plan: ConditionalPlan, style: Style) -> str:
 
 
 def _write_query(query: Query) -> list[dict[str, str]]:
+    """Convert a query to JSON: one object per clause."""
     rows = []
     for clause in query.clauses:
         row = {"first": f"the {clause.subject}", "is": f"{'not ' if clause.negated else ''}{clause.predicate}"}
@@ -154,7 +157,7 @@ def _write_query(query: Query) -> list[dict[str, str]]:
 
 
 def read_structured(text: str) -> Reading:
-    """Read the steps of a plan as JSON, up to the first fault; it never raises. Conditions may also be sentences."""
+    """Parse the steps of a plan in JSON up to the first fault, and never raise. Conditions may also be sentences."""
     reading = Reading()
     match = _STEPS.search(text)
     if match is None:
@@ -177,10 +180,11 @@ def read_structured(text: str) -> Reading:
             clause = Clause(line, condition, one_line(skill), _read_query(row.get("goal")), reason)
             reading.section.clauses.append(clause)
         else:
-            reading.note(line, f"a step without a condition or a skill is left out: {shown(step)}")
+            reading.note(line, f"a step without a condition or without a skill is left out: {shown(step)}")
 
 
 def _read_query(value: Any) -> str:
+    """Convert the JSON of a query to text; "" if there is no clause."""
     texts = []
     for row in value if isinstance(value, list) else [value]:
         if isinstance(row, dict):
@@ -191,7 +195,7 @@ def _read_query(value: Any) -> str:
     return " and ".join(one_line(text) for text in texts if text.strip())
 
 
-# Limits end the answer of a model that repeats itself; the longest shipped plan has 6 steps, of up to 5 clauses.
+# Limits that stop a model that repeats itself; shipped plans have at most 6 steps, with at most 5 clauses each.
 MOST_STEPS, MOST_CLAUSES = 8, 5
 _SKILL = "^[a-z]+( [a-z'-]+){1,12}$"
 _BECAUSE = "^[A-Za-z0-9,.:;'-]+( [A-Za-z0-9,.:;'-]+){1,29}$"
@@ -201,18 +205,19 @@ _BECAUSE = "^[A-Za-z0-9,.:;'-]+( [A-Za-z0-9,.:;'-]+){1,29}$"
 def plan_schema(
     task: str | Task, format: str = "basic_py", *, skills: Skills | None = None, free_skills: bool = False
 ) -> dict[str, Any]:
-    """Return the JSON Schema of plans of a task, as :func:`write_structured` writes them.
+    """Build the JSON Schema for a task's plans, in the form that :func:`write_structured` writes.
 
-    It uses only what the strict modes of OpenAI, vLLM, Ollama, llama.cpp and llama-cpp-python have in common. A clause
-    is three choices, not one of hundreds: OpenAI allows 1,000 words to choose from; the largest task has 320.
+    The schema uses only features that the strict modes of OpenAI, vLLM, Ollama, llama.cpp and llama-cpp-python share. A
+    clause is three small choices rather than one among hundreds: OpenAI allows 1,000 enum values in total; the largest
+    task has 320.
 
     Args:
-        format: determines the style: a reason before each clause if it explains, a goal in a goal format.
-        skills: the scripted skills to choose from; None for the shipped ones.
-        free_skills: allow skills in any words.
+        format: the format, whose style determines whether each step has a reason and a goal.
+        skills: the scripted skills to choose from; None for the shipped skills.
+        free_skills: allow free-form skills.
 
     Raises:
-        SkillError: (a ValueError) no scripted skill suits the task.
+        SkillError: (a ValueError) the task can use no scripted skill.
 
     Example:
         >>> plan_schema("reach")["properties"]["steps"]["items"]["properties"]["skill"]["enum"][0]
@@ -222,7 +227,7 @@ def plan_schema(
     style = PLAN_FORMATS[check_choice("format", format, PLAN_FORMATS)].style
     scripted = list(skills_for(task, skills))
     if not scripted and not free_skills:
-        raise SkillError(f"no scripted skill suits task {task.name!r}; free_skills=True takes any words")
+        raise SkillError(f"task {task.name!r} can use no scripted skill; pass free_skills=True to allow any text")
     step: dict[str, Any] = {"because": {"type": "string", "pattern": _BECAUSE}} if style.explains else {}
     step["condition"] = _list({"anyOf": _clauses(task)}, MOST_CLAUSES)
     if style.goals:
@@ -232,7 +237,7 @@ def plan_schema(
 
 
 def passes(value: Any, schema: Mapping[str, Any]) -> bool:
-    """Check JSON against a schema of :func:`plan_schema`."""
+    """Return whether a JSON value follows a schema from :func:`plan_schema`."""
     if "anyOf" in schema:
         return any(passes(value, choice) for choice in schema["anyOf"])
     if "enum" in schema:
@@ -247,7 +252,7 @@ def passes(value: Any, schema: Mapping[str, Any]) -> bool:
 
 
 def _clauses(task: Task) -> list[dict[str, Any]]:
-    """Return schemas for the base queries: for each subject and predicate, only the objects that complete a query."""
+    """Build schemas for clauses that allow, for each subject and predicate, only objects that complete a base query."""
     seconds = defaultdict[tuple[str, str], list[str | None]](list)
     for clause in base_clauses(task, tuple(PREDICATES)):
         predicate = f"not {clause.predicate}" if clause.negated else clause.predicate
@@ -263,12 +268,15 @@ def _clauses(task: Task) -> list[dict[str, Any]]:
 
 
 def _choice(words: list[str]) -> dict[str, Any]:
+    """Build the schema of a string that is one of ``words``."""
     return {"type": "string", "enum": words}
 
 
 def _list(items: dict[str, Any], most: int) -> dict[str, Any]:
+    """Build the schema of a list of 1 to ``most`` items."""
     return {"type": "array", "items": items, "minItems": 1, "maxItems": most}
 
 
 def _object(properties: dict[str, Any]) -> dict[str, Any]:
+    """Build the schema of an object with exactly these properties."""
     return {"type": "object", "properties": properties, "required": list(properties), "additionalProperties": False}

@@ -1,4 +1,4 @@
-"""check_plan runs a plan in the simulator; repair_plans reports its failures to the model that wrote it."""
+"""Checks of plans in the simulator, and repair: reporting failures to the model that wrote a plan."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -20,23 +20,23 @@ from lw_torchrl.modules.scripted_skill_actor import ScriptedSkillActor
 from lw_torchrl.planners.answer_files import CUT_OFF, Answer
 from lw_torchrl.planners.openai_planner import OpenAIPlanner
 
-_GAPS = 3  # number of gaps to print, the longest ones
+_GAPS = 3  # number of gaps to print, longest first
 
 
 @dataclass(frozen=True)
 class PlanCheck:
-    """How a plan was read, and how it performs in the simulator."""
+    """A report on how a plan was decoded and how it performs in the simulator."""
 
     task: str
     decoded: DecodedPlan
-    expert: TaskUse | None = None  # its conditions in the states of Meta-World's expert; None without a plan
-    own: TaskUse | None = None  # its steps under scripted skills; None if these cannot carry it out
-    success: float = 0.0  # success rate under scripted skills
-    failed: tuple[Tensor, ...] = ()  # observations of failed episodes, (T, 39) float32
+    expert: TaskUse | None = None  # the plan's conditions in the expert's states; None without a plan
+    own: TaskUse | None = None  # the plan's conditions in its own episodes; None if a step has no scripted skill
+    success: float = 0.0  # success rate with scripted skills
+    failed: tuple[Tensor, ...] = ()  # observations (T, 39) float32 of each failed episode
 
     @property
     def never(self) -> tuple[int, ...]:
-        """The steps, from 0, whose condition was true neither in the expert's states nor in the plan's own."""
+        """The plan steps (from 0) whose condition was never true in the episodes of the expert and of the plan."""
         if self.expert is None:
             return ()
         own = [0.0] * len(self.expert.true) if self.own is None else self.own.true
@@ -47,26 +47,28 @@ class PlanCheck:
             return "\n".join([f"{self.task}: no plan: {self.decoded.reason}", *map(str, self.decoded.notes)])
         lines = [f"{self.task}, {len(self.decoded.plan.steps)} steps"]
         for k, step in enumerate(step for step in self.decoded.steps if not step.dropped):
-            own = "" if self.own is None else f", {self.own.true[k]:.0%} of its own; acts in {self.own.chosen[k]:.0%}"
+            use = self.own
+            own = "" if use is None else f" and {use.true[k]:.0%} of the plan's, acts in {use.chosen[k]:.0%} of these"
             lines += [
                 f"{k + 1}  when {step.condition}{_written(step.written_condition, step.condition_distance)}",
                 f"   {step.scripted or 'no scripted skill'}{_written(step.written_skill, step.skill_distance)}",
                 f"   holds in {self.expert.true[k]:.0%} of the expert's states{own}",
             ]
         lines += [f"left out, {note}" for note in self.decoded.notes]
-        lines.append(f"Some condition holds in {self.expert.covered:.0%} of the states up to the expert's success.")
+        lines.append(f"In {self.expert.covered:.0%} of states up to the expert's success, some condition holds.")
         for episode, first, last in sorted(self.expert.gaps, key=lambda gap: gap[1] - gap[2])[:_GAPS]:
             steps = f"step {first}" if first == last else f"steps {first} to {last}"
             lines.append(f"No condition holds in {steps} of the expert's episode {episode}.")
-        lines += [f"Step {k + 1} never fires: its condition held in no state that was visited." for k in self.never]
+        lines += [f"Step {k + 1} never fires: its condition was false in every visited state." for k in self.never]
         if self.own is None:
-            lines.append("Scripted skills cannot carry it out: a step's skill is near none of them.")
+            lines.append("Scripted skills cannot carry out the plan: a step has no scripted skill.")
         else:
-            lines.append(f"Carried out by scripted skills it succeeds in {self.success:.0%} of episodes.")
+            lines.append(f"With scripted skills the plan succeeds in {self.success:.0%} of episodes.")
         return "\n".join(lines)
 
 
 def _written(text: str, distance: float) -> str:
+    """Show the original text and the distance of a replacement; "" for an exact match."""
     return f"   <- {text!r} ({distance:.2f})" if distance else ""
 
 
@@ -80,9 +82,9 @@ def check_plan(
     skills: Skills | None = None,
     tasks: Tasks = TASKS,
 ) -> PlanCheck:
-    """Decode a text with :func:`~lw_torchrl.decode_plan`, and find the states in which its plan's conditions hold.
+    """Decode a plan with :func:`~lw_torchrl.decode_plan`, and run it in the simulator to check its conditions.
 
-    The task is one of Meta-World's. The expert and the plan, under scripted skills, run ``episodes`` each.
+    The task must be a Meta-World task. The expert and the plan (with scripted skills) run ``episodes`` each.
 
     Example:
         >>> import lw_torchrl as lw
@@ -124,20 +126,20 @@ def _check_decoded(decoded: DecodedPlan, task: Task, episodes: int, seed: int, s
 
 @dataclass(frozen=True)
 class Repair:
-    """The first answer and its revisions, one for each round, with the check of each."""
+    """An answer and its revisions (one per round), with the check of each."""
 
     answers: tuple[Answer, ...]
     checks: tuple[PlanCheck, ...]
 
 
 def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
-    """Write the report to a model on how its plan performed. Of the answer's ``notes``, only truncation is reported.
+    """Write a report for the model on how its plan performed; of ``notes``, only truncation is reported.
 
     Example:
         >>> from lw_torchrl.language.tasks import TASKS
         >>> print(plan_facts(check_plan("I cannot.", "reach", "basic_py"), TASKS["reach"]))
-        The answer was read, and no plan was found in it: it has no steps, neither for reach nor for another task.
-        In the answer, line 1: is not part of a plan: 'I cannot.'
+        The answer was read, and no plan was found in it: the text has no steps for reach or any other task.
+        In the answer, line 1: the text is not part of a plan: 'I cannot.'
         Write the plan for `reach` again, the whole of it, in the same form, with this corrected.
     """
     again = f"Write the plan for `{task.name}` again, the whole of it, in the same form, with this corrected."
@@ -161,7 +163,7 @@ def plan_facts(check: PlanCheck, task: Task, notes: Sequence[str] = ()) -> str:
 
 
 def _distances(task: Task, failed: Iterable[Tensor]) -> list[str]:
-    """Report how near the gripper came to each object, and moved objects to still ones: medians of failed episodes."""
+    """Report the least and final distances (cm) of gripper and objects, as medians over failed episodes."""
     episodes = [task.published.positions(observation) for observation in failed]
     if not episodes:
         return []
@@ -190,14 +192,14 @@ def repair_plans(
     out: AnyPath | None = None,
     progress: bool = True,
 ) -> list[Repair]:
-    """Carry out plans, report the failures to the model, and ask for better plans, round by round.
+    """Run plans in the simulator, report failures to the model and request revised plans, round by round.
 
     Args:
         planner: the planner that wrote the answers.
-        answers: its answers, in one format.
+        answers: the planner's answers, all in one format.
         rounds: maximum number of rounds.
-        enough: a plan with at least this success rate is not revised.
-        episodes, seed: the episodes in which scripted skills carry out each plan. Compare plans with another seed.
+        enough: the success rate (0 to 1) at which a plan is good enough and is not revised.
+        episodes, seed: number and seed of the episodes that check each plan; use a different seed for evaluation.
         tasks, out, progress: see :meth:`OpenAIPlanner.revise`.
     """
     check_value("rounds", rounds, Count)

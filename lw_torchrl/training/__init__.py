@@ -1,4 +1,4 @@
-"""Training: behavioral cloning, any loss over a replay buffer, query evaluators, and their files."""
+"""Training: behavioral cloning, any loss on a replay buffer, query evaluators, and checkpoint files."""
 
 import lw_torchrl._util.keys  # noqa: F401
 from lw_torchrl.training.checkpoint import load_actor, load_evaluator, save_actor, save_evaluator

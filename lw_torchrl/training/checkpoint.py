@@ -1,4 +1,4 @@
-"""Files of policies, query evaluators and training states: one .safetensors file each, with a description as JSON."""
+"""Checkpoint files of policies, query evaluators and training states: .safetensors files with a JSON description."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from lw_torchrl.modules.query_evaluator import QueryEvaluator
 VERSION = 2
 KINDS: Mapping[str, str] = {"actor": "a policy", "evaluator": "an evaluator", "training": "a training state"}
 _ARGUMENTS = {"actor": "checkpoint", "evaluator": "evaluator", "training": "checkpoint"}
-_TEXTS = "texts/"  # prefix of text vectors, by which a file recognises the text encoder it was made with
-_TEXT_TOLERANCE = 0.01  # the vectors of one encoder differ by less between machines
+_TEXTS = "texts/"  # prefix of text vectors, which identify the text encoder that a file was saved with
+_TEXT_TOLERANCE = 0.01  # between machines, the vectors of the same encoder differ by less than this
 
 
 @typed
 def save_actor(actor: TensorDictModuleBase, path: AnyPath, **about: Any) -> None:
-    """Write a policy for :func:`load_actor`. An earlier file is replaced whole.
+    """Save a policy to a file that :func:`load_actor` reads. An existing file is replaced atomically.
 
     Args:
-        actor: a policy made of this library's modules and of custom modules. A custom module needs an attribute
-            ``config``, a dict of its constructor's keyword arguments as JSON.
-        path: the file, by convention named ``.safetensors``.
-        **about: further metadata, as JSON.
+        actor: a policy built from this library's modules and custom modules. A custom module needs an attribute
+            ``config``, a dict of the keyword arguments of its constructor, as JSON.
+        path: the file to write, by convention with the suffix ``.safetensors``.
+        **about: additional metadata, as JSON.
 
     Raises:
         TypeError: a module has no ``config``; the message names the module.
-        ValueError: :func:`load_actor` could not rebuild the policy, because its weights do not fit its description or
+        ValueError: :func:`load_actor` could not rebuild the policy, because the weights do not fit the description or
             are not finite; or ``about`` uses a reserved name.
-        OSError: the file cannot be written; an earlier file stays.
+        OSError: the file cannot be written; an existing file is kept.
 
     Example:
         >>> import lw_torchrl as lw, os, tempfile
@@ -60,15 +60,15 @@ def load_actor(path: AnyPath, *, text_encoder: TextEncoder | None = None, parts:
     """Load a policy with its plans and weights, in eval mode.
 
     Args:
-        path: the file, or the name of a shipped policy, "few-shot-mt50", if there is no file of that name.
-        text_encoder: the encoder that the policy was made with, if it was not the shipped one.
-        parts: custom classes in the policy. Classes whose module is imported already need not be listed.
+        path: the file, or the name of a shipped policy, such as "few-shot-mt50", if no file has that name.
+        text_encoder: the text encoder that the policy was saved with; None for the shipped text encoder.
+        parts: custom module classes in the policy. Classes whose Python module is already imported can be left out.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is damaged or not a policy, its weights do not fit its description or are not finite, a
-            class is unknown, or the policy was made with another text encoder.
-        ImportError: its texts are not shipped, and the extra ``[text]`` is not installed.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is corrupted or not a policy, the weights do not fit the description or are not finite, a
+            class is unknown, or the policy was saved with a different text encoder.
+        ImportError: the policy uses texts whose vectors are not shipped, and the extra ``[text]`` is not installed.
 
     Example:
         >>> import lw_torchrl as lw
@@ -80,11 +80,11 @@ def load_actor(path: AnyPath, *, text_encoder: TextEncoder | None = None, parts:
 
 @typed
 def save_evaluator(evaluator: QueryEvaluator, path: AnyPath, **about: Any) -> None:
-    """Write an evaluator's network for :func:`load_evaluator`. An earlier file is replaced whole.
+    """Save an evaluator's network to a file that :func:`load_evaluator` reads. An existing file is replaced atomically.
 
     Args:
-        evaluator: the evaluator; a custom class keeps its constructor's keyword arguments in ``config``.
-        path, **about: as for :func:`save_actor`, with its errors.
+        evaluator: the evaluator; a custom class must store the keyword arguments of its constructor in ``config``.
+        path, **about: see :func:`save_actor`, also for the errors.
 
     Example:
         >>> import lw_torchrl as lw, os, tempfile
@@ -104,11 +104,11 @@ def load_evaluator(
     text_encoder: TextEncoder | None = None,
     parts: Sequence[type[nn.Module]] = (),
 ) -> QueryEvaluator:
-    """Load an evaluator for the conditions of any plans, in eval mode.
+    """Load an evaluator in eval mode, to answer the conditions of any plans.
 
     Args:
-        path, text_encoder, parts: as for :func:`load_actor`, with its errors.
-        plans: the plans; :class:`ValueError` if the evaluator cannot answer their conditions.
+        path, text_encoder, parts: see :func:`load_actor`, also for the errors.
+        plans: the plans; :class:`ValueError` if the evaluator cannot answer a plan's conditions.
     """
     answered = [as_plans(plans).to_json()]
     evaluator: QueryEvaluator = _load(
@@ -119,7 +119,7 @@ def load_evaluator(
 
 def _save(path: AnyPath, kind: str, module: nn.Module, about: dict[str, Any]) -> None:
     if reserved := sorted({"format", "version", "versions", kind, "state"} & set(about)):
-        raise ValueError(f"about must not use the reserved name {', '.join(reserved)}")
+        raise ValueError(f"about must not use reserved names, got {', '.join(reserved)}")
     check_can_be_saved(module, kind)
     _write(path, kind, {kind: describe(module), **about}, contents_of(module))
 
@@ -139,15 +139,15 @@ def _load(path: Path, kind: str, make: Callable[[Any], nn.Module]) -> Any:
         _copy_tensors(tensors, contents_of(module))
     except ImportError:
         raise
-    except Exception as error:  # a damaged description can make any constructor fail
+    except Exception as error:  # a corrupted description can make any constructor fail with any error
         hint = "; import the module that registers your relations first" if isinstance(error, PlanError) else ""
-        message = f"{_ARGUMENTS[kind]}: the {kind} of {str(path)!r} cannot be made ({_one_line(error)}){hint}"
+        message = f"{_ARGUMENTS[kind]}: the {kind} in {str(path)!r} cannot be rebuilt ({_one_line(error)}){hint}"
         raise ValueError(message) from error
     return module.eval()
 
 
 def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return the description and the tensors of a file of the given kind."""
+    """Read the description and the tensors of a file, and check that the file is of the given kind."""
     if not path.exists():
         command = "train-evaluator" if kind == "evaluator" else "train"
         raise FileNotFoundError(f"{_ARGUMENTS[kind]}: {absent_policy(path, command)}")
@@ -157,7 +157,7 @@ def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
         raise ValueError(f"{_ARGUMENTS[kind]}: {str(path)!r} cannot be read: {error}") from error
     if {name: description.get(name) for name in ("format", "version")} != _header(kind):
         raise ValueError(
-            f"{_ARGUMENTS[kind]}: {str(path)!r} must be {KINDS[kind]} of version {VERSION}, got format "
+            f"{_ARGUMENTS[kind]}: {str(path)!r} must hold {KINDS[kind]} of version {VERSION}, got format "
             f"{description.get('format')!r:.60}, version {description.get('version')!r:.60}"
         )
     return description, tensors
@@ -168,13 +168,13 @@ def _one_line(error: Exception) -> str:
 
 
 def contents_of(module: nn.Module) -> dict[str, Tensor]:
-    """Return the tensors that a file stores for a module: its weights, and its text vectors."""
+    """Return the tensors that a file stores for a module: the weights and the text vectors."""
     return {**module.state_dict(keep_vars=True), **text_vectors(module)}
 
 
 def text_vectors(module: nn.Module) -> dict[str, Tensor]:
-    """Return the vectors of a module's texts by name; they identify the text encoder."""
-    parts = module.named_modules(remove_duplicate=False)  # an ensemble may hold a member twice
+    """Return the vectors of a module's texts by name; the vectors identify the text encoder."""
+    parts = module.named_modules(remove_duplicate=False)  # an ensemble may contain the same member twice
     vectors = ((name, getattr(part, "text_vectors", None)) for name, part in parts)
     return {_TEXTS + name: tensor for name, tensor in vectors if tensor is not None}
 
@@ -183,14 +183,14 @@ def text_vectors(module: nn.Module) -> dict[str, Tensor]:
 def _copy_tensors(stored: Mapping[str, Tensor], live: Mapping[str, Tensor]) -> None:
     """Copy weights in place; raise :class:`ValueError` where names, shapes, dtypes or text vectors differ."""
     if different := sorted(stored.keys() ^ live.keys()):
-        raise ValueError(f"the file and the module must have the same tensors, they differ in {different[:8]}")
+        raise ValueError(f"the file and the module must have the same tensors, but differ in {different[:8]}")
     weights = {name: tensor for name, tensor in live.items() if not name.startswith(_TEXTS)}
     for name in live.keys() - weights.keys():
         old, new = stored[name], live[name]
         if old.shape != new.shape or not torch.allclose(old.to(new), new, atol=_TEXT_TOLERANCE, rtol=0.0):
-            raise ValueError("text_encoder must be the one that the file was made with: its vectors differ")
+            raise ValueError("text_encoder must be the encoder that the file was saved with, but its vectors differ")
     for name, tensor in weights.items():
-        if isinstance(tensor, nn.parameter.UninitializedParameter):  # of a lazy layer
+        if isinstance(tensor, nn.parameter.UninitializedParameter):  # a lazy layer has no shape yet
             tensor.materialize(stored[name].shape)
         if (stored[name].dtype, stored[name].shape) != (tensor.dtype, tensor.shape):
             got = f"{stored[name].dtype} of shape {tuple(stored[name].shape)}"
@@ -204,85 +204,88 @@ def check_finite(weights: Mapping[str, Tensor]) -> None:
     """Raise :class:`ValueError` if a weight is NaN or infinite."""
     for name, tensor in weights.items():
         if not tensor.isfinite().all():
-            raise ValueError(f"weights: {name} must be finite, it holds NaN or infinity")
+            raise ValueError(f"weights: {name} must be finite, but holds NaN or infinity")
 
 
 def check_can_be_saved(module: nn.Module, kind: str = "actor") -> None:
-    """Raise an error unless a module can be saved and loaded. Trainers call it first, so that no training is lost."""
+    """Raise an error unless a module can be saved and loaded; called before training so that no training is lost."""
     widths = [vectors.shape[-1] for vectors in text_vectors(module).values()] or [TEXT_DIMENSION]
     custom = [type(part) for part in module.modules() if not type(part).__module__.startswith("torch.")]
     description = json.loads(json.dumps(describe(module)))
     try:
         with torch.random.fork_rng(devices=[]):
-            # The stand-in encoder avoids loading a language model just for the check.
+            # A dummy text encoder avoids loading a language model just for this check.
             again = from_description(description, lambda texts: torch.ones(len(texts), widths[0]), custom)
         if not same_keys(module, again):
-            raise ValueError("its in_keys or out_keys were changed later: pass them to its constructor")
+            raise ValueError("in_keys or out_keys were changed after construction; pass them to the constructor")
         _copy_tensors(module.state_dict(), again.state_dict(keep_vars=True))
     except Exception as error:
-        message = f"{kind} cannot be saved, because its description does not rebuild it"
+        message = f"{kind} cannot be saved, because it cannot be rebuilt from its description"
         raise ValueError(f"{message} ({_one_line(error)})") from error
 
 
 def policy_file(path: AnyPath) -> Path:
-    """Return the file of a policy: the path itself, or the file of the shipped policy of that name."""
+    """Return the file of the shipped policy named ``path``, or otherwise the path itself."""
     return shipped_policy(path) or Path(path)
 
 
 def read_description(path: AnyPath) -> dict[str, Any]:
-    """Return a policy file's description; errors as for :func:`load_actor`."""
+    """Read the JSON description in a policy file; see :func:`load_actor` for the errors."""
     return _read(policy_file(path), "actor")[0]
 
 
 def demonstration_seeds(path: AnyPath) -> set[int]:
-    """Return the seeds of the demonstrations that a policy was trained on, as far as its file records them."""
+    """Return the seeds of the demonstrations that a policy was trained on, if the policy's file records the seeds."""
     data = read_description(path).get("data") or {}
     return {part["seed"] for part in data.get("parts", [data]) if "seed" in part}
 
 
 def demonstrated_tasks(path: AnyPath) -> set[str]:
-    """Return the tasks of the demonstrations that a policy was trained on, as far as its file records them."""
+    """Return the tasks of the demonstrations that a policy was trained on, if the policy's file records the tasks."""
     data = read_description(path).get("data") or {}
     return {task for tasks in data.get("episodes", [data.get("tasks", ())]) for task in tasks}
 
 
 def training_file(checkpoint: Path) -> Path:
-    """Return the file of the training state next to a policy, for example ``mt10.training.safetensors``."""
+    """Return the path of the training state stored next to a policy, for example ``mt10.training.safetensors``."""
     return checkpoint.with_name(f"{checkpoint.stem}.training{checkpoint.suffix}")
 
 
 def check_description(path: Path, expected: Mapping[str, Any], stored: Mapping[str, Any] | None = None) -> None:
-    """Raise :class:`ValueError` unless the description of a file agrees with ``expected``; None to read a policy's."""
+    """Raise :class:`ValueError` unless a file's description has the entries ``expected``.
+
+    ``stored`` is the file's description; None reads the description of the policy file ``path``.
+    """
     stored = read_description(path) if stored is None else stored
     for part, now in json.loads(json.dumps(expected)).items():  # as JSON, which has no tuples
         if (before := stored.get(part)) != now:
             names = differences(before if isinstance(before, dict) else {}, now or {})
             kind = "architecture" if part in ("actor", "actors", "evaluator", "loss") else "configuration"
             raise ValueError(
-                f"checkpoint: {str(path)!r} is of another {kind}, its {part} differs in {', '.join(names[:8])}"
-                f"{', ...' * (len(names) > 8)}; choose another file, or delete it to start again"
+                f"checkpoint: {str(path)!r} has a different {kind}: its {part} differs in {', '.join(names[:8])}"
+                f"{', ...' * (len(names) > 8)}; choose another file, or delete this file to start again"
             )
 
 
 class CheckpointFiles:
-    """The file of a policy or evaluator and the training state next to it, written by one training at a time.
+    """The files of one training: a policy or evaluator, and the training state next to it, with a lock against others.
 
     Args:
-        checkpoint: the file.
-        part: what the file holds, "actor" or "evaluator"; None if it is the training state itself.
+        checkpoint: the path of the policy, evaluator or training state.
+        part: the content of ``checkpoint``, "actor" or "evaluator"; None if ``checkpoint`` is the training state.
     """
 
     def __init__(self, checkpoint: AnyPath, part: str | None) -> None:
         self.checkpoint, self.part = Path(checkpoint), part
         self.state = training_file(self.checkpoint) if part else self.checkpoint
-        self._known: tuple[int, ...] | None = None  # identifies the version of the state that was read or written last
+        self._known: tuple[int, ...] | None = None  # identifies the last version of the training state read or written
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock these files against other trainings within the block."""
+        """Lock the files within a ``with`` block, so that no other training writes them."""
         with locked(self.checkpoint, "checkpoint", "training"):
             if self._version() not in (None, self._known):
-                message = "was written by another training after this one began; start again to resume from it"
+                message = "was written by another training after this training began; start again to resume from it"
                 raise ValueError(f"checkpoint: {str(self.checkpoint)!r} {message}, or choose another file")
             yield
 
@@ -295,17 +298,17 @@ class CheckpointFiles:
     def write(
         self, description: Mapping[str, Any], device: torch.device, tensors: Any, state: Any, part: nn.Module | None
     ) -> None:
-        """Write ``tensors`` and ``state``, then the policy or evaluator ``part``. Earlier files are replaced whole."""
+        """Write the training state (``tensors`` and ``state``), then the policy or evaluator ``part``, atomically."""
         _write(self.state, "training", {**description, "device": device.type}, tensors, state)
         self._known = self._version()
         if self.part is not None and part is not None:
             _write(self.checkpoint, self.part, description, contents_of(part))
 
     def exist(self) -> bool:
-        """Return whether there is a state; ValueError if there is only a policy, which would be overwritten."""
+        """Return whether the training state exists; raise ValueError if only the policy exists, to keep the policy."""
         if not self.state.exists() and self.checkpoint.exists():
-            message = f"{str(self.checkpoint)!r} exists, but not its training state {str(self.state)!r}"
-            raise ValueError(f"checkpoint: {message}; choose another file, or delete it to start again")
+            message = f"{str(self.checkpoint)!r} exists, but its training state {str(self.state)!r} does not"
+            raise ValueError(f"checkpoint: {message}; choose another file, or delete this file to start again")
         return self.state.exists()
 
     def restore(
@@ -334,6 +337,6 @@ class CheckpointFiles:
             _copy_tensors(stored, tensors)
             load_state(state)
         except (ValueError, KeyError, TypeError, RuntimeError) as error:
-            message = f"{name} does not fit, it is damaged or of another architecture"
+            message = f"{name} does not fit: the file is corrupted, or was written for a different architecture"
             raise ValueError(f"{message} ({_one_line(error)})") from error
         self._known = version

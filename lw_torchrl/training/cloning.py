@@ -1,4 +1,4 @@
-"""Behavioral cloning with TorchRL's BCLoss: AdamW, a cosine schedule, checkpoints that resume bit for bit."""
+"""Behavioral cloning with TorchRL's BCLoss, AdamW, a cosine schedule, and checkpoints that resume bit-exactly."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ class BehavioralCloningConfig:
 
     Attributes:
         steps: number of minibatches.
-        batch_size: rows of a minibatch; with ``TaskBalancedSampler(exact=True)``, a multiple of the number of tasks.
+        batch_size: rows per minibatch; with ``TaskBalancedSampler(exact=True)``, a multiple of the number of tasks.
         learning_rate: initial learning rate.
-        momentum: momentum of "sgd".
-        schedule: schedule of the learning rate, "cosine" to 0 or "constant".
-        normalize: before the first step, fit the statistics of the observation's features to the demonstrations.
-        loss_function: distance between the actor's action and the demonstrated one.
-        max_grad_norm: gradients are clipped to this norm.
+        momentum: momentum of the optimizer "sgd".
+        schedule: learning rate schedule, "cosine" (to 0) or "constant".
+        normalize: fit the normalization statistics of the observation features to the demonstrations before training.
+        loss_function: distance between the actor's action and the demonstrated action.
+        max_grad_norm: maximum norm to which gradients are clipped.
         seed: seed of the minibatches, and of random numbers in the buffer's transforms and in the actor.
-        checkpoint_every: steps between checkpoints; the last step always writes one.
-        qaf_anchor: weight of the cross entropy between a learned evaluator's answers and the exact ones. It keeps
-            conditions true to their words while imitation trains the evaluator.
+        checkpoint_every: number of minibatches between checkpoints; the last minibatch always writes a checkpoint.
+        qaf_anchor: weight of the cross entropy between a learned evaluator's answers and the exact answers. This loss
+            term keeps the answers true to the conditions' meaning while imitation trains the evaluator.
     """
 
     steps: Count = 8000
@@ -69,25 +69,25 @@ def bc_loss(actor: nn.Module, distance: str) -> BCLoss:
 
 
 class _Steps(NamedTuple):
-    mask: Tensor  # (T, S) bool, the steps of each task's plan
+    mask: Tensor  # (T, S) bool, the plan steps that each task's plan has
 
 
 class EvaluatorAnchor:
-    """The cross entropy between the answers of a policy's learned evaluator and the exact answers."""
+    """A loss term: the cross entropy between the answers of a policy's learned evaluator and the exact answers."""
 
     def __init__(self, actor: nn.Module) -> None:
         evaluators = evaluators_of(actor)
         if len(evaluators) != 1:
             raise ValueError(
-                "qaf_anchor needs a policy with one learned evaluator, TensorDictSequential(evaluator, actor); this "
-                f"{type(actor).__name__} has {len(evaluators) or 'none'}"
+                "qaf_anchor requires a policy with exactly one learned evaluator, such as "
+                f"TensorDictSequential(evaluator, actor), got {type(actor).__name__} with {len(evaluators)} evaluators"
             )
         self.evaluator, plans = evaluators[0], evaluators[0].plans
         self.program, tables = plan_program(plans), PlanTables(plans)
         self.steps = TaskTables(tables.index, _Steps(tables.mask), f"tasks without a plan in {plans!r}")
 
     def __call__(self, batch: TensorDictBase) -> Tensor:
-        """Return () float32 for rows of ``observation``, ``task_id`` and the keys that the evaluator reads."""
+        """Return the loss () float32 of a batch with ``observation``, ``task_id`` and the evaluator's input keys."""
         observation, task = batch.get("observation"), batch.get("task_id")
         logits = self.evaluator.logits_of(batch)
         truth = self.program(observation, task).to(logits.dtype)
@@ -97,23 +97,23 @@ class EvaluatorAnchor:
 
 
 class BehavioralCloningTrainer(Training):
-    """Trains an actor to imitate the demonstrated actions.
+    """A trainer that fits an actor to the demonstrated actions.
 
-    Any TensorDict module that writes ``action`` can be trained, for example ``TensorDictSequential(evaluator, actor)``,
-    which trains both.
+    The actor can be any TensorDict module that writes ``action``, for example
+    ``TensorDictSequential(evaluator, actor)``, in which evaluator and actor are trained together.
 
     Args:
         actor: the actor, trained in place.
-        replay: a buffer whose samples hold what the actor reads and ``action`` (B, 4) float32.
+        replay: a replay buffer whose samples hold the keys that the actor reads and ``action`` (B, 4) float32.
         config: hyperparameters; None for the defaults.
-        device: where to train: "cpu", "cuda", "cuda:1", "mps", or "auto" for the GPU if there is one. The actor is
-            moved there and stays there. None leaves it where it is. Make the buffer with the same ``device``; otherwise
-            each minibatch is copied.
-        **options: of :class:`~lw_torchrl.training.loop.Training`, with its errors.
+        device: the device to train on: "cpu", "cuda", "cuda:1", "mps", or "auto" for a GPU if available. The actor is
+            moved to the device and stays there; None does not move the actor. Create the buffer with the same
+            ``device``; otherwise each minibatch is copied.
+        **options: keyword arguments of :class:`~lw_torchrl.training.loop.Training`, which also lists their errors.
 
     Raises:
-        ValueError: the actor does not write ``action``, or has no evaluator for ``qaf_anchor``.
-        TypeError: there is a ``checkpoint``, and the actor cannot be saved.
+        ValueError: the actor does not write ``action``, or ``qaf_anchor`` is set and the actor has no evaluator.
+        TypeError: ``checkpoint`` is set and the actor cannot be saved.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
@@ -153,7 +153,7 @@ class BehavioralCloningTrainer(Training):
         self.loss = bc_loss(actor, config.loss_function)
         self.optimizer = make_optimizer([(self.loss.parameters(), config.learning_rate)], config, self.device)
         self.minibatches = [Minibatches(replay, config.batch_size, config.seed)]
-        if self.resume():  # the checkpoint holds the statistics of the features
+        if self.resume():  # the checkpoint includes the normalization statistics
             return
         if config.normalize and statistics_of(actor):
             fit_normalization(actor, replay)

@@ -1,4 +1,4 @@
-"""QueryEvaluatorTrainer: a network learns the exact answers to queries, from observations or from pictures."""
+"""QueryEvaluatorTrainer: train a network on the exact answers to queries, from observations or from pictures."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from lw_torchrl.training.labelled_queries import (
 from lw_torchrl.training.loop import Training, TrainingOptions, make_optimizer
 from lw_torchrl.training.minibatches import Minibatches
 
-_MOST_WEIGHT = 20.0  # maximum weight of a rare answer, as a multiple of the median
+_MOST_WEIGHT = 20.0  # maximum weight of a rare answer, as a multiple of the median weight
 
 
 class _StateQueries:
-    """Pairs of a state and a clause, with equally many of each predicate and truth in a minibatch."""
+    """A source of minibatches of (state, clause) pairs, with equally many pairs of each predicate and truth value."""
 
     def __init__(self, evaluator: ClauseEvaluator, tasks: list[TaskQueries]) -> None:
         self.observation = torch.cat([task.observation for task in tasks])
         self.clauses = evaluator.code([(task.task, clause) for task in tasks for clause in task.clauses])
-        # A group is a predicate and a truth; it lists its pairs of a row and a clause, as int32 to save memory.
+        # Each (predicate, truth) group lists its (row, clause) pairs, as int32 to save memory.
         predicate = 2 * self.clauses.predicate.to(torch.uint8)
         groups: dict[int, list[Tensor]] = {}
         row = first = 0
@@ -53,8 +53,8 @@ class _StateQueries:
         self.digest = _digest((self.observation, self.pairs, self.sizes))
 
     def sample(self, size: int) -> TensorDictBase:
-        """Draw ``observation`` (B, 39) float32, ``clauses`` (B, 1) and their ``truth`` (B, 1) float32."""
-        # The groups take turns from a random one on, so that a batch smaller than their number favours none.
+        """Draw ``observation`` (B, 39) float32, ``clauses`` (B, 1) and the clauses' ``truth`` (B, 1) float32."""
+        # Cycle through the groups from a random start, so that a batch smaller than their number favors none.
         group = (torch.arange(size) + torch.randint(len(self.sizes), ())) % len(self.sizes)
         place = (torch.rand(size, dtype=torch.float64) * self.sizes[group]).long()
         row, clause = self.pairs[self.starts[group] + place].long().unbind(-1)
@@ -68,7 +68,7 @@ class _StateQueries:
 
 
 class _PictureQueries:
-    """Pictures of states, equally many of each task, with all clauses of the task and the objects' positions."""
+    """A source of minibatches of pictures, equally many of each task, with the task's clauses and object positions."""
 
     def __init__(self, evaluator: ImageQueryEvaluator, tasks: list[TaskQueries]) -> None:
         for task in tasks:
@@ -80,7 +80,7 @@ class _PictureQueries:
         self.digest = _digest(part for task in tasks for part in (task.observation, task.truth, task.view("pixels")))
 
     def sample(self, size: int) -> TensorDictBase:
-        """Draw ``size`` states in all, as a TensorDict for each task."""
+        """Draw about ``size`` states in total, as one nested TensorDict per task with the same number of states."""
         each = max(1, size // len(self.tasks))
         batch = TensorDict()
         for number, task in enumerate(self.tasks):
@@ -99,7 +99,7 @@ class _PictureQueries:
 
     @staticmethod
     def loss(network: Any, batch: TensorDictBase, config: Any) -> Tensor:
-        """Return the mean over the tasks of the weighted error of the answers plus that of the objects' positions."""
+        """Return the mean over tasks of the weighted loss of the answers plus the loss of the objects' positions."""
         losses = []
         for states in batch.values():
             places, _ = network.places(states["pixels"], network.names.weight)
@@ -107,7 +107,7 @@ class _PictureQueries:
             errors = nn.functional.binary_cross_entropy_with_logits(logits, states["truth"], reduction="none")
             answers = (errors * states["weights"]).sum() / states["weights"].sum()
             located, known = places.index_select(1, states["objects"]), states["known"]
-            # In units of 5 cm, so that both terms have about the same size.
+            # Errors are measured in units of 5 cm, so that both terms have about the same size.
             errors = nn.functional.smooth_l1_loss(located / 0.05, states["positions"] / 0.05, reduction="none")
             losses.append(answers + config.position_weight * (errors * known).sum() / (known.sum() * len(errors)))
         return torch.stack(losses).mean()
@@ -118,10 +118,10 @@ def _as_tensordict(clauses: Clauses) -> TensorDict:
 
 
 def _known_positions(queries: TaskQueries, names: tuple[str, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the indices of a task's n objects in ``names``, (n,) int64, their positions and openings, and a mask.
+    """Return the indices (n,) int64 of a task's objects in ``names``, their positions and openings, and a mask.
 
-    Positions and openings, how far each object is open, are (R, n, 4) float32; the mask (n, 4) is 1 where they are
-    known.
+    Three coordinates and the opening (how far the object is open) form a tensor (R, n, 4) float32; the mask (n, 4) is 1
+    where a value is known.
     """
     own = [name for name in queries.task.object_names if name in names]
     positions, openings = queries.task.positions(queries.observation), queries.task.openings
@@ -135,7 +135,7 @@ def _known_positions(queries: TaskQueries, names: tuple[str, ...]) -> tuple[Tens
 
 
 def _answer_weights(queries: TaskQueries) -> Tensor:
-    """Return weights (2, Q) float32 of a clause's false and true answers, which balance each predicate and truth."""
+    """Return weights (2, Q) float32 of each clause's false and true answers, to balance predicates and truth values."""
     true = queries.truth.double().mean(0)
     predicates = [clause.predicate for clause in queries.clauses]
     weights = torch.zeros(2, len(predicates))
@@ -154,22 +154,22 @@ def _digest(tensors: Iterable[Tensor]) -> str:
 
 
 class QueryEvaluatorTrainer(Training):
-    """Trains an evaluator of observations or of pictures on the exact answers to all base queries of tasks.
+    """A trainer that fits an evaluator of observations or pictures to the exact answers to all base queries of tasks.
 
-    A minibatch of observations has equally many pairs of a state and a clause of each predicate and truth. A minibatch
-    of pictures has equally many states of each task, with all of its clauses, weighted to the same effect.
+    A minibatch of observations holds equally many (state, clause) pairs of each predicate and truth value. A minibatch
+    of pictures holds equally many states of each task with all clauses of the task, weighted to the same effect.
 
     Args:
-        evaluator: the evaluator, trained in place; its plans do not matter.
-        data: the queries and their answers, some of them held out.
-        config: the config that the data were made with, an :class:`ImageQueryEvaluatorConfig` for pictures.
-        device: where to train, as for :class:`BehavioralCloningTrainer`.
-        **options: of :class:`~lw_torchrl.training.loop.Training`, with its errors. :func:`load_evaluator` reads the
-            checkpoint.
+        evaluator: the evaluator, trained in place; the evaluator's plans do not affect training.
+        data: the queries and their answers, some of which are held out.
+        config: the config from which ``data`` was built; pictures require an :class:`ImageQueryEvaluatorConfig`.
+        device: the device to train on, see :class:`BehavioralCloningTrainer`.
+        **options: keyword arguments of :class:`~lw_torchrl.training.loop.Training`, which also lists their errors.
+            :func:`load_evaluator` reads the checkpoint.
 
     Raises:
-        TypeError: the evaluator reads pictures, and the config is not an :class:`ImageQueryEvaluatorConfig`.
-        ValueError: all data are held out, or the evaluator reads pictures and the rows have none.
+        TypeError: the evaluator reads pictures, and ``config`` is not an :class:`ImageQueryEvaluatorConfig`.
+        ValueError: all data are held out, or the evaluator reads pictures and the data have no pictures.
 
     Example:
         >>> import lw_torchrl as lw, tempfile
@@ -210,7 +210,7 @@ class QueryEvaluatorTrainer(Training):
         self.evaluator, self.module, self.networks = evaluator, evaluator, [evaluator]
         self.device = place(evaluator, device)
         if not (tasks := data.parts["training"]):
-            raise ValueError("data must have states and queries to train on, all are held out")
+            raise ValueError("data must hold states and queries to train on, but all are held out")
         queries: _StateQueries | _PictureQueries
         if isinstance(evaluator, ImageQueryEvaluator):
             if not isinstance(config, ImageQueryEvaluatorConfig):

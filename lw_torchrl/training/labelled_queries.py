@@ -1,4 +1,4 @@
-"""LabelledQueries: all base queries of tasks in a dataset's states, with their exact answers."""
+"""LabelledQueries: the exact answers to all base queries of tasks in the states of a dataset."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from lw_torchrl.language.relations import PREDICATES
 from lw_torchrl.language.tasks import Task, task_id
 from lw_torchrl.suites.suite import find_suite
 
-_MOVED = 0.02  # metres; a hand that moves further between two pictures must look different
+_MOVED = 0.02  # meters; if the hand moves further than this between two pictures, the pictures must differ
 
 
 @typed_fields
 @dataclass(frozen=True)
 class QueryEvaluatorConfig:
-    """Hyperparameters of a query evaluator's training by AdamW, and what is held out.
+    """Hyperparameters for training a query evaluator with AdamW, and the held-out splits.
 
     Attributes:
-        steps, weight_decay, checkpoint_every: as for :class:`BehavioralCloningConfig`.
-        batch_size: pairs of a state and a clause in a minibatch.
-        learning_rate: initial learning rate; it follows a cosine to 0.
-        states_per_task: maximum number of states of a task to train on, drawn from its rows.
-        every: use every N-th state of an episode; with pictures, N is the number of steps between pictures.
-        held_out_states: fraction of a task's episodes whose states are held out, at most 0.9.
+        steps, weight_decay, checkpoint_every: see :class:`BehavioralCloningConfig`.
+        batch_size: number of (state, clause) pairs per minibatch.
+        learning_rate: initial learning rate, which decays to 0 on a cosine schedule.
+        states_per_task: maximum number of training states per task, drawn from the rows of the task.
+        every: use every N-th state of an episode; with pictures, N is the number of time steps between pictures.
+        held_out_states: fraction of each task's episodes whose states are held out, at most 0.9.
         held_out_pairs: fraction of the pairs of object names that are held out in all tasks, at most 0.9.
-        held_out_tasks: names of held-out tasks, or a number of tasks to draw.
-        seed: seed of what is held out, of the states and of the minibatches.
+        held_out_tasks: names of the held-out tasks, or the number of held-out tasks to draw.
+        seed: seed for drawing the held-out splits, the training states and the minibatches.
     """
 
     steps: Count = 4000
@@ -61,12 +61,12 @@ class QueryEvaluatorConfig:
 @typed_fields
 @dataclass(frozen=True)
 class ImageQueryEvaluatorConfig(QueryEvaluatorConfig):
-    """Hyperparameters of an :class:`ImageQueryEvaluator`'s training; others are those of :class:`QueryEvaluatorConfig`.
+    """Hyperparameters for training an :class:`ImageQueryEvaluator`, in addition to :class:`QueryEvaluatorConfig`.
 
     Attributes:
-        batch_size: states in a minibatch, each with all clauses of its task.
-        position_weight: weight of the error of the objects' positions and openings, which the simulator knows; 0 to
-            learn only from answers.
+        batch_size: number of states per minibatch, each with all clauses of its task.
+        position_weight: weight of the loss on the objects' positions and openings, whose targets come from the
+            simulator; 0 to learn only from answers.
     """
 
     batch_size: Count = 48
@@ -77,12 +77,12 @@ class ImageQueryEvaluatorConfig(QueryEvaluatorConfig):
 
 @dataclass(frozen=True)
 class TaskQueries:
-    """Exact answers to Q clauses, none negated, in R states of a task.
+    """Exact answers to Q clauses (none of them negated) in R states of a task.
 
     Attributes:
-        observation: (R, 39) float32.
-        truth: (R, Q) bool.
-        pixels: (R, H, W, 3) uint8; None for rows without pictures.
+        observation: the states, (R, 39) float32.
+        truth: the answers, (R, Q) bool.
+        pixels: pictures of the states, (R, H, W, 3) uint8; None without pictures.
     """
 
     task: Task
@@ -92,7 +92,7 @@ class TaskQueries:
     pixels: Tensor | None = None
 
     def view(self, key: str) -> Tensor:
-        """Return the states as an evaluator that reads ``key``, "observation" or "pixels", sees them."""
+        """Return the input for an evaluator that reads ``key`` ("observation" or "pixels")."""
         view = self.observation if key == "observation" else self.pixels
         if view is None:
             raise ValueError(
@@ -103,23 +103,23 @@ class TaskQueries:
 
 
 class LabelledQueries:
-    """Exact answers to all base queries of a dataset's tasks, not only those of plans, some of them held out.
+    """Exact answers to all base queries of a dataset's tasks, including queries that no plan uses, split for training.
 
     Attributes:
-        tasks, held_out_tasks: the tasks to train on, and the held-out ones.
-        held_out_pairs: held-out pairs of object names, each sorted.
-        parts: the queries by name: "training"; "states", the same clauses in held-out states; "queries", clauses about
-            held-out pairs, in these states; "tasks", all clauses of held-out tasks. Each may be empty.
+        tasks, held_out_tasks: the names of the training tasks and of the held-out tasks.
+        held_out_pairs: held-out pairs of object names, each pair sorted.
+        parts: the splits by name: "training"; "states" (the training clauses in held-out states); "queries" (clauses
+            about held-out pairs in held-out states); "tasks" (all clauses of held-out tasks). Any split may be empty.
 
     Args:
-        replay: a buffer whose rows hold ``observation`` (R, 39) float32, ``task_id`` and ``episode`` (R,) int64, and,
-            for an evaluator of pictures, ``pixels`` (R, H, W, 3) uint8.
-        config: what to hold out.
-        tasks: definitions of the buffer's tasks; None for the shipped ones.
+        replay: a replay buffer whose rows hold ``observation`` (R, 39) float32, ``task_id`` and ``episode`` (R,) int64,
+            and, for an evaluator of pictures, ``pixels`` (R, H, W, 3) uint8.
+        config: the config that defines the held-out splits.
+        tasks: definitions of the buffer's tasks; None for the shipped definitions.
 
     Raises:
-        ValueError: a row's or held-out task is not among the tasks; everything is held out; a picture stays the same
-            while the hand moves.
+        ValueError: a task of the rows or a held-out task has no definition; all tasks are held out; or two pictures are
+            equal although the hand moved between them.
     """
 
     @typed
@@ -129,13 +129,13 @@ class LabelledQueries:
         shipped = find_suite(getattr(replay, "tasks", ())).tasks
         known = {task_id(task.name): task for task in (shipped.values() if tasks is None else tasks)}
         rows = replay[:]
-        if config.every > 1:  # counted from each episode's first row, where its first picture is
+        if config.every > 1:  # counted from the first row of each episode, which has the first picture
             _, lengths = torch.unique_consecutive(rows.get(("collector", "traj_ids")), return_counts=True)
             first = (lengths.cumsum(0) - lengths).repeat_interleave(lengths)
             rows = rows[(torch.arange(len(rows)) - first) % config.every == 0]
         ids = rows.get("task_id")
         if other := sorted({*ids.unique().tolist()} - {*known}):
-            raise ValueError(f"tasks must have all tasks of the rows, they lack the task ids {other[:8]}")
+            raise ValueError(f"tasks must include all tasks of the rows, but the task ids {other[:8]} are missing")
         present = [known[number] for number in ids.unique().tolist()]
         _check_pictures(rows, present[0].layout)
         generator = torch.Generator().manual_seed(config.seed)
@@ -147,7 +147,7 @@ class LabelledQueries:
         self.parts: dict[str, list[TaskQueries]] = {"training": [], "states": [], "queries": [], "tasks": []}
         for task in present:
             own, most = ids == task_id(task.name), config.states_per_task
-            # A negated clause has the opposite answer, so it would add nothing to learn.
+            # Skip negated clauses: their answers are the opposite, so there would be nothing more to learn.
             clauses = [clause for clause in base_clauses(task, tuple(PREDICATES)) if not clause.negated]
             train = _at_most(most, (own & ~held_out).nonzero().flatten(), generator)
             test = _at_most(most, (own & held_out).nonzero().flatten(), generator)
@@ -168,7 +168,7 @@ class LabelledQueries:
             self.parts[part].append(TaskQueries(task, tuple(clauses), observation, truth, rows.get("pixels", None)))
 
     def describe(self) -> dict[str, Any]:
-        """Describe what is trained on and what is held out, as JSON."""
+        """Return a JSON description of the training and held-out splits."""
         return {
             "tasks": list(self.tasks),
             "held_out_tasks": list(self.held_out_tasks),
@@ -184,14 +184,14 @@ def _pair(clause: Clause) -> tuple[str, str]:
 
 
 def _at_most(number: int, rows: Tensor, generator: torch.Generator) -> Tensor:
-    """Draw ``number`` of the rows; return all if there are fewer."""
+    """Draw ``number`` rows without replacement; return all rows if there are fewer."""
     if len(rows) <= number:
         return rows
     return rows[torch.randperm(len(rows), generator=generator)[:number].sort().values]
 
 
 def _check_pictures(rows: TensorDictBase, layout: Layout) -> None:
-    """Raise if a picture stays the same while the hand moves: it would show an earlier state, with other answers."""
+    """Raise ValueError if consecutive pictures are equal although the hand moved, since one shows an earlier state."""
     pixels, hand = rows.get("pixels", None), rows.get("observation")[:, layout.positions[0]]
     if pixels is None or len(rows) < 2:
         return
@@ -199,7 +199,8 @@ def _check_pictures(rows: TensorDictBase, layout: Layout) -> None:
     same_episode = rows.get(("collector", "traj_ids"))[1:] == rows.get(("collector", "traj_ids"))[:-1]
     for row in (moved & same_episode).nonzero().flatten().tolist():
         if torch.equal(pixels[row], pixels[row + 1]):
-            raise ValueError("every must be the number of steps between pictures: a picture stays while the hand moves")
+            hint = "two consecutive pictures are equal although the hand moved between them"
+            raise ValueError(f"every must be the number of time steps between pictures: {hint}")
 
 
 def _draw_tasks(held_out: int | tuple[str, ...], names: Sequence[str], generator: torch.Generator) -> tuple[str, ...]:
@@ -213,7 +214,7 @@ def _draw_tasks(held_out: int | tuple[str, ...], names: Sequence[str], generator
 
 
 def _draw_pairs(fraction: float, tasks: Sequence[Task], generator: torch.Generator) -> tuple[tuple[str, str], ...]:
-    """Draw a fraction of the pairs of different objects, at least one unless the fraction is 0."""
+    """Draw a fraction of the pairs of distinct objects: at least one pair, unless the fraction is 0."""
     clauses = chain.from_iterable(base_clauses(task, ("near",)) for task in tasks)
     pairs = sorted({_pair(clause) for clause in clauses if clause.object is not None})
     number = min(len(pairs) - 1, max(1, round(fraction * len(pairs)))) if fraction else 0
@@ -221,9 +222,9 @@ def _draw_pairs(fraction: float, tasks: Sequence[Task], generator: torch.Generat
 
 
 def _held_out_rows(episode: Tensor, ids: Tensor, fraction: float) -> Tensor:
-    """Return a mask (R,) bool of the rows of a fraction of each task's episodes, spread evenly over them.
+    """Return a mask (R,) bool of the rows in held-out episodes, a fraction of each task's episodes, evenly spaced.
 
-    Episodes of the same number start in the same state in every dataset, so they are held out together.
+    Episodes with the same index start in the same state in every dataset, so they are held out together.
     """
     held_out = torch.zeros_like(ids, dtype=torch.bool)
     for number in ids.unique().tolist():

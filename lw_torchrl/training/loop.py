@@ -1,4 +1,4 @@
-"""The training loop of every trainer: steps, logs, evaluations, and checkpoints that training resumes from."""
+"""The training loop shared by all trainers: optimizer steps, logging, evaluation, and resumable checkpoints."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from lw_torchrl.training.minibatches import Minibatches
 from lw_torchrl.training.normalization import share_contacts
 
 READ_EVERY = 100
-"""Steps between two readings of the losses; only a reading waits for the device."""
+"""Number of optimizer steps between two transfers of the losses to the CPU, which wait for the device."""
 
 
 def make_optimizer(
     rates: Iterable[tuple[Iterable[Tensor], float]], config: Any, device: torch.device
 ) -> torch.optim.Optimizer:
-    """Return the config's optimizer over groups of parameters and their learning rates.
+    """Create the optimizer that the config selects, for groups of parameters with a learning rate each.
 
-    On a CUDA device the learning rates are tensors, so that a graph can capture the optimizer's step.
+    On a CUDA device the learning rates are tensors, so that a CUDA graph can capture the optimizer step.
     """
     on_gpu = device.type == "cuda"
     groups: list[dict[str, Any]] = []
@@ -48,7 +48,7 @@ def make_optimizer(
 
 
 def _set_learning_rates(optimizer: torch.optim.Optimizer, config: Any, step: int) -> None:
-    """Set the learning rates for the step after N steps: on a cosine from the initial ones to 0, or constant."""
+    """Set the learning rates after ``step`` optimizer steps: on a cosine from the initial value to 0, or constant."""
     is_constant = getattr(config, "schedule", "cosine") == "constant"
     factor = 1.0 if is_constant else 0.5 * (1.0 + math.cos(math.pi * step / config.steps))
     for group in optimizer.param_groups:
@@ -60,7 +60,7 @@ def _set_learning_rates(optimizer: torch.optim.Optimizer, config: Any, step: int
 
 
 def _check_loss(losses: Tensor, step: int, config: Any) -> None:
-    """Raise :class:`ValueError` if a loss, () or (M,) of M actors, is not finite."""
+    """Raise :class:`ValueError` if a loss of one actor () or of M actors (M,) is not finite."""
     if losses.isfinite().all():
         return
     number = int((~losses.reshape(-1).isfinite()).nonzero()[0])
@@ -72,7 +72,7 @@ def _check_loss(losses: Tensor, step: int, config: Any) -> None:
 
 
 class _Interrupt:
-    """Records whether Ctrl-C was pressed once (``requested``) or twice (``insisted``)."""
+    """A record of whether Ctrl-C was pressed once (``requested``) or twice (``insisted``)."""
 
     requested = insisted = False
 
@@ -81,7 +81,7 @@ class _Interrupt:
 def _interrupts_between_steps() -> Iterator[_Interrupt]:
     """Record the first Ctrl-C, and raise :class:`KeyboardInterrupt` at the end of the block.
 
-    A second Ctrl-C raises at once. Nothing changes outside the main thread, or where SIGINT is ignored.
+    A second Ctrl-C raises immediately. Nothing changes outside the main thread, or if SIGINT is ignored.
     """
     interrupt = _Interrupt()
     previous = signal.getsignal(signal.SIGINT) if threading.current_thread() is threading.main_thread() else None
@@ -98,7 +98,7 @@ def _interrupts_between_steps() -> Iterator[_Interrupt]:
     try:
         yield interrupt
     except Exception as error:
-        if interrupt.insisted:  # tensordict may have turned the KeyboardInterrupt into another error
+        if interrupt.insisted:  # tensordict may have converted the KeyboardInterrupt to another error
             raise KeyboardInterrupt from error
         raise
     finally:
@@ -108,7 +108,7 @@ def _interrupts_between_steps() -> Iterator[_Interrupt]:
 
 
 class TrainingOptions(TypedDict, total=False):
-    """Options that every trainer accepts; see :class:`Training`."""
+    """The keyword arguments that every trainer accepts; see :class:`Training`."""
 
     checkpoint: AnyPath | None
     evaluate: Callable[[], Mapping[str, float]] | None
@@ -119,32 +119,33 @@ class TrainingOptions(TypedDict, total=False):
 
 
 class Training:
-    """Base class of the trainers. A subclass sets the attributes below and implements :meth:`losses`.
+    """Base class for trainers. A subclass sets the attributes below and implements :meth:`losses`.
 
     Args:
-        config: hyperparameters: ``steps``, ``checkpoint_every`` and ``learning_rate``; ``schedule``, "cosine" or
-            "constant", and ``max_grad_norm`` where the training has them.
-        checkpoint: the file to write the trained policy to, "mt10.safetensors". The training state is written next to
-            it, "mt10.training.safetensors". If the state exists, training resumes from it.
-        evaluate: returns numbers to log as ``evaluation/NAME``, for example the success rate on held-out seeds.
-        evaluate_every: call ``evaluate`` every N steps, and after the last, with the networks in eval mode.
-        logger: a TorchRL logger, which receives the mean losses of each 100 steps as ``train/NAME``.
-        progress, title: whether to show a progress bar, and its title.
+        config: hyperparameters: ``steps``, ``checkpoint_every``, ``learning_rate``, and optionally ``schedule``
+            ("cosine" or "constant") and ``max_grad_norm``.
+        checkpoint: the file to write the trained policy to, for example "mt10.safetensors". The training state is
+            written next to the policy ("mt10.training.safetensors"). If that file exists, training resumes from it.
+        evaluate: a function that returns numbers to log as ``evaluation/NAME``, such as success on held-out seeds.
+        evaluate_every: call ``evaluate`` every N minibatches and after the last, with the networks in eval mode.
+        logger: a TorchRL logger, which receives the mean losses of every 100 minibatches as ``train/NAME``.
+        progress, title: whether to show a progress bar, and the title of the progress bar.
 
     Attributes:
-        module, optimizer: hold everything that is trained.
-        networks, device: the networks, in train mode during training and in eval mode afterwards; their device.
-        minibatches: one for each buffer.
-        description: the training as JSON; it only resumes from a training state with the same description.
-        part: what ``checkpoint`` holds, "actor" or "evaluator"; None if it is the training state itself.
-        steps, last: the number of minibatches so far, and the means of the latest 100, by name.
+        module, optimizer: the module that contains all trained parameters, and their optimizer.
+        networks, device: the networks (in train mode during training, in eval mode afterwards), and their device.
+        minibatches: the sources of minibatches, one for each buffer.
+        description: a JSON description of the training. Training resumes only from a state with an equal description.
+        part: the content of ``checkpoint``, "actor" or "evaluator"; None if ``checkpoint`` is the training state.
+        steps, last: the number of minibatches so far, and the mean losses of the latest 100 minibatches, by name.
 
     Warns:
-        UserWarning: training resumes, but not bit for bit, for example on another kind of device or version of torch.
+        UserWarning: training resumes, but not bit-exactly, for example on another device type or torch version.
 
     Raises:
-        ValueError: the checkpoint is damaged, or of another architecture, config or dataset; a loss or weight is NaN.
-        OSError: the checkpoint cannot be written; the earlier one stays.
+        ValueError: the checkpoint is corrupted, or has another architecture, config or dataset; or a loss or weight is
+            NaN or infinite.
+        OSError: the checkpoint cannot be written; the existing checkpoint is kept.
     """
 
     part: str | None = None
@@ -175,17 +176,17 @@ class Training:
         self._values: deque[dict[str, Tensor]] = deque(maxlen=READ_EVERY)
 
     def losses(self, batch: Any) -> Mapping[str, Tensor]:
-        """Return a minibatch's losses, whose names begin with "loss" and which are added, and other values to log."""
+        """Return a minibatch's loss terms, whose names begin with "loss" and which are added, and values to log."""
         raise NotImplementedError(f"{type(self).__name__} must implement losses")
 
     def step(self) -> Tensor:
-        """Train on one minibatch and return its loss, () float32, on the device, which may still be computing it."""
+        """Train on one minibatch and return the loss () float32, which the device may still be computing."""
         (minibatches,) = self.minibatches
         with minibatches.drawing(self.device):
             return self.train_on(minibatches.draw(self.device))
 
     def train_on(self, batch: Any) -> Tensor:
-        """Train on a given minibatch and return its loss, () float32, or (M,) float32 of M models."""
+        """Train on a given minibatch and return the loss () float32, or the losses (M,) float32 of M models."""
         values = self.update(batch)
         self.steps += 1
         _set_learning_rates(self.optimizer, self.config, self.steps)
@@ -193,14 +194,15 @@ class Training:
         return values["loss"]
 
     def update(self, batch: Any) -> dict[str, Tensor]:
-        """Update the parameters and return the values to log, detached: everything that the device does in a step.
+        """Run one optimizer step and return the detached values to log.
 
-        On a GPU no value is read back, and no shape depends on data, so that a CUDA graph can capture it.
+        This method contains all work on the device. On a GPU no value is read back and no shape depends on data, so
+        that a CUDA graph can capture the method.
         """
         values = dict(self.losses(batch))
         terms = [value for name, value in values.items() if name.startswith("loss")]
         values["loss"] = loss = terms[0] if len(terms) == 1 else torch.stack(terms).sum(0)
-        if self.device == CPU:  # reading the loss on a GPU would wait for it
+        if self.device == CPU:  # on a GPU, reading the loss would wait for the device
             _check_loss(loss.detach(), self.steps, self.config)
         self.optimizer.zero_grad()
         loss.sum().backward()
@@ -210,13 +212,13 @@ class Training:
         return {name: value.detach() for name, value in values.items() if name == "loss" or value.numel() == 1}
 
     def clip_gradients(self) -> None:
-        """Clip the gradients of each group of parameters before the optimizer's step."""
+        """Clip the gradients of each parameter group before the optimizer step."""
         if (norm := getattr(self.config, "max_grad_norm", None)) is not None:
             for group in self.optimizer.param_groups:
                 clip_grad_norm_(group["params"], norm)
 
     def after_update(self) -> None:
-        """Do what follows the optimizer's step, for example update target networks."""
+        """Run after each optimizer step, for example to update target networks; does nothing by default."""
 
     @property
     def saved(self) -> nn.Module:
@@ -228,14 +230,14 @@ class Training:
         return dict(self.module.named_parameters())
 
     def contents(self) -> dict[str, Tensor]:
-        """Return the tensors to resume from."""
+        """Return the tensors that a training state stores: weights, buffers and text vectors."""
         return contents_of(self.module)
 
     def run(self, until: int | None = None) -> Tensor:
-        """Train as :meth:`train` does, and return the latest 100 losses, (n,) or (n, M) float32 on the CPU."""
+        """Train like :meth:`train`, but return the latest 100 losses, (n,) or (n, M) float32, on the CPU."""
         total = self.config.steps
         if until is not None and check_value("until", until, Count) > total:
-            raise ValueError(f"until must be at most the config's steps, {total}, got {until}")
+            raise ValueError(f"until must be at most config.steps = {total}, got {until}")
         self._values.clear()
         self._set_training(True)
         last = total if until is None else until
@@ -243,7 +245,7 @@ class Training:
         with lock, _interrupts_between_steps() as interrupt:
             with Progress(self.title, total, "step", initial=self.steps, show=self.progress) as bar:
                 if self.steps >= last:
-                    self.save()  # the process may have been killed after writing the training state, before the policy
+                    self.save()  # an earlier process may have been killed after writing the state, before the policy
                 while self.steps < last and not interrupt.requested:
                     self.step()
                     bar.update()
@@ -255,18 +257,18 @@ class Training:
         return self._read_losses()
 
     def train(self, until: int | None = None) -> float:
-        """Train to the last step and return the mean of the latest 100 losses; NaN if no step was left.
+        """Train on the remaining minibatches and return the mean of the latest 100 losses; NaN if none remained.
 
-        Ctrl-C saves a checkpoint after the current step and stops; a second one stops at once.
+        Ctrl-C finishes the current minibatch, saves a checkpoint and stops; a second Ctrl-C stops immediately.
 
         Args:
-            until: stop after this many steps in all, with a checkpoint; a later call resumes. None for all steps.
+            until: save a checkpoint and stop after N minibatches in total; a later call continues. None for all.
         """
         losses = self.run(until)
         return losses.double().mean().item() if len(losses) else math.nan
 
     def _report(self, bar: Progress, done: bool) -> None:
-        """Log, save and evaluate after a step, if any of them is due."""
+        """Log, save and evaluate after a minibatch, if logging, saving or evaluation is due."""
         logs, saves = (done or self.steps % every == 0 for every in (READ_EVERY, self.config.checkpoint_every))
         if logs or saves:
             self._read_losses()
@@ -290,7 +292,7 @@ class Training:
             network.train(training)
 
     def _read_losses(self) -> Tensor:
-        """Wait for the device, set ``last``, and return the latest losses; raise ValueError if one is not finite."""
+        """Wait for the device, update ``last`` and return the latest losses; raise ValueError if any is not finite."""
         if not self._values:
             return torch.empty(0)
         names = [name for name in self._values[0] if all(name in values for values in self._values)]
@@ -301,33 +303,33 @@ class Training:
         return read["loss"]
 
     def save(self) -> None:
-        """Write the checkpoint, if the training has one. Earlier files are replaced whole."""
+        """Check that all weights are finite, and write the checkpoint, if any, atomically replacing existing files."""
         try:
             check_finite(self.parameters())
         except ValueError as error:
-            raise ValueError(f"{error} after step {self.steps}: the learning rate is too high") from error
+            raise ValueError(f"{error} after step {self.steps}; try a lower learning rate") from error
         if self._files is not None:
             part = self.saved if self.part else None
             self._files.write(self.description, self.device, self.contents(), self.state_dict(), part)
 
     def resume(self) -> bool:
-        """Resume from the checkpoint and return True, if there is one."""
+        """Resume from the training state and return True if it exists; otherwise return False."""
         if self._files is None or not self._files.exist():
             return False
         for minibatches in self.minibatches:
-            getattr(minibatches.source, "verify", lambda: None)()  # a dataset's rows must be those it recorded
+            getattr(minibatches.source, "verify", lambda: None)()  # the dataset's rows must match their checksums
         self._files.restore(self.description, self.device, self.contents(), self.load_state_dict)
         for network in self.networks:
             share_contacts(network)
         return True
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that training resumes from, except the weights."""
+        """Return the state needed to resume training, except the weights."""
         minibatches = [each.state_dict() for each in self.minibatches]
         return {"step": self.steps, "optimizer": self.optimizer.state_dict(), "minibatches": minibatches}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the result of :meth:`state_dict`."""
+        """Restore a state returned by :meth:`state_dict`."""
         for minibatches, stored in zip(self.minibatches, state["minibatches"], strict=True):
             minibatches.load_state_dict(stored)
         self.optimizer.load_state_dict(state["optimizer"])

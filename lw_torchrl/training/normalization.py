@@ -1,4 +1,4 @@
-"""Fit the statistics of features, in policies, critics and losses, to the rows of a replay buffer."""
+"""Fit the normalization statistics of features in policies, critics and losses to the rows of a replay buffer."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from lw_torchrl.modules.relative_features import RoleFeatures
 
 @typed
 def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None:
-    """Call :meth:`Features.fit` of all features in a module, or in the networks of a loss, with a buffer's rows.
+    """Fit all features in a module, or in the networks of a loss, to a buffer's rows with :meth:`Features.fit`.
 
-    The statistics reach every copy of a network that the loss holds, and its target networks. Rows have equal
+    In a loss, the statistics are also copied to all copies of a network and to the target networks. Rows have equal
     weights, except with :class:`CoLearningSampler`, which puts half of the weight on the target task's few rows.
 
     Args:
         target: an actor, a critic, any module that contains :class:`~lw_torchrl.modules.Features`, or a loss.
-        replay: a buffer whose rows hold what the features read.
+        replay: a replay buffer whose rows hold the keys that the features read.
 
     Raises:
-        ValueError: the module holds no features, the buffer is empty, or a row lacks a key or holds NaN or infinity.
+        ValueError: the module contains no features, the buffer is empty, a row lacks a key, or a value is not finite.
 
     Example:
         >>> import lw_torchrl as lw, torch
@@ -47,19 +47,19 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
     """
     features = _features_of(target)
     if not features:
-        raise ValueError(f"target must hold Features to normalise, this {type(target).__name__} holds none")
+        raise ValueError(f"target must contain Features to normalize, got a {type(target).__name__} without Features")
     if not len(replay):
-        raise ValueError("replay must hold rows to fit the features to, and it is empty")
+        raise ValueError("replay must hold rows to fit the features to, but it is empty")
     row_weights = getattr(replay.sampler, "row_weights", None)
     weights = None if row_weights is None else row_weights(replay.storage)
     keys = {key for _, part in features for key in part.in_keys}
     stored = replay.storage.get(slice(0, len(replay)))
-    if isinstance(stored, list):  # of a ListStorage
+    if isinstance(stored, list):  # a ListStorage returns a list
         stored = torch.stack([row.select(*keys, strict=False) for row in stored])
-    rows = stored.select(*keys, strict=False).cpu()  # the sums then have the same bits on every device
+    rows = stored.select(*keys, strict=False).cpu()  # the statistics are then bit-identical on every device
     held = statistics_of(target) if isinstance(target, LossModule) else {}
     for path, part in features:
-        # A loss holds its networks' buffers outside the networks, so a copy of the features is fitted.
+        # Fit a copy of the features, because a loss stores the buffers of its networks outside the networks.
         fitted = copy.deepcopy(part).cpu() if held else part
         fitted.fit(rows, weights)
         for name, value in fitted.state_dict().items() if held else ():
@@ -70,9 +70,9 @@ def fit_normalization(target: nn.Module, replay: TensorDictReplayBuffer) -> None
 
 
 def share_contacts(module: nn.Module) -> None:
-    """Call :meth:`RoleFeatures.share` of all features in a module, or in a loss, after their buffers were changed.
+    """Call :meth:`RoleFeatures.share` for all features in a module or loss, after the features' buffers were changed.
 
-    A critic of which a loss holds several copies keeps its own buffers, so there is nothing to share.
+    If a loss holds several copies of a critic, the copies have separate buffers, so there is nothing to share.
     """
     changed = {buffer.data_ptr() for buffer in statistics_of(module).values()}
     for _, part in _features_of(module):
@@ -81,7 +81,7 @@ def share_contacts(module: nn.Module) -> None:
 
 
 def statistics_of(module: nn.Module) -> dict[str, Tensor]:
-    """Return the buffers that :func:`fit_normalization` fits, by name; of a loss, those of all copies and targets."""
+    """Return the buffers that :func:`fit_normalization` fits, by name; in a loss, including copies and targets."""
     names = [f"{path}.{name}".lstrip(".") for path, part in _features_of(module) for name in part.state_dict()]
     buffers = dict(module.named_buffers())
     if isinstance(module, LossModule):
@@ -90,31 +90,31 @@ def statistics_of(module: nn.Module) -> dict[str, Tensor]:
 
 
 def _features_of(module: nn.Module) -> list[tuple[str, Features]]:
-    """Return the features in a module with their paths; the networks of a loss are not among its children."""
+    """Return the features in a module, or in the networks of a loss, with their paths."""
     networks: Iterator[tuple[str, nn.Module]] = iter([("", module)])
-    if isinstance(module, LossModule):
+    if isinstance(module, LossModule):  # the networks of a loss are attributes, but not registered as children
         networks = ((name, value) for name, value in vars(module).items() if isinstance(value, nn.Module))
     parts = (named for name, network in networks for named in network.named_modules(prefix=name))
     return [(path, part) for path, part in parts if isinstance(part, Features)]
 
 
 def _copies(name: str) -> list[str]:
-    """Return the names of a loss's copies of a network's buffer, for example of ``actor_network.features.mean``."""
+    """Return the names under which a loss stores a network's buffer, such as ``actor_network.features.mean``."""
     network, _, path = name.partition(".")
     return [f"{network}_params.{path}", f"target_{network}_params.{path}"]
 
 
 def check_contacts(module: nn.Module) -> None:
-    """Raise :class:`ValueError` if role features would be trained before they know where objects are touched."""
+    """Raise :class:`ValueError` if role features were not yet fitted to the points where objects are touched."""
     if any(name.endswith("fitted") and not fitted.all() for name, fitted in statistics_of(module).items()):
         raise ValueError(
-            "RoleFeatures need the points where demonstrations touch objects: use normalize=True, or call "
+            "RoleFeatures need the points where demonstrations touch objects; use normalize=True, or call "
             "lw.training.fit_normalization(actor, replay)"
         )
 
 
 def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
-    """Call :func:`fit_normalization`; raise :class:`ValueError` if a network was trained with other statistics."""
+    """Call :func:`fit_normalization`; raise ValueError if a network was already fitted to different statistics."""
     held = statistics_of(loss)
     before = {name: buffer.clone() for name, buffer in held.items()}
     fit_normalization(loss, replay)
@@ -125,6 +125,6 @@ def fit_untrained(loss: LossModule, replay: TensorDictReplayBuffer) -> None:
                 held[restored].copy_(value)
             share_contacts(loss)
             raise ValueError(
-                "normalize=True would replace the statistics with which a network of the loss was trained; use "
-                "normalize=False, and call fit_normalization(network, replay) for fresh networks"
+                "normalize=True would replace the statistics with which a network in the loss was trained; use "
+                "normalize=False, and call fit_normalization(network, replay) for untrained networks"
             )

@@ -1,4 +1,4 @@
-"""OfflineTrainer: train any loss of TorchRL or of this library on a replay buffer."""
+"""OfflineTrainer: train any loss from TorchRL or from this library on a replay buffer."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ from lw_torchrl.training.minibatches import (
 from lw_torchrl.training.normalization import fit_normalization, fit_untrained, statistics_of
 
 GAMMA, N_STEPS = 0.99, 10
-"""The discount of a step, and the number of steps that a value's target looks ahead."""
+"""The discount factor per time step, and the number n of time steps in n-step value targets."""
 DISTRIBUTIONS = {"advantage": None, "iql": "normal", "td3-bc": None, "cql": "tanh_normal"}
-"""The losses by name, and the distribution of actions that the actor needs."""
-_CHUNK = 20_000  # rows whose advantages are computed together
-_REPLACED = {"loss_actor_bc"}  # CQL's actor minimises this entry instead of another one in its first steps
+"""A mapping from each loss to the action distribution that it requires of the actor."""
+_CHUNK = 20_000  # number of rows whose advantages are computed together
+_REPLACED = {"loss_actor_bc"}  # CQL offers this entry as a substitute for loss_actor in the first training steps
 
 
 def make_loss(name: str, actor: TensorDictModuleBase, plans: Plans, replay: TensorDictReplayBuffer) -> LossModule:
-    """Return the loss of that name for an actor, with plan-conditioned critics normalised to the buffer's rows.
+    """Create the loss ``name`` for an actor, with plan-conditioned critics normalized to the buffer's rows.
 
-    The actor has the distribution in :data:`DISTRIBUTIONS`. "advantage" reads the column ``advantage``; for the others
-    the buffer looks :data:`N_STEPS` ahead with the discount :data:`GAMMA`.
+    The actor must have the distribution in :data:`DISTRIBUTIONS`. "advantage" reads the column ``advantage``; the other
+    losses require a buffer with ``n_steps`` = :data:`N_STEPS` and ``gamma`` = :data:`GAMMA`.
 
     Source: Kostrikov et al., "Implicit Q-Learning"; Fujimoto and Gu, "A Minimalist Approach to Offline Reinforcement
     Learning"; Kumar et al., "Conservative Q-Learning".
@@ -71,9 +71,9 @@ def make_loss(name: str, actor: TensorDictModuleBase, plans: Plans, replay: Tens
 def learn_advantages(
     plans: Plans, replay: TensorDictReplayBuffer, config: OfflineConfig, device: torch.device, **options: Any
 ) -> Tensor:
-    """Train a value by expectile regression and return each row's advantage, standardised by task, (R, 1) float32.
+    """Train a value by expectile regression and return each row's advantage (R, 1) float32, standardized per task.
 
-    The buffer's rows look :data:`N_STEPS` ahead with the discount :data:`GAMMA`.
+    The buffer must have ``n_steps`` = :data:`N_STEPS` and ``gamma`` = :data:`GAMMA`.
     """
     value = PlanConditionedValue(plans, ensemble=2).to(device)
     loss = ExpectileValueLoss(value, expectile=0.7).make_value_estimator(gamma=GAMMA)
@@ -87,15 +87,15 @@ def learn_advantages(
 @typed_fields
 @dataclass(frozen=True)
 class OfflineConfig:
-    """Hyperparameters of training with any loss, by AdamW. Others are those of :class:`BehavioralCloningConfig`.
+    """Hyperparameters for training with any loss and AdamW. See :class:`BehavioralCloningConfig` for the other fields.
 
     Attributes:
         learning_rate: initial learning rate of the actor.
-        critic_learning_rate: initial learning rate of everything else that the loss trains.
-        target_eps: the fraction of a target network that is kept in each step, if the loss has target networks.
-        normalize: before the first step, fit the statistics of the features to the buffer's rows; False for networks
-            that were trained on other rows.
-        max_grad_norm: the actor's gradients, and those of everything else, are clipped to this norm.
+        critic_learning_rate: initial learning rate of all other trained parameters.
+        target_eps: the fraction of a target network's weights that is kept at each update (as in ``SoftUpdate``).
+        normalize: fit the normalization statistics of the features to the buffer's rows before training; use False
+            for networks that were trained on other rows.
+        max_grad_norm: maximum norm to which the actor's gradients, and separately all other gradients, are clipped.
     """
 
     steps: Count = 5000
@@ -112,26 +112,26 @@ class OfflineConfig:
 
 
 class OfflineTrainer(Training):
-    """Trains the networks of a loss on a replay buffer.
+    """A trainer for the networks of a loss on a replay buffer.
 
-    A step minimises the sum of the loss's ``loss_`` entries, each of which reaches only its own network, and moves the
-    target networks. CQL's ``loss_actor_bc`` is left out.
+    Each optimizer step minimizes the sum of the loss's ``loss_`` entries (each has gradients only for one network), and
+    then updates the target networks. CQL's entry ``loss_actor_bc`` is left out.
 
     Args:
-        loss: a loss of ``torchrl.objectives`` or ``lw_torchrl.objectives``, with its value estimator. Its networks are
-            trained in place, on their device.
-        replay: a buffer whose samples hold what the loss reads.
+        loss: a loss from ``torchrl.objectives`` or ``lw_torchrl.objectives``, with its value estimator. The networks
+            of the loss are trained in place, on their device.
+        replay: a replay buffer whose samples hold the keys that the loss reads.
         config: hyperparameters; None for the defaults.
-        actor: the policy inside the loss. ``checkpoint`` is then its file, with the training state next to it; None
-            writes only the training state.
-        **options: of :class:`~lw_torchrl.training.loop.Training`, with its errors.
+        actor: the policy inside the loss, which is written to ``checkpoint``, with the training state next to it; None
+            writes only the training state to ``checkpoint``.
+        **options: keyword arguments of :class:`~lw_torchrl.training.loop.Training`, which also lists their errors.
 
     Raises:
-        ValueError: the buffer answers the queries of other plans, draws by priorities, or lacks rewards or next
-            observations that the loss reads; its n steps have another gamma than the loss's value estimator; the loss
-            does not return means, or is a CQLLoss with a Lagrange multiplier; with ``normalize``, a network was trained
-            with other statistics; the buffer has RandomYaw or JitterTarget, and the loss would not pass on what they
-            write to FocusFeatures or RoleFeatures.
+        ValueError: the buffer evaluates the conditions of other plans, has a PrioritizedSampler, or lacks rewards or
+            next observations that the loss reads; the buffer's n-step ``gamma`` differs from the value estimator's; the
+            loss is not reduced to a mean, or is a CQLLoss with a Lagrange multiplier; with ``normalize``, a network was
+            fitted to other statistics; or the buffer has RandomYaw or JitterTarget, and the loss would not pass their
+            keys on to FocusFeatures or RoleFeatures.
         TypeError: the loss is not a LossModule.
 
     Example:
@@ -168,7 +168,7 @@ class OfflineTrainer(Training):
         self.device = next(loss.parameters()).device
         check_minibatches(self.networks, replay, config.batch_size)
         check_augmentations(loss, self.networks, replay)
-        getattr(loss, "target_entropy", None)  # SAC's becomes a buffer when it is first read
+        getattr(loss, "target_entropy", None)  # SACLoss registers this buffer on first access
         self.minibatches = [Minibatches(replay, config.batch_size, config.seed)]
         delayed = any(name.startswith("target_") and name.endswith("_params") for name, _ in loss.named_children())
         self.targets = SoftUpdate(loss, eps=config.target_eps) if delayed else None
@@ -193,7 +193,7 @@ class OfflineTrainer(Training):
         return self.module if self.actor is None else self.actor
 
     def contents(self) -> dict[str, Tensor]:
-        """Return the tensors of the loss, with target networks and statistics."""
+        """Return all parameters and buffers of the loss, including target networks and normalization statistics."""
         return {**dict(self.loss.named_parameters()), **dict(self.loss.named_buffers())}
 
     def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:
@@ -208,25 +208,25 @@ class OfflineTrainer(Training):
 
 
 def networks_of(loss: LossModule) -> list[nn.Module]:
-    """Return the networks of a loss, without their parameters."""
+    """Return the networks of a loss; the loss stores their parameters separately."""
     networks = (getattr(loss, name.removesuffix("_params"), None) for name, _ in loss.named_children())
     return [network for network in networks if isinstance(network, nn.Module)]
 
 
 def check_loss(loss: Any, replay: TensorDictReplayBuffer) -> None:
-    """Raise unless a loss can be trained on a buffer. A loss without a value estimator gets TorchRL's default one."""
+    """Raise an error unless a loss can be trained on a buffer; create TorchRL's default value estimator if missing."""
     if not isinstance(loss, LossModule):
         hint = "to compile a loss, call loss.compile()"
         if loss is None:
-            hint = "make_value_estimator of TorchRL's losses returns None, so call it on a line of its own"
+            hint = "TorchRL's make_value_estimator returns None, so call it in a separate statement"
         raise TypeError(f"loss must be a LossModule, got {type(loss).__name__}; {hint}")
     if getattr(loss, "reduction", "mean") == "none":
-        raise ValueError("loss must return the mean over the rows, got reduction='none'")
+        raise ValueError("loss must be reduced to the mean over the rows, got reduction='none'; use reduction='mean'")
     if getattr(loss, "with_lagrange", False):
-        raise ValueError("loss: with_lagrange=True keeps loss_cql from the critics; use with_lagrange=False")
+        raise ValueError("loss: with_lagrange=True keeps loss_cql from training the critics; use with_lagrange=False")
     ahead = [key for key in loss.in_keys if isinstance(key, tuple) and key[0] == "next"]
     if ahead and len(replay) and "next" not in replay.storage[0].keys():
-        lack = f"{type(loss).__name__} needs rewards and next observations, which replay's rows lack"
+        lack = f"{type(loss).__name__} requires rewards and next observations, which the rows of replay lack"
         raise ValueError(f"loss: {lack}; open the buffer with label='executed'")
     gammas = [part.gamma for part in replay.transform if isinstance(part, MultiStepTransform)]
     expected = next(iter(gammas), getattr(replay, "gamma", None))  # None where ``next`` is one step ahead
@@ -235,13 +235,13 @@ def check_loss(loss: Any, replay: TensorDictReplayBuffer) -> None:
     gamma = getattr(loss.value_estimator, "gamma", None)
     if gamma is not None and abs(float(gamma) - expected) > 1e-6:
         raise ValueError(
-            f"loss: its value estimator's gamma must be that of the replay buffer's n steps, {expected}, got "
+            f"loss: the value estimator's gamma must equal the replay buffer's gamma = {expected}, got "
             f"{float(gamma):.6g}; call loss.make_value_estimator(gamma={expected})"
         )
 
 
 def describe_loss(loss: LossModule) -> dict[str, Any]:
-    """Describe a loss as JSON, without its trained weights: class, options, networks, and a digest of its constants."""
+    """Return a JSON description of a loss: class, options, networks, parameter shapes, and a digest of constants."""
     digest, fitted = sha256(), statistics_of(loss)
     for name, tensor in sorted(loss.named_buffers()):
         digest.update(f"{name} {tuple(tensor.shape)}".encode())

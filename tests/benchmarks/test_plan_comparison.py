@@ -44,7 +44,7 @@ def test_every_answer_is_compared(answers):
     assert comparison.mean("other", "chain_py") == 0.0
     assert comparison.best_format("good") == "basic_md"
     assert "| good  | chain_py | 2     | 4       | 2 " in comparison.table()
-    reason = "it has no steps, neither for the task nor for another task"
+    reason = "the text has no steps for the task or any other task"
     assert no_plans(comparison) == ["answers without a plan: 4", f"4: {reason}"]
 
 

@@ -27,7 +27,7 @@ def datasets(tmp_path_factory):
     root = tmp_path_factory.mktemp("shown")
     return [
         collect(root / "good", noise_scale=(0.0, 0.3), noise_hold=7, redraw_failures=False),
-        collect(root / "spoilt", policy="spoilt-30", seed=5),
+        collect(root / "mixed", policy="noisy-30", seed=5),
         collect(root / "random", tasks="reach", policy="random"),
     ]
 
@@ -59,7 +59,7 @@ def test_summary_of_a_mixture_equals_one_by_hand(capsys, datasets):
     assert shown["all"] == {"label": "all", **by_hand([pair for _, *pair in every])}
     for row in shown["tasks"]:
         assert row == {"label": row["label"]} | by_hand([pair for _, *pair in every if pair[0].task == row["label"]])
-    assert [row["label"] for row in shown["behaviours"]] == ["noisy", "random", "spoilt-30"]
+    assert [row["label"] for row in shown["behaviours"]] == ["noisy", "noisy-30", "random"]
     for row in shown["behaviours"]:
         assert row == {"label": row["label"]} | by_hand([pair for label, *pair in every if label == row["label"]])
     printed = run(capsys, "data", "show", *[dataset.root for dataset in datasets])

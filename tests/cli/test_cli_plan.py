@@ -114,11 +114,11 @@ def test_generate_writes_answers_and_counts_valid_plans(capsys, tmp_path):
         first, second = run(capsys, *command), run(capsys, *command)
         shown = document(capsys, "plan generate", *command[2:])
         constrained = run(capsys, *generate(address, tmp_path, "push", "--format", "basic_py", "--constrain"))
-    assert shown["notes"] == [{"note": "it was cut off at max_tokens", "answers": 4}]
+    assert shown["notes"] == [{"note": "the answer was cut off at max_tokens", "answers": 4}]
     rows = table(first)
     assert rows["push", "chain_py"] == ["2", "2", "2", "2", "200", "20"]
     assert rows["reach", "basic_md"] == ["2", "0", "0", "2", "200", "20"]
-    assert "4 answers: it was cut off at max_tokens" in first
+    assert "4 answers: the answer was cut off at max_tokens" in first
     assert f"880 tokens; written to {tmp_path / 'plans' / 'a_model'}" in first
     again = table(second)
     assert again["push", "chain_py"] == ["2", "2", "2", "0", "200", "20"]
@@ -155,7 +155,7 @@ def test_repair_asks_again_and_shows_the_success_of_each_round(capsys, tmp_path)
         shown = document(capsys, "plan repair", *command[2:])
     assert shown["plans"] == [{"task": "reach", "attempt": 0, "success": [0.0, 1.0]}]
     assert ["reach", "0", "0%", "100%"] in [line.split() for line in printed.splitlines()]
-    assert "1 answer: it was cut off at max_tokens" in printed
+    assert "1 answer: the answer was cut off at max_tokens" in printed
     assert (tmp_path / "plans/m-round1/chain_py/reach-0.py").is_file()
 
 

@@ -26,7 +26,7 @@ NET = ["--width", 8, "--depth", 1]
 def noisy(tmp_path_factory):
     root = tmp_path_factory.mktemp("data") / "noisy"
     short = {"episodes_per_task": 2, "max_steps": 40, "progress": False}
-    lw.collect_demonstrations(["push", "reach"], root=root, policy="spoilt-60", **short)
+    lw.collect_demonstrations(["push", "reach"], root=root, policy="noisy-60", **short)
     return root
 
 
@@ -103,7 +103,7 @@ def test_two_processes_cannot_train_into_one_file(tmp_path):
     assert sorted(process.returncode for process in both) == [0, 2], errors
     (winner,) = (seed for seed, process in enumerate(both) if process.returncode == 0)
     assert read_description(out)["training"]["seed"] == winner
-    reasons = ("another training is writing to", "was written by another training", "is of another configuration")
+    reasons = ("another training is writing to", "was written by another training", "has a different configuration")
     assert any(reason in errors[1 - winner] for reason in reasons), errors
     assert [path.name for path in tmp_path.iterdir() if path.name[0] == "."] == []
 

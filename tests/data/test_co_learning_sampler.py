@@ -195,7 +195,7 @@ def test_a_wrong_fraction_is_an_error(fraction):
     ("rows", "message"),
     [
         (with_episodes((1, 3), (2, 3)), f"no row of '{TARGET}'; its tasks are {MT50[1]}, {MT50[2]}"),
-        (with_episodes((task_id(TARGET), 3)), "no row of any other task"),
+        (with_episodes((task_id(TARGET), 3)), "has rows of the target only"),
     ],
 )
 def test_rows_without_target_or_base_tasks_are_errors(rows, message):

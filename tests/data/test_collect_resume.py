@@ -125,7 +125,7 @@ def test_resuming_runs_only_the_missing_episodes(half_made, dataset, monkeypatch
 def test_a_damaged_episode_file_is_named(half_made, dataset):
     path = sorted((half_made / ".partial").glob("*.npz"))[0]
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(DatasetError, match=rf"{path.name}' is damaged"):
+    with pytest.raises(DatasetError, match=rf"{path.name}' is corrupted"):
         collect(half_made)
     path.unlink()
     collect(half_made)
@@ -138,7 +138,7 @@ def test_a_pickle_in_an_episodes_file_is_never_executed(half_made, tmp_path):
         arrays = {key: file[key] for key in file.files}
     arrays["observation"] = np.array([Evil(tmp_path / "executed")] * STEPS, dtype=object)
     np.savez(path, allow_pickle=True, **arrays)
-    with pytest.raises(DatasetError, match="is damaged"):
+    with pytest.raises(DatasetError, match="is corrupted"):
         collect(half_made)
     assert not (tmp_path / "executed").exists()
 

@@ -49,7 +49,7 @@ def test_rows_depend_neither_on_num_envs_nor_on_other_tasks(datasets, name, tmp_
     assert (together == load_rows(alone).exclude("collector")).all()
 
 
-@pytest.mark.parametrize("name", ["spoilt-30", "random"])
+@pytest.mark.parametrize("name", ["noisy-30", "random"])
 def test_interruptions_do_not_change_the_dataset(datasets, name, tmp_path, monkeypatch):
     root = tmp_path / "stopped"
     for episodes in (1, 2):
@@ -105,7 +105,7 @@ def test_segments_have_the_given_lengths_and_probability(right, otherwise, short
     assert lengths[0] == draws.integers(shortest, shortest + more + 1, -(-500 // shortest))[0]
 
 
-@pytest.mark.parametrize(("name", "right"), [("spoilt-60", 0.6), ("spoilt-30", 0.3), ("wrong", 0.0), ("scripted", 1.0)])
+@pytest.mark.parametrize(("name", "right"), [("noisy-60", 0.6), ("noisy-30", 0.3), ("wrong", 0.0), ("scripted", 1.0)])
 def test_the_share_of_right_segments(name, right):
     actor = acting(BEHAVIOURS[name])
     actor._begin(1)
@@ -155,7 +155,7 @@ def test_wrong_acts_by_skills_of_the_plan(tmp_path):
     [
         ("expert", "scripted", r"policy.kind \('expert', now 'segments'\), policy.name \('expert', now 'scripted'\)"),
         ("scripted", "expert", r"policy.name \('scripted', now 'expert'\)"),
-        ("spoilt-30", "spoilt-60", r"policy.name \('spoilt-30', now 'spoilt-60'\), policy.right \(0.3, now 0.6\)"),
+        ("noisy-30", "noisy-60", r"policy.name \('noisy-30', now 'noisy-60'\), policy.right \(0.3, now 0.6\)"),
     ],
 )
 def test_another_behaviour_is_an_error_with_the_difference(tmp_path, was, now, message):
@@ -194,7 +194,7 @@ def test_the_column_behaviour_is_the_labels_rank(datasets):
 def test_one_label_for_two_behaviours_is_an_error(tmp_path, datasets):
     first = collect(tmp_path / "one", policy=trained(), behaviour="tiny")
     second = collect(tmp_path / "other", policy=trained(seed=1), behaviour="tiny")
-    with pytest.raises(ValueError, match="'tiny' names different behaviours"):
+    with pytest.raises(ValueError, match="the label 'tiny' stands for different behaviours"):
         lw.LanguageWorldExperienceReplay([first.root, second.root], label="executed")
     metadata = json.loads((second.root / "metadata.json").read_text())
     metadata["config"]["policy"]["name"] = "second"
@@ -207,7 +207,7 @@ def test_one_label_for_two_behaviours_is_an_error(tmp_path, datasets):
 
 def test_a_checkpoint_records_seeds_and_tasks_of_its_demonstrations(tmp_path, datasets, capsys):
     tiny = collect(tmp_path / "tiny", tasks="reach", policy=trained(), behaviour="tiny", seed=77)
-    roots = [datasets["spoilt-60"].root, tiny.root]
+    roots = [datasets["noisy-60"].root, tiny.root]
     for number, (root, seeds, tasks) in enumerate(
         [(roots, {SEED, 77}, {"push", "reach"}), (roots[0], {SEED}, {"push", "reach"}), (roots[1], {77}, {"reach"})]
     ):
@@ -307,14 +307,14 @@ RANDOM = lw.ScriptedSkillActor(PLANS, "random")
 @pytest.mark.parametrize(
     ("policy", "options", "error", "message"),
     [
-        (trained(), dict(behaviour=None), ValueError, "behaviour must name the policy"),
+        (trained(), dict(behaviour=None), ValueError, "behaviour must be a label for the policy"),
         (trained(), dict(behaviour="noisy"), ValueError, "'noisy' is reserved"),
         ("random", dict(behaviour="expert"), ValueError, "'expert' is reserved"),
         (Behaviour("wrong", right=0.9), dict(behaviour=None), ValueError, "'wrong' is reserved"),
-        (Behaviour("mine", "policy"), {}, ValueError, "give the policy itself"),
+        (Behaviour("mine", "policy"), {}, ValueError, "pass the policy itself"),
         ("raondm", {}, ValueError, "policy must be one of 'expert'.*did you mean 'random'"),
         (lambda state: state, {}, ValueError, "must write 'action'"),
-        (lambda state: state, dict(behaviour=None), ValueError, "behaviour must name the policy"),
+        (lambda state: state, dict(behaviour=None), ValueError, "behaviour must be a label for the policy"),
         (trained("description"), dict(tasks=("push", "drawer-open")), ValueError, "tasks must be .* drawer-open"),
         (Odd("value"), {}, ValueError, "NaN"),
         (Odd("key"), {}, ValueError, "must write 'action'"),

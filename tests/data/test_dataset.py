@@ -89,7 +89,7 @@ def test_another_format_or_version_is_an_error(root, format, number):
 )
 def test_damaged_metadata_are_an_error(root, change):
     edit(root, change)
-    check_error(root, "metadata.json' are damaged .*; delete the folder")
+    check_error(root, "metadata.json' is corrupted .*; delete the folder")
 
 
 @pytest.mark.parametrize("damage", ["missing", "truncated", "longer", "empty"])
@@ -99,7 +99,7 @@ def test_a_column_of_another_size_is_an_error(root, damage):
     path.unlink()
     if damage != "missing":
         path.write_bytes({"truncated": content[:-8], "longer": content + bytes(8), "empty": b""}[damage])
-    check_error(root, "the rows in .* are damaged")
+    check_error(root, "the rows in .* are corrupted")
 
 
 @pytest.mark.parametrize("name", ["/".join(key) for key in COLUMNS])

@@ -80,7 +80,7 @@ def test_tasks_are_mapped_and_episodes_counted(tmp_path):
     with pytest.raises(ValueError, match=r"task .* 'shove'.*; or map it"):
         lw.import_dataset(source, tmp_path / "out")
     mapping = {"shove": "push"}
-    with pytest.raises(ValueError, match=r"episodes_per_task, .* 2 of push, 1 of reach"):
+    with pytest.raises(ValueError, match=r"episodes_per_task .* 2 of push, 1 of reach"):
         lw.import_dataset(source, tmp_path / "out", task=mapping)
     with pytest.raises(ValueError, match="episodes_per_task must be at most 1"):
         lw.import_dataset(source, tmp_path / "out", task=mapping, episodes_per_task=2)
@@ -93,7 +93,7 @@ def test_tasks_are_mapped_and_episodes_counted(tmp_path):
 
 def test_actions_beyond_one_are_clipped(tmp_path):
     source = lerobot(tmp_path / "theirs", action=list(ACTIONS * 2))
-    rows = load_rows(imported(source, tmp_path / "out", "larger ones are clipped", task="push", episodes_per_task=3))
+    rows = load_rows(imported(source, tmp_path / "out", "larger actions are clipped", task="push", episodes_per_task=3))
     np.testing.assert_array_equal(rows["unclipped_action"], ACTIONS * 2)
     np.testing.assert_array_equal(rows["action"], (ACTIONS * 2).clip(-1, 1))
 
@@ -101,11 +101,14 @@ def test_actions_beyond_one_are_clipped(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"action": None}, "needs a column action of 4 numbers"),
-        ({"observation.environment_state": None}, r"needs a column observation of 39 .* observation.state \(4\)"),
+        ({"action": None}, "requires a column 'action' with 4 numbers"),
+        (
+            {"observation.environment_state": None},
+            r"requires a column 'observation' .* observation.state \(4\)",
+        ),
         ({"action": [[0.0] * 4] * 8 + [[float("nan")] * 4]}, "action holds NaN"),
-        ({"action": [[0.0] * 4] * 8 + [None]}, "action must hold equally many numbers"),
-        ({"action": [[0.0] * 4] * 8 + [[0.0] * 3]}, "action must hold equally many numbers"),
+        ({"action": [[0.0] * 4] * 8 + [None]}, "action must have the same number of values"),
+        ({"action": [[0.0] * 4] * 8 + [[0.0] * 3]}, "action must have the same number of values"),
         ({"next.success": [0.0] * 8 + [0.3]}, "next.success must hold booleans"),
         ({"task_index": [0, 0, 0, 1, 1, 1, 2, 2, 2]}, "task_index must be the same"),
     ],

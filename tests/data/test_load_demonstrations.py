@@ -128,5 +128,5 @@ def test_rows_have_only_the_chosen_keys(roots):
     assert set(rows.keys(True, True)) == {"action", "is_demonstration"}
     with pytest.raises(ValueError, match=r"keys .* got 'next/reward'"):
         lw.load_demonstrations(roots, keys=[("next", "reward")])
-    with pytest.raises(ValueError, match="keys='rollout' need label"):
+    with pytest.raises(ValueError, match="keys='rollout' require label"):
         lw.load_demonstrations(roots, keys="rollout")

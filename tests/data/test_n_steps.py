@@ -114,7 +114,7 @@ def test_n_steps_of_a_dataset_end_with_the_episode(root, after):
 
 
 def test_n_steps_need_a_discount_and_executed_actions(root):
-    with pytest.raises(ValueError, match="n_steps=3 needs gamma"):
+    with pytest.raises(ValueError, match="n_steps=3 requires gamma"):
         LanguageWorldExperienceReplay(root, label="executed", n_steps=3)
-    with pytest.raises(ValueError, match=r"n_steps, .* need label='executed'"):
+    with pytest.raises(ValueError, match=r"n_steps, .* require label='executed'"):
         LanguageWorldExperienceReplay(root, n_steps=3, gamma=0.9)

@@ -361,5 +361,5 @@ def test_values_of_other_rows_are_errors(opened, dataset, other_dataset):
     replay.add_column("advantage", torch.zeros(len(ahead), 1), of=ahead)
     turned = LanguageWorldExperienceReplay([other_dataset.root, dataset.root], label="executed")
     assert len(turned) == len(replay)
-    with pytest.raises(ValueError, match="of must show"):
+    with pytest.raises(ValueError, match="of must hold the rows"):
         replay.add_column("other", torch.zeros(len(turned), 1), of=turned)

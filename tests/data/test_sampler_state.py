@@ -41,7 +41,7 @@ def test_the_state_of_other_rows_is_an_error_at_the_next_batch(tasks):
     replay = make(tasks, batch_size=12)
     replay.sampler.load_state_dict(state)
     for _ in range(2):
-        with pytest.raises(ValueError, match="state_dict must be of the storage's"):
+        with pytest.raises(ValueError, match="state_dict must fit the storage's"):
             replay.sample()
 
 

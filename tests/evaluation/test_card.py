@@ -55,11 +55,11 @@ def test_a_card_describes_the_file_and_the_evaluation(result):
     assert (card.data.library_name, card.data.pipeline_tag) == ("lw_torchrl", "robotics")
     assert card.data.eval_results[0].metric_value == 0.75
     text = str(card)
-    assert "It knows 50 tasks and was trained on demonstrations of 50." in text
+    assert "The policy knows 50 tasks and was trained on demonstrations of 50 of these tasks." in text
     assert "episodes_per_task 10, seed 0, noise_scale [0.0, 0.1, 0.2, 0.3, 0.4]" in text
     assert "steps 6000" in text
     assert "| push | 1.00 |\n| reach | 0.50 |\n| **mean** | **0.750** |" in text
-    assert "3 of 4 episodes, 95 % interval 0.301 to 0.954 (Wilson)." in text
+    assert "3 of 4 episodes succeeded, 95 % interval 0.301 to 0.954 (Wilson)." in text
     assert "- Success below 0.8: reach (0.50)." in text
     assert "policy = lw.from_pretrained('me/mine')" in text
 

@@ -61,7 +61,7 @@ def test_the_first_difference_between_two_runs_is_found():
     assert difference(rollout([0.0, 1.0, 3.0], [0.5, 0.5, 0.5]), again) == Difference("environment", 2)
     actions = difference(rollout([0.0, 1.0, 3.0], [0.5, 0.2, 0.5]), again)
     assert (actions.part, actions.at, actions.size) == ("actions", 1, pytest.approx(0.3))
-    assert "the executed actions, from step 1 on, there by 0.3" in finding_text(actions)
+    assert "the executed actions, from step 1 on, by 0.3 at that step" in finding_text(actions)
     states = difference(rollout([0.0, 3.0], [0.5, 0.5]).exclude("action"), again)
     assert states == Difference("states", 1)
     assert "holds no actions" in finding_text(states)

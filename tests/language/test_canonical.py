@@ -295,15 +295,15 @@ def test_vectors_of_roles_have_a_one_for_verb_and_manner_each():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"roles": []}, "one entry for each"),
+        ({"roles": []}, "one entry per step"),
         ({"confidence": 2}, "confidence"),
         ({"confidence": "high"}, "confidence"),
-        ({"more": 1}, "must be like"),
+        ({"more": 1}, "must be an object"),
         ({"roles": {"verb": "juggle"}}, "verb"),
         ({"roles": {"direction": "north"}}, "direction"),
         ({"roles": {"target": "moon"}}, "object of task 'dial-turn'"),
         ({"roles": {"confidence": None}}, "confidence"),
-        ({"roles": {"colour": "red"}}, "role must be a table"),
+        ({"roles": {"colour": "red"}}, "role must be an object"),
     ],
 )
 def test_broken_json_is_refused(change, message):

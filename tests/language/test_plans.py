@@ -115,7 +115,7 @@ def test_plans_are_a_sorted_immutable_mapping():
 def test_faulty_plans_are_refused():
     for wrong, message in (
         ({}, "at least one plan"),
-        ([plan(), plan()], "one for each task"),
+        ([plan(), plan()], "one per task"),
         ({"reach": plan()}, r"plans\['reach'\].*'push'"),
     ):
         with pytest.raises(PlanError, match=message):

@@ -205,12 +205,12 @@ def test_a_custom_relation_is_listed_parsed_and_matched_until_it_is_removed():
         ("Beside", OWN["beside"], "lower-case words"),
         (" beside", OWN["beside"], "lower-case words"),
         (3, OWN["beside"], "lower-case words"),
-        ("open", OWN["beside"], "own meaning"),
-        ("not near", OWN["beside"], "own meaning"),
+        ("open", OWN["beside"], "reserved in queries"),
+        ("not near", OWN["beside"], "reserved in queries"),
         ("near and dear to", OWN["beside"], "'and'"),
         ("beside", (), "at least one"),
-        ("beside", OWN["beside"][0], "tuple of Comparison"),
-        ("beside", ("xy < 0.1",), "tuple of Comparison"),
+        ("beside", OWN["beside"][0], "at least one Comparison"),
+        ("beside", ("xy < 0.1",), "at least one Comparison"),
     ],
 )
 def test_a_faulty_relation_is_refused(name, parts, message):

@@ -86,7 +86,7 @@ def test_a_faulty_file_is_refused(tmp_path, text, message):
 
 
 def test_a_skill_for_objects_that_a_task_lacks():
-    with pytest.raises(SkillError, match=r"needs 'puck', which task 'drawer-open' lacks; it has .*drawer handle"):
+    with pytest.raises(SkillError, match=r"needs 'puck', which task 'drawer-open' lacks .objects: .*drawer handle"):
         load_skills()["place the gripper above the puck"].for_task("drawer-open")
 
 

@@ -330,7 +330,7 @@ def test_a_point_on_an_object_at_fixed_coordinates_is_written_as_a_point_on_that
         (PUSH + "points.edge = {object = 'disc', offset = [0, 0]}", ["'edge'", "offset"]),
         (PUSH + "points.edge = {object = ['disc'], offset = [0, 0, 0]}", ["'edge'", "['disc']"]),
         (PUSH + "points.edge = 'obs[4]'", ["'edge'", "'obs[4:7]'"]),
-        (PUSH + "points.disc = [0, 0, 0]", ["'push'", "different names", "'disc'"]),
+        (PUSH + "points.disc = [0, 0, 0]", ["'push'", "distinct names", "'disc'"]),
         (PUSH + "points.disc = " + "[" * 5000, ["mine.toml"]),
         (PUSH + "points.disc = " + "9" * 5000, ["4300 digits"]),
     ],
@@ -399,7 +399,7 @@ def test_plans_queries_and_actors_of_a_51st_task(stacking):
     actor = lw.PlanConditionedActor(plans, text_encoder=lambda texts: torch.eye(len(texts), 8))
     assert actor(batch.clone())["skill_weights"][0, 2:].tolist() == [0.0] * (batch["qaf"].shape[-1] - 2)
     without = actor.with_plans({"push": plans["push"]}).eval()
-    with pytest.raises(ValueError, match=rf"without a plan.*{lw.task_id('stack-blocks')} \(none of the 50\)"):
+    with pytest.raises(ValueError, match=rf"without a plan.*{lw.task_id('stack-blocks')} \(not a Meta-World task\)"):
         without(batch.clone())
 
 

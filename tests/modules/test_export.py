@@ -50,7 +50,7 @@ def test_exported_policy_gives_the_same_bits_for_any_number_of_rows(name):
         with torch.no_grad():
             assert torch.equal(run(*make_rows(number)), module(*make_rows(number))), number
     observation, ids = make_rows(7)
-    with pytest.raises(RuntimeError, match="task_id names tasks"):
+    with pytest.raises(RuntimeError, match="task_id contains tasks"):
         run(observation, torch.full_like(ids, lw.task_id("soccer")))
 
 

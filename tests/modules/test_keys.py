@@ -197,5 +197,5 @@ def test_renamed_out_keys_are_saved_or_refused(name, tmp_path):
         lw.save_actor(actor, tmp_path / "policy.safetensors")
         assert lw.load_actor(tmp_path / "policy.safetensors").out_keys == actor.out_keys
         return
-    with pytest.raises(ValueError, match="in_keys or out_keys were changed later: pass them to its constructor"):
+    with pytest.raises(ValueError, match="in_keys or out_keys were changed after construction"):
         lw.save_actor(actor, tmp_path / "policy.safetensors")

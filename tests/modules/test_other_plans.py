@@ -17,7 +17,7 @@ STEPS = [
     ("the gripper is not above the puck", "place the gripper above the puck"),
     ("the gripper is above the puck", "lower the gripper around the puck"),
 ]
-REFUSED = "qaf answers other plans.* push"
+REFUSED = "qaf belongs to plans.* push"
 
 
 def plans_of(pairs, *more):
@@ -73,7 +73,7 @@ def test_each_row_carries_the_number_of_its_plan():
     assert mixed["qaf_plan"][0] == state(PLANS)["qaf_plan"][0], "whatever stands beside it"
     lw.PlanConditionedActor(both)(mixed)
     other = lw.ConditionalPlan.from_pairs("reach", [("the gripper is closed", "close the gripper")] * 2)
-    with pytest.raises(ValueError, match="for reach; give"):
+    with pytest.raises(ValueError, match="for reach; pass"):
         lw.PlanConditionedActor(plans_of(STEPS, other))(mixed)
 
 
@@ -140,7 +140,7 @@ def test_compiled_actor_refuses_at_run_time():
     actor = lw.PlanConditionedActor(PLANS).eval()
     act = torch.compile(lambda data: actor(data)["action"], backend="eager")
     assert act(state(PLANS)).shape == (3, 4)
-    with pytest.raises(RuntimeError, match="qaf answers other plans"):
+    with pytest.raises(RuntimeError, match="qaf belongs to plans"):
         act(state(OTHERS["another skill"]))
     wrong = state(PLANS)
     wrong["observation"][1, 2] = torch.nan

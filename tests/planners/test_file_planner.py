@@ -48,14 +48,14 @@ def test_missing_answers(folder, tmp_path):
         planner.plans("push", format="chain_md", attempts=3)
     with pytest.raises(lw.planners.PlannerError, match=r"reach in chain_md, attempt 0.*none"):
         planner.plans("reach", format="chain_md")
-    with pytest.raises(ValueError, match="has answers of one, two_2"):
+    with pytest.raises(ValueError, match="several: one, two_2"):
         lw.planners.FilePlanner(folder)
     with pytest.raises(ValueError, match="model must be one of 'one', 'two_2', got 'tow'"):
         lw.planners.FilePlanner(folder, "tow")
     with pytest.raises(FileNotFoundError, match="nowhere"):
         lw.planners.FilePlanner(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match="holds no answers"):
+    with pytest.raises(ValueError, match="holds no answer files"):
         lw.planners.FilePlanner(tmp_path / "empty")
 
 
@@ -74,10 +74,13 @@ def test_lines_of_json(tmp_path):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("[" * 10**5, "line 2: it is not JSON"),
-        (json.dumps({**ROW, "attempt": "0"}), "line 2: an answer needs llm"),
+        ("[" * 10**5, "line 2: the line is not JSON"),
+        (json.dumps({**ROW, "attempt": "0"}), "line 2: an answer needs the fields llm"),
         (json.dumps({**ROW, "format": "chain"}), "line 2: format must be one of"),
-        (json.dumps({**ROW, "llm": "PaLM_2"}) + "\n" + json.dumps({**ROW, "llm": "PaLM/2"}), "would both be 'PaLM_2'"),
+        (
+            json.dumps({**ROW, "llm": "PaLM_2"}) + "\n" + json.dumps({**ROW, "llm": "PaLM/2"}),
+            "same folder name 'PaLM_2'",
+        ),
     ],
     ids=range(4),
 )

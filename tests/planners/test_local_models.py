@@ -51,7 +51,7 @@ def test_a_constrained_model_writes_plans_that_run(address, tmp_path):
         assert answer.decoded.all_scripted, answer.raw
         assert not answer.decoded.notes, answer.decoded.notes
         assert answer.tokens.completion > 0
-        assert answer.notes == ("the schema was sent as json_object, since the server takes no json_schema",)
+        assert answer.notes == ("the schema was sent as json_object, since the server rejects json_schema",)
     again = planner.plans(tasks, format="basic_py")
     assert [(one.text, one.cached) for one in again] == [(one.text, True) for one in answers]
     plans = {answer.task: answer.decoded.scripted for answer in answers}

@@ -85,23 +85,23 @@ def test_a_damaged_cached_answer_is_requested_again(ask, tmp_path, content):
 
 
 FAILURES = {
-    "429": (error(429, "slow down"), "too many requests, asked 2 times"),
-    "429 for long": (error(429, "no", **{"retry-after-ms": "9e9"}), "too many requests, asked 1 time"),
-    "500": (error(500, "my fault"), "server failed, asked 2 times .*my fault"),
+    "429": (error(429, "slow down"), "too many requests, tried 2 times"),
+    "429 for long": (error(429, "no", **{"retry-after-ms": "9e9"}), "too many requests, tried 1 time"),
+    "500": (error(500, "my fault"), "server failed, tried 2 times .*my fault"),
     "500, without a message": (Failure(500, "<p>oops</p>", {"retry-after-ms": "1"}), "failed.*oops"),
     "429 in 200": (Failure(200, {"error": {"message": "slow down", "code": 429}}), "too many requests"),
-    "401": (error(401, "no"), "key, in OPENAI_API_KEY"),
+    "401": (error(401, "no"), "key in OPENAI_API_KEY"),
     "404": (error(404, "no model a/model"), "no such model .*/v1/models"),
-    "400": (error(400, "unknown field"), "refused .*unknown field"),
-    "400, plain": (Failure(400, "no top_k"), "refused .*no top_k"),
-    "context": (error(400, "maximum context length is 2048"), "does not fit .*max_tokens"),
-    "cut body": (Failure(200, completion("x" * 99), cut=True), "broke off, asked 2"),
+    "400": (error(400, "unknown field"), "rejects the request .*unknown field"),
+    "400, plain": (Failure(400, "no top_k"), "rejects the request .*no top_k"),
+    "context": (error(400, "maximum context length is 2048"), "exceeds the model.s context .*max_tokens"),
+    "cut body": (Failure(200, completion("x" * 99), cut=True), "was interrupted, tried 2"),
     "cut JSON": (Failure(200, '{"choices": ['), "cut off or is not JSON"),
     "HTML": (Failure(200, "<style>a{}</style><body>Welcome</body>"), "not a chat completion: Welcome"),
     "other JSON": (Failure(200, {"hello": 1}), "not a chat completion"),
     "no choices": (Failure(200, {"choices": []}), "not a chat completion"),
-    "a slow reply": (Failure(200, completion("x"), drip=1.0), "answer within 0.4 s, asked 2 times"),
-    "a dripping reply": (Failure(200, completion("x"), drip=0.1), "answer within 0.4 s, asked 1 time"),
+    "a slow reply": (Failure(200, completion("x"), drip=1.0), "answer within 0.4 s, tried 2 times"),
+    "a dripping reply": (Failure(200, completion("x"), drip=0.1), "answer within 0.4 s, tried 1 time"),
     "a large reply": (Failure(200, completion("x" * REPLY_LIMIT)), "larger than 4 MiB"),
 }
 
@@ -186,7 +186,7 @@ def test_the_key_is_sent_and_appears_nowhere_else(monkeypatch, ask, tmp_path, ca
         with pytest.raises(PlannerError, match=r"\(the key\)") as caught:
             ask(refusing, "reach")
         texts += [repr(caught.value), "".join(traceback.format_exception(caught.value))]
-    assert "the key in OPENAI_API_KEY is not accepted" in "".join(texts)
+    assert "the server rejects the key in OPENAI_API_KEY" in "".join(texts)
     files = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert len(files) == 3
     texts += [*map(str, capsys.readouterr()), *(path.read_text() for path in files)]
@@ -198,7 +198,7 @@ def test_a_missing_or_broken_key(tmp_path, monkeypatch):
         lw.OpenAIPlanner("m", cache=tmp_path).plans("push")
     for key in ("sk-\u20ac9876543", "sk-98765\n43210"):
         monkeypatch.setenv("OPENAI_API_KEY", key)
-        with pytest.raises(PlannerError, match="the key in OPENAI_API_KEY has characters") as caught:
+        with pytest.raises(PlannerError, match="the key in OPENAI_API_KEY has invalid characters") as caught:
             lw.OpenAIPlanner("m", cache=tmp_path).plans("push")
         assert "9876" not in str(caught.value)
 
@@ -215,10 +215,10 @@ def test_a_printed_address_has_no_secrets():
 @pytest.mark.parametrize(
     ("body", "note"),
     [
-        (completion(None), "it is empty"),
+        (completion(None), "the answer is empty"),
         (completion(None, refusal="I cannot"), "the model refused: 'I cannot'"),
-        (completion("", "length"), "it was cut off at max_tokens"),
-        (completion("    if check(\"gripper open\"):\n        robot.push(\"pu", "length"), "it was cut off"),
+        (completion("", "length"), "the answer was cut off at max_tokens"),
+        (completion("    if check(\"gripper open\"):\n        robot.push(\"pu", "length"), "the answer was cut off"),
         (completion(None, "content_filter"), "content filter"),
         (completion(None, reasoning_content="hm"), "the server sent reasoning_content instead of an answer"),
         ({**completion("no"), "usage": None}, None),
@@ -253,7 +253,7 @@ def test_thoughts_and_parts_are_not_the_answer(ask):
 )
 def test_another_model_is_noted(ask, model, noted):
     (answer,) = ask(FakeServer(lambda body: {**shipped(body), "model": model}), "push")
-    note = "the server says that the model 'smollm2-135m' answered, not 'a/model'"
+    note = "the server reports that model 'smollm2-135m' answered instead of 'a/model'"
     assert answer.notes == ((note,) if noted else ())
 
 
@@ -284,7 +284,7 @@ def test_a_custom_task(ask, tmp_path):
     ("options", "error", "message"),
     [
         ({"base_url": "127.0.0.1:8000"}, ValueError, "base_url must be an address"),
-        ({"free_skills": True}, ValueError, "free_skills needs constrain"),
+        ({"free_skills": True}, ValueError, "free_skills=True needs constrain=True"),
         ({"options": {"model": "x"}}, ValueError, "must not set model"),
         ({"options": {"x": {1}}}, TypeError, "options"),
     ],

@@ -119,7 +119,7 @@ def test_the_report_says_that_the_json_was_cut_off(planner):
         first = model.plans("push", progress=False)
         (repair,) = repair_plans(model, first, rounds=1, episodes=1, enough=1.0, progress=False)
     facts = server.requests[1]["messages"][-1]["content"]
-    assert "The answer is too long: it was cut off at max_tokens." in facts
+    assert "The answer is too long: the answer was cut off at max_tokens." in facts
     assert "In the answer, line 1: the answer ends or is not JSON from here" in facts
     assert "ends or is not JSON from here" in str(repair.checks[0])
 

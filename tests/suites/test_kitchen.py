@@ -146,7 +146,7 @@ def test_evaluator_reads_an_objects_opening():
 def test_errors_where_a_displacement_is_needed():
     go = ScriptedSkill("go there", "microwave")
     plan = lw.ConditionalPlan.from_pairs(MICROWAVE, [("the microwave is closed", go.text)])
-    missing = "layout 'kitchen' has no displacement"
+    missing = "displacement of the hand, got layout 'kitchen'"
     with pytest.raises(ValueError, match=f"scripted skills: .*{missing}"):
         lw.ScriptedSkillActor(lw.Plans([plan]), skills={go.text: go})
     with pytest.raises(ValueError, match=f"RandomYaw: .*{missing}"):

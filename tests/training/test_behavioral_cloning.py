@@ -181,7 +181,7 @@ def test_a_buffer_of_other_plans_of_the_same_length_is_refused(demos):
     plans = lw.Plans({**PLANS, "reach": lw.ConditionalPlan.from_pairs("reach", swapped)})
     assert plans.num_steps == PLANS.num_steps
     replay = lw.LanguageWorldExperienceReplay(demos, transform=lw.QAFTransform(plans))
-    with pytest.raises(ValueError, match=r"the actor's plans, they differ for reach"):
+    with pytest.raises(ValueError, match=r"the actor's plans, but they differ for reach"):
         BehavioralCloningTrainer(make_actor(), replay, CONFIG)
 
 

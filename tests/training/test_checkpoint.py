@@ -230,8 +230,8 @@ def test_saving_draws_no_random_numbers(path):
 @pytest.mark.parametrize(
     ("about", "message"),
     [
-        ({"format": 3}, "about must not use the reserved name format"),
-        ({"state": 3}, "about must not use the reserved name state"),
+        ({"format": 3}, "about must not use reserved names, got format"),
+        ({"state": 3}, "about must not use reserved names, got state"),
         ({"note": {1: "a", "1": "b"}}, "the key '1' more than once"),
         ({"note": float("nan")}, "JSON"),
     ],
@@ -264,9 +264,9 @@ def test_files_of_another_kind_are_refused(saved, tmp_path, path):
         assert_refused(path, "cannot be read: the file is corrupted or not a .safetensors file")
     save_file({"weight": torch.ones(2)}, path)
     assert_refused(path, "not written by lw_torchrl")
-    assert_refused(saved[0].with_name("policy.training.safetensors"), "must be a policy .*'lw_torchrl.training'")
+    assert_refused(saved[0].with_name("policy.training.safetensors"), "must hold a policy .*'lw_torchrl.training'")
     save_evaluator(lw.modules.StateQueryEvaluator(PLANS, width=8), path)
-    assert_refused(path, "must be a policy .*'lw_torchrl.evaluator'")
+    assert_refused(path, "must hold a policy .*'lw_torchrl.evaluator'")
 
 
 def test_a_pickle_is_not_loaded(tmp_path, path):
@@ -287,7 +287,7 @@ CHANGES = {
     "a plan that cannot be parsed": ("plans", "reach", "def raech(", "plan of 'reach' must be like"),
     "NaN": ("tensors", "module.decoder.network.2.bias", NAN, "must be finite"),
     "another dtype": ("tensors", "module.decoder.network.2.bias", NAN.double(), "got torch.float64"),
-    "another tensor": ("tensors", "more", NAN, "they differ in .*more"),
+    "another tensor": ("tensors", "more", NAN, "but differ in .*more"),
 }
 
 
@@ -299,7 +299,7 @@ def test_weights_that_do_not_fit_the_description_are_refused(saved, path, inside
     described = {None: actor, "decoder": decoder, "plans": actor["plans"][0], "tensors": tensors}[inside]
     described[name] = value
     write_tensors(path, description, tensors)
-    assert_refused(path, f"the actor of .* cannot be made .*{message}")
+    assert_refused(path, f"the actor in .* cannot be rebuilt .*{message}")
 
 
 def test_a_flipped_bit_is_detected(path):

@@ -176,7 +176,7 @@ def test_other_files_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="train-evaluator"):
         lw.training.load_evaluator(path, PLANS)
     lw.save_actor(lw.PlanConditionedActor(PLANS), path)
-    with pytest.raises(ValueError, match=r"must be an evaluator of version 2, got format 'lw_torchrl\.actor'"):
+    with pytest.raises(ValueError, match=r"must hold an evaluator of version 2, got format 'lw_torchrl\.actor'"):
         lw.training.load_evaluator(path, PLANS)
     path.write_bytes(b"PK")
     with pytest.raises(ValueError, match=r"is corrupted or not a \.safetensors file"):

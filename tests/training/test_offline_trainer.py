@@ -277,7 +277,7 @@ def checkpoint(demos, tmp_path_factory):
         (dict(gamma=0.5, n_steps=1), "loss differs in fixed"),
         (dict(width=8), "shapes.value_network_params.heads.0.0.bias"),
         (dict(sampler=RandomSampler()), "replay differs in sampler"),
-        (dict(episodes=1), "of another configuration"),
+        (dict(episodes=1), "a different configuration"),
         (dict(reward="cost"), r"replay differs in reward \('sparse', now 'cost'\)"),
         (dict(n_steps=2), r"replay differs in n_steps \(3, now 2\)"),
         (dict(terminate_on_success=True), "replay differs in .*terminate_on_success"),
@@ -319,7 +319,7 @@ def test_augmentations_that_features_would_not_see_are_refused(demos, name):
         replay.append_transform(augmented)
         iql = IQLLoss(actor, lw.PlanConditionedQValue(plans, **CRITIC), value)
         iql.make_value_estimator(gamma=GAMMA)
-        assert_refused(iql, replay, f"Features would not see what {name} writes")
+        assert_refused(iql, replay, f"Features cannot read the key that {name} writes")
         loss = lw.objectives.ExpectileValueLoss(value).make_value_estimator(gamma=GAMMA)
         OfflineTrainer(loss, replay, replace(CONFIG, steps=1), progress=False).train()
 
@@ -340,7 +340,7 @@ def test_unsuitable_losses_are_refused(demos):
     assert_refused(make_sac(CQLLoss, 0.0, with_lagrange=True), replay, "loss: with_lagrange")
     assert_refused(torch.nn.Sequential(make_loss("td3-bc")), replay, "loss must be a LossModule", TypeError)
     made = LOSSES["iql"](0.0).make_value_estimator(gamma=GAMMA)  # which is None
-    assert_refused(made, replay, "got NoneType; make_value_estimator", TypeError)
+    assert_refused(made, replay, "got NoneType; .*make_value_estimator", TypeError)
 
 
 def test_a_loss_without_entries_to_minimise_is_refused(demos):

@@ -54,7 +54,7 @@ ACTORS = {
 def test_a_checkpoint_of_another_architecture_is_refused(demos, checkpoint, difference):
     actor = ACTORS[difference]()
     before = {name: value.clone() for name, value in actor.state_dict().items()}
-    message = f"of another architecture, its actor differs in .*{difference}"
+    message = f"a different architecture: its actor differs in .*{difference}"
     assert_refused(checkpoint, message, lambda: make_trainer(demos, checkpoint, actor=actor))
     assert all(torch.equal(value, before[name]) for name, value in actor.state_dict().items())
 
@@ -72,7 +72,7 @@ OTHER_VALUES = {
 @pytest.mark.parametrize("name", OTHER_VALUES)
 def test_a_checkpoint_of_another_configuration_is_refused(demos, checkpoint, name):
     config = lw.BehavioralCloningConfig(**{**vars(CONFIG), name: OTHER_VALUES[name]})
-    message = f"of another configuration, its training differs in {name} "
+    message = f"a different configuration: its training differs in {name} "
     assert_refused(checkpoint, message, lambda: make_trainer(demos, checkpoint, config=config))
 
 
@@ -107,14 +107,14 @@ def test_a_checkpoint_of_other_samples_is_refused(long_demos, tmp_path, change, 
 
     trainer().save()
     trainer()
-    assert_refused(path, f"of another configuration, its replay differs in {difference}", lambda: trainer(**change))
+    assert_refused(path, f"a different configuration: its replay differs in {difference}", lambda: trainer(**change))
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not quite", b"years of work\n"])
 def test_a_file_of_another_program_is_refused(demos, tmp_path, content):
     path, state = tmp_path / "thesis.tex", tmp_path / "thesis.training.tex"
     path.write_bytes(content)
-    assert_refused(path, "exists, but not its training state", lambda: make_trainer(demos, path))
+    assert_refused(path, "exists, but its training state .* does not", lambda: make_trainer(demos, path))
     state.write_bytes(content)
     assert_refused(state, "corrupted or not a .safetensors file", lambda: make_trainer(demos, path))
 
@@ -122,7 +122,7 @@ def test_a_file_of_another_program_is_refused(demos, tmp_path, content):
 def test_a_policy_without_a_training_state_is_not_overwritten(demos, tmp_path):
     path = tmp_path / "policy.safetensors"
     lw.save_actor(make_actor(), path)
-    assert_refused(path, "exists, but not its training state", lambda: make_trainer(demos, path))
+    assert_refused(path, "exists, but its training state .* does not", lambda: make_trainer(demos, path))
 
 
 def test_a_training_file_without_a_state_is_refused(demos, checkpoint, tmp_path):

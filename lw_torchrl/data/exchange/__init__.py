@@ -1,4 +1,4 @@
-"""Export datasets to LeRobot and Minari, and import these formats and robomimic's HDF5."""
+"""Export datasets to LeRobot and Minari, and import datasets from LeRobot, Minari and robomimic's HDF5."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ __all__ = [
 ExportFormat = Literal["lerobot", "minari"]
 ImportFormat = Literal["lerobot", "minari", "robomimic"]
 FORMATS: tuple[str, ...] = get_args(ExportFormat)
-_EXTRAS = {"av": "exchange", "h5py": "exchange", "minari": "minari"}  # package to the extra that installs it
+_EXTRAS = {"av": "exchange", "h5py": "exchange", "minari": "minari"}  # the extra that installs each package
 
 
 class MissingDataWarning(UserWarning):
-    """An imported source lacks columns of a dataset."""
+    """A warning that an imported file lacks columns of a dataset."""
 
 
 @contextmanager
 def _format(name: str) -> Iterator[Any]:
-    """Yield the module of a format; an ImportError in the block names the extra to install."""
+    """Yield the module for a format; if a package is missing, raise an ImportError that names the extra to install."""
     try:
         yield import_module(f"lw_torchrl.data.exchange.{name}")
     except ModuleNotFoundError as error:
         if (extra := _EXTRAS.get((error.name or "").partition(".")[0])) is None:
             raise
         install = f"pip install 'lw_torchrl[{extra}]'"
-        raise ImportError(f"format {name!r} needs {error.name}, which is not installed: {install}") from error
+        raise ImportError(f"format {name!r} requires {error.name}, which is not installed: {install}") from error
 
 
 @typed
@@ -62,23 +62,23 @@ def export_dataset(
     plans: AnyPlans | None = None,
     suite: str | Suite | None = None,
 ) -> Path:
-    """Write a dataset in another library's format, and return its folder.
+    """Write a dataset in another library's format, and return the folder of the exported dataset.
 
-    :func:`import_dataset` restores it bit for bit. A row is a step. docs/data.md lists the columns of both formats: the
-    dataset's own, the task's name and description, the plan's text, and ``plan_holds`` (R, S) bool, which of the plan's
-    conditions hold in the observation. Pictures of :func:`add_pictures` become videos in "lerobot".
+    :func:`import_dataset` restores the dataset bit-exactly. docs/data.md lists the columns of both formats: the
+    dataset's columns, the task's name and description, the plan's text, and ``plan_holds`` (R, S) bool, the conditions
+    of the plan that hold in each row (time step). In "lerobot", pictures of :func:`add_pictures` become videos.
 
     Args:
-        root: the dataset's folder, of :func:`collect_demonstrations`.
-        format: "lerobot", version 3 of LeRobot's format; or "minari".
-        out: the folder to write, new or empty.
-        plans: plans for ``plan_holds``; None for the suite's.
-        suite: the suite of the dataset's tasks; None for the suite that their names begin with.
+        root: the dataset's folder, written by :func:`collect_demonstrations`.
+        format: "lerobot" (version 3 of LeRobot's format) or "minari".
+        out: the folder to write, which must be new or empty.
+        plans: the plans for ``plan_holds``; None for the suite's plans.
+        suite: the suite of the dataset's tasks; None to derive the suite from the tasks' names.
 
     Raises:
-        DatasetError: (a ValueError) ``root`` holds no dataset, or a damaged one.
+        DatasetError: (a ValueError) ``root`` holds no dataset, or a corrupted dataset.
         ValueError: ``out`` is a file, or a folder that is not empty.
-        ImportError: the format needs a package that is not installed; the message names the extra.
+        ImportError: the format requires a package that is not installed; the message names the extra.
 
     Example:
         >>> import tempfile, lw_torchrl as lw
@@ -111,48 +111,48 @@ def import_dataset(
     behaviour: str = "imported",
     episodes_per_task: Count | None = None,
 ) -> Demonstrations:
-    """Convert files to a dataset, and return its description.
+    """Convert files of another format to a dataset, and return the dataset's description.
 
-    Files of :func:`export_dataset` are restored bit for bit, so the options after ``format`` are only for files from
-    elsewhere. These need observations and actions of the suite's sizes. docs/data.md lists the column names that are
-    recognised, and the values of missing columns. Use such datasets with ``label="executed"``: they hold no expert
+    Files written by :func:`export_dataset` are restored bit-exactly; the options after ``format`` only apply to other
+    files, whose observations and actions must have the suite's sizes. docs/data.md lists the recognized column names
+    and the values that replace missing columns. Load such a dataset with ``label="executed"``, because it has no expert
     actions.
 
     Args:
-        source: the file or folder.
-        out: the dataset's folder, new or empty.
-        format: "lerobot", "minari" or "robomimic" (HDF5, also LIBERO's); None to recognise it by the files.
-        task: the task of all episodes, or a mapping from the file's task names to ours; None if the file has our names
-            or descriptions, or Meta-World's own names, "reach-v3".
+        source: the file or folder to import.
+        out: the dataset's folder, which must be new or empty.
+        format: "lerobot", "minari" or "robomimic" (HDF5, also LIBERO's); None to detect the format from the files.
+        task: the task of all episodes, or a mapping from the file's task names to lw_torchrl's; None if the file has
+            lw_torchrl's task names or descriptions, or Meta-World's task names, such as "reach-v3".
         suite: the :class:`~lw_torchrl.suites.Suite` of the tasks.
         behaviour: the label of the episodes, for :class:`EpisodeFilter`.
-        episodes_per_task: number of episodes of each task, the first ones; None for all.
+        episodes_per_task: import only the first N episodes of each task; None for all.
 
     Warns:
-        UserWarning: columns are missing; the message names the values that are used instead.
+        MissingDataWarning: (a UserWarning) columns are missing; the message names the values used instead.
 
     Raises:
-        ExchangeError: (a ValueError) ``source`` is damaged, of another format, or lacks observations or actions.
-        ValueError: an unknown task, different numbers of episodes, or ``out`` is not an empty folder.
-        ImportError: the format needs a package that is not installed; the message names the extra.
+        ExchangeError: (a ValueError) ``source`` is corrupted, of another format, or lacks observations or actions.
+        ValueError: a task is unknown, the tasks have different numbers of episodes, or ``out`` is not an empty folder.
+        ImportError: the format requires a package that is not installed; the message names the extra.
 
     Source: LeRobot's format 2.0 to 3.0, Minari, robomimic's HDF5 layout.
     """
     source, target = Path(source), _new_folder(out)
     if not source.exists():
-        raise FileNotFoundError(f"source: there is no file or folder {str(source)!r}")
+        raise FileNotFoundError(f"source: no file or folder {str(source)!r}")
     with _format(_format_of(source) if format is None else format) as module, _reading(source):
         table: Table = module.read(source)
     if table.metadata is not None:
         options = {"task": task is not None, "episodes_per_task": episodes_per_task is not None}
         options |= {"suite": suite != "metaworld", "behaviour": behaviour != "imported"}
         if given := [name for name, is_given in options.items() if is_given]:
-            raise ValueError(f"{given[0]} must not be given: {str(source)!r} is our own export, which is restored")
+            raise ValueError(f"{given[0]} must not be given: {str(source)!r} was written by export_dataset")
         with _reading(source):
             description = parse_metadata(table.metadata, target)
             columns, spans = exported_columns(table), [*table.spans()]
             if tuple(episode.length for episode in description.episodes) != table.lengths:
-                raise ExchangeError("its episodes have other lengths than those that were exported")
+                raise ExchangeError("the episodes' lengths differ from those in the exported metadata")
         return write_dataset(columns, spans, description, target, exported_as=source)
     suite = load_suite(suite)
     names = task_names(table, suite, task)
@@ -166,26 +166,26 @@ def import_dataset(
 
 @contextmanager
 def _reading(source: Path) -> Iterator[None]:
-    """Add the source to errors in the block."""
+    """Add the path of the source to errors raised within a ``with`` block."""
     try:
         yield
     except (ImportError, MemoryError):
         raise
     except ExchangeError as error:
         raise ExchangeError(f"source: {str(source)!r}: {error}") from error
-    except Exception as error:  # pyarrow, h5py and Minari raise many kinds of errors for damaged files
-        raise ExchangeError(f"source: {str(source)!r} is damaged ({type(error).__name__}: {error})") from error
+    except Exception as error:  # pyarrow, h5py and Minari raise many kinds of errors for corrupted files
+        raise ExchangeError(f"source: {str(source)!r} is corrupted ({type(error).__name__}: {error})") from error
 
 
 def _new_folder(out: AnyPath) -> Path:
     folder = Path(out)
     if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
-        raise ValueError(f"out must be a new folder, or an empty one, {str(folder)!r} is not")
+        raise ValueError(f"out must be a new folder or an empty folder, got {str(folder)!r}")
     return folder
 
 
 def _format_of(source: Path) -> ImportFormat:
-    """Recognise the format of a file, or of a folder by its files."""
+    """Detect the format of a file, or of the files in a folder."""
     if (source / "meta" / "info.json").is_file():
         return "lerobot"
     if (source / "data" / "metadata.json").is_file() or (source / "main_data.hdf5").is_file():
@@ -193,5 +193,5 @@ def _format_of(source: Path) -> ImportFormat:
     if {path.suffix for path in ([source] if source.is_file() else source.iterdir())} & {".hdf5", ".h5"}:
         return "robomimic"
     raise ExchangeError(
-        f"source: {str(source)!r} is not a LeRobot or Minari dataset, nor robomimic's HDF5; if it is, name its format="
+        f"source: {str(source)!r} is not a LeRobot dataset, Minari dataset or robomimic HDF5 file; if it is, set format"
     )

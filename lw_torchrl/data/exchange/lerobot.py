@@ -1,14 +1,14 @@
-"""LeRobot's dataset format, written as version 3, read as version 2.0, 2.1 or 3.
+"""Write LeRobot datasets in version 3, and read LeRobot datasets in version 2.0, 2.1 or 3.
 
-meta/info.json                                    the columns, their types and shapes; steps per second
+meta/info.json                                    the columns with types and shapes; time steps per second
 meta/stats.json                                   min, max, mean, std and count of each column
-meta/tasks.parquet                                task_index, by the task's description; the task's name and plan
-meta/episodes/chunk-000/file-000.parquet          the place of each episode, and its statistics
-data/chunk-000/file-000.parquet                   the steps
+meta/tasks.parquet                                description, task_index, name and plan of each task
+meta/episodes/chunk-000/file-000.parquet          location and statistics of each episode
+data/chunk-000/file-000.parquet                   the time steps
 videos/CAMERA/chunk-000/file-000.mp4              the pictures of ``add_pictures``
-meta/lw_torchrl.json                              the metadata of our dataset, which LeRobot does not read
+meta/lw_torchrl.json                              the metadata of the lw_torchrl dataset, which LeRobot ignores
 
-Version 2 has a file of steps for each episode, and ``meta/tasks.jsonl``.
+Version 2 has one data file per episode, and ``meta/tasks.jsonl``.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from lw_torchrl.data.pictures import Pictures
 INFO, ABOUT_FILE = "meta/info.json", f"meta/{ABOUT}.json"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _EPISODES = "meta/episodes/chunk-000/file-000.parquet"
-_FILE_MB, _FILES = 100, 1000  # approximate megabytes of a file of steps, and files in a folder
+_FILE_MB, _FILES = 100, 1000  # approximate megabytes per data file, and number of files per folder
 _NAMES = {name: others[0] for name, others in NAMES.items()}
 _VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _EPISODES_IN_VIDEO = 100
-_PICTURES = re.compile(r"(.+)-(\d+)x(\d+)-every(\d+)")  # the folder of pictures with these options
+_PICTURES = re.compile(r"(.+)-(\d+)x(\d+)-every(\d+)")  # matches the name of a folder of pictures
 
 
 def _columns(table: Table) -> dict[str, Array]:
-    """Return the columns of the steps' files, under LeRobot's names."""
+    """Return the columns of the data files under LeRobot's names."""
     frame = np.concatenate([np.arange(length) for length in table.lengths])
     descriptions = [*table.descriptions]
     return {_NAMES.get(name, name): column for name, column in table.columns.items()} | {
@@ -64,7 +64,7 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
     columns, lengths, spans = _columns(table), np.asarray(table.lengths), [*table.spans()]
     arrow = pa.table({name: _arrow_column(column) for name, column in columns.items()})
     rows_of_file = max(1, int(_FILE_MB * 1e6 / sum(column.nbytes / len(column) for column in columns.values())))
-    place = np.array([start // rows_of_file for start, _ in spans])  # the file of each episode
+    place = np.array([start // rows_of_file for start, _ in spans])  # the file number of each episode
     for number, file in enumerate(dict.fromkeys(place.tolist())):
         in_file = [span for span, each in zip(spans, place, strict=True) if each == file]
         path = folder / _DATA.format(chunk_index=number // _FILES, file_index=number % _FILES)
@@ -72,7 +72,7 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
         steps = arrow.slice(in_file[0][0], in_file[-1][1] - in_file[0][0])
         pq.write_table(steps, path, compression="zstd", use_dictionary=False)
         bar.update(len(steps))
-    place = np.unique(place, return_inverse=True)[1]  # a long episode may skip a number
+    place = np.unique(place, return_inverse=True)[1]  # renumber, because long episodes may skip a file number
     episodes: dict[str, Any] = {
         "episode_index": np.arange(len(lengths)),
         "tasks": [[table.descriptions[task]] for task in table.tasks],
@@ -121,7 +121,7 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
 
 
 def _tasks(table: Table) -> Any:
-    """Return the table of tasks, whose index for pandas is the description."""
+    """Return the Arrow table of tasks, with the description as pandas index."""
     import pyarrow as pa
 
     columns = {
@@ -139,7 +139,7 @@ def _tasks(table: Table) -> Any:
 
 
 def _arrow_column(column: Array) -> Any:
-    """Convert a column to an Arrow array; LeRobot's tables hold a list of one number as a number."""
+    """Convert a column to an Arrow array; as in LeRobot, a column of width 1 becomes plain numbers."""
     import pyarrow as pa
 
     flat, width = pa.array(np.ascontiguousarray(column).reshape(-1)), column.size // len(column)
@@ -147,7 +147,7 @@ def _arrow_column(column: Array) -> Any:
 
 
 def _existing_pictures(demonstrations: Demonstrations) -> dict[str, Pictures]:
-    """Return the pictures that all episodes of a dataset have, by LeRobot's name of their column."""
+    """Return the sets of pictures that exist for all episodes of a dataset, by LeRobot's column name."""
     pictures = {}
     for path in (demonstrations.root / "pictures").glob("*"):
         if (match := _PICTURES.fullmatch(path.name)) is None:
@@ -164,7 +164,7 @@ def _pixel_format(pictures: Pictures) -> str:
 
 
 def _video_feature(pictures: Pictures, fps: int) -> dict[str, Any]:
-    """Return a video's entry in LeRobot's info.json."""
+    """Return the entry for a video column in LeRobot's info.json."""
     height, width, _ = pictures.shape
     info: dict[str, Any] = {"video.height": height, "video.width": width, "video.channels": 3, "video.fps": fps}
     info |= {"video.codec": "h264", "video.pix_fmt": _pixel_format(pictures)}
@@ -173,13 +173,13 @@ def _video_feature(pictures: Pictures, fps: int) -> dict[str, Any]:
 
 
 def _statistics(values: Array) -> dict[str, Array]:
-    """Return statistics of rows (R, n), as LeRobot names them."""
+    """Return statistics of rows (R, n) under LeRobot's names."""
     statistics = {name: getattr(values, name)(0) for name in ("min", "max", "mean", "std")}
     return statistics | {"count": np.array([len(values)])}
 
 
 def _combined(parts: list[dict[str, Array]]) -> dict[str, Array]:
-    """Combine the statistics of parts to those of all rows."""
+    """Merge the statistics of the parts into statistics of all rows."""
     each = {name: np.stack([part[name] for part in parts]) for name in parts[0]}
     share = (each["count"] / each["count"].sum()).reshape(-1, *[1] * (each["mean"].ndim - 1))
     mean = (each["mean"] * share).sum(0)
@@ -191,8 +191,10 @@ def _combined(parts: list[dict[str, Array]]) -> dict[str, Array]:
 def _write_videos(
     demonstrations: Demonstrations, pictures: Pictures, folder: Path, key: str, fps: int
 ) -> tuple[dict[str, list[Any]], list[dict[str, Array]]]:
-    """Write a picture for each row, for rows between two rendered pictures the earlier one. Return the place of each
-    episode, and the statistics of its pixels, from 0 to 1, (3, 1, 1)."""
+    """Write videos with one frame per row; rows between two rendered pictures repeat the earlier picture.
+
+    Return the location of each episode, and statistics (3, 1, 1) of each episode's pixel values in [0, 1].
+    """
     import av
 
     names = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
@@ -224,30 +226,30 @@ def _write_videos(
 
 
 def _numbers(name: str, column: Any) -> Array:
-    """Convert an Arrow column to numbers, (R,) or (R, n)."""
+    """Convert an Arrow column to an array of numbers, (R,) or (R, n)."""
     import pyarrow as pa
 
     column = column.combine_chunks()
     if not pa.types.is_nested(column.type):
         values = column
     elif column.null_count or len(column.value_lengths().unique()) > 1:
-        raise ExchangeError(f"{name} must hold equally many numbers in each row")
+        raise ExchangeError(f"{name} must have the same number of values in every row")
     else:
         values = column.flatten()
     if values.null_count:
-        raise ExchangeError(f"{name} must hold a number in each row, {values.null_count} are missing")
+        raise ExchangeError(f"{name} must have a value in every row, but {values.null_count} values are missing")
     return values.to_numpy(zero_copy_only=False).reshape((len(column), -1) if values is not column else -1)
 
 
 def _steps(source: Path, frames: Any) -> dict[str, Array]:
-    """Return the known columns of the files of steps, sorted by episode and frame."""
+    """Read the known columns of the data files, sorted by episode and frame."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     paths = sorted(path for path in (source / "data").rglob("*.parquet") if not path.name.startswith("."))
     rows = sum(pq.read_metadata(path).num_rows for path in paths)
-    if not rows or rows != frames:  # before the rows take memory
-        raise ExchangeError(f"{INFO} promises {frames} steps, the files hold {rows}")
+    if not rows or rows != frames:  # checked before the rows are loaded into memory
+        raise ExchangeError(f"{INFO} lists {frames} time steps, but the data files hold {rows}")
     known = KNOWN | {"episode_index", "frame_index", "task_index"}
     names = [name for name in pq.read_schema(paths[0]).names if name in known]
     table = pa.concat_tables(pq.read_table(path, columns=names, partitioning=None) for path in paths)
@@ -258,7 +260,7 @@ def _steps(source: Path, frames: Any) -> dict[str, Array]:
 
 
 def _task_texts(source: Path) -> dict[int, str]:
-    """Return the text of each task_index: our name of the task, or its description."""
+    """Return the name of each task by task_index, or the task's description if the file has no name."""
     import pyarrow.parquet as pq
 
     lines = source / "meta" / "tasks.jsonl"
@@ -271,10 +273,10 @@ def _task_texts(source: Path) -> dict[int, str]:
 
 
 def read(source: Path) -> Table:
-    """Read a LeRobot dataset of version 2.0, 2.1 or 3.0."""
+    """Read a LeRobot dataset of version 2.0, 2.1 or 3.0 as a table."""
     info = read_json(source / INFO, "the description")
     if not (version := str(info["codebase_version"])).startswith(("v2.", "v3.")):
-        raise ExchangeError(f"LeRobot's version {shown(version)} is not supported; supported are v2.0 to v3.0")
+        raise ExchangeError(f"LeRobot format version {shown(version)} is not supported; use v2.0 to v3.0")
     columns = _steps(source, info["total_frames"])
     starts = np.flatnonzero(np.diff(columns["episode_index"], prepend=-1))
     lengths = np.diff(starts, append=len(columns["episode_index"]))

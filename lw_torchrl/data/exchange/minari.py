@@ -1,9 +1,9 @@
-"""Minari's datasets, written and read by Minari itself.
+"""Write and read Minari datasets with the minari package.
 
 data/main_data.hdf5    a group for each episode: observations (T + 1, 39), actions (T, 4), dense rewards, terminations
-                       and truncations (T,), infos/... (T + 1, ...): success and reward_sparse belong to the step before
-                       and are zero in the first row; the others belong to the step after and are zero in the last row
-data/metadata.json     Minari's description, and the metadata of our dataset
+                       and truncations (T,), and infos/... (T + 1, ...). success and reward_sparse describe the
+                       preceding step (zero in the first row); all others the following step (zero in the last row)
+data/metadata.json     Minari's description, and the metadata of the lw_torchrl dataset
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _OF_STEP = {*NAMES["success"], *NAMES["reward_sparse"], *NAMES["reward_dense"]}
 
 
 def _infos(table: Table, start: int, end: int) -> dict[str, Array]:
-    """Return an episode's other columns, a row longer; next observations only if they differ from the next rows."""
+    """Return an episode's infos (T + 1 rows); next observations only if they differ from the following observations."""
     infos = {}
     observation, after = (table.columns[name][start:end] for name in ("observation", "next_observation"))
     for name in (*_AFTER, *_BEFORE):
@@ -42,9 +42,9 @@ def _infos(table: Table, start: int, end: int) -> dict[str, Array]:
 
 
 def write(table: Table, folder: Path, bar: Progress) -> None:
-    """Write a table as a dataset. Its id is its folder's name, followed by -v0 if the name has no version."""
+    """Write a table as a Minari dataset, whose id is the folder's name, with the suffix -v0 if it has no version."""
     if shutil.disk_usage(folder).free < 2 * sum(column.nbytes for column in table.columns.values()):
-        # A write that fails inside HDF5 leaves the file open, and the process crashes when it ends.
+        # Check in advance: a write that fails inside HDF5 leaves the file open, and the process crashes at exit.
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
     import minari
     from gymnasium.spaces import Box
@@ -78,21 +78,21 @@ def write(table: Table, folder: Path, bar: Progress) -> None:
         for task in table.tasks
     )
     name = re.sub(r"[^-\w]", "-", re.sub(r"^\.|\.[0-9a-f]{16}\.tmp$", "", folder.name))
-    about = "Demonstrations of tasks whose descriptions and plans are in the episodes' metadata."
+    about = "Robot demonstrations; the metadata of each episode hold the task's description and plan."
     versioned = name if re.search(r"-v\d+$", name) else f"{name}-v0"
     metadata = {"dataset_id": versioned, "minari_version": minari.__version__, "description": about}
     storage.update_metadata({**metadata, ABOUT: json.dumps(table.metadata)})
 
 
 def _flat(name: str, value: Any) -> dict[str, Array]:
-    """Return the arrays in nested ones, by their names joined by dots."""
+    """Flatten nested mappings of arrays to one mapping, whose names are joined by dots."""
     if isinstance(value, Mapping):
         return {key: array for inner, part in value.items() for key, array in _flat(f"{name}.{inner}", part).items()}
     return {name: np.asarray(value)}
 
 
 def _columns(episode: Mapping[str, Any]) -> dict[str, Array]:
-    """Return the columns of an episode's rows."""
+    """Convert a Minari episode to columns with one row per time step."""
     steps = len(episode["rewards"])
     columns = {name: np.asarray(episode[name]) for name in ("rewards", "terminations", "truncations")}
     columns |= _flat("actions", episode["actions"])
@@ -107,7 +107,7 @@ def _columns(episode: Mapping[str, Any]) -> dict[str, Array]:
 
 
 def read(source: Path) -> Table:
-    """Read a dataset with Minari."""
+    """Read a Minari dataset as a table."""
     from minari.dataset.minari_storage import MinariStorage
 
     storage = MinariStorage.read(source / "data" if (source / "data").is_dir() else source)

@@ -1,7 +1,7 @@
 """Read HDF5 files in the layout of robomimic and LIBERO.
 
-data                        attributes: env_args, JSON with env_name; task or another name of it; LIBERO's problem_info
-data/demo_0                 a group for each episode; attributes: task or another name of it
+data                        attributes: env_args (JSON with env_name), the task (see TASK_NAMES), LIBERO's problem_info
+data/demo_0                 a group for each episode; attributes: the task (see TASK_NAMES)
 data/demo_0/obs/...         (T, n), or (T + 1, n) where the last row is the observation after the last action
 data/demo_0/actions         (T, n); also rewards, dones, next_obs/..., success
 """
@@ -19,7 +19,7 @@ from lw_torchrl.data.exchange.table import KNOWN, TASK_NAMES, Array, ExchangeErr
 
 
 def _files(source: Path) -> list[Path]:
-    """Return the HDF5 files at a path, sorted by name, numbers by their value."""
+    """Return the HDF5 files at a path, in natural order (numbers in names are compared by value)."""
     if source.is_file():
         return [source]
     paths = [path for path in source.iterdir() if path.suffix in (".hdf5", ".h5") and path.name[0] != "."]
@@ -27,11 +27,11 @@ def _files(source: Path) -> list[Path]:
 
 
 def _episode(group: Any) -> dict[str, Array]:
-    """Return the known columns of an episode's group."""
+    """Read the known columns from an episode's HDF5 group."""
     columns: dict[str, Array] = {}
 
     def add(path: str, item: Any) -> None:
-        # Only known columns are loaded: images may be larger than the memory.
+        # Load only known columns, because images may not fit into memory.
         name = path.replace("/", ".")
         if name in KNOWN and getattr(item, "dtype", np.dtype("O")).kind in "biuf" and item.ndim:
             columns[name] = item[()]
@@ -44,12 +44,12 @@ def _episode(group: Any) -> dict[str, Array]:
         columns.setdefault(f"next_{name}", columns[name][1:])
         columns[name] = columns[name][:-1]
     if odd := [name for name, column in columns.items() if len(column) != steps]:
-        raise ExchangeError(f"{group.name} has {steps} actions and {len(columns[odd[0]])} rows of {odd[0]}")
+        raise ExchangeError(f"{group.name} has {steps} actions, but {len(columns[odd[0]])} rows of {odd[0]}")
     return columns
 
 
 def _task(attributes: Any) -> str:
-    """Return the task that attributes name; "" if they do not."""
+    """Return the task stated in HDF5 attributes, or "" if there is none."""
     texts = {name: attributes[name] for name in TASK_NAMES if name in attributes}
     for name, keys in {"problem_info": TASK_NAMES, "env_args": ("env_name",)}.items():
         texts |= {key: value for key, value in json.loads(attributes.get(name, "{}")).items() if key in keys}
@@ -58,7 +58,7 @@ def _task(attributes: Any) -> str:
 
 
 def read(source: Path) -> Table:
-    """Read a file in robomimic's layout, or all files of a folder."""
+    """Read a file in robomimic's layout, or all such files in a folder, as a table."""
     import h5py
 
     parts, tasks = [], []
@@ -71,6 +71,6 @@ def read(source: Path) -> Table:
                 parts.append(_episode(groups[name]))
                 tasks.append(_task(groups[name].attrs) or _task(file["data"].attrs))
     if not parts or any(part.keys() != parts[0].keys() for part in parts):
-        raise ExchangeError("it needs at least one episode, and the same columns in all")
+        raise ExchangeError("there must be at least one episode, and all episodes must have the same columns")
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return Table(columns, tuple(len(part["actions"]) for part in parts), tuple(tasks))

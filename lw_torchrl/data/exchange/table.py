@@ -1,4 +1,4 @@
-"""Table: the common form of all formats in :mod:`lw_torchrl.data.exchange`; from a dataset to a table, and back."""
+"""Table: the intermediate form of all exchange formats; convert datasets to tables and tables to datasets."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ KEYS: Mapping[str, tuple[str, ...]] = {
         name: ("next", name) for name in ("reward_sparse", "reward_dense", "success", "done", "terminated", "truncated")
     },
 }
-"""The columns of an exported table, and their keys in a dataset; the dataset's other keys follow from the episodes."""
-WIDE = ("observation", "next_observation", "action", "expert_action", "unclipped_action")  # the others are scalars
+"""A mapping from the columns of an exported table to keys of a dataset; all other keys follow from the episodes."""
+WIDE = ("observation", "next_observation", "action", "expert_action", "unclipped_action")  # other columns are scalars
 NAMES: Mapping[str, tuple[str, ...]] = {
     "observation": (
         "observation.state", "observation.environment_state", "observation", "observations",
@@ -54,30 +54,30 @@ NAMES: Mapping[str, tuple[str, ...]] = {
     "terminated": ("next.terminated", "terminated", "terminations", "terminals"),
     "truncated": ("next.truncated", "truncated", "truncations", "timeouts"),
 }  # fmt: skip
-"""The names of each column in files, the most likely first; names in groups are joined by dots."""
+"""The names that files use for each column, the most likely first; nested names are joined by dots."""
 KNOWN = frozenset(name for names in NAMES.values() for name in names)
 TASK_NAMES = ("task", "task_name", "language_instruction", "instruction", "task_description", "language")
-HOLDS = "plan_holds"  # (R, S) bool: which conditions of the plan hold in a row, false beyond the plan's last
-ABOUT = "lw_torchrl"  # the name of our metadata in exported files
-_BLOCK = 50_000  # rows whose conditions are evaluated at once
+HOLDS = "plan_holds"  # (R, S) bool: which conditions of the plan hold in each row; padded with False
+ABOUT = "lw_torchrl"  # the name of the dataset's metadata in exported files
+_BLOCK = 50_000  # number of rows whose conditions are evaluated at once
 
 
 class ExchangeError(DatasetError):
-    """A file or folder of another format is damaged, has another format, or lacks columns that a dataset needs."""
+    """An error for a file that is corrupted, has an unknown format, or lacks columns that a dataset requires."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of episodes, one after another.
+    """The rows of consecutive episodes, in a form that is independent of file formats.
 
     Attributes:
-        columns: name to (R, ...), scalars as (R,): the names of :data:`KEYS` and :data:`HOLDS` for a table to export,
-            the file's own names for a table that was read.
+        columns: arrays (R, ...) by name, scalars as (R,). A table to export has the names of :data:`KEYS` and
+            :data:`HOLDS`; an imported table has the names in the file.
         lengths: the number of rows of each episode.
-        tasks: the task of each episode, by name or in the file's own text; "" if the file does not name it.
-        descriptions, plans: task to its description and to its plan's text.
-        metadata: of the exported dataset; None for files from elsewhere.
-        demonstrations, fps: the dataset that is exported, and its steps per second.
+        tasks: the task of each episode, by name or as written in the file; "" if the file does not state the task.
+        descriptions, plans: the description and the plan's text of each task, by name.
+        metadata: the metadata of the exported dataset; None for files not written by :func:`export_dataset`.
+        demonstrations, fps: the dataset to export, and its number of time steps per second.
     """
 
     columns: Mapping[str, Array]
@@ -94,16 +94,16 @@ class Table:
         return sum(self.lengths)
 
     def spans(self) -> Iterator[tuple[int, int]]:
-        """Yield the first row of each episode, and the row after its last."""
+        """Yield the start row and the end row (exclusive) of each episode."""
         return pairwise(accumulate(self.lengths, initial=0))
 
     def repeat(self, values: Any) -> Array:
-        """Repeat a value of each episode for each of its rows."""
+        """Repeat each episode's value for every row of the episode."""
         return np.repeat(np.asarray(values), self.lengths)
 
 
 def table_of(demonstrations: Demonstrations, metadata: Mapping[str, Any], suite: Suite, plans: Plans | None) -> Table:
-    """Return a dataset's rows, compared with their checksums, and the truth of its tasks' conditions."""
+    """Verify a dataset's checksums, then return a table of its rows and the truth values of its plans' conditions."""
     dataset.verify(demonstrations, demonstrations.episodes)
     rows, tasks = dataset.load_rows(demonstrations), demonstrations.config.tasks
     columns: dict[str, Array] = {name: np.asarray(rows.get(key)) for name, key in KEYS.items()}
@@ -136,7 +136,7 @@ def _holds(table: Table, plans: Plans) -> Array:
 
 
 def names_in(columns: Mapping[str, Any], name: str) -> list[str]:
-    """Return the columns of a file that may hold our column ``name``, the most likely first."""
+    """Return the columns of a file that may hold the dataset's column ``name``, the most likely first."""
     return [candidate for candidate in NAMES[name] if candidate in columns]
 
 
@@ -147,8 +147,10 @@ def write_dataset(
     out: Path,
     exported_as: Path | None = None,
 ) -> Demonstrations:
-    """Write rows, an episode for each span, as the described dataset, atomically. Rows of an export must match the
-    checksums in the description."""
+    """Write rows as the described dataset, atomically, with one episode for each (start, end) in ``spans``.
+
+    If the rows come from an exported dataset (``exported_as``), they must match the checksums in the description.
+    """
 
     def episodes() -> Iterator[tuple[str, int, TensorDict]]:
         with Progress("importing", sum(end - start for start, end in spans), "row") as bar:
@@ -166,16 +168,16 @@ def write_dataset(
     with replacing_folder(out) as folder:
         infos = dataset.write_rows(folder / dataset.DATA, episodes(), description.config.layout)
         if exported_as and infos != description.episodes:
-            raise ExchangeError(f"source: {str(exported_as)!r} is damaged: its rows differ from their checksums")
+            raise ExchangeError(f"source: {str(exported_as)!r} is corrupted: the rows differ from their checksums")
         dataset.write_metadata(replace(description, root=folder, episodes=infos))
     return dataset.read_metadata(out)
 
 
 def exported_columns(table: Table) -> dict[str, Array]:
-    """Return the columns of our own export, under our names."""
+    """Return the columns of a file written by :func:`export_dataset`, under the names in :data:`KEYS`."""
     columns: dict[str, Array] = {}
     for name in KEYS:
-        if name == "done" and "terminations" in table.columns:  # Minari stores only the two kinds of ends
+        if name == "done" and "terminations" in table.columns:  # Minari does not store "done" itself
             columns[name] = table.columns["terminations"] | table.columns["truncations"]
         elif names := names_in(table.columns, name):
             columns[name] = table.columns[names[0]]
@@ -185,7 +187,7 @@ def exported_columns(table: Table) -> dict[str, Array]:
 
 
 def complete_columns(table: Table, suite: Suite) -> tuple[dict[str, Array], list[str]]:
-    """Return all columns of a dataset, from files made elsewhere, and a sentence for each missing column."""
+    """Return all columns of a dataset from an imported table, and an explanation for each missing column."""
     layout, rows = suite.layout, table.rows
     columns: dict[str, Array] = {}
     for name in KEYS:
@@ -197,7 +199,7 @@ def complete_columns(table: Table, suite: Suite) -> tuple[dict[str, Array], list
         elif name in ("observation", "action"):
             sizes = ", ".join(f"{name} ({column.size // rows})" for name, column in table.columns.items())
             raise ExchangeError(
-                f"suite {suite.name!r} needs a column {name} of {width} numbers; the columns are {sizes}"
+                f"suite {suite.name!r} requires a column {name!r} with {width} numbers per row; the columns are {sizes}"
             )
     lacking = []
     last = np.zeros(rows, dtype=bool)
@@ -206,23 +208,23 @@ def complete_columns(table: Table, suite: Suite) -> tuple[dict[str, Array], list
     if (action != action.clip(-1, 1)).any():
         columns.setdefault("unclipped_action", action)
         action = columns["action"] = action.clip(-1, 1)
-        lacking.append("actions in [-1, 1]: larger ones are clipped, as the environment does")
+        lacking.append("actions in [-1, 1]: larger actions are clipped, as the environment does")
     for name in ("expert_action", "unclipped_action"):
         columns.setdefault(name, action)
     if "next_observation" not in columns:
         columns["next_observation"] = np.where(last[:, None], observation, np.roll(observation, -1, 0))
-        lacking.append("the observation after the last action of an episode: the observation before it is used")
+        lacking.append("the observation after the last action of an episode: the preceding observation is used")
     reward = columns.get("reward_sparse", columns.get("reward_dense"))
     if "success" not in columns:
         is_sparse = reward is not None and np.isin(reward, (0.0, 1.0)).all()
         columns["success"] = np.asarray(reward == 1.0) if is_sparse else np.zeros(rows, dtype=bool)
         if not is_sparse:
-            lacking.append("success: no row succeeds")
+            lacking.append("success: all rows are marked as unsuccessful")
     if "reward_dense" not in columns or (columns["reward_dense"] == columns["success"]).all():
         columns["reward_dense"] = np.full(rows, np.nan, dtype=np.float32)
-        lacking.append("a dense reward: it is NaN, so use reward='sparse' or 'cost'")
+        lacking.append("a dense reward: the column is filled with NaN, so use reward='sparse' or 'cost'")
     if max(table.lengths) > suite.max_steps:
-        lacking.append(f"episodes of at most {suite.max_steps} steps: the longest has {max(table.lengths)}")
+        lacking.append(f"episodes of at most {suite.max_steps} steps: the longest has {max(table.lengths)} steps")
     columns["reward_sparse"] = columns["success"].astype(np.float32)
     terminated = columns.get("terminated", ~last) & last
     return columns | {"done": last, "terminated": terminated, "truncated": last & ~terminated}, lacking
@@ -236,12 +238,12 @@ def _converted(name: str, source_name: str, column: Array) -> Array:
             raise ExchangeError(f"{source_name} holds NaN or infinity")
         return column
     if (odd := column[~np.isin(column, (0, 1))]).size:
-        raise ExchangeError(f"{source_name} must hold booleans, or 0 and 1, got {odd[0]}")
+        raise ExchangeError(f"{source_name} must hold booleans, or the numbers 0 and 1, got {odd[0]}")
     return column.astype(bool)
 
 
 def task_names(table: Table, suite: Suite, task: str | Mapping[str, str] | None) -> list[str]:
-    """Return the suite's name of each episode's task: by ``task``, or by a name or description that the suite has."""
+    """Return each episode's task name in the suite, from ``task`` or by matching the suite's names and descriptions."""
     known = {name: name for name in suite.tasks}
     known |= {name.removeprefix(f"{suite.name}/"): name for name in suite.tasks}
     known |= {each.description: name for name, each in suite.tasks.items()}
@@ -254,7 +256,7 @@ def task_names(table: Table, suite: Suite, task: str | Mapping[str, str] | None)
         plain = re.sub(r"-v[0-9]+(-goal-(observable|hidden))?$", "", text.strip())
         name = known.get(text, known.get(plain, known.get(plain.lower().replace("_", "-").replace(" ", "-"))))
         if name is None and not text:
-            raise ValueError("task must be given, 'reach' for example: the files do not name it")
+            raise ValueError("task must be given, for example 'reach', because the files do not state the task")
         if name is None:
             hint = f"; or map it with task={{{shown(text)}: 'reach'}}, for example"
             raise ValueError(f"{unknown_name('task', text, suite.tasks)}{hint}")
@@ -264,21 +266,23 @@ def task_names(table: Table, suite: Suite, task: str | Mapping[str, str] | None)
 
 def _one_task(suite: Suite, name: str) -> str:
     if len(names := suite.named_tasks(name)) != 1:
-        raise ValueError(f"task must be one task, {shown(name)} is a set of {len(names)}; use 'reach', for example")
+        raise ValueError(f"task must be one task, such as 'reach', but {shown(name)} is a set of {len(names)} tasks")
     return next(iter(names))
 
 
 def describe(
     names: Sequence[str], table: Table, suite: Suite, behaviour: str, episodes_per_task: int | None
 ) -> tuple[Demonstrations, list[tuple[int, int]]]:
-    """Return the description of a dataset of episodes from elsewhere, and the rows of each episode."""
+    """Return the description of the dataset to import, and the (start, end) rows of each of its episodes."""
     count = Counter(names)
     if episodes_per_task is None and len({*count.values()}) > 1:
         counts = ", ".join(f"{number} of {name}" for name, number in sorted(count.items())[:5])
-        raise ValueError(f"give episodes_per_task, {min(count.values())} for example: the episodes are {counts}")
+        hint = f"episodes_per_task must be set, for example to {min(count.values())}"
+        raise ValueError(f"{hint}, because the tasks have different numbers of episodes: {counts}")
     each = min(count.values()) if episodes_per_task is None else episodes_per_task
     if short := [name for name, number in count.items() if number < each]:
-        raise ValueError(f"episodes_per_task must be at most {count[short[0]]}, as {short[0]!r} has, got {each}")
+        limit = f"at most {count[short[0]]}, the number of episodes of {short[0]!r}"
+        raise ValueError(f"episodes_per_task must be {limit}, got {each}")
     spans: dict[str, list[tuple[int, int]]] = {name: [] for name in sorted(count)}
     for name, span in zip(names, table.spans(), strict=True):
         spans[name].append(span)

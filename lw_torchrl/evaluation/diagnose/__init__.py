@@ -1,1 +1,1 @@
-"""Diagnosis of failed episodes: re-run them with one part of the policy replaced, and report the cause as data."""
+"""Diagnosis of failed episodes: re-run each one with one part of the policy replaced, and report the cause as data."""

@@ -1,4 +1,4 @@
-"""attribute_failures: find why episodes failed, by re-running them with one part of the policy replaced."""
+"""attribute_failures: find out why episodes failed by re-running them with one part of the policy replaced."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from lw_torchrl.modules.parts import evaluating
 from lw_torchrl.modules.policy import plans_of
 from lw_torchrl.suites.suite import Suite, find_suite
 
-MARGIN = 0.3  # a clear lead, as a share of the task's failed episodes
-_FACTS = ("perception", "query")  # tried only if an observation or answer was wrong, which is a fact
+MARGIN = 0.3  # a clear lead of one replacement, as a fraction of the task's failed episodes
+_FACTS = ("perception", "query")  # tried only after a wrong observation or answer was recorded, which is a fact
 _WIDER = {"skill": ("gripper", "actuation", "policy"), "gripper": ("policy",), "actuation": ("policy",)}
-"""Replacements that contain another one, so that they fix every episode that it fixes."""
+"""Replacements that contain another replacement, so that they fix every episode that the contained one fixes."""
 
 
 @typed
@@ -50,51 +50,51 @@ def attribute_failures(
     device: str | torch.device | None = None,
     progress: bool = True,
 ) -> list[Failure]:
-    """Find the cause of each failed episode: the observations, the answers, the plan, a skill, another part of the
-    policy, or the time limit.
+    """Find the cause of each failed episode: the observations, the answers to the plan's conditions, the plan, a skill,
+    another part of the policy, or the time limit.
 
-    **A rule reads the states.** The cause is *query* if the policy acted on wrong answers; else *plan* if, late in the
-    episode, the plan requests another action than the reference plan; else *skill*. This is no proof: a plan that
-    differs from the reference may succeed. Without a reference the rule recognises only wrong answers, a plan of which
-    no condition holds, and a skill that stays far from its target. Without ``actor``, only the rule is used.
+    **A rule examines the states.** The cause is *query* if the policy acted on wrong answers; otherwise *plan* if, late
+    in the episode, plan and reference plan request different actions; otherwise *skill*. The rule is not a proof: a
+    plan that differs from the reference may succeed. Without a reference, the rule detects only wrong answers, a plan
+    without a true condition, and a skill that stays far from its target. Without ``actor``, only the rule is used.
 
-    **Counterfactuals decide**, with ``actor``. First comes the null control: the same episode is re-run with the same
-    noise and nothing replaced. If it succeeds, the failure is *not reproducible*, and the finding says what differs.
-    Otherwise the episode is re-run with one part replaced by a sound one:
+    **Counterfactual re-runs decide**, if ``actor`` is given. First comes the null control: the episode is re-run with
+    the same noise and nothing replaced. If the re-run succeeds, the failure is *not reproducible*, and the finding
+    reports what differs. Otherwise the episode is re-run with one part replaced by a trusted one:
 
-    - *perception*: the observations, if the policy was shown wrong ones;
-    - *query*: the answers, where they were wrong;
-    - *plan*: the plan, by the reference;
-    - *skill*: the policy's action in one step of the plan, by that of a scripted skill, or of the expert where the step
-      has no scripted skill; *gripper* and *actuation*: only the gripper's or the hand's part of the action, in all
-      steps; *policy*: the whole action, in all steps;
-    - *out of time*: twice the time.
+    - *perception*: the true observations, if the policy received wrong observations;
+    - *query*: the true answers, if the policy acted on wrong answers;
+    - *plan*: the reference plan;
+    - *skill*: in one plan step, the action of a scripted skill (of the expert if the plan step has no scripted skill);
+      *gripper* and *actuation*: in all plan steps, only the gripper's or the hand's part of the action; *policy*: in
+      all plan steps, the whole action;
+    - *out of time*: twice the time limit.
 
-    If nothing helps, pairs are tried, which give ``cause`` and ``also``. If several replacements help, the one that
-    fixes most of the task's failed episodes counts, and of those about as good the smallest. A skill does not count if
-    other steps have the same fault. For a policy without plans, no step is reported.
+    If no replacement helps, pairs are tried, which give ``cause`` and ``also``. If several replacements help, the one
+    that fixes most of the task's failed episodes counts; among about equally good ones, the smallest. A skill does not
+    count if other plan steps have the same fault. For a policy without plans, no plan step is reported.
 
     Args:
-        rollouts: episodes as :func:`evaluate` passes them to ``on_episode``, or TensorDicts of batch (T,), each one
-            episode from its first state on; successful ones are skipped. Keys: ``observation`` (T, 39) float32,
-            ``task_id`` (T,) int64, ``("next", "success")`` (T, 1) bool; of a TensorDict ``episode`` (T,) int64.
-            Optional: the answers that the policy acted on, ``qaf_logits`` (T, S) float32, else ``qaf`` (T, S) bool;
-            ``skill_weights`` (T, S) float32, for the active step.
-        plans: the plans that were carried out.
-        actor: the policy; the counterfactuals of a stochastic policy are less reliable.
+        rollouts: episodes as :func:`evaluate` passes them to ``on_episode``, or TensorDicts of batch (T,), each with
+            one whole episode; successful episodes are skipped. Keys: ``observation`` (T, 39) float32, ``task_id`` (T,)
+            int64, ``("next", "success")`` (T, 1) bool, and, in a TensorDict, ``episode`` (T,) int64. Optional: the
+            answers that the policy acted on, ``qaf_logits`` (T, S) float32 or ``qaf`` (T, S) bool; and
+            ``skill_weights`` (T, S) float32, which determine the active plan step.
+        plans: the plans that the policy followed.
+        actor: the policy; re-runs of a stochastic policy are less reliable.
         reference: trusted plans for some of the tasks.
-        evaluator: as for :func:`evaluate`; an evaluator inside the policy is found there.
-        skills: trusted scripted skills by text; None for the suite's, :func:`load_skills` of Meta-World.
-        seed, noise_scale, max_steps, suite, engine: those of the episodes. An episode that was cut before ``max_steps``
-            is run to its end: if it then succeeds, it is not reproducible.
-        num_envs, num_threads, device, progress: as for :func:`evaluate`.
+        evaluator: see :func:`evaluate`; an evaluator inside the policy is detected automatically.
+        skills: trusted scripted skills by text; None for the suite's skills (:func:`load_skills` for Meta-World).
+        seed, noise_scale, max_steps, suite, engine: the settings with which the episodes were run. An episode that was
+            cut before ``max_steps`` is re-run to the end; if the re-run succeeds, the failure is *not reproducible*.
+        num_envs, num_threads, device, progress: see :func:`evaluate`.
 
     Returns:
         A :class:`Failure` for each failed episode, in the order of the rollouts.
 
     Raises:
-        ValueError: a rollout lacks a key, an episode occurs twice, a task has no plan, the plans are not the actor's,
-            or an episode does not begin as (task, seed, episode) does.
+        ValueError: a rollout lacks a key, an episode occurs twice, a task has no plan, the plans differ from the
+            actor's plans, or an episode does not start from the initial state of (task, seed, episode).
 
     Example:
         >>> import lw_torchrl as lw
@@ -110,11 +110,11 @@ def attribute_failures(
         >>> failure.cause, failure.counterfactuals
         ('skill', {'skill': True})
 
-    Source: the plan's conditions, its steps and their execution are separate, so each can be replaced.
+    Source: a plan's conditions, skills and skill execution are separate in the policy, so each can be replaced.
     """
     answered = as_plans(plans)
     if actor is not None and (own := plans_of(actor)) is not None and (other := answered.differences(own)):
-        raise ValueError(f"plans differ from the actor's own for {', '.join(other)}; pass the actor's plans")
+        raise ValueError(f"plans differ from the actor's plans for {', '.join(other)}; pass the actor's plans")
     failed = _failed(rollouts, answered)
     if not failed:
         return []
@@ -145,7 +145,7 @@ def attribute_failures(
 
 
 def _failed(rollouts: Iterable[Any], plans: Plans) -> list[tuple[str, int, TensorDictBase]]:
-    """Return task, episode and steps of each failed episode."""
+    """Return the task, the episode index and the time steps of each failed episode."""
     by_id = {task_id(task): task for task in plans}
     failed: list[tuple[str, int, TensorDictBase]] = []
     seen: set[EpisodeId] = set()
@@ -154,19 +154,19 @@ def _failed(rollouts: Iterable[Any], plans: Plans) -> list[tuple[str, int, Tenso
         steps, number = (rollout.steps, rollout.episode) if isinstance(rollout, FinishedEpisode) else (rollout, None)
         if not isinstance(steps, TensorDictBase) or steps.batch_dims != 1 or not len(steps):
             got = type(steps).__name__
-            raise ValueError(f"{name} must be a finished episode, or a TensorDict of batch (T,), got {got}")
+            raise ValueError(f"{name} must be a finished episode, or a non-empty TensorDict of batch (T,), got {got}")
         needed = ["observation", "task_id", ("next", "success"), *(["episode"] if number is None else [])]
         if missing := [str(key) for key in needed if steps.get(key, None) is None]:
             raise missing_keys(steps.keys(True, True), *missing)
         tasks = steps.get("task_id").unique().tolist()
         if len(tasks) != 1 or tasks[0] not in by_id:
-            raise ValueError(f"{name} must be of one task that plans has, {', '.join(plans)}; got {tasks}")
+            raise ValueError(f"{name} must be of exactly one task in plans ({', '.join(plans)}), got task_id {tasks}")
         episodes = steps.get("episode").unique().tolist() if number is None else [number]
         if len(episodes) != 1:
-            raise ValueError(f"{name} must be one episode, got {len(episodes)}: split them")
+            raise ValueError(f"{name} must hold one episode, got {len(episodes)} episodes; pass one rollout for each")
         which = by_id[tasks[0]], episodes[0]
         if which in seen:
-            raise ValueError(f"{name} is episode {which[1]} of {which[0]!r} again")
+            raise ValueError(f"{name} repeats episode {which[1]} of {which[0]!r}; pass each episode once")
         seen.add(which)
         if not steps.get(("next", "success")).any():
             failed.append((*which, steps))
@@ -174,13 +174,13 @@ def _failed(rollouts: Iterable[Any], plans: Plans) -> list[tuple[str, int, Tenso
 
 
 def _answers(steps: TensorDictBase, actor: Any) -> Tensor | None:
-    """Return the answers (T, S) of the evaluators inside a policy, the mean of several; None without an evaluator."""
+    """Return the answers (T, S) bool of a policy's evaluators, averaged over their logits; None without evaluator."""
     evaluators = own_evaluators(actor)
     if not evaluators or "qaf_logits" in steps.keys():
         return None
     keys = dict.fromkeys(key for evaluator in evaluators for key in evaluator.in_keys)
     if missing := ", ".join(str(key) for key in keys if steps.get(key, None) is None):
-        needed = f"rollouts must hold {missing}, which the policy's evaluator reads, or its answers, qaf_logits"
+        needed = f"rollouts must hold {missing}, which the policy's evaluator reads, or the evaluator's qaf_logits"
         raise ValueError(f"{needed}; evaluate(..., attribute=True) records them")
     with torch.no_grad(), evaluating(actor):
         device = device_of(actor)
@@ -189,21 +189,21 @@ def _answers(steps: TensorDictBase, actor: Any) -> Tensor | None:
 
 
 def keys_to_attribute(actor: Any, env: EnvBase) -> list[NestedKey]:
-    """Return the keys of each step that attribution reads, as far as environment and actor write them."""
+    """Return the keys that attribution reads from each time step: the required ones, and the actor's input keys."""
     written = set(env.full_observation_spec.keys(True, True))
     keys = [key for key in getattr(actor, "in_keys", ()) if key in written]
     return ["observation", "task_id", "qaf", *keys, "skill_weights", "qaf_logits"]
 
 
 def _plans_agree(explanation: Explanation) -> bool:
-    """Return whether plan and reference request the same actions in all states of an episode."""
+    """Return whether the plan and the reference request the same actions in all states of an episode."""
     return explanation.evidence.get("plan_departs") == 0.0
 
 
 def _by_counterfactuals(
     seen: EpisodeStates, explanation: Explanation, tried: Counterfactuals, shares: Mapping[str, float], seed: int
 ) -> Failure:
-    """Return the failure as the counterfactuals show it, with findings from the states."""
+    """Return the failure with the cause found by the counterfactual re-runs, and the finding from the states."""
     which, null = seen.which, tried.null
     share, number = null.share(seen.task), float(sum(task == seen.task for task, _ in null.episodes))
     record: dict[str, Any] = {"evidence": {**explanation.evidence, "failed": number}}
@@ -214,7 +214,7 @@ def _by_counterfactuals(
         return Failure(seen.task, seed, seen.episode, "not reproducible", None, None, first.at, first, **record)
     tried_here = {name: results[which] is not None for name, results in tried.results.items() if which in results}
     record["counterfactuals"] = tried_here
-    # Where both plans request the same, the reference cannot have helped by what it says.
+    # If both plans request the same actions, a success with the reference is not due to the reference's content.
     same = _plans_agree(explanation)
     counting = [name for name in tried.mending(seen) if not (same and name == "plan")]
     decision = decide(counting, shares, share)
@@ -227,7 +227,7 @@ def _by_counterfactuals(
         if cause == "actuation" and tried_here.get("skill") and "skill" not in counting:
             record["scripted_step"] = tried.step[which]
     elif explanation.cause == "query" and "query" not in tried_here and not (same and tried_here.get("plan")):
-        cause = "query"  # wrong answers are a fact, even where they could not be replaced
+        cause = "query"  # wrong answers are a fact, even if they could not be replaced
     step: int | None
     finding: Finding | None
     step, at, finding = explanation.blames.get(cause, explanation.blames["undecided"])
@@ -245,7 +245,7 @@ def _by_counterfactuals(
 
 
 class Decision(NamedTuple):
-    """The cause, a second cause, the replacement that counts, and the next best replacement."""
+    """A failure's cause, a second cause, the deciding replacement (``by``), and the next best one (``rival``)."""
 
     cause: Cause
     also: Cause | None = None
@@ -254,16 +254,16 @@ class Decision(NamedTuple):
 
 
 def decide(mended: Collection[str], shares: Mapping[str, float], null: float = 0.0) -> Decision:
-    """Return the cause of a failed episode, from the replacements with which it succeeds (``mended``).
+    """Decide the cause of a failed episode from the replacements with which the episode succeeds (``mended``).
 
-    ``shares`` is the share of the task's failed episodes that each replacement fixes, among those it was tried on, and
-    ``null`` that of a plain re-run.
+    ``shares`` is, for each replacement, the fraction of the task's failed episodes it was tried on that it fixes;
+    ``null`` is that fraction for a plain re-run.
 
-    Wrong observations and answers come first, if correcting them helps. Of the other replacements, the one that fixes
-    most of the task's failed episodes counts. Among those about as good, the first counts: the plan, unless scripts
-    that follow it succeed; a skill in one step; the gripper or the motion. It is the policy, without naming a part, if
-    two replacements that do not contain each other are about as good, or if none leads clearly over a plain re-run.
-    Time comes last, then pairs.
+    Wrong observations and answers come first, if correcting them helps. Among the other replacements, the one that
+    fixes most of the task's failed episodes counts. Among about equally good ones, the first in this order counts: the
+    plan, unless scripts that follow the plan succeed; a skill in one plan step; the gripper or the motion. The cause is
+    the policy as a whole if two replacements that do not contain each other are about equally good, or if none is
+    clearly better than a plain re-run. The time limit comes last, then pairs.
     """
     single = {name: causes[0] for name, causes in REPLACEMENTS.items() if len(causes) == 1}
     fixes = {name: shares.get(name, 1.0) for name in single if name in mended}
@@ -274,7 +274,7 @@ def decide(mended: Collection[str], shares: Mapping[str, float], null: float = 0
         pair = choose_pair(mended, shares)
         return Decision("undecided") if pair is None else Decision(*pair)
     if "policy" in fixes and any(name in fixes for name in ("skill", "gripper", "actuation")):
-        fixes.pop("plan", None)  # scripts that follow the plan succeed
+        fixes.pop("plan", None)  # the plan is sound, because scripts that follow it succeed
     best = next(iter(fixes))
     if facts := [name for name in fixes if name in _FACTS]:
         best = max(facts, key=fixes.__getitem__)
@@ -291,9 +291,9 @@ def decide(mended: Collection[str], shares: Mapping[str, float], null: float = 0
 
 
 def choose_pair(mended: Iterable[str], shares: Mapping[str, float]) -> tuple[Cause, Cause, str] | None:
-    """Return the pair of causes that counts, with its replacement.
+    """Return the pair of causes that counts, and the replacement that fixes both; None if no pair helps.
 
-    Wrong answers come first, then the cause whose replacement alone fixes more.
+    Wrong answers come first, then the cause whose replacement fixes more episodes on its own.
     """
     alone = {**shares, "skill": max(shares.get("skill", 0.0), shares.get("policy", 0.0))}
     pairs = [name for name in mended if len(REPLACEMENTS[name]) > 1]

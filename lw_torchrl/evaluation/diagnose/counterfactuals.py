@@ -1,4 +1,4 @@
-"""Re-run failed episodes exactly as they were run, with nothing, one part or two parts of the policy replaced."""
+"""Re-run failed episodes with the same seed and noise, with zero, one or two parts of the policy replaced."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from lw_torchrl.language.tasks import Task, task_id
 from lw_torchrl.modules.policy import plans_of, with_plans
 
 _KEYS: list[NestedKey] = ["observation", "task_id", "episode", "action", ("next", "success"), ("next", "reward")]
-_TRIED_STEPS = 3  # the number of steps in which a skill is replaced, one at a time
+_TRIED_STEPS = 3  # maximum number of plan steps whose skill is replaced, one at a time
 
 
 @dataclass(frozen=True)
 class Rerun:
-    """The settings with which episodes were run, to run them again."""
+    """A callable that re-runs episodes with the settings of the original run."""
 
     tasks: Mapping[str, Task]
     env_options: Mapping[str, Any]
@@ -63,7 +63,7 @@ class Rerun:
         longer: int = 1,
         wrap: Callable[[Any], Any] | None = None,
     ) -> dict[EpisodeId, FinishedEpisode]:
-        """Return the episodes, each up to its first success, with ``longer`` times the time limit."""
+        """Re-run episodes, each up to its first success, with ``longer`` times the original time limit."""
         listed = {task: [k for _, k in group] for task, group in groupby(sorted(which), itemgetter(0))}
         episodes: dict[EpisodeId, FinishedEpisode] = {}
 
@@ -71,7 +71,7 @@ class Rerun:
             episodes[episode.task, episode.episode] = episode
 
         rollout(
-            f"again with {label}",
+            f"re-running with {label}",
             actor,
             {task: self.tasks[task] for task in listed},
             listed,
@@ -93,17 +93,17 @@ class Rerun:
 
 
 class NullControl(NamedTuple):
-    """Failed episodes after a plain re-run."""
+    """The results of re-running the failed episodes with nothing replaced."""
 
     episodes: Mapping[EpisodeId, FinishedEpisode]
-    misled: Mapping[EpisodeId, Misled]  # episodes in which the policy was shown a wrong state
-    differs: Mapping[EpisodeId, Difference]  # the first difference of episodes that did not repeat exactly
+    misled: Mapping[EpisodeId, Misled]  # episodes in which the policy received a wrong observation
+    differs: Mapping[EpisodeId, Difference]  # the first difference, for episodes whose re-run was not identical
 
     def succeeds(self, which: EpisodeId) -> bool:
         return self.episodes[which].first_success is not None
 
     def share(self, task: str) -> float:
-        """Return the share of a task's failed episodes that succeed in the re-run."""
+        """Return the fraction of a task's failed episodes that succeed in the plain re-run."""
         succeeded = [episode.first_success is not None for (of, _), episode in self.episodes.items() if of == task]
         return sum(succeeded) / len(succeeded)
 
@@ -111,7 +111,7 @@ class NullControl(NamedTuple):
 def null_control(
     rerun: Rerun, failed: Mapping[EpisodeId, TensorDictBase], actor: Any, plans: Plans, evaluator: Any
 ) -> NullControl:
-    """Re-run the failed episodes; raise :class:`ValueError` if one does not begin as it did."""
+    """Re-run the failed episodes with nothing replaced; raise ValueError if an initial state differs."""
     with Perception(actor) as seen:
         episodes = rerun("nothing replaced", list(failed), actor, plans, evaluator)
     differs = {}
@@ -119,8 +119,8 @@ def null_control(
         again = episodes[which].steps
         if not torch.equal(again.get("observation")[0], steps.get("observation")[0]):
             raise ValueError(
-                f"rollouts: episode {which[1]} of {which[0]!r} does not begin as that episode of "
-                f"seed={rerun.env_options['seed']} does; pass its own seed and engine, and all its states"
+                f"rollouts: the first state of episode {which[1]} of {which[0]!r} differs from its re-run with "
+                f"seed={rerun.env_options['seed']}; pass the seed and engine of the rollouts, and whole episodes"
             )
         if (first := difference(steps, again)) is not None:
             differs[which] = first
@@ -129,7 +129,7 @@ def null_control(
 
 
 def difference(steps: TensorDictBase, again: TensorDictBase) -> Difference | None:
-    """Return the first difference between two runs of an episode, or None."""
+    """Return the first difference between two runs of an episode, or None if they are identical."""
     both = min(len(steps), len(again))
     states = (steps.get("observation")[:both] != again.get("observation")[:both]).any(-1)
     if not states.any():
@@ -146,38 +146,39 @@ def difference(steps: TensorDictBase, again: TensorDictBase) -> Difference | Non
 
 
 class Counterfactuals:
-    """Run the counterfactuals that can decide something, and keep the results."""
+    """The counterfactual re-runs that can decide the cause of each failed episode, and their results."""
 
     def __init__(
         self, actor: Any, evaluator: Any, reference: Plans | None, scripts: Scripts, rerun: Rerun, null: NullControl
     ) -> None:
         self.actor, self.evaluator, self.scripts, self.rerun, self.null = actor, evaluator, scripts, rerun, null
         self.plans = plans = scripts.plans
-        # By replacement, for each episode that it was tried on: the re-run episode if it succeeds, else None.
+        # For each replacement and each episode it was tried on: the re-run if it succeeded, otherwise None.
         self.results: dict[str, dict[EpisodeId, FinishedEpisode | None]] = {}
-        self.step: dict[EpisodeId, int] = {}  # the step in which a scripted skill fixes an episode
+        self.step: dict[EpisodeId, int] = {}  # the plan step in which a scripted skill fixes the episode
         self.comparisons: dict[EpisodeId, ScriptComparison] = {}  # policy and scripts in the failed episode's states
-        # The same, joined with the states of re-runs in which a script controlled a step.
+        # The same comparison by scripted plan step, extended with the states of the re-run with that script.
         self.with_script: dict[EpisodeId, dict[int, ScriptComparison]] = {}
         self.reference: Plans | None = None
-        self.other = self.other_evaluator = None  # policy and evaluator for the reference
+        self.other = self.other_evaluator = None  # the policy and the evaluator with the reference plans
         different = [] if reference is None else [reference[task] for task in reference.differences(plans)]
         if not different:
             return
         reference = Plans(different)
         try:
             other = with_plans(actor, canonical_like(reference, plans_of(actor)))
-            reference = plans_of(other) or reference  # a policy may complete its plans
+            reference = plans_of(other) or reference  # a policy may add plans that the reference lacks
             other_evaluator = evaluator.with_plans(reference) if hasattr(evaluator, "with_plans") else evaluator
             self.other, self.other_evaluator, self.reference = other, other_evaluator, reference
         except (AttributeError, ImportError, RuntimeError, TypeError, ValueError) as error:
             reason = f"{type(error).__name__}: {error}"
-            warnings.warn(f"reference: the policy cannot follow it, so no plan is replaced ({reason})", stacklevel=4)
+            message = f"reference: the policy cannot follow the reference, so no plan is replaced ({reason})"
+            warnings.warn(message, stacklevel=4)
 
     def run(self, seen: Sequence[EpisodeStates], same: Collection[EpisodeId] = ()) -> None:
-        """Run the replacements; ``same`` are the episodes in which plan and reference request the same actions.
+        """Re-run the episodes with each replacement that can still decide the cause of the episode.
 
-        Each replacement is tried only on the episodes in which it can still decide the cause.
+        ``same`` lists the episodes in which the plan and the reference request the same actions.
         """
         seen = [states for states in seen if not self.null.succeeds(states.which)]
         every = [states.which for states in seen]
@@ -197,7 +198,7 @@ class Counterfactuals:
         left = self._unfixed(left, "skill", "gripper", "actuation", "policy")
         left = [which for which in left if which in same or not self._fixes("plan", which)]
         self._run("time", left, self.actor, self.plans, self.evaluator, longer=2)
-        # Pairs are tried only where no replacement helps on its own.
+        # Try pairs only on the episodes that no single replacement fixes.
         left = self._unfixed(left, "time")
         pair = [which for which in left if which in wrong]
         with_reference = [which for which in left if which in with_reference]
@@ -225,21 +226,21 @@ class Counterfactuals:
         return again
 
     def _scripted(self, plans: Plans | None, **where: Any) -> Any:
-        """Return the function that puts an actor of ``plans`` under scripted control."""
+        """Return a function that wraps an actor for ``plans`` in :class:`ScriptedControl`; None without plans."""
         if plans is None:
             return None
         scripts = self.scripts if plans is self.plans else Scripts(plans, self.scripts.table)
         return lambda actor: ScriptedControl(actor, plans, scripts, **where)
 
     def _run_scripts(self, seen: Sequence[EpisodeStates]) -> None:
-        """Give scripts control of one step, trying the likeliest steps in turn; of gripper or motion; of everything."""
-        ranked: dict[EpisodeId, list[int]] = {}  # the steps to try in each episode
+        """Re-run with scripts in control of one plan step (likeliest first), of gripper or motion, or of everything."""
+        ranked: dict[EpisodeId, list[int]] = {}  # the plan steps to try in each episode, the likeliest first
         for states in seen:
             comparison = compare_with_scripts(self.actor, states, self.scripts)
             unlike = None if comparison is None else comparison.unlike()
             if comparison is not None:
                 self.comparisons[states.which] = comparison
-            if unlike is None or unlike.any():  # else the policy acts as the scripts do, so they would change nothing
+            if unlike is None or unlike.any():  # if the policy acts as the scripts do, they would change nothing
                 ranked[states.which] = candidates(states, unlike)
         has_steps = plans_of(self.actor) is not None
         for turn in range(_TRIED_STEPS if has_steps else 0):
@@ -258,21 +259,21 @@ class Counterfactuals:
                 wrap = self._scripted(self.plans, part=part)
                 self._run(name, left, self.actor, self.plans, self.evaluator, wrap=wrap)
         parts = self._unfixed(left, "skill", "gripper", "actuation")
-        # Where the reference helps, "policy" shows whether scripts can follow the plan that was carried out.
+        # If the reference helps, "policy" shows whether scripts succeed with the plan that the policy followed.
         left = [which for which in ranked if which in parts or self._fixes("plan", which)]
         self._run("policy", left, self.actor, self.plans, self.evaluator, wrap=self._scripted(self.plans))
 
     def _parts(self, comparison: ScriptComparison) -> tuple[ScriptComparison, ScriptComparison]:
-        """Return the comparison of the hand's motion and that of the gripper."""
+        """Split a comparison into a comparison of the hand's motion and a comparison of the gripper."""
         gripper = torch.zeros(comparison.done.shape[-1], dtype=torch.bool)
         if self.plans.layout.gripper is not None:
             gripper[self.plans.layout.gripper] = True
         return comparison.part(~gripper), comparison.part(gripper)
 
     def _in_one_step(self, which: EpisodeId) -> bool:
-        """Return whether the motion is wrong only in the step that a script fixes.
+        """Return whether the motion is wrong only in the plan step whose scripted skill fixes the episode.
 
-        The policy must equal the scripts in every other step, also in those that it reaches with the script.
+        In every other plan step, including those reached only with the script, the policy must act as the scripts do.
         """
         if which not in self.comparisons:
             return False
@@ -281,11 +282,12 @@ class Counterfactuals:
         return in_one and bool(self._parts(comparison)[0].unlike().any())
 
     def mending(self, states: EpisodeStates) -> list[str]:
-        """Return the replacements that fix an episode and count.
+        """Return the replacements that fix an episode and count as evidence for a cause.
 
-        If scripts for the gripper and for the motion both help, those for a part that is close to the scripts anyway do
-        not count. A script in one step does not count if only the gripper is wrong there, or if the same fault is in
-        other steps, and scripts for that part in all steps help too. If it counts, scripts for the motion do not.
+        If scripts help for the gripper and for the motion, scripts for a part in which the policy already acts like the
+        scripts do not count. If scripts for one part in all plan steps help, a script in one plan step does not count
+        if only the gripper is wrong there or other plan steps have the same fault. If that script counts because other
+        plan steps do not have the fault, scripts for the motion do not count.
         """
         names = [name for name in self.results if self._fixes(name, states.which)]
         comparison, step = self.comparisons.get(states.which), self.step.get(states.which)
@@ -312,7 +314,7 @@ class Counterfactuals:
         return names
 
     def step_of_motion(self, states: EpisodeStates) -> int | None:
-        """Return the only step in which the motion is wrong; None if others are wrong too, or that is unknown."""
+        """Return the only plan step in which the motion is wrong; None if there are several or if this is unknown."""
         steps = range(states.truth.shape[1])
         for comparison in self.with_script.get(states.which, {}).values():
             motion, _ = self._parts(comparison)
@@ -323,7 +325,7 @@ class Counterfactuals:
         return None
 
     def mended(self, by: str | None, which: EpisodeId) -> MendedEpisode | None:
-        """Return the successful re-run of an episode with a replacement, and the plan that is carried out in it."""
+        """Return the successful re-run of an episode with replacement ``by``; None if there is none."""
         episode = None if by is None else self.results[by].get(which)
         if episode is None or by is None:
             return None
@@ -331,7 +333,7 @@ class Counterfactuals:
         return MendedEpisode(by, plans[which[0]], episode.steps)
 
     def shares(self) -> dict[str, dict[str, float]]:
-        """Return, by task, the share of its failed episodes that each replacement fixes, of those it was tried on."""
+        """Return, by task and replacement, the fraction of the failed episodes it was tried on that it fixes."""
         shares: dict[str, dict[str, float]] = {}
         for name, results in self.results.items():
             for task in {task for task, _ in results}:

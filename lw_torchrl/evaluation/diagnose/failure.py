@@ -1,4 +1,4 @@
-"""Failure: why one episode failed, as typed data. Its parts are a cause, a finding, and the results of re-runs."""
+"""Failure: why one episode failed, as typed data: a cause, a finding, and the results of re-runs."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ Cause = Literal[Blamed, "out of time", "undecided"]
 
 CAUSES: dict[str, str] = {
     "not reproducible": "a plain re-run succeeds",
-    "perception": "the policy was shown a wrong state",
+    "perception": "the policy received a wrong observation",
     "query": "a condition was answered wrongly",
     "plan": "the plan is wrong",
     "skill": "the policy executed a skill badly",
     "gripper": "the gripper opened or closed wrongly",
     "actuation": "the hand moved wrongly in several steps",
-    "policy": "the policy, unclear which part of it",
-    "out of time": "it succeeds with more time",
+    "policy": "the policy acted wrongly, unclear which part",
+    "out of time": "the episode succeeds with more time",
     "undecided": "no replacement helps",
 }
-"""Each cause and its meaning."""
+"""A mapping from each cause to its meaning."""
 
 REPLACEMENTS: dict[str, tuple[Cause, ...]] = {
     "perception": ("perception",),
@@ -42,7 +42,7 @@ REPLACEMENTS: dict[str, tuple[Cause, ...]] = {
     "query + plan": ("query", "plan"),
     "plan + skill": ("plan", "skill"),
 }
-"""The name of each replacement, and the causes to blame if an episode succeeds with it."""
+"""A mapping from each replacement to the causes to blame if an episode succeeds with that replacement."""
 
 Finite = Annotated[float, Is[lambda x: abs(x) < 1e300]]
 _Replacement = Annotated[str, Is[lambda name: name in REPLACEMENTS]]
@@ -58,7 +58,7 @@ _Tried = Annotated[
 @typed_fields
 @dataclass(frozen=True)
 class WrongAnswers:
-    """The condition of a step was answered wrongly in ``states`` of ``of`` states, first at ``first``."""
+    """A finding: a plan step's condition was answered wrongly in ``states`` of ``of`` states, first at ``first``."""
 
     step: Natural
     condition: str
@@ -70,7 +70,7 @@ class WrongAnswers:
 @typed_fields
 @dataclass(frozen=True)
 class NoCondition:
-    """No condition of the plan held in ``states`` of the last ``of`` states."""
+    """A finding: no condition of the plan held in ``states`` of the last ``of`` states."""
 
     states: Natural
     of: Count
@@ -79,21 +79,21 @@ class NoCondition:
 @typed_fields
 @dataclass(frozen=True)
 class PlanDeparts:
-    """The plan requested another action than the reference in ``states`` of ``of`` states, the last if ``late``."""
+    """A finding: plan and reference requested different actions in ``states`` of ``of`` states (last if ``late``)."""
 
-    step: Natural  # of the plan, in most of these states
+    step: Natural  # the active plan step in most of these states
     skill: str
     reference: str  # the skill that the reference requests there
     states: Natural
     of: Count
     late: bool
-    uncovered: bool  # no condition of the plan held in most of them
+    uncovered: bool  # whether no condition of the plan held in most of these states
 
 
 @typed_fields
 @dataclass(frozen=True)
 class ActiveStep:
-    """A step was active in ``states`` of the last ``of`` states, and at the end ``distance`` metres from its target."""
+    """A finding: a plan step was active in ``states`` of the last ``of`` states, ``distance`` m from its target."""
 
     step: Natural
     skill: str
@@ -105,7 +105,7 @@ class ActiveStep:
 @typed_fields
 @dataclass(frozen=True)
 class Misled:
-    """The observation that the policy was shown differed from the true one, most in entry ``number``, by ``error``."""
+    """A finding: the policy's observation differed from the true one, by up to ``error`` in entry ``number``."""
 
     error: Scale
     number: Natural
@@ -114,10 +114,11 @@ class Misled:
 @typed_fields
 @dataclass(frozen=True)
 class Difference:
-    """The first difference between two runs of an episode, with ``at``, the state to look at.
+    """A finding: the first difference between the rollout and the plain re-run of an episode, in state ``at``.
 
-    ``part`` is "length", of ``given`` and ``again`` steps; "actions", which differ there by ``size``; "environment", if
-    the same action leads to another state; "states", in a rollout without actions; or "nothing" that was recorded.
+    ``part`` is "length" if the numbers of time steps differ (``given`` and ``again``), "actions" if the executed
+    actions differ (by ``size``), "environment" if the same action leads to different states, "states" if the states
+    differ and the rollout has no actions, or "nothing" if no recorded data differ.
     """
 
     part: Literal["length", "actions", "environment", "states", "nothing"]
@@ -132,40 +133,41 @@ _FINDINGS = {kind.__name__: kind for kind in get_args(Finding)}
 
 
 class MendedEpisode(NamedTuple):
-    """A failed episode that succeeds when it is re-run with a part replaced.
+    """A successful re-run of a failed episode with one part replaced.
 
-    ``steps`` has batch (T,), up to the first success: ``observation``, ``action`` as executed, ``task_id``,
-    ``episode``, ``("next", "success")``, ``("next", "reward")`` and, where they exist, ``qaf`` and ``skill_weights``.
+    ``steps`` has batch (T,) up to the first success: ``observation``, the executed ``action``, ``task_id``,
+    ``episode``, ``("next", "success")``, ``("next", "reward")`` and, if recorded, ``qaf`` and ``skill_weights``.
     """
 
-    by: str  # the replacement, one of REPLACEMENTS
-    plan: ConditionalPlan  # the plan that was carried out
+    by: str  # the name of the replacement in REPLACEMENTS
+    plan: ConditionalPlan  # the plan that the policy followed in the re-run
     steps: TensorDictBase
 
 
 @typed_fields
 @dataclass(frozen=True)
 class Failure:
-    """Why one episode failed. Every field is data; :attr:`why` writes it in English.
+    """The reason why one episode failed, as data; :attr:`why` expresses the reason in English.
 
     Attributes:
-        task, seed, episode: which episode; ``episode_seed(task, seed, episode)`` is its seed.
-        cause: one of :data:`CAUSES`.
+        task, seed, episode: the episode, which was seeded with ``episode_seed(task, seed, episode)``.
+        cause: the cause, one of :data:`CAUSES`.
         also: a second cause, if the episode succeeds only with both replaced.
-        step: the step of the plan to which the failure belongs, from 0; None if it belongs to no step.
-        at: the step of the episode to look at first, from 0.
-        finding: what the episode's states show about the cause, or about ``suspect``.
-        replaced: the replacement that decided, one of :data:`REPLACEMENTS`; None if none did.
+        step: the plan step to which the failure belongs (0-based); None if it belongs to no plan step.
+        at: the time step of the episode to look at first (0-based).
+        finding: what the episode's states show about ``cause``, or about ``suspect``.
+        replaced: the replacement that decided the cause, one of :data:`REPLACEMENTS`; None if no replacement did.
         rival: the next best replacement.
-        succeeds_at: the step at which the episode succeeds with ``replaced``, or in a plain re-run.
-        scripted_step: a step in which a scripted skill also suffices, although other steps have the same fault.
-        suspect: the cause that the states alone suggest, if it is undecided.
-        evidence: name to number, measured in the episode's states.
-        counterfactuals: each replacement that was tried, see :func:`attribute_failures`, and whether the same episode
-            then succeeded; pairs like "query + plan" replace both, with "skill" in all steps.
-        shares: each replacement, and the share of the task's failed episodes that succeed with it; "nothing" is a plain
-            re-run.
-        mended: the episode with the cause replaced, if it then succeeds; it is not saved.
+        succeeds_at: the time step at which the episode succeeds with ``replaced``, or in a plain re-run.
+        scripted_step: a plan step in which a scripted skill also fixes the episode, although other plan steps have the
+            same fault.
+        suspect: the cause that the states alone suggest, if ``cause`` is "undecided".
+        evidence: numbers measured in the episode's states, by name.
+        counterfactuals: each replacement that was tried (see :func:`attribute_failures`), and whether the episode
+            succeeded with it; a pair like "query + plan" replaces both, where "skill" stands for all plan steps.
+        shares: each replacement, and the fraction of the task's failed episodes that succeed with it; "nothing" is a
+            plain re-run.
+        mended: the successful re-run with the cause replaced, if there is one; not saved.
     """
 
     task: str
@@ -188,12 +190,12 @@ class Failure:
 
     def __post_init__(self) -> None:
         if self.also is not None and (self.also == self.cause or "undecided" in (self.also, self.cause)):
-            raise ValueError(f"also must be None or another decided cause than {self.cause!r}, got {self.also!r}")
+            raise ValueError(f"also must be None or a decided cause other than {self.cause!r}, got {self.also!r}")
 
     @property
     def why(self) -> str:
-        """The failure in a few English sentences."""
-        from lw_torchrl.evaluation.diagnose.sentences import explain_failure  # which imports this module
+        """The reason for the failure in a few English sentences."""
+        from lw_torchrl.evaluation.diagnose.sentences import explain_failure  # avoids a circular import
 
         return explain_failure(self)
 
@@ -206,7 +208,7 @@ class Failure:
 
     @classmethod
     def from_json(cls, content: Any) -> Failure:
-        """Return a failure from the result of :meth:`to_json`; raise :class:`ValueError` for other JSON."""
+        """Rebuild a failure from the result of :meth:`to_json`; raise :class:`ValueError` for any other JSON."""
         stated = content.get("finding") if isinstance(content, dict) else None
         if isinstance(stated, dict):
             kind = _FINDINGS.get(str(stated.get("kind")))
@@ -222,8 +224,9 @@ class Failure:
 
 
 def record_from_json(kind: type[Any], content: Any) -> Any:
-    """Return a dataclass from a JSON object of exactly its compared fields; the dataclass checks their values."""
+    """Build the dataclass ``kind`` from a JSON object whose keys are exactly its compared fields."""
     names = {each.name for each in fields(kind) if each.compare}
     if not isinstance(content, dict) or set(content) != names:
-        raise ValueError(f"a {kind.__name__} must be an object of {', '.join(sorted(names))}, got {shown(content)}")
+        keys = ", ".join(sorted(names))
+        raise ValueError(f"a {kind.__name__} must be an object with the keys {keys}, got {shown(content)}")
     return kind(**content)

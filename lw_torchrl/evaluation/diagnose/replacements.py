@@ -1,4 +1,4 @@
-"""Sound parts that replace those of a policy: true observations, exact answers, and scripted skills."""
+"""Trusted parts that replace the parts of a policy: true observations, exact answers, and scripted skills."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.suites.metaworld.experts import ExpertActor
 from lw_torchrl.transforms.qaf import plan_program
 
-EpisodeId = tuple[str, int]  # task, episode
-TRUE_OBSERVATION = "true_observation"  # the environment's own, before any transform or module changes it
-_REST = ScriptedSkill("", GRIPPER, gain=(0.0, 0.0, 0.0))  # for a step without a scripted skill
-_RULER = 1e-3  # action per metre, so small that no distance is clipped
+EpisodeId = tuple[str, int]  # task and episode index
+TRUE_OBSERVATION = "true_observation"  # the environment's observation, before any transform or module changes it
+_REST = ScriptedSkill("", GRIPPER, gain=(0.0, 0.0, 0.0))  # stands in for a plan step without a scripted skill
+_RULER = 1e-3  # gain (action per meter) to measure distances, so small that no action is clipped
 
 
 class Perception:
-    """A context that records the observations that a policy is shown, or corrects them.
+    """A context manager that detects wrong observations at a policy's input, and corrects them if ``correct`` is True.
 
-    It looks at the policy's innermost modules, so it sees changes by the modules around them, but not by functions.
+    Hooks on the policy's innermost modules see changes made by the modules around them, but not by plain functions.
     """
 
     def __init__(self, actor: Any, correct: bool = False) -> None:
         self.actor, self.correct = actor, correct
-        self.misled: dict[tuple[int, int], Misled] = {}  # by (task id, episode), where an observation was wrong
+        self.misled: dict[tuple[int, int], Misled] = {}  # by (task id, episode), for episodes with wrong observations
         self._now: TensorDictBase | None = None
         self._hooks: list[Any] = []
 
@@ -83,7 +83,7 @@ def _innermost(actor: nn.Module) -> list[nn.Module]:
 
 
 class TrueAnswers(QueryEvaluator):
-    """An evaluator whose answers are exact: true or false, with logits of 5 and -5."""
+    """A query evaluator with exact answers, whose logits are 5 for true and -5 for false."""
 
     def __init__(self, plans: Plans) -> None:
         super().__init__(plans)
@@ -95,7 +95,7 @@ class TrueAnswers(QueryEvaluator):
 
 
 def own_evaluators(actor: Any) -> list[QueryEvaluator]:
-    """Return the evaluators inside a policy, without those inside another evaluator."""
+    """Return the query evaluators inside a policy, except evaluators nested in another evaluator."""
     if isinstance(actor, QueryEvaluator):
         return [actor]
     children = actor.children() if isinstance(actor, nn.Module) else ()
@@ -103,7 +103,7 @@ def own_evaluators(actor: Any) -> list[QueryEvaluator]:
 
 
 def with_true_answers(actor: Any) -> Any:
-    """Return the policy with exact answers instead of its own evaluators; the policy itself if it has none."""
+    """Return a copy of the policy with exact answers instead of its evaluators, or the policy if it has none."""
     if not own_evaluators(actor):
         return actor
     other = deepcopy(actor)
@@ -115,11 +115,11 @@ def with_true_answers(actor: Any) -> Any:
 
 
 class Scripts:
-    """The scripted skills of the steps of plans, from a table of text to scripted skill."""
+    """The scripted skills for the steps of plans, looked up by skill text in ``table``."""
 
     def __init__(self, plans: Plans, table: Mapping[str, ScriptedSkill]) -> None:
         self.plans, self.table = plans, table
-        self.known: dict[str, list[bool]] = {}  # by task, whether each step has a scripted skill
+        self.known: dict[str, list[bool]] = {}  # for each task, whether each plan step has a scripted skill
         skills: dict[Any, list[ScriptedSkill]] = {}
         rulers: dict[Any, list[ScriptedSkill]] = {}
         for task, plan in plans.items():
@@ -132,14 +132,14 @@ class Scripts:
         self.program, self._ruler = SkillProgram(skills), SkillProgram(rulers)
 
     def distance(self, observation: Tensor, task_id: Tensor, step: int) -> Tensor:
-        """Return the distance (T,) in metres from what a step's skill moves to its target."""
+        """Return the distance (T,) in meters between what a plan step's skill moves and the skill's target."""
         return self._ruler(observation, task_id)[:, step, :3].norm(dim=-1) / _RULER
 
 
 def attended(weights: Tensor, steps: Tensor) -> Tensor:
-    """Return the active step (...): the first with most attention, ``weights`` (..., S), of ``steps`` (..., S) bool.
+    """Return the active plan step (...) int64: the first of ``steps`` (..., S) bool with the largest weight (..., S).
 
-    It is -1 where all steps have the same weight, since no condition holds or all do.
+    The active plan step is -1 where all plan steps have the same weight, because either no or every condition holds.
     """
     most = weights.masked_fill(~steps, -1.0).amax(-1, keepdim=True)
     least = weights.masked_fill(~steps, 2.0).amin(-1, keepdim=True)
@@ -149,10 +149,11 @@ def attended(weights: Tensor, steps: Tensor) -> Tensor:
 
 
 class ScriptedControl(nn.Module):
-    """A policy under scripted control: its attention mixes the actions of scripted skills, wherever a step is active.
+    """A policy whose attention weights mix the actions of scripted skills, instead of decoding an action.
 
-    Where the active step has no scripted skill, the action is the expert's. ``steps`` maps (task, episode) to the step
-    in which scripts take control, None for all steps; ``part`` is "displacement" or "gripper", None for all.
+    If no plan step is active, the policy's own action is kept. If the active plan step has no scripted skill, the
+    expert acts. ``steps`` maps (task, episode) to the plan step in which scripts take control (None for all plan
+    steps); ``part`` is the part of the action to replace, "displacement" or "gripper" (None for both).
     """
 
     def __init__(
@@ -183,14 +184,14 @@ class ScriptedControl(nn.Module):
         rows = self._tables.rows(task)
         mask, known = self._tables.mask.to(action.device)[rows], self._known.to(action.device)[rows]
         weights = tensordict.get("skill_weights", None)
-        if weights is None:  # the first true step has all the weight, else the last step
+        if weights is None:  # put all the weight on the first plan step whose condition holds, otherwise on the last
             truth = (tensordict.get("qaf") > 0.5) & mask
             first = torch.where(truth.any(-1), truth.int().argmax(-1), mask.sum(-1) - 1)
             weights = one_hot(first, mask.shape[-1]).float()
         step = attended(weights, mask)
         replaced = step >= 0
         if self._steps is not None:
-            # Scripts take control where the step that is replaced in the row's episode has any weight.
+            # Scripts take control where the plan step to replace in the row's episode has a noticeable weight.
             episodes = zip(task.tolist(), seen.get("episode").tolist(), strict=True)
             own = torch.tensor([self._steps.get(which, -1) for which in episodes], device=action.device)
             weight = weights.gather(-1, own.clamp(min=0).unsqueeze(-1)).squeeze(-1)

@@ -1,4 +1,4 @@
-"""The English of a diagnosis: the only place where failures and findings become sentences."""
+"""English sentences for failures and findings; no other module converts a diagnosis to text."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ _TEXTS = {
     "policy": ("scripted skills in every step", "all actions"),
     "out of time": ("twice the time", "the time limit"),
 }
-"""For each cause, the part that its replacement puts in, and the part that it takes out."""
+"""A mapping from each cause to the part that its replacement inserts, and the part that is removed."""
 _IN_PAIRS = _TEXTS | {"skill": ("scripted skills", "all actions")}
 
 
 def replacement_text(name: str) -> str:
-    """Return the parts that a replacement puts in, for example "the true answers and scripted skills"."""
+    """Return the parts that a replacement inserts, for example "the true answers and scripted skills"."""
     return " and ".join(new for new, _ in _texts(name))
 
 
 def replaced_text(name: str) -> str:
-    """Return the parts that a replacement takes out, for example "the answers and all actions"."""
+    """Return the parts that a replacement removes, for example "the answers and all actions"."""
     return " and ".join(old for _, old in _texts(name))
 
 
@@ -44,13 +44,13 @@ def _texts(name: str) -> list[tuple[str, str]]:
 
 
 def explain_failure(failure: Failure) -> str:
-    """Return why an episode failed, in a few sentences."""
+    """Explain in a few sentences why an episode failed."""
     parts = [] if failure.finding is None else [finding_text(failure.finding)]
     if failure.cause == "not reproducible":
-        fails = "it fails in another way, and other episodes of the task succeed"
-        ending = fails if failure.succeeds_at is None else "it succeeds"
-        parts = [f"in a plain re-run {ending}", *parts]
-    elif not failure.shares:  # by the rule alone: no episode was re-run
+        fails = "fails in a different way, and other episodes of the task succeed"
+        ending = fails if failure.succeeds_at is None else "succeeds"
+        parts = [f"a plain re-run {ending}", *parts]
+    elif not failure.shares:  # no episode was re-run, so only the rule decided the cause
         parts = ["The states alone do not show the cause", *parts] if failure.cause == "undecided" else parts
     else:
         parts += _counterfactual_texts(failure)
@@ -58,7 +58,7 @@ def explain_failure(failure: Failure) -> str:
 
 
 def _counterfactual_texts(failure: Failure) -> list[str]:
-    """Return the results of re-running the episode."""
+    """Return clauses that describe the results of re-running the episode."""
     if failure.also is not None and failure.replaced is not None:
         first, second = _IN_PAIRS[failure.cause][0], _IN_PAIRS[failure.also][0]
         return [f"neither {first} nor {second} is enough; with both, the episode succeeds"]
@@ -71,19 +71,19 @@ def _counterfactual_texts(failure: Failure) -> list[str]:
             parts.append(f"{suffices}, but the motion is as wrong in other steps")
         return parts
     if failure.counterfactuals.get("plan"):
-        parts = ["with the reference plan it succeeds, although both plans request the same actions in every state"]
+        parts = ["the episode succeeds with the reference plan, but both plans request the same action in every state"]
     elif failure.cause == "query":
         parts = ["these answers could not be replaced"]
     elif failure.counterfactuals:
         *texts, last = map(replacement_text, failure.counterfactuals)
-        parts = [f"it also fails with {' or with '.join([*filter(None, [', '.join(texts)]), last])}"]
+        parts = [f"the episode also fails with {' or with '.join([*filter(None, [', '.join(texts)]), last])}"]
     else:
-        parts = ["there is nothing to replace"]
+        parts = ["no part of the policy could be replaced"]
     return parts if failure.suspect is None else [*parts, f"the states alone suggest the {failure.suspect}"]
 
 
 def _success_text(failure: Failure) -> str:
-    """Return which replacement helps, and how clearly it leads."""
+    """Return a clause with the replacement that helps, and the fractions of failed episodes that re-runs fix."""
     assert failure.replaced is not None
     share = failure.shares.get
     text = f"with {replacement_text(failure.replaced)} the same episode succeeds, at t = {failure.succeeds_at}"
@@ -95,8 +95,8 @@ def _success_text(failure: Failure) -> str:
 
 
 def finding_text(finding: Finding) -> str:
-    """Return a finding as a clause with its numbers."""
-    # Steps count from 1 for a reader, and from 0 in the data.
+    """Express a finding as a clause with numbers."""
+    # Plan steps are counted from 1 in texts, and from 0 in the data.
     match finding:
         case WrongAnswers(step, condition, states, of, first):
             often = f"{states} of {of} states, first at {first}"
@@ -104,7 +104,7 @@ def finding_text(finding: Finding) -> str:
         case NoCondition(states, of):
             return f"no condition of the plan held in {states} of the last {of} states"
         case PlanDeparts(step, skill, reference, states, of, late, uncovered):
-            departs = f"the plan requests another action than the reference, in step {step + 1}, '{skill}'"
+            departs = f"the plan requests a different action than the reference in step {step + 1}, '{skill}'"
             departs = "no condition of the plan holds" if uncovered else departs
             often = f"in {states} of {'the last ' if late else ''}{of} states"
             return f"{often} {departs}, where the reference requests '{reference}'"
@@ -113,14 +113,14 @@ def finding_text(finding: Finding) -> str:
             return text if distance is None else f"{text} and ended {100 * distance:.0f} cm from its target"
         case Misled(error, number):
             wrong = f"entry {number} was off by up to {error:.2g}"
-            return f"the policy was shown another observation than the true one: {wrong}"
+            return f"the policy's observation differed from the true one: {wrong}"
         case Difference(part, at, given, again, size):
-            differ = f"from step {at} on, there by {size or 0:.2g}: noise or a random policy"
+            differ = f"from step {at} on, by {size or 0:.2g} at that step, due to noise or a random policy"
             texts = {
                 "length": f"the length: the rollout has {given} steps, the re-run {again}",
                 "actions": f"the executed actions, {differ}",
-                "environment": f"the environment: the same action in state {at - 1} leads to another state",
-                "states": f"the states, from {at} on; the rollout holds no actions, which would show more",
+                "environment": f"the environment: the same action in state {at - 1} leads to a different state",
+                "states": f"the states, from {at} on; the rollout holds no actions, so record them to find out more",
                 "nothing": "in data that were not recorded",
             }
             return f"the first difference is {texts[part]}"

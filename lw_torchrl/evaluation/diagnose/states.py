@@ -1,4 +1,4 @@
-"""The states of a failed episode: wrong answers, departures of the plan from a reference, and the step it ended in."""
+"""Analyze the states of a failed episode: wrong answers, deviations from a reference plan, and the final plan step."""
 
 from __future__ import annotations
 
@@ -22,43 +22,43 @@ from lw_torchrl.modules.parts import evaluating
 from lw_torchrl.modules.policy import draws, plans_of
 from lw_torchrl.transforms.qaf import plan_program
 
-_OFTEN, _BRIEF = 0.4, 5  # "often" is a larger share of a step's states; fewer states decide nothing
-_SAME = 0.02  # actions that differ by less count as equal to the script's
-_HALF = 0.5  # the share of the error that a fault may leave unexplained, and that counts in other steps
-_LATE = 100  # the last states of a failed episode, in which it made no progress
-_AHEAD, _STILL = 10, 0.01  # the hand stands still if it moves less than a centimetre in 10 states
-_AWAY = 25  # longest interruption of a stay in a step, in states: two alternating steps are one stay
-_WRONG = 0.01  # the smallest share of states with wrong answers that counts
-OTHER = 0.3  # actions that differ by more, on some axis, have different purposes
+_OFTEN, _BRIEF = 0.4, 5  # "often": more than this fraction of a plan step's states; with fewer than 5, undecided
+_SAME = 0.02  # actions that differ from the script's by less than this count as equal
+_HALF = 0.5  # the fraction of the error that a fault may leave unexplained, and that counts in other plan steps
+_LATE = 100  # number of last states of a failed episode, in which the episode made no progress
+_AHEAD, _STILL = 10, 0.01  # the hand stands still if it moves less than 1 cm in 10 states
+_AWAY = 25  # longest interruption (in states) of a visit to a plan step, so that two alternating steps are one visit
+_WRONG = 0.01  # the smallest fraction of states with wrong answers that counts
+OTHER = 0.3  # actions that differ by more than this on any axis serve different purposes
 
 
 class ScriptComparison(NamedTuple):
-    """A policy's actions in T states, and the actions of the scripted skills of the active steps."""
+    """A policy's actions in T states, and the actions of the active plan steps' scripted skills."""
 
-    done: Tensor  # (T, A) float32
-    wanted: Tensor  # (T, A) float32, infinite where the active step has no scripted skill
-    active: Tensor  # (T,) int64, the active step, -1 for none
+    done: Tensor  # (T, A) float32, the policy's actions
+    wanted: Tensor  # (T, A) float32, the scripts' actions; infinite where the active plan step has no scripted skill
+    active: Tensor  # (T,) int64, the active plan step, -1 for none
 
     def followed_by(self, other: ScriptComparison | None) -> ScriptComparison:
-        """Append another episode's states."""
+        """Return the comparison with another episode's states appended."""
         if other is None:
             return self
         return ScriptComparison(*(torch.cat(both) for both in zip(self, other, strict=True)))
 
     def part(self, numbers: Tensor) -> ScriptComparison:
-        """Select some of the action's numbers, (A,) bool."""
+        """Return the comparison of the action's entries selected by ``numbers`` (A,) bool."""
         return ScriptComparison(self.done[:, numbers], self.wanted[:, numbers], self.active)
 
     def differ_by(self, size: float) -> Tensor:
-        """Return (T,) bool: whether the actions differ by more than ``size`` on any axis; False without active step."""
+        """Return (T,) bool: whether actions differ by more than ``size`` on any axis; False if no step is active."""
         return (self.done - self.wanted).abs().amax(-1).masked_fill(self.active < 0, 0.0) > size
 
     def unlike(self) -> Tensor:
-        """Return (T,) bool: whether the policy's action is not the script's."""
+        """Return (T,) bool: whether the policy's action differs from the script's."""
         return self.differ_by(_SAME)
 
     def far(self, steps: Iterable[int]) -> float:
-        """Return the largest share, over these steps, of a step's states whose actions are far from the scripts'."""
+        """Return the largest fraction, over plan steps, of a step's states with actions far from the script's."""
         far, stays = self.differ_by(OTHER), [self.active == step for step in steps]
         return max((float(far[stay].float().mean()) for stay in stays if stay.sum() >= _BRIEF), default=0.0)
 
@@ -69,11 +69,12 @@ class ScriptComparison(NamedTuple):
         return self.far(steps) < _OFTEN / 2
 
     def in_other_steps(self, step: int) -> bool | None:
-        """Return whether the other steps have the fault of a step; None if that cannot be decided.
+        """Return whether the other plan steps have the same fault as ``step``; None if that cannot be decided.
 
         The fault is estimated on the axis with the largest error, as a factor of the script's action or as a shift. The
-        other steps have it if it explains at least half of their error. It is undecided if neither describes the step's
-        error, if the fault would not show in the other steps, or if these are half as far off in another way.
+        other plan steps have the fault if it explains more than half of their error. The result is None if neither a
+        factor nor a shift explains the error in ``step``, if the fault would not show in the other plan steps, or if
+        their error is large (more than half of the error in ``step``) but unexplained.
         """
         known = self.wanted.isfinite().all(-1) & (self.active >= 0)
         inside, others = known & (self.active == step), known & (self.active != step)
@@ -96,9 +97,9 @@ def _off(values: Tensor, where: Tensor) -> float:
 
 
 def compare_with_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> ScriptComparison | None:
-    """Compare a policy with scripts in an episode's states; return None if its actions there cannot be computed.
+    """Compare a policy's actions with the scripts' actions in an episode's states.
 
-    That is so if the policy draws its actions, or reads keys that were not recorded.
+    Return None if the policy's actions cannot be computed, because it is stochastic or reads keys not recorded.
     """
     keys = [key for key in getattr(actor, "in_keys", ()) if key != "qaf"]
     plans = plans_of(actor)
@@ -117,29 +118,29 @@ def compare_with_scripts(actor: Any, seen: EpisodeStates, scripts: Scripts) -> S
 
 
 class EpisodeStates(NamedTuple):
-    """The T states of a failed episode under a plan of S steps."""
+    """The T states of a failed episode under a plan with S steps."""
 
     task: str
     episode: int
-    steps: TensorDictBase  # of batch (T,)
+    steps: TensorDictBase  # the recorded time steps, of batch (T,)
     truth: Tensor  # (T, S) bool, the exact answers
-    answers: Tensor  # (T, S) bool, those that the policy acted on
-    weights: Tensor  # (T, S) float32, the policy's attention over the plan's steps
-    active: Tensor  # (T,) int64, the step with most attention; -1 where all steps have the same
+    answers: Tensor  # (T, S) bool, the answers that the policy acted on
+    weights: Tensor  # (T, S) float32, the policy's attention over the plan steps
+    active: Tensor  # (T,) int64, the plan step with the largest weight; -1 where all weights are equal
 
     @property
     def which(self) -> tuple[str, int]:
         return self.task, self.episode
 
     def active_time(self, plan: ConditionalPlan, step: int, distance: float | None = None) -> ActiveStep:
-        """Return how long a step was active late in the episode."""
+        """Return a finding with the number of the last 100 states in which a plan step was active."""
         late = min(_LATE, len(self.active))
         states = int((self.active == step)[-late:].sum())
         return ActiveStep(step, plan.steps[step].skill, states, late, distance)
 
 
 class Blame(NamedTuple):
-    """The step of the plan and the state at which a cause shows, and the finding there."""
+    """The plan step and the state (``at``) at which a cause shows, and the finding there."""
 
     step: int
     at: int
@@ -147,21 +148,21 @@ class Blame(NamedTuple):
 
 
 class Explanation(NamedTuple):
-    """The cause that the states alone show."""
+    """The cause that follows from the states alone, without re-runs."""
 
-    cause: Cause  # "undecided" if they do not decide
-    blames: Mapping[str, Blame]  # by possible cause
-    evidence: Mapping[str, float]
+    cause: Cause  # "undecided" if the states do not show the cause
+    blames: Mapping[str, Blame]  # for each possible cause, where it shows
+    evidence: Mapping[str, float]  # measured numbers by name
 
 
 def chosen(truth: Tensor, steps: int) -> Tensor:
-    """Return (T,) int64: the first of ``steps`` steps whose condition holds in (T, S) bool, else the last step."""
+    """Return (T,) int64: the first of ``steps`` plan steps whose condition holds in ``truth`` (T, S), or the last."""
     here = truth[..., :steps]
     return torch.where(here.any(-1), here.int().argmax(-1), steps - 1)
 
 
 def states_of(task: str, episode: int, steps: TensorDictBase, plans: Plans, answers: Tensor | None) -> EpisodeStates:
-    """Return an episode's states under the policy's plan; ``answers`` are the policy's, None for the recorded ones."""
+    """Return an episode's states under the policy's plan; ``answers`` are used if no ``qaf_logits`` were recorded."""
     number = len(plans[task].steps)
     truth = plan_program(Plans([plans[task]]))(steps.get("observation"), steps.get("task_id"))[:, :number]
     if (logits := steps.get("qaf_logits", None)) is not None:
@@ -176,9 +177,10 @@ def states_of(task: str, episode: int, steps: TensorDictBase, plans: Plans, answ
 
 
 def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
-    """Return the steps that may be to blame for a failure, the likeliest first, by the states ``among`` (T,) bool.
+    """Return the plan steps that may be to blame for a failure, the likeliest first.
 
-    The furthest and the most frequent step late in the episode come first, then those of all states, then the others.
+    Only the states ``among`` (T,) bool count (None for all). The furthest and the most frequent plan step late in the
+    episode come first, then the furthest and the most frequent of the whole episode, then the others by frequency.
     """
     counted = seen.active >= 0 if among is None else (seen.active >= 0) & among
     if not counted.any():
@@ -193,7 +195,7 @@ def candidates(seen: EpisodeStates, among: Tensor | None = None) -> list[int]:
 
 
 def last_stay_start(states: Tensor) -> int:
-    """Return the start of the last stay in ``states`` (T,) bool; an interruption of up to 25 states does not end it."""
+    """Return the first state of the last visit in ``states`` (T,) bool; gaps of up to 25 states do not end a visit."""
     places = states.nonzero().flatten()
     if not len(places):
         return len(states) - 1
@@ -202,7 +204,10 @@ def last_stay_start(states: Tensor) -> int:
 
 
 def stall_step(seen: EpisodeStates, step: int, layout: Layout = METAWORLD) -> int:
-    """Return the state of the last stay in a step from which the hand stands still, else the start of the stay."""
+    """Return the state in which the hand stopped during the last visit to a plan step.
+
+    If the hand did not stop, return the first state of the visit.
+    """
     inside = seen.active == step
     begin = last_stay_start(inside)
     hand = seen.steps.get("observation")[begin:, layout.positions[0]]
@@ -213,7 +218,7 @@ def stall_step(seen: EpisodeStates, step: int, layout: Layout = METAWORLD) -> in
 def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) -> Explanation:
     """Apply the rule of :func:`attribute_failures` to an episode's states.
 
-    Without a reference, the plan is to blame if no condition holds, and a skill that stays active far from its target.
+    Without a reference, the plan is to blame if no condition holds, and a skill if it stays active far from its target.
     """
     plan, length = scripts.plans[seen.task], len(seen.active)
     late = min(_LATE, length)
@@ -221,7 +226,7 @@ def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) ->
     stalled = stall_step(seen, stuck, scripts.plans.layout)
     blames, evidence = {}, {"states": float(length)}
 
-    # Wrong answers; those that changed the chosen step matter most.
+    # Query: wrong answers, of which those that changed the chosen plan step matter most.
     wrong = seen.answers != seen.truth
     share = evidence["answers_wrong"] = float(wrong.any(-1).float().mean())
     if share:
@@ -234,7 +239,7 @@ def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) ->
         wrong_answers = WrongAnswers(column, condition, int(here.sum()), length, int(here.argmax()))
         blames["query"] = Blame(column, int(matter[:, column].int().argmax()), wrong_answers)
 
-    # The plan: states in which no condition holds, or in which the reference requests another action.
+    # Plan: states in which no condition holds, or in which the reference requests a different action.
     none = ~seen.truth.any(-1)
     evidence["no_condition_late"] = float(none[-late:].float().mean())
     if reference is None or seen.task not in reference.plans:
@@ -256,7 +261,7 @@ def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) ->
         finding = PlanDeparts(step, plan.steps[step].skill, requested, states, of, bool(recent), uncovers)
         blames["plan"] = Blame(step, at, finding)
 
-    # The step in which the episode ended.
+    # Skill: the plan step in which the episode got stuck.
     evidence["in_step_late"] = float((seen.active == stuck)[-late:].float().mean())
     if scripts.known[seen.task][stuck]:
         last = seen.steps[-1:]
@@ -281,7 +286,7 @@ def explain(seen: EpisodeStates, scripts: Scripts, reference: Scripts | None) ->
 def _departs(
     seen: EpisodeStates, plan: ConditionalPlan, scripts: Scripts, other: ConditionalPlan, other_scripts: Scripts
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return whether the plan's true step requests another action than the reference's, (T,) bool, and both steps."""
+    """Return whether plan and reference request different actions (T,) bool, and the chosen plan step of each (T,)."""
     observation, task_id = seen.steps.get("observation"), seen.steps.get("task_id")
     answers = plan_program(Plans([other]))(observation, task_id)
     ours, theirs = chosen(seen.truth, len(plan.steps)), chosen(answers, len(other.steps))
@@ -289,7 +294,7 @@ def _departs(
     done = scripts.program(observation, task_id)[rows, ours]
     wanted = other_scripts.program(observation, task_id)[rows, theirs]
     differ = (done - wanted).abs().amax(-1) > OTHER
-    # Skills without a script differ if their texts do.
+    # Two skills of which one has no script differ if their texts differ.
     same_text = torch.tensor([[a.skill == b.skill for b in other.steps] for a in plan.steps])[ours, theirs]
     scripted = torch.tensor(scripts.known[plan.task])[ours] & torch.tensor(other_scripts.known[other.task])[theirs]
     return torch.where(scripted, differ, ~same_text), ours, theirs

@@ -1,4 +1,4 @@
-"""The plan formats by name: the paper's nine, three styles in three containers, and those that you add."""
+"""Plan formats: the paper's nine (three styles in three containers), and custom formats."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from lw_torchrl.language.plans import ConditionalPlan
 
 
 def _check_format(name: str, format: Any) -> PlanFormat:
-    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):  # it is a folder's name too
-        raise ValueError(f"a plan format must be named in lower case, like 'basic_py', got {shown(name)}")
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):  # the name is also a folder's name
+        raise ValueError(f"name of a plan format must be lower case like 'basic_py', got {shown(name)}")
     return check_value(f"plan format {name!r}", format, PlanFormat)
 
 
@@ -26,15 +26,15 @@ PLAN_FORMATS = Registry(
     {f"{name}_{container}": make(style) for name, style in STYLES.items() for container, make in _CONTAINERS.items()},
     _check_format,
 )
-"""The formats by name: the nine of the paper, and those that you add, ``PLAN_FORMATS["mine"] = PlanFormat(...)``."""
+"""The plan formats by name. Add a custom format with ``PLAN_FORMATS["mine"] = PlanFormat(...)``."""
 
 
 @typed
 def encode_plan(plan: ConditionalPlan, format: str) -> str:
-    """Write a plan as text, from which :func:`~lw_torchrl.decode_plan` reads an equal plan.
+    """Convert a plan to text in a format; :func:`~lw_torchrl.decode_plan` converts the text back to an equal plan.
 
-    Reasons are written only in the chain and goal formats. A goal that is not the skill's usual one is written only in
-    goal formats.
+    Only the chain and goal formats contain reasons. Only the goal formats contain goals other than the skills' usual
+    goals.
 
     Example:
         >>> plan = ConditionalPlan.from_pairs("reach", [("gripper is open", "move the gripper to the target")])

@@ -1,4 +1,4 @@
-"""Plans in prose, "- When C, the robot should S.": a writer, and a tolerant reader."""
+"""The prose format of plans ("- When C, the robot should S."): a writer and a tolerant reader."""
 
 import re
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ from lw_torchrl.language.tasks import TASKS, Task
 
 
 def md(style: Style) -> PlanFormat:
-    """Return the prose format of a style; the goal style writes "- When C, move the robot's gripper until G."
+    """Build the prose format for a style; the goal style writes "- When C, move the robot's gripper until G."
 
-    Source: paper section 'Conditional Plan Generation', which tried plans in prose beside those in code.
+    Source: paper section 'Conditional Plan Generation', which compared plans in prose with plans in code.
     """
 
     def prompt(examples: Sequence[ConditionalPlan], task: Task, hints: Sequence[str]) -> str:
@@ -26,6 +26,7 @@ def md(style: Style) -> PlanFormat:
 
 
 def _opening(task: Task) -> str:
+    """Return the two lines that introduce a task's rules."""
     return f"The task `{task.name}`: {one_line(task.description)}\nThe robot does it reliably by these rules:\n"
 
 
@@ -44,7 +45,7 @@ def _write(plan: ConditionalPlan, style: Style) -> str:
     return _opening(plan.definition) + "".join(f"{line}\n" for line in lines)
 
 
-# Headings: "The task `push`: ...", or a task's name alone on its line.
+# Headings: "The task `push`: ...", or a task's name on a line of its own.
 _NAMED = re.compile(r"[\s#>*\"'`]*(?:the\s+)?task\b[\s:]*([`\"'“‘*]*)([A-Za-z0-9][\w-]*(?:/[\w-]+)?)", re.IGNORECASE)
 _ALONE = re.compile(r"[\s#>*\"'`]*([a-z0-9]+(?:[-_][a-z0-9]+)*)[\s\"'`:,*]*")
 _BULLET = re.compile(r"\s*(?:[-*•–+>]|\(?\[?\d{1,3}[.)\]]|[a-z]\))\s+")
@@ -59,36 +60,37 @@ _SHOULD = re.compile(
 )
 _UNTIL = re.compile(r",?\s(?:then\s)?move\s(?:the\s)?(?:robot's\s)?gripper\suntil\s", re.IGNORECASE)
 _COMMA = re.compile(r",\s(?:then\s)?")
-# After "When C, " these words begin a sentence that is not a skill.
+# A sentence that begins with one of these words after "When C, " is not a skill.
 _NO_SKILL = frozenset(("the", "a", "an", "it", "this", "that", "you", "we", "they", "there", "and", "or"))
 
 
 def _is_read(line: str) -> bool:
-    """Return whether a line would be read as a part of a plan, not as a comment."""
+    """Return whether the reader would parse a line as part of a plan rather than as a comment."""
     match = END.search(line) or _heading(line) or _BULLET.match(line) or item(line) or _clause(1, line, bullet=False)
     return bool(match) or _listing(line) is not None
 
 
 class ProseReading(Reading):
-    """The clauses of a text in prose.
+    """A reader of plans in prose.
 
-    A clause is a bullet that begins with "When", "If" or the like. In a section without such bullets it is a sentence
-    "When C, the robot should S". Other sentences are the reason of the next clause.
+    A clause is a bullet that begins with "When", "If" or the like. In a section without such bullets a clause is a
+    sentence "When C, the robot should S". Any other sentence becomes the reason of the next clause.
     """
 
     def __init__(self, text: str) -> None:
         super().__init__()
-        self.bulleted: dict[int, bool] = {}  # section number to whether its clauses are bullets
+        self.bulleted: dict[int, bool] = {}  # section number to whether the section's clauses are bullets
         self.reason: list[str] = []
         self.listing = False
         for number, line in enumerate(text.splitlines(), 1):
             before, *cut = END.split(line, maxsplit=1)
             self.read(number, before.strip())
             if cut:
-                self.note(number, "the answer ends here")
+                self.note(number, "the answer ends here; later text is ignored")
                 break
 
     def read(self, number: int, raw: str) -> None:
+        """Parse one line."""
         line = " ".join(raw.split())
         bullet = _BULLET.match(line)
         if name := _heading(line):
@@ -103,15 +105,16 @@ class ProseReading(Reading):
             self.section.listed += f"  {numbered[0]}. {numbered[1]}"
             return
         elif bullet and not item(line):
-            self.note(number, f"a rule without a condition or a skill is left out: {shown(line)}")
+            self.note(number, f"a rule without a condition or without a skill is left out: {shown(line)}")
         elif line and not line.startswith(("```", "~~~")) and not line.endswith(":"):
             self.reason.append(line)
         self.listing = self.listing and steps is not None
 
     def add(self, clause: Clause, bullet: bool, line: str) -> None:
+        """Append a clause; if the section has bullets, treat a plain sentence as a reason instead."""
         place = len(self.sections)
         if bullet and not self.bulleted.get(place, True):
-            self.section.clauses.clear()  # where there are bullets, sentences only explain
+            self.section.clauses.clear()  # in a section with bullets, sentences are only reasons
         if bullet or not self.bulleted.get(place, False):
             self.bulleted[place] = bullet
             self.section.clauses.append(replace(clause, reason=" ".join(self.reason)))
@@ -121,7 +124,7 @@ class ProseReading(Reading):
 
 
 def _heading(line: str) -> str:
-    """Return the task that a heading names; "" if the line is not a heading."""
+    """Return the name of the task in a heading; "" if the line is not a heading."""
     if (named := _NAMED.match(line)) and (named[1] or named[2].lower() in TASKS):
         return named[2].replace("_", "-").lower()
     if (alone := _ALONE.fullmatch(line)) and ("-" in alone[1] or alone[1].replace("_", "-") in TASKS):
@@ -130,11 +133,13 @@ def _heading(line: str) -> str:
 
 
 def _listing(line: str) -> str | None:
+    """Return the text after "Steps:"; None if the line does not begin with "Steps:"."""
     match = re.match(r"[#*\s]*steps\s*:[*\s]*(.*)", line, re.IGNORECASE)
     return match[1] if match else None
 
 
 def _clause(number: int, line: str, bullet: bool) -> Clause | None:
+    """Parse a line as a clause; return None if the line is not a clause."""
     start = _BULLET.match(line)
     match = _WHEN.match(line, start.end() if start else 0)
     if not match:
@@ -158,7 +163,7 @@ def _clause(number: int, line: str, bullet: bool) -> Clause | None:
 
 
 def _ended(text: str) -> str:
-    """Return the end of a sentence without its full stop, quotes and closing tags."""
+    """Strip the full stop, quotes and closing tags from the end of a sentence."""
     sentence = text.rstrip()
     while True:
         shorter = sentence.rstrip("\"'`,\\* ")

@@ -1,4 +1,4 @@
-"""Plans that look like Python: a writer, and a tolerant reader, which executes nothing."""
+"""The Python formats of plans: a writer, and a tolerant reader that never executes the text."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -13,10 +13,10 @@ from lw_torchrl.language.tasks import TASKS, Task
 
 
 def py(style: Style) -> PlanFormat:
-    """Return the format of a style as a function, with ``if check("…"):`` and ``robot.verb("…")`` for each step.
+    """Build the format that writes a plan as a function: ``if check("…"):`` and ``robot.verb("…")`` for each step.
 
-    The goal style writes a skill as the place that the gripper is to reach,
-    ``robot.move_gripper("above the puck", close_gripper=True)``, or as another state to reach,
+    The goal style writes a skill as the place for the gripper to reach,
+    ``robot.move_gripper("above the puck", close_gripper=True)``, or as any other state to reach,
     ``robot.move_gripper(until="the puck is near the target location")``.
 
     Source: paper section 'Conditional Plan Generation' and its figure of a plan.
@@ -36,13 +36,14 @@ def _write(plan: ConditionalPlan, style: Style) -> str:
     for number, (step, goal) in enumerate(zip(plan.steps, plan.goals, strict=True)):
         if style.explains and (reason := one_line(step.reason).lstrip("# ")):
             if number == 0 and re.match(r"\[?\d", reason):
-                lines.append("#")  # a reason like "2. and so on" would continue the list
+                lines.append("#")  # otherwise a reason like "2. and so on" would continue the list
             lines.append(f"# {reason}")
         lines += [f"if check({quote(str(step.condition))}):", f"    robot.{_call(step, goal if style.goals else None)}"]
     return function_head(plan.definition) + "".join(f"    {line}\n" for line in lines)
 
 
 def _call(step: PlanStep, goal: Query | None) -> str:
+    """Write the method call for a step: its skill, or ``move_gripper`` with the goal."""
     if goal is None:
         verb, _, details = step.skill.partition(" ")
         return f"{verb}({quote(details)})"
@@ -58,7 +59,7 @@ _HELD = {"": "", _OPENED: ", open_gripper=True", _CLOSED: ", close_gripper=True"
 
 
 def py_md(style: Style) -> PlanFormat:
-    """Return the format of a style as a chat message with functions in fenced code blocks."""
+    """Build the format that writes a plan as a chat message with the function in a fenced code block."""
 
     def fenced(code: str) -> str:
         return f"```python\n{code}```\n"
@@ -80,10 +81,10 @@ def py_md(style: Style) -> PlanFormat:
     return PlanFormat("md", encode, PythonReading, prompt, style)
 
 
-# A Python string, with any prefix; possessive quantifiers (*+) keep the time linear in broken text.
+# A Python string with any prefix. Possessive quantifiers (*+) keep the time linear for malformed text.
 _STRING = r'(?:[fFrRbBuU]{0,2}(?:"(?:[^"\\]|\\.)*+"|\'(?:[^\'\\]|\\.)*+\'))'
 _STRINGS = rf"{_STRING}(?:[\s+]*{_STRING})*"
-_LITERAL = re.compile(r'"(?:[^"\\]|\\.?)*+("|\Z)|\'(?:[^\'\\]|\\.?)*+(\'|\Z)')  # or the start of a cut-off string
+_LITERAL = re.compile(r'"(?:[^"\\]|\\.?)*+("|\Z)|\'(?:[^\'\\]|\\.?)*+(\'|\Z)')  # or an unterminated string
 _BRANCH = re.compile(r"(if|elif|while)\b\s*|(else)\s*:")
 # An argument: an optional name, then strings or a plain value.
 _ARGUMENT = re.compile(rf"(?:(\w+)\s*=\s*)?(?:({_STRINGS})|([^\s,()\"'][^,()\"']*))\s*(?:,\s*)?")
@@ -91,23 +92,23 @@ _PRINTED = re.compile(r"\s*print\(\s*(\"|')(.*)\1\s*\)\s*;?")
 _DEF = re.compile(r"(?:async\s+)?def\b\s*(\w*)")
 _CHECK = re.compile(rf"(and\b|or\b)?\s*(not\b)?\s*\(?\s*(?:self\.|robot\.)?check\s*\(\s*({_STRINGS})\s*\)?\s*")
 _CALL = re.compile(r"(?:self\.)?robot\.(\w+)\s*\(\s*")
-# A comment that may begin a task: "# drawer-open: ...".
+# A comment that may begin the section of a task: "# drawer-open: ...".
 _HEADING = re.compile(r"#+\s*([A-Za-z][\w-]*)\s*:")
-_MOST_JOINED = 6  # lines that a statement may span
+_MOST_JOINED = 6  # maximum number of lines of a statement
 
 
 @dataclass
 class _Block:
-    """An ``if`` statement."""
+    """An open ``if`` statement."""
 
     indent: int
     line: int
-    condition: str | None  # None if it cannot be read
-    body: int | None = None  # indentation of its block
+    condition: str | None  # None if it cannot be parsed
+    body: int | None = None  # indentation of the statement's block; None before the first line
 
 
 class PythonReading(Reading):
-    """The clauses of a text in Python, read line by line. A nested ``if`` requires both conditions."""
+    """A line-by-line reader of plans in Python. A skill in a nested ``if`` requires all enclosing conditions."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -120,10 +121,10 @@ class PythonReading(Reading):
                 break
 
     def read(self, number: int, line: str) -> bool:
-        """Read a line; return False if the answer ends with it."""
+        """Parse one line, and return whether the answer continues after it."""
         code = line.strip()
         if END.match(code):
-            self.note(number, "the answer ends here")
+            self.note(number, "the answer ends here; later text is ignored")
             return False
         if code.startswith("#"):
             self.comment(number, line)
@@ -135,6 +136,7 @@ class PythonReading(Reading):
         return END.search(_bare(code)) is None
 
     def comment(self, number: int, line: str) -> None:
+        """Parse a comment: a heading, a list of steps, or a reason."""
         words = line.strip().lstrip("#")
         numbered, heading = item(words), _HEADING.match(line)
         if heading and (name := _task_name(heading[1])) in TASKS:
@@ -149,19 +151,21 @@ class PythonReading(Reading):
                 self.reason.append(words.strip())
 
     def open(self, name: str, number: int) -> None:
+        """Begin the section of a task."""
         super().open(name, number)
         self.blocks.clear()
         self.reason.clear()
         self.listing = False
 
     def code(self, number: int, line: str, code: str) -> None:
+        """Parse a line of code, and close the ``if`` blocks that do not contain the line."""
         indent = len(line) - len(line.lstrip())
         call, branch = _CALL.match(code), _BRANCH.match(code)
-        # Models indent in many ways, so the blocks follow the indentation that was seen, not multiples of four.
-        while self.blocks:  # close the blocks that do not contain the line
+        # Models indent inconsistently, so blocks follow the actual indentation, not multiples of four.
+        while self.blocks:  # close each block that does not contain the line
             last = self.blocks[-1]
             if last.body is None and call and indent == last.indent:
-                break  # a call right below a condition belongs to it, even if it is not indented
+                break  # a call right below a condition is in its block, even without indentation
             if indent > last.indent and (last.body is None or indent >= last.body):
                 break
             self.blocks.pop()
@@ -172,20 +176,21 @@ class PythonReading(Reading):
         elif call:
             self.call(number, indent, code, call)
         elif code.startswith("robot."):
-            self.note(number, f"is cut off: {shown(code)}")
+            self.note(number, f"the call is cut off: {shown(code)}")
         else:
-            if not self.is_outside:  # one note for several such lines
-                self.note(number, f"is not part of a plan: {shown(code)}")
+            if not self.is_outside:  # one note for consecutive lines
+                self.note(number, f"the text is not part of a plan: {shown(code)}")
             self.is_outside = True
             return
         self.is_outside = False
 
     def branch(self, number: int, indent: int, code: str, branch: re.Match[str]) -> None:
+        """Parse an ``if`` or ``else`` and a call on the same line."""
         condition, rest = (None, code[branch.end() :]) if branch[2] else self.condition(number, code, branch.end())
         if branch[2]:
-            self.note(number, "an 'else' has no condition; its skills are left out")
+            self.note(number, "'else' has no condition; the skills under it are left out")
         if branch[1] == "elif":
-            self.note(number, "'elif' is read as 'if'; the negation of the conditions above it is left out")
+            self.note(number, "'elif' is read as 'if', without the negation of the conditions above")
         if self.blocks and self.blocks[-1].body is None:
             self.blocks[-1].body = indent
         self.blocks.append(_Block(indent, number, condition))
@@ -193,29 +198,30 @@ class PythonReading(Reading):
             self.call(number, indent + 1, rest, call)
 
     def condition(self, number: int, code: str, at: int) -> tuple[str | None, str]:
-        """Return the condition of an ``if``, None if it cannot be read, and the code after its colon."""
+        """Parse an ``if``; return its condition (None if it cannot be parsed) and the code after its colon."""
         conditions: list[str] = []
         fault = ""
         while match := _CHECK.match(code, at):
             text = _unquoted(match[3])
             if match[1] == "or":
-                fault = "a plan cannot express an 'or' of conditions"
+                fault = "a condition cannot contain 'or'"
             if match[2] and re.search(r"\band\b", text):
-                fault = "a plan cannot express the negation of several conditions"
+                fault = "a condition cannot negate a conjunction"
             conditions.append(f"not {text}" if match[2] else text)
             at = match.end()
         rest = code[at:].lstrip(" )")
         if not conditions:
             bare = _bare(code)
             cut = '"' in bare or not bare.rstrip().endswith(":")
-            fault = f"is cut off: {shown(code)}" if cut else f'has no check("..."): {shown(code)}'
+            fault = f"the condition is cut off: {shown(code)}" if cut else f'expected check("..."), got {shown(code)}'
         elif not rest.startswith((":", "#")):
-            fault = fault or (f'has more than check("..."): {shown(code)}' if rest else "")
+            fault = fault or (f'expected only check("..."), got {shown(code)}' if rest else "")
         if fault:
             self.note(number, fault)
         return (None if fault else " and ".join(conditions)), rest.lstrip(": ")
 
     def call(self, number: int, indent: int, code: str, call: re.Match[str]) -> None:
+        """Parse a call of a skill, and append the clause under the open conditions."""
         words, named, at = list[str](), dict[str, str](), call.end()
         while match := _ARGUMENT.match(code, at):
             value = _unquoted(match[2]) if match[2] else match[3].strip()
@@ -225,18 +231,18 @@ class PythonReading(Reading):
                 words.append(value)
             at = match.end()
         if code[at : at + 1] != ")" and (at < len(code) or not (words or named)):
-            self.note(number, f"is cut off: {shown(code)}")
+            self.note(number, f"the call is cut off: {shown(code)}")
             return
         if not self.blocks:
             self.note(number, f"a skill without a condition is left out: {shown(code)}")
             return
         block = self.blocks[-1]
         if self.section.clauses and self.section.clauses[-1].line == block.line:
-            self.note(number, "a second skill under the same condition is a step of its own")
+            self.note(number, "a second skill under the same condition becomes a separate step")
         block.body = indent if block.body is None else block.body
         conditions = [above.condition for above in self.blocks if above.condition is not None]
         if len(conditions) < len(self.blocks):
-            return  # the note on the `if` says why
+            return  # the note on the `if` gives the reason
         skill, goal = f"{call[1]} {' '.join(words)}", named.get("goal", "")
         if call[1] == "move_gripper":
             skill, goal = _state_to_reach(" ".join(words), named)
@@ -245,7 +251,7 @@ class PythonReading(Reading):
 
 
 def _state_to_reach(place: str, named: dict[str, str]) -> tuple[str, str]:
-    """Return the skill and the goal of ``robot.move_gripper``; one of them is ""."""
+    """Return (skill, goal) for a call of ``robot.move_gripper``; either the skill or the goal is empty."""
     parts = [f"the {GRIPPER} is {place}"] if place else []
     parts += [text for name in ("until", "goal") if (text := named.get(name, ""))]
     for name, state in (("close_gripper", "closed"), ("open_gripper", "open")):
@@ -255,17 +261,18 @@ def _state_to_reach(place: str, named: dict[str, str]) -> tuple[str, str]:
 
 
 def _unquoted(strings: str) -> str:
+    """Return the content of adjacent string literals."""
     bodies = [literal.lstrip("fFrRbBuU")[1:-1] for literal in re.findall(_STRING, strings)]
     return " ".join("".join(re.sub(r"\\(.)", r"\1", body) for body in bodies).split())
 
 
 def _task_name(name: str) -> str:
-    """Return a function's task: "door-lock" for "door_lock" and "DoorLock"."""
+    """Convert a function's name to a task's name: "door_lock" and "DoorLock" give "door-lock"."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name).replace("_", "-").strip("-").lower() or "?"
 
 
 def _statements(text: str) -> Iterator[tuple[int, str]]:
-    """Yield the numbered lines of a text, with the lines of a call joined and the text of ``print`` unquoted."""
+    """Yield (line number, statement) for a text; join the lines of a call, and unwrap ``print("...")``."""
     lines = text.expandtabs(4).splitlines()
     at = 0
     while at < len(lines):
@@ -277,13 +284,13 @@ def _statements(text: str) -> Iterator[tuple[int, str]]:
         while joins and at < len(lines) and at - start < _MOST_JOINED:
             bare, code = _bare(line), lines[at].strip()
             if '"' in bare or bare.count("(") <= bare.count(")"):
-                break  # no parenthesis is open, or a string is
+                break  # no parenthesis is open, or a string is unterminated
             if not code or code.startswith(("#", "```", "def ", "robot.")) or _BRANCH.match(code):
-                break  # a statement of its own
+                break  # the next line is a new statement
             line, at = f"{line} {code}", at + 1
         yield start + 1, line
 
 
 def _bare(code: str) -> str:
-    """Return a line without its strings and its comment; a cut-off string leaves a quote."""
+    """Remove the strings and the comment from a line; an unterminated string leaves a quote."""
     return _LITERAL.sub(lambda literal: "" if literal[1] or literal[2] else '"', code).partition("#")[0]

@@ -128,7 +128,7 @@ def test_table_shows_means_and_differences(out):
         assert f"{run.label} " in head
         assert f"{results[run].mean_success:.3f}" in head
     text = (out / "quick.md").read_text()
-    assert "20 spoilt-30, 20 wrong, 10 random" in text
+    assert "20 noisy-30, 20 wrong, 10 random" in text
     assert "advantage, plan - filtered-bc, plan:" in text
     assert {*json.loads((out / "quick.json").read_text())["W"]["methods"]} == {run.label for run in runs}
     assert (out / "quick.png").stat().st_size > 10_000

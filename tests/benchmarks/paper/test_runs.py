@@ -85,7 +85,7 @@ def test_result_of_another_configuration_raises(copied):
     with pytest.raises(ValueError, match="differs in own_tasks"):
         load_result(a_run("dc"), described, copied)
     (copied / a_run("dc").folder / "results.json").unlink()
-    with pytest.raises(ValueError, match="is of another configuration, its run differs in training"):
+    with pytest.raises(ValueError, match="has a different configuration: its run differs in training"):
         execute(a_run("dc", preset=longer), copied)
 
 

@@ -75,7 +75,7 @@ def test_training_resumes_and_writes_the_weights_back(demos, tmp_path):
         assert not actor.training
         for name, value in actor.named_parameters():
             assert torch.equal(value, whole._parameters[name][number])
-    with pytest.raises(ValueError, match="is of another configuration, its training differs in steps"):
+    with pytest.raises(ValueError, match="has a different configuration: its training differs in steps"):
         stack(demos, config=lw.BehavioralCloningConfig(steps=21, batch_size=30, checkpoint_every=10), checkpoint=path)
 
 
