@@ -284,7 +284,7 @@ CHANGES = {
     "other options": ("decoder", "width", 32, r"of shape \(32, .* got .* \(16, "),
     "an unknown option": ("decoder", "depht", 1, "depht"),
     "an unknown class": (None, "class", "ElephantActor", "'ElephantActor'"),
-    "a plan that cannot be parsed": ("plans", "reach", "def raech(", "plan of 'reach' must be like"),
+    "a plan that cannot be parsed": ("plans", "reach", "def raech(", "plan of 'reach' must be an object"),
     "NaN": ("tensors", "module.decoder.network.2.bias", NAN, "must be finite"),
     "another dtype": ("tensors", "module.decoder.network.2.bias", NAN.double(), "got torch.float64"),
     "another tensor": ("tensors", "more", NAN, "but differ in .*more"),
