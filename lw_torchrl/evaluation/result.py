@@ -130,8 +130,8 @@ class EvaluationResult:
                 raise ValueError("success_once and config must have the same tasks")
             return result
         except FileNotFoundError:
-            hint = "write a result with evaluate(...).save(path)"
-            raise FileNotFoundError(f"path: no result file {str(path)!r}; {hint}") from None
+            advice = "write a result with evaluate(...).save(path)"
+            raise FileNotFoundError(f"path: no result file {str(path)!r}; {advice}") from None
         except (ValueError, KeyError, TypeError) as error:
             expected = f"result of {FORMAT} version {FORMAT_VERSION}"
             reason = f"{type(error).__name__}: {str(error)[:500]}"
