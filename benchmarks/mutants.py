@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -155,11 +156,11 @@ def is_found(root: Path, mutant: Mutant, timeout: int) -> bool:
 def main(args: Arguments) -> int:
     chosen = choose(args.before, args.after, args.seed, args.count)
     rows, different = [], 0
+    checkouts = {"before": args.before, "after": args.after}
     for mutant in chosen:
-        found = {
-            name: is_found(root, mutant, args.timeout)
-            for name, root in (("before", args.before), ("after", args.after))
-        }
+        with ThreadPoolExecutor() as pool:
+            runs = {name: pool.submit(is_found, root, mutant, args.timeout) for name, root in checkouts.items()}
+        found = {name: run.result() for name, run in runs.items()}
         different += found["before"] != found["after"]
         state = (
             "found by both" if all(found.values()) else "found by neither" if not any(found.values()) else str(found)
