@@ -47,7 +47,9 @@ def version_changes(recorded: Any, names: Iterable[str]) -> list[str]:
 
 
 def warn_of_other_versions(path: object, recorded: Any, names: Iterable[str] = LIBRARIES) -> None:
-    """Warn if a checkpoint was written with other package versions, so that training will not resume bit-exactly."""
+    """Warn if a checkpoint was written with different package versions, in which case training will not resume
+    bit-exactly.
+    """
     if changes := version_changes(recorded, names):
         warnings.warn(
             f"checkpoint: {str(path)!r} was written with other versions ({'; '.join(changes)}): training continues, "

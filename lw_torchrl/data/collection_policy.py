@@ -29,7 +29,7 @@ from lw_torchrl.suites.suite import Suite, load_suite
 @typed_fields
 @dataclass(frozen=True)
 class Behaviour:
-    """A collection policy, as described in a dataset's metadata; equal behaviours act identically.
+    """A collection policy (behaviour), as described in a dataset's metadata; two equal behaviours act identically.
 
     A behaviour of kind "segments" divides an episode into segments. With probability ``right`` a segment follows the
     plan with scripted skills; other segments are perturbed. The random draws depend only on (task, seed, episode).

@@ -177,7 +177,9 @@ class GroupSampler(Sampler):
         return torch.cat(parts), ended
 
     def _layout(self, batch_size: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return each group's number of rows (G,), and for each batch row (B,) the group and the index in the group."""
+        """Return the number of rows in each group (G,) and, for each batch row, its group (B,) and its index within
+        that group (B,).
+        """
         if self._laid_out is None or self._laid_out[0] != batch_size:
             weights, reason = self._weights(len(self._size))
             divisor = reduce(gcd, weights)

@@ -1,4 +1,6 @@
-"""run_episodes: run exactly the requested episodes on any number of rows, to collect data or evaluate a policy."""
+"""run_episodes: run exactly the requested episodes on any number of parallel environments, to collect data or evaluate
+a policy.
+"""
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,7 +33,9 @@ class FinishedEpisode(NamedTuple):
 
     @property
     def first_success(self) -> int | None:
-        """The first successful time step, from 1; None without success. Requires ("next", "success") in ``steps``."""
+        """The first successful time step, counted from 1; None if the episode never succeeds. Requires ("next",
+        "success") in ``steps``.
+        """
         return first_success(self.steps.get(("next", "success")))
 
 

@@ -181,7 +181,7 @@ class LanguageWorldEnv(EnvBase):
         return self._counter.dump()
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Restore seed and counters, and end all episodes."""
+        """Restore the seed and the counters from a saved state, and end all episodes."""
         self._counter.load(state)
         self._rows.over[:] = True
 

@@ -156,7 +156,7 @@ def _as_skill(goal: str) -> str:
 
 
 def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedStep:
-    """Map a clause to a query and a scripted skill, and append notes on changes."""
+    """Map a clause to a query and a scripted skill, and append a note for each change made to the clause."""
 
     def note(text: str) -> None:
         notes.append(Note(clause.line, text))

@@ -56,7 +56,9 @@ def parse_plan(text: str, task: str | None = None, source: str = "plan", tasks: 
 def check_plan(
     text: str, task: str | None = None, source: str = "plan", tasks: Tasks = TASKS
 ) -> tuple[ConditionalPlan | None, list[str]]:
-    """Parse a plan like :func:`parse_plan`; return (plan, []), or (None, all faults in the order of the lines)."""
+    """Parse a plan as :func:`parse_plan` does, but return (plan, []) or (None, all errors in line order) instead of
+    raising.
+    """
     if len(text) > PLAN_LIMIT:
         return None, [f"{source}: a plan's text must have at most {PLAN_LIMIT} characters, got {len(text)}"]
     name: str | None = None

@@ -102,7 +102,7 @@ class ConditionalPlan:
         if not 1 <= len(self.steps) <= MOST_STEPS:
             raise PlanError(f"{plan} must have 1 to {MOST_STEPS} steps, got {len(self.steps)}")
         if task.name != self.task:
-            raise PlanError(f"definition of {plan} must be the task {self.task!r}, got {task.name!r}")
+            raise PlanError(f"definition of {plan} must define the task {self.task!r}, but it defines {task.name!r}")
         steps = []
         for number, step in enumerate(self.steps, 1):
             try:

@@ -80,7 +80,7 @@ def clause_atoms(clause: Clause, task: Task) -> list[Atom]:
 
 
 class QueryTables(NamedTuple):
-    """The atoms (A) of each task, and the J atoms of each clause (K) of each query (S).
+    """Tensors that encode queries: the A atoms of each task and, for each of its S queries, K clauses of J atoms each.
 
     The first dimension is the tasks (T), or the rows of the batch (B) in tables that were selected for a batch.
     """

@@ -17,7 +17,9 @@ from lw_torchrl.language.layout import Layout
 @typed_fields
 @dataclass(frozen=True)
 class Comparison:
-    """A comparison of the length or one coordinate of d (first position - second position) with a threshold."""
+    """A comparison with a threshold of d = first position - second position: either its length or one of its
+    coordinates.
+    """
 
     axes: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"]  # the axes of d to compare
     sense: Literal["<", ">", "<="]

@@ -64,7 +64,7 @@ class Task:
 
     @cached_property
     def published(self) -> Task:
-        """The task as in the paper: without our added points, and without the openings of objects."""
+        """The task as defined in the paper, without the points and object openings that this package adds."""
         return replace(self, objects=tuple(replace(named, opening=None) for named in self.objects if not named.ours))
 
     def object(self, name: str) -> NamedObject:

@@ -150,7 +150,7 @@ def descriptor_trunk(
     features: nn.Module | None = None,
     text_encoder: TextEncoder | None = None,
 ) -> TensorDictSequential:
-    """Build a trunk that writes the latent of the task's description and the features.
+    """Build a trunk that writes two keys: the latent of the task description, and the features.
 
     See :class:`DescriptorConditionedActor` for the arguments, and :func:`plan_trunk` for the counterpart with plans.
     """

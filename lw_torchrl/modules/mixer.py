@@ -43,7 +43,9 @@ class SkillEncoder(MLP):
 
 
 class _Mixer(Part):
-    """A base class of mixers, which hold the vectors of the distinct skills and the index of each plan step's skill."""
+    """Base class for mixers. A mixer holds one vector per distinct skill and, for each plan step, the index of its
+    skill.
+    """
 
     index: Tensor
     vectors: Tensor

@@ -140,9 +140,9 @@ def _reading(module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[A
 def _rename_parts(
     module: Any, renamed: Mapping[NestedKey, NestedKey], copies: dict[Any, Any], in_order: bool = False
 ) -> None:
-    """Replace a module's parts by copies that read renamed keys.
+    """Replace a module's parts with copies that read renamed keys.
 
-    If the parts run ``in_order``, later parts read a key that an earlier part writes by its old name.
+    If the parts run ``in_order``, a key that an earlier part writes is not renamed in the parts that follow it.
     """
     in_sequence, remaining, parts = isinstance(module, TensorDictSequential), renamed, {}
     for name, part in module._modules.items():
@@ -259,7 +259,9 @@ def _named_parts(trunk: TensorDictSequential) -> list[Any]:
 
 
 def trunk_attributes(trunk: TensorDictSequential) -> tuple[Any, Any, Layout]:
-    """Return ``plans`` and ``tasks`` (or None) and ``layout`` of the first part of a trunk that has a layout."""
+    """Find the first part of a trunk that has a layout, and return its ``(plans, tasks, layout)``; ``plans`` and
+    ``tasks`` are None if the part has none.
+    """
     part = next((part for part in _named_parts(trunk) if hasattr(part, "layout")), None)
     if part is None:
         raise ValueError("trunk must have a part with a layout: PlanAttention, SkillMixer, TaskLatent or features")

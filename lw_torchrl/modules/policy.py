@@ -84,7 +84,9 @@ def tasks_of(actor: Any) -> tuple[str, ...] | None:
 
 
 def layout_of(actor: Any) -> Layout:
-    """Return the layout of an actor's observations: that of the actor, its plans or its parts, or Meta-World's."""
+    """Return the observation layout of an actor: the first one defined by the actor, its plans or its parts, otherwise
+    Meta-World's.
+    """
     own, plans = getattr(actor, "layout", None), plans_of(actor)
     layout: Layout = own or (plans.layout if plans is not None else _first(actor, "layout")) or METAWORLD
     return layout

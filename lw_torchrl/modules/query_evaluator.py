@@ -151,7 +151,7 @@ def evaluators_of(policy: Any) -> list[QueryEvaluator]:
 
 _PADDING = -1e4  # the logit beyond a plan's last step, as in QueryProgram.logits
 LARGEST_LOGIT = 30.0
-"""The maximum absolute logit of a clause, which is a probability of 1e-13."""
+"""The maximum absolute logit of a clause; it keeps probabilities within [1e-13, 1 - 1e-13]."""
 _SCALES = (0.005, 0.02, 0.1, 0.5)  # metres, the scales at which tanh squashes a difference
 
 

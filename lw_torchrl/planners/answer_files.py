@@ -174,7 +174,7 @@ def recorded_answers(source: AnyPath) -> dict[str, dict[_Place, str | Path]]:
 
 
 def answer_text(answer: str | Path) -> str:
-    """Return the text of an answer (a text or a file) from :func:`recorded_answers`."""
+    """Return the text of an answer (a string or a file path) from :func:`recorded_answers`."""
     return _storable(read_text(answer, ValueError) if isinstance(answer, Path) else answer)
 
 

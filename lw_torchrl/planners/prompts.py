@@ -59,7 +59,7 @@ def _shipped() -> Plans:
 
 
 def example_plans(plans: AnyPlans | None) -> Plans:
-    """Return the plans from which examples are chosen; None stands for the shipped MT10 plans."""
+    """Return the plans from which examples are chosen; ``plans=None`` selects the shipped MT10 plans."""
     return _shipped() if plans is None else as_plans(plans)
 
 
@@ -69,7 +69,8 @@ def plan_prompt(
 ) -> str:
     """Build the prompt that requests a plan from a language model; :func:`~lw_torchrl.decode_plan` parses the answer.
 
-    The prompt shows the plans from :func:`prompt_examples` in the format, then the task's name and description.
+    The prompt shows the plans from :func:`prompt_examples` in the requested format, then the task's name and
+    description.
 
     Args:
         format: a name in :data:`~lw_torchrl.PLAN_FORMATS`.

@@ -44,7 +44,7 @@ class TargetPose(NamedTuple):
 
     @property
     def distance(self) -> NDArray[np.float32]:
-        """The distance (T,) in metres between moved object and target; NaN for a relative target."""
+        """The distance (T,) in metres between the moved object and its target; NaN for a relative target."""
         distance = np.linalg.norm(self.position - self.moved, axis=1)
         return np.full_like(distance, np.nan) if self.relative else distance
 
@@ -133,7 +133,9 @@ class RecordedEpisode:
         return None if np.isnan(distance).all() else distance
 
     def with_target_poses(self, task: Task, suite: Suite | None) -> RecordedEpisode:
-        """Return a copy of the episode with the target poses of the plan's scripted skills in ``task``."""
+        """Return a copy of the episode that also holds the target poses of the plan's scripted skills for the task
+        ``task``.
+        """
         skills = load_skills() if suite is None or suite.skills is None else suite.skills
         assert self.observation is not None
         positions = task.positions(torch.from_numpy(self.observation))

@@ -260,7 +260,7 @@ class RerunLogger(Logger):
         return number
 
     def _send(self, *, now: bool = False, layout: bool = False) -> None:
-        """Save new tabs, and send the buffered scalars if enough time has passed or if ``now``.
+        """Save new tabs, and send the buffered scalars if enough time has passed or ``now`` is true.
 
         Rerun accepts only complete layouts (0.1 MB per page), so the layout is sent to a file only at the end, and to a
         live viewer only occasionally.
@@ -416,7 +416,7 @@ def _numbers(name: str, value: Any) -> list[float]:
 
 
 def _flatten(cfg: Mapping[Any, Any], prefix: str = "") -> dict[str, str]:
-    """Flatten nested mappings to a dict from keys such as "actor.width" to the values as text."""
+    """Flatten nested mappings into a dict of strings with dotted keys such as "actor.width"."""
     flat: dict[str, str] = {}
     for key, value in cfg.items():
         if isinstance(value, Mapping) and value:

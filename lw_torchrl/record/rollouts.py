@@ -123,7 +123,7 @@ def read_rollout(
     suite: Suite | None = None,
     step_time: float | None = None,
 ) -> tuple[Heading, RecordedEpisode]:
-    """Check a rollout (T,), which :func:`log_rollout` describes, and return the heading and the recorded episode."""
+    """Validate a rollout (T,) (see :func:`log_rollout`), and return its heading and the recorded episode."""
     plans = None if plans is None else as_plans(plans)
     number = _constant(rollout, "task_id", required=True)
     index = _constant(rollout, "episode", required=seed is not None)

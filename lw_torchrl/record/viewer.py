@@ -148,8 +148,9 @@ def find_recordings(path: AnyPath) -> list[Path]:
 
 @contextmanager
 def readable(recording: Path) -> Iterator[Path]:
-    """Yield the path of a recording, or of a repaired copy if the recording was not closed: Rerun would wait for the
-    rest of an incomplete file."""
+    """Yield the path of a recording, or of a repaired copy if the recording was not closed properly; otherwise Rerun
+    would wait for the rest of the incomplete file.
+    """
     from rerun.chunk import RrdReader
 
     if is_complete(recording):

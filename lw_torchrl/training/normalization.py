@@ -81,7 +81,9 @@ def share_contacts(module: nn.Module) -> None:
 
 
 def statistics_of(module: nn.Module) -> dict[str, Tensor]:
-    """Return the buffers that :func:`fit_normalization` fits, by name; in a loss, including copies and targets."""
+    """Return the buffers that :func:`fit_normalization` fits, by name; for a loss, this includes the buffers of its
+    copies and target networks.
+    """
     names = [f"{path}.{name}".lstrip(".") for path, part in _features_of(module) for name in part.state_dict()]
     buffers = dict(module.named_buffers())
     if isinstance(module, LossModule):

@@ -25,7 +25,7 @@ ACTIVE = 0.01  # a plan step with more attention is active; a false step has abo
 
 
 class Augmentation(Transform):
-    """A base class of transforms that change sampled rows at random. Use in an environment raises a TypeError."""
+    """Base class for transforms that randomly change sampled rows. Using one in an environment raises a TypeError."""
 
     def _refuse(self) -> NoReturn:
         name = type(self).__name__
@@ -77,7 +77,9 @@ class PlanAugmentation(Augmentation):
         return qaf, rows, self.table("steps", rows.device)[rows, torch.zeros_like(rows) if turn is None else turn % 2]
 
     def active(self, tensordict: TensorDictBase, keys: Keys) -> tuple[Tensor, Tensor]:
-        """Return a mask of the active plan steps (B, S) bool, and the row indices of the tables (B,) int64."""
+        """Return a mask of the active plan steps (B, S) bool, and, for each batch row, the index of its row in the
+        query tables (B,) int64.
+        """
         qaf, rows, steps = self.answers(tensordict, keys)
         weights = (10.0 * qaf.to(torch.float32) - 5.0).masked_fill(~steps, -torch.inf).softmax(-1)
         return weights > ACTIVE, rows

@@ -76,7 +76,9 @@ class CameraTransform(KeepsEnvState):
             raise TypeError(f"CameraTransform needs a LanguageWorldEnv, got {type(env).__name__}")
 
     def _draw(self, which: Tensor, tensordict: TensorDictBase) -> TensorDictBase:
-        """Render the rows where ``which`` (N,) bool is true, and write the pictures of all rows."""
+        """Re-render the images of the rows selected by the boolean mask ``which`` (N,), then write the images of all N
+        rows.
+        """
         env: Any = base_env(self)
         rows = which.nonzero().flatten()
         if self._taken is None:

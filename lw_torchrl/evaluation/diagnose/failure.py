@@ -224,7 +224,9 @@ class Failure:
 
 
 def record_from_json(kind: type[Any], content: Any) -> Any:
-    """Build the dataclass ``kind`` from a JSON object whose keys are exactly its compared fields."""
+    """Build an instance of the dataclass ``kind`` from a JSON object. Its keys must be exactly the fields of ``kind``
+    with ``compare=True``.
+    """
     names = {each.name for each in fields(kind) if each.compare}
     if not isinstance(content, dict) or set(content) != names:
         keys = ", ".join(sorted(names))

@@ -89,7 +89,7 @@ class Reading:
         self.notes.append(Note(line, text))
 
     def open(self, task: str, line: int) -> None:
-        """Begin a section for a task; a ``def`` right below a heading for the same task begins no new section."""
+        """Begin a section for a task, unless a ``def`` follows right below a heading for the same task."""
         if self.section.task != task or self.section.clauses:
             self.sections.append(Section(task, line))
 

@@ -48,7 +48,7 @@ def load_skills() -> Skills:
 
 
 def load_plans() -> Plans:
-    """Load a plan for each task; :func:`load_skills` has a scripted skill for every plan step."""
+    """Load a plan for each task; :func:`load_skills` returns a scripted skill for every plan step."""
     return plan_files.load_plans(str(_DATA / "plans"), tasks=TASKS)
 
 

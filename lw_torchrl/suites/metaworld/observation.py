@@ -245,7 +245,7 @@ class SuccessFunction:
         return scene.near[rows] & (scene.goal[rows, 2] - scene.point[rows, 2] > 0.0)
 
     def _object_above_goal(self, rows: Index, scene: Scene) -> Mask:
-        """Return whether the object is higher than the goal, at any x and y."""
+        """Return whether the object is higher than the goal, regardless of x and y."""
         return scene.current[rows, OBJECT.stop - 1] > scene.goal[rows, 2]
 
     def _joint_above(self, rows: Index, scene: Scene) -> Mask:

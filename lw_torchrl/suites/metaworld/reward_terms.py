@@ -96,8 +96,10 @@ def _points(reward: TaskReward) -> list[list[list[list[int]]]]:
 
 
 def _less(term: Term) -> float:
-    """Return the number to subtract from the distance between the margin's two points. If the margin is a number, both
-    points are the same, so that the (absolute) result equals the margin."""
+    """Return the offset that is subtracted from the distance between the margin's two points. The margin is the
+    absolute value of the difference. A constant margin uses two identical points, so its distance is 0 and the offset
+    alone gives the margin.
+    """
     if isinstance(term.margin, tuple):
         return term.less
     if term.margin == FIRST_DISTANCE:

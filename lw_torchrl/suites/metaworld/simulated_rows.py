@@ -186,7 +186,9 @@ class ThreadedEngine(SeenRows):
 
     @abstractmethod
     def _step_running(self, rows: Index, action: NDArray[Any], reward: Array, success: Mask) -> None:
-        """Step ``rows``, given the actions of all rows, and write observations, rewards, success flags and faults."""
+        """Step ``rows``, given the actions of all rows, and write their observations, rewards, success flags and
+        errors.
+        """
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> Array:
         index, seed_of = seeds_of_rows(rows, seeds)
