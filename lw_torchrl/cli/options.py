@@ -83,7 +83,7 @@ class Output:
             print(f"{counted(times, 'answer')}: {note}")
 
     def finish(self) -> None:
-        """Print the JSON document, if requested, and raise a :class:`ValueError` if there is a fault."""
+        """Print the JSON document, if requested, and raise a :class:`ValueError` if there is an error."""
         if self.as_json:
             print(json.dumps(_plain(self._document), indent=2, allow_nan=False))
         if self.fault:
@@ -160,7 +160,7 @@ _PLAN_TASK = re.compile(r"^def[ \t]+([a-z]\w*)[ \t]*\(", re.MULTILINE)
 
 
 def import_object(option: str, name: str) -> Any:
-    """Import the object called "package.module:name", searching the working folder first."""
+    """Import the object given as "package.module:name", searching the working directory first."""
     module, _, attribute = name.partition(":")
     if "" not in sys.path:
         sys.path.insert(0, "")
@@ -235,7 +235,7 @@ def tasks_of_plans(path: Path, task: str | None, task_file: Path | None) -> Mapp
 
 
 def select_tasks(names: Sequence[str], tasks: Mapping[str, Task], suite: lw.suites.Suite | None = None) -> list[str]:
-    """Return the names of the tasks in ``names``, in which MT10, MT50 and a suite's name stand for several tasks."""
+    """Expand ``names`` to task names; MT10, MT50 and a suite's name stand for several tasks."""
     if (suite := suite or read_suite(None, names)) is None:
         return list(resolve_tasks(names[0] if len(names) == 1 else names, tasks=tasks))
     return list(suite.tasks if list(names) == [suite.name] else suite.named_tasks(names))

@@ -243,8 +243,9 @@ class Read:
         return [plans[self.task]]
 
     def _decoded(self, file: Path) -> list[lw.ConditionalPlan]:
-        """Return a list with the plan in a language model's answer. If the answer has no plan, raise a PlanError, or
-        return an empty list if there are several sources."""
+        """Return a list with the plan in a language model's answer. Without a plan, raise a PlanError if this is the
+        only source, otherwise return an empty list.
+        """
         from lw_torchrl.language.plan_decoding import decode_plan
 
         task, format = self.task or re.sub(r"-\d+$", "", file.stem), self.format or file.absolute().parent.name

@@ -106,7 +106,7 @@ class GroupSampler(Sampler):
         return None
 
     def _covered(self, storage: Storage) -> int:
-        """Return the number N if the first N rows of the storage are grouped."""
+        """Return the number of rows to group, counted from the start of the storage."""
         return len(storage) if storage.ndim == 1 else storage.shape.numel()
 
     def _group(self, storage: Storage) -> None:
@@ -451,5 +451,7 @@ class CoLearningSampler(GroupSampler):
         for name, own in self._identity().items():
             stored = state_dict.get(name)
             if not isinstance(stored, Tensor) or not torch.equal(stored.cpu(), own):
-                raise ValueError(f"state_dict has another {name} than this sampler ({name}={getattr(self, name)!r})")
+                raise ValueError(
+                    f"state_dict has a different {name} than this sampler ({name}={getattr(self, name)!r})"
+                )
         super().load_state_dict(state_dict)

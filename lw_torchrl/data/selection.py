@@ -195,7 +195,7 @@ def select(
     check_behaviours(datasets)
     sizes = {(dataset.config.layout.size, dataset.config.layout.action_size) for dataset in datasets}
     if len(sizes) > 1:
-        raise ValueError(f"root: all folders must have the same layout, got observation and action sizes {sizes}")
+        raise ValueError(f"root: all folders must have the same observation and action sizes, got {sizes}")
     is_single = isinstance(root, (str, os.PathLike))
     parts = [
         choose_episodes(dataset, choice, "episodes" if is_single else f"episodes[{number}]")

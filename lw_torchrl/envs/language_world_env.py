@@ -173,7 +173,7 @@ class LanguageWorldEnv(EnvBase):
 
     @property
     def seed(self) -> int:
-        """The seed, which determines every reset together with task and episode."""
+        """The seed, which, with task and episode, determines every reset."""
         return self._counter.seed
 
     def get_extra_state(self) -> Tensor:

@@ -78,10 +78,10 @@ def canonical_plan(plan: ConditionalPlan, fallback: bool = False) -> Conditional
     """Convert a free-form plan to a plan with a role for each step, and complete an underspecified plan.
 
     Each step gets a verb, an object that moves, a target and a direction (:class:`StepRole`), which are inferred from
-    the step's words, its condition and the task's objects only. Where the hand touches an object with a named point,
-    the point replaces the object. A plan whose conditions miss typical states, or that moves an object without grasping
-    it first, keeps its motion, objects and direction, but gets standard conditions. A plan without any motion is
-    replaced by :func:`fallback_plan`. A plan that already has roles is not parsed again.
+    the step's words, its condition and the task's objects only. If the object that the hand touches has a named point,
+    this point replaces the object. A plan whose conditions miss typical states, or that moves an object without
+    grasping it first, keeps its motion, objects and direction, but gets standard conditions. A plan without any motion
+    is replaced by :func:`fallback_plan`. A plan that already has roles is not parsed again.
 
     Args:
         plan: a plan in free-form English.

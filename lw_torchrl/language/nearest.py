@@ -225,7 +225,7 @@ def _nearest_condition(text: str, task: Task) -> tuple[Query | None, float]:
 
 
 def _with_target(text: str, task: Task) -> str:
-    """Convert a text to lower case, with the task's name for the goal in place of "goal", "target position", etc."""
+    """Lower-case a text and replace "goal", "target position", etc. with the task's name for the goal."""
     name = next((name for name in _TARGETS if name in task.object_names), None)
 
     def named(goal: re.Match[str]) -> str:

@@ -17,7 +17,7 @@ WORDS: Mapping[str, Any] = read_toml(files("lw_torchrl.language") / "data" / "wo
 
 GRIPPER = "robot's gripper"
 GOAL = "target location"
-"""The name of the goal in step roles; every observation has a goal, which tasks may name differently."""
+"""The name of the goal in step roles; every observation has a goal, but tasks may call it something else."""
 Coordinate = int | Finite
 """A coordinate: an int is an index into the observation, a float a fixed value in metres."""
 TypedPosition = tuple[tuple[bool, Coordinate], ...]

@@ -60,7 +60,8 @@ class PlanStep:
     role: StepRole | None = None  # the action and its objects, in plans of :func:`~lw_torchrl.canonical_plan`
 
     def mentions(self, task: Task) -> set[str]:
-        """Return the names of the objects that the condition or the skill mentions; the goal may be "target location".
+        """Return the names of the objects that the condition or the skill mentions; the goal may appear as "target
+        location".
 
         The skill's objects are taken from the step's role or, without a role, found by name in the skill's text.
         """
@@ -282,7 +283,7 @@ AnyPlans = Plans | Mapping[str, ConditionalPlan]
 
 
 def as_plans(plans: AnyPlans, argument: str = "plans") -> Plans:
-    """Convert a mapping to :class:`Plans`, and return Plans unchanged. Errors name the ``argument``."""
+    """Convert a mapping to :class:`Plans`, and return Plans unchanged. Error messages name the ``argument``."""
     if isinstance(plans, Plans):
         return plans
     if not isinstance(plans, Mapping):

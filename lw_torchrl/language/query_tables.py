@@ -147,7 +147,7 @@ Bits = NDArray[np.uint64]
 class QueryFacts(NamedTuple):
     """The facts (F) of all tasks as bits, one task after another.
 
-    A task's facts are its comparisons of lengths, its comparisons of one coordinate, and its conjunctions (D). A query
+    A task's facts are its length comparisons, single-coordinate comparisons and conjunctions (D). A query
     is true if ``facts & care == want``, where ``care`` masks the bits that the query depends on.
     """
 

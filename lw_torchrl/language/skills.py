@@ -77,7 +77,7 @@ def _skill(text: str, row: Any, tasks: Tasks) -> ScriptedSkill:
     values = dict(row)
     changes = values.pop("for", {})
     if not isinstance(changes, Mapping) or not all(isinstance(change, Mapping) for change in changes.values()):
-        raise SkillError(f"for must map task names to tables, got {shown(changes)}")
+        raise SkillError(f"'for' must map task names to tables, got {shown(changes)}")
     variants = {check_task(task, tasks): _skill(text, {**values, **change}, tasks) for task, change in changes.items()}
     for key in values:
         check_choice("key", key, _KEYS)

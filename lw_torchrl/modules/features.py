@@ -266,7 +266,7 @@ def differences(observation: Tensor, layout: Layout) -> Tensor:
 
 
 def squash(difference: Tensor) -> tuple[Tensor, Tensor]:
-    """Squash differences in metres by tanh at 2 cm, which shows alignment, and at 10 cm, which shows direction."""
+    """Squash differences in metres with tanh at two scales: 2 cm for alignment and 10 cm for direction."""
     return torch.tanh(difference / _FINE), torch.tanh(difference / _COARSE)
 
 

@@ -66,7 +66,7 @@ class PointingNetwork(ClauseNetwork):
         materialize(self.place, torch.zeros(1, cameras * (2 + _KEPT + 2 * _LANDMARKS) + KEYS))
 
     def forward(self, seen: Tensor, clauses: Clauses) -> Tensor:
-        """Return logits (B, Q) of clauses (B, Q) from pictures (B, H, W·C, 3) uint8 of C cameras side by side."""
+        """Return logits (B, Q) of clauses (B, Q) from images (B, H, W·C, 3) uint8, with C camera views side by side."""
         return self.judge_at(self.places(seen, self.names.weight)[0], clauses)
 
     def judge_at(self, places: Tensor, clauses: Clauses) -> Tensor:

@@ -115,8 +115,8 @@ def transform_of(actor: Any, plans: Plans | None = None) -> Transform | None:
 
     Args:
         actor: any actor; the transforms of parts with a method ``transform()`` are included.
-        plans: the plans whose conditions are answered even if the actor does not read ``qaf``; None for the actor's
-            plans, if the actor reads ``qaf``.
+        plans: plans whose conditions to check even if the actor does not read ``qaf``. None: the actor's plans if it
+            reads ``qaf``, otherwise no plans.
     """
     own, reads = plans_of(actor), list(getattr(actor, "in_keys", ()))
     transforms: list[Transform] = []

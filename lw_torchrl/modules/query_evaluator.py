@@ -222,7 +222,7 @@ class ClauseEvaluator(QueryEvaluator):
         self.tables: TaskTables[Clauses] = TaskTables(index, tables, f"tasks without a plan in {plans!r}")
 
     def check_seen(self, seen: Tensor) -> None:
-        """Raise a :class:`ValueError` unless the view has the shape and dtype that the network reads."""
+        """Raise a :class:`ValueError` unless the view has the shape and dtype that the network expects."""
         raise NotImplementedError(f"{type(self).__name__} must override check_seen")
 
     def logits(self, *read: Tensor) -> Tensor:

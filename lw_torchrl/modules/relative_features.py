@@ -246,7 +246,9 @@ class RoleFeatures(_RelativePositions):
         return other
 
     def share(self) -> None:
-        """Copy the contacts to all features made by :meth:`with_plans`; call this method after changing the buffers."""
+        """Copy the contact points to all modules created by :meth:`with_plans`; call this method after changing the
+        buffers.
+        """
         for other in self._sharing:
             if other is not self:
                 other._copy(self)

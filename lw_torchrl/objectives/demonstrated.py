@@ -75,8 +75,8 @@ class DemonstratedTD3Loss(_ImitatesDemonstrations, TD3BCLoss):
     """A TD3 loss on demonstrations and collected rows, in which the actor also imitates the demonstrations.
 
     The actor's loss is -Q / mean(abs(Q)) over all rows, where Q is the mean over the critics, plus ``bc_weight``
-    times the mean squared distance to ``action`` over the rows where ``is_demonstration`` is true (rows of datasets,
-    but not of a collector). The critics' loss is TD3's.
+    times the mean squared distance to ``action`` over the rows where ``is_demonstration`` is true (dataset rows, not
+    collector rows). The critics' loss is TD3's.
 
     Reads the keys of TD3 and ``is_demonstration`` (B,) bool. Writes the keys of :class:`torchrl.objectives.TD3BCLoss`:
     ``loss_actor`` and ``loss_qvalue``, () float32 each, and, detached, the unweighted ``bc_loss`` (), ``lmbd`` (),

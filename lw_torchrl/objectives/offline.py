@@ -174,7 +174,7 @@ class ExpectileValueLoss(LossModule):
 
 
 class AdvantageWeightedLoss(LossModule):
-    """An imitation loss whose rows have the weight exp(β·A), at most ``max_weight``, where A is a row's advantage.
+    """An imitation loss that weights each row by exp(β·A), capped at ``max_weight``, where A is the row's advantage.
 
     Reads the actor's input keys, ``action`` (B, 4) float32, and ``advantage`` (B, 1) float32, which
     :meth:`ExpectileValueLoss.advantage` returns and :func:`standardize_by_task` standardizes. Returns ``loss_actor`` ()

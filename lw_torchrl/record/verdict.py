@@ -19,7 +19,7 @@ AFTER_SUCCESS, AROUND_FAILURE = 8, 60
 shows."""
 LONGEST = 200  # maximum number of time steps to show from the ghost's divergence to the failure
 PLAN_LINES, LINE = 13, 78
-"""The maximum number of plan lines that leave room for the scene in a 1100×700 window, and of characters per line."""
+"""The maximum numbers of plan lines and of characters per line that leave room for the scene in a 1100×700 window."""
 SPARSE = 8  # outside the shown range, the scene is drawn every 8th time step (a tenth of a second)
 MARKS = {True: "✓", False: "✗", None: "·"}
 

@@ -225,7 +225,7 @@ def check_can_be_saved(module: nn.Module, kind: str = "actor") -> None:
 
 
 def policy_file(path: AnyPath) -> Path:
-    """Return the file of the shipped policy named ``path``, or otherwise the path itself."""
+    """Return the file of the shipped policy named ``path``, or the path itself if there is none."""
     return shipped_policy(path) or Path(path)
 
 

@@ -48,7 +48,9 @@ def make_optimizer(
 
 
 def _set_learning_rates(optimizer: torch.optim.Optimizer, config: Any, step: int) -> None:
-    """Set the learning rates after ``step`` optimizer steps: on a cosine from the initial value to 0, or constant."""
+    """Set the learning rates after ``step`` optimizer steps: a cosine schedule from the initial value to 0, or
+    constant.
+    """
     is_constant = getattr(config, "schedule", "cosine") == "constant"
     factor = 1.0 if is_constant else 0.5 * (1.0 + math.cos(math.pi * step / config.steps))
     for group in optimizer.param_groups:

@@ -260,7 +260,7 @@ def _steps(source: Path, frames: Any) -> dict[str, Array]:
 
 
 def _task_texts(source: Path) -> dict[int, str]:
-    """Return the name of each task by task_index, or the task's description if the file has no name."""
+    """Map each task_index to the task's name, or to its description if the file stores no task names."""
     import pyarrow.parquet as pq
 
     lines = source / "meta" / "tasks.jsonl"

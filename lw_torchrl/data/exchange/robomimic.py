@@ -58,7 +58,7 @@ def _task(attributes: Any) -> str:
 
 
 def read(source: Path) -> Table:
-    """Read a file in robomimic's layout, or all such files in a folder, as a table."""
+    """Read a file in robomimic's format, or all such files in a folder, as a table."""
     import h5py
 
     parts, tasks = [], []

@@ -203,7 +203,9 @@ def _plans_agree(explanation: Explanation) -> bool:
 def _by_counterfactuals(
     seen: EpisodeStates, explanation: Explanation, tried: Counterfactuals, shares: Mapping[str, float], seed: int
 ) -> Failure:
-    """Return the failure with the cause found by the counterfactual re-runs, and the finding from the states."""
+    """Return the failure with two additions: the cause found by the counterfactual re-runs and the finding from the
+    states.
+    """
     which, null = seen.which, tried.null
     share, number = null.share(seen.task), float(sum(task == seen.task for task, _ in null.episodes))
     record: dict[str, Any] = {"evidence": {**explanation.evidence, "failed": number}}

@@ -133,7 +133,7 @@ class EpisodeStates(NamedTuple):
         return self.task, self.episode
 
     def active_time(self, plan: ConditionalPlan, step: int, distance: float | None = None) -> ActiveStep:
-        """Return a finding with the number of the last 100 states in which a plan step was active."""
+        """Return a finding that counts in how many of the last 100 states a plan step was active."""
         late = min(_LATE, len(self.active))
         states = int((self.active == step)[-late:].sum())
         return ActiveStep(step, plan.steps[step].skill, states, late, distance)

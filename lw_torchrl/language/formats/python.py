@@ -272,7 +272,7 @@ def _task_name(name: str) -> str:
 
 
 def _statements(text: str) -> Iterator[tuple[int, str]]:
-    """Yield (line number, statement) for a text; join the lines of a call, and unwrap ``print("...")``."""
+    """Yield a (line number, statement) pair per statement; join multi-line calls and unwrap ``print("...")``."""
     lines = text.expandtabs(4).splitlines()
     at = 0
     while at < len(lines):

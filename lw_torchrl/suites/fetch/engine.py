@@ -46,7 +46,7 @@ def our_quaternions(quaternions: Array) -> Array:
 
 
 def turned_quaternions(quaternions: Array) -> Array:
-    """Turn body orientations (..., 4) float64, in w, x, y, z order, from Fetch's to Meta-World's axes."""
+    """Convert body orientations (..., 4) float64, in w, x, y, z order, from Fetch's to Meta-World's axes."""
     w, x, y, z = np.moveaxis(quaternions, -1, 0)
     return np.sqrt(0.5) * np.stack((w - z, x - y, x + y, w + z), -1)
 
@@ -226,7 +226,7 @@ class FetchEngine(ThreadedEngine):
         self._observation[rows, :_NOW] = now
 
     def _now(self, rows: Index) -> Array:
-        """Return the first 11 values (len(rows), 11) of the observations, which describe the current time step."""
+        """Return the part of the observations for the current time step: the first 11 values (len(rows), 11)."""
         read, origin = self._read[rows], self._origin[rows]
         now = np.zeros((len(rows), _NOW))
         now[:, :3] = our_positions(read[:, :3], origin)

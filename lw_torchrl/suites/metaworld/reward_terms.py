@@ -161,7 +161,7 @@ def hamacher_product(a: Numbers, b: Numbers) -> Numbers:
 
 
 def limited(x: Numbers, low: float, high: float) -> Numbers:
-    """Clip x as ``np.clip`` does; for small arrays, this takes a third of the time."""
+    """Clip x like ``np.clip``, but three times as fast for small arrays."""
     return np.minimum(np.maximum(x, low), high)
 
 
