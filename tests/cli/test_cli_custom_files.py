@@ -72,7 +72,7 @@ def test_a_policy_is_trained_with_custom_files(capsys, tmp_path):
     policy = tmp_path / "policy.safetensors"
     files = ("--plans", "reach.plan", "--task-file", "tasks.toml", "--text-encoder", "my_texts:encode")
     run(capsys, "train", "demos", "--out", policy, "--tasks", "reach", *files, *TINY, "--batch-size", 8)
-    assert "text_encoder must be the one" in fails(capsys, "evaluate", policy, "--text-encoder", "my_texts:other")
+    assert "text_encoder must be the encoder" in fails(capsys, "evaluate", policy, "--text-encoder", "my_texts:other")
     few = ("--text-encoder", "my_texts:encode", "--episodes", 1, "--stop-at-success")
     run(capsys, "evaluate", policy, *few, "--out", tmp_path / "out")
     saved = json.loads((tmp_path / "out" / "results.json").read_text())

@@ -48,7 +48,7 @@ def test_train_writes_a_policy_and_resumes(capsys, demos, policy):
 def test_train_requires_a_plan_and_demonstrations_of_every_task(capsys, tmp_path, demos):
     lw.save_plans({"push": lw.load_plans("MT10")["push"]}, tmp_path / "plans")
     out = ("--out", tmp_path / "p.safetensors")
-    assert "plans lack reach" in fails(capsys, "train", demos, *out, "--plans", tmp_path / "plans", *TINY)
+    assert "plans have no plan for reach" in fails(capsys, "train", demos, *out, "--plans", tmp_path / "plans", *TINY)
     assert "door-open" in fails(capsys, "train", demos, *out, "--tasks", "reach", "door-open")
     assert not out[1].exists()
 
@@ -95,7 +95,7 @@ def test_evaluate_runs_the_demonstrated_tasks_by_default(capsys, policy, tmp_pat
     shown = document(capsys, "evaluate", policy, "--plans", "MT10", *SHORT, "--attribute")
     assert len(shown["tasks"]) == len(shown["failures"]) == 10
     assert shown["config"]["max_steps"] == 5
-    assert "plans lack sweep-into" in fails(capsys, "evaluate", policy, "--tasks", "sweep-into")
+    assert "plans have no plan for sweep-into" in fails(capsys, "evaluate", policy, "--tasks", "sweep-into")
     assert "--seed 0" in fails(capsys, "evaluate", policy, "--seed", 0)
 
 

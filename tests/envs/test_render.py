@@ -138,7 +138,7 @@ def test_a_custom_engine_needs_no_render():
 
     env = lw.LanguageWorldEnv("reach", engine=Still)
     env.reset()
-    with pytest.raises(NotImplementedError, match="Still has no render"):
+    with pytest.raises(NotImplementedError, match="Still has no method render"):
         env.render()
     env.close()
 

@@ -300,9 +300,9 @@ def test_an_actor_without_plans_receives_the_answers_for_given_plans():
 
 
 def test_a_task_without_a_plan_is_refused():
-    with pytest.raises(ValueError, match="plans lack sweep-into"):
+    with pytest.raises(ValueError, match="plans have no plan for sweep-into"):
         run(make_actor(), ["reach", "sweep-into"])
-    with pytest.raises(ValueError, match="plans lack push"):
+    with pytest.raises(ValueError, match="plans have no plan for push"):
         run(lambda state: state, "push", plans={"reach": PLANS["reach"]})
 
 

@@ -21,6 +21,7 @@ def tip_of(rollout):
 
 
 def test_objects_are_drawn_without_a_robot(tmp_path):
+    torch.manual_seed(0)
     rollout = PendulumEnv().rollout(20)
     with lw.RerunLogger(tmp_path / "a.rrd") as logger:
         name = logger.log_episode(rollout, task="swing", objects={"tip": tip_of(rollout)}, step_time=0.05)
@@ -38,6 +39,7 @@ def test_objects_are_drawn_without_a_robot(tmp_path):
 
 
 def test_an_observation_of_another_size_needs_no_layout(tmp_path):
+    torch.manual_seed(0)
     rollout = PendulumEnv().rollout(20)
     rollout["observation"] = tip_of(rollout)
     with lw.RerunLogger(tmp_path / "a.rrd") as logger:

@@ -288,7 +288,7 @@ def test_verdict_of_a_success(tmp_path, pushed):
         (lambda r: r.exclude("task_id"), {}, "task_id"),
         (lambda r: r.set("episode", torch.arange(60) // 30), {}, "episode"),
         (lambda r: r.set("qaf_plan", r["qaf_plan"] + 1), {"plans": PLANS}, "plans"),
-        (lambda r: r, {"plans": lw.Plans([PLANS["reach"]])}, "plans lack push"),
+        (lambda r: r, {"plans": lw.Plans([PLANS["reach"]])}, "plans have no plan for push"),
         (lambda r: r, {"failure": failure_of(episode=3)}, "failure"),
     ],
 )

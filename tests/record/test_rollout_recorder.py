@@ -123,7 +123,7 @@ def test_wrong_rows_plans_and_environments_are_errors(tmp_path):
     with lw.RerunLogger(tmp_path / "a.rrd") as logger:
         with pytest.raises(ValueError, match="rows must be less than 2"):
             make(logger, rows=(7,))
-        with pytest.raises(ValueError, match="plans lack soccer"):
+        with pytest.raises(ValueError, match="plans have no plan for soccer"):
             TransformedEnv(lw.LanguageWorldEnv("soccer"), RolloutRecorder(logger, plans=PLANS))
         with pytest.raises(TypeError, match="SerialEnv"):
             TransformedEnv(SerialEnv(1, lambda: lw.LanguageWorldEnv("reach")), RolloutRecorder(logger))

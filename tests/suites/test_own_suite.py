@@ -340,9 +340,9 @@ def test_check_finds_a_gripper_that_does_not_move():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"opening": 2}, "number 2 .*two"),
-        ({"things": (Slot(3),)}, "number 3 .*two"),
-        ({"past": 2, "size": 40}, "two"),
+        ({"opening": 2}, "index 2 .*more than once"),
+        ({"things": (Slot(3),)}, "index 3 .*more than once"),
+        ({"past": 2, "size": 40}, "more than once"),
         ({"gripper": 2}, "gripper .*displacement"),
     ],
 )

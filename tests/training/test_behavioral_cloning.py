@@ -193,7 +193,7 @@ def test_an_actor_that_writes_no_action_is_refused(demos):
 
 def test_rows_without_answers_are_refused(demos):
     trainer = BehavioralCloningTrainer(make_actor(), lw.LanguageWorldExperienceReplay(demos), CONFIG, progress=False)
-    with pytest.raises(ValueError, match=r"without qaf: QAFTransform\(plans\)"):
+    with pytest.raises(ValueError, match=r"qaf missing; add QAFTransform\(plans\)"):
         trainer.train()
 
 

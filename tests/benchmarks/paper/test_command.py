@@ -75,7 +75,7 @@ def test_other_plans_have_their_own_folder(capsys, tmp_path, tiny):
     lw.save_plans({"push": lw.load_plans("MT10")["push"]}, folder)
     given = arguments(tmp_path, "--plans", "MT50", folder, "--list", methods=["pcbc"], seeds=[0])
     assert run(capsys, *given).split()[1:] == ["few-shot/strong-MT50+llama3.1-chain_py/pcbc/seed0"]
-    with pytest.raises(ValueError, match="plans lack assembly, "):
+    with pytest.raises(ValueError, match="plans have no plan for assembly, "):
         main([str(one) for one in arguments(tmp_path, "--plans", folder, "--list")])
 
 
