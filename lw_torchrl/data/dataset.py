@@ -83,7 +83,7 @@ class CollectConfig:
         object.__setattr__(self, "noise_scale", noise_scale)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the config as JSON, without ``policy`` if it is the expert and ``layout`` if it is Meta-World's."""
+        """Return the config as JSON; omit ``policy`` for the expert and ``layout`` for Meta-World."""
         config = {each.name: getattr(self, each.name) for each in fields(self)}
         config |= {"tasks": list(self.tasks), "noise_scale": list(self.noise_scale)}
         for key, default in (("policy", EXPERT), ("layout", METAWORLD)):

@@ -54,7 +54,9 @@ end at success (``terminate_on_success``), so that the best return is 0 and stay
 
 
 def episode_returns(reward: Tensor, lengths: Sequence[int] | Tensor) -> Tensor:
-    """Return the return and the number of rows (E, 2) float64 of E consecutive episodes with rewards (R, 1) float32."""
+    """Compute each episode's return and length, (E, 2) float64, from the rewards (R, 1) float32 of E consecutive
+    episodes.
+    """
     rows = torch.as_tensor(lengths, dtype=torch.int64)
     total = torch.zeros(len(rows), dtype=torch.float64)
     total.index_add_(0, torch.repeat_interleave(rows), reward.reshape(-1).double())
@@ -63,7 +65,7 @@ def episode_returns(reward: Tensor, lengths: Sequence[int] | Tensor) -> Tensor:
 
 @typed
 def n_step_returns(rollout: TensorDictBase, n_steps: Count, gamma: Probability) -> TensorDictBase:
-    """Compute n-step transitions: replace ``"next"`` of each row by that of the row n - 1 time steps later.
+    """Compute n-step transitions: replace each row's ``"next"`` with that of the row n - 1 time steps later.
 
     Fewer time steps are used where a trajectory or the rollout ends. Done flags also come from the later row (TorchRL's
     ``MultiStep`` keeps the flags of the first). ``("next", "reward")`` becomes the discounted sum of rewards, and

@@ -88,8 +88,9 @@ class EpisodeFilter:
 
 Label = Literal["expert", "unclipped", "executed"]
 EpisodeChoice = int | Mapping[str, int | Sequence[int]] | None
-"""A choice of episodes: None for all, a number N for the first N of each task, or a mapping from the tasks to use to
-such a number or to a list of episode indices."""
+"""A choice of episodes: None for all, a number N for the first N of each task, or a mapping whose keys are the tasks to
+use and whose values are an N or a list of episode indices.
+"""
 
 
 def choose_episodes(dataset: Demonstrations, choice: EpisodeChoice, argument: str = "episodes") -> Demonstrations:

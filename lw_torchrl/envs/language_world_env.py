@@ -274,7 +274,7 @@ class LanguageWorldEnv(EnvBase):
     def render(
         self, *, camera: str = "corner2", height: int = 240, width: int = 320, rows: Sequence[int] | None = None
     ) -> Tensor:
-        """Render pictures of the rows' current state, (len(rows), height, width, 3) uint8, or (height, width, 3) with
+        """Render images of the rows' current state, (len(rows), height, width, 3) uint8, or (height, width, 3) with
         ``batch_size=()``. Rendering uses OpenGL (EGL on Linux without a display, unless MUJOCO_GL is set).
 
         TorchRL's PixelRenderTransform and VideoRecorder, and :class:`CameraTransform`, call this method. With a

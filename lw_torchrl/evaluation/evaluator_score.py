@@ -24,7 +24,7 @@ _ROWS = 256
 
 @dataclass(frozen=True)
 class PartScore:
-    """The numbers of correct and of all answers on one held-out split of :class:`LabelledQueries`, by predicate."""
+    """Correct and total answer counts per predicate on one held-out split of :class:`LabelledQueries`."""
 
     correct: dict[str, tuple[int, int]]  # number of correct answers where the clause is false, and where it is true
     total: dict[str, tuple[int, int]]  # number of all answers where the clause is false, and where it is true

@@ -41,8 +41,9 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
 
     Args:
         policy: the policy's file, or the name of a shipped policy.
-        result: an evaluation of the policy; None for the stored result of a shipped policy, otherwise no success rates.
-        repo: the Hub repository that the card loads the policy from, such as "me/my-policy"; "" to load from the file.
+        result: an evaluation of the policy; None for a shipped policy's stored result (other policies: no success
+        rates). repo: the Hub repository that the card loads the policy from, such as "me/my-policy"; "" to load from
+        the file.
 
     Returns:
         A ``huggingface_hub.ModelCard``; ``str(card)`` is Markdown, and ``card.save("README.md")`` writes a file.
@@ -104,7 +105,7 @@ def describe_policy(policy: AnyPath, result: EvaluationResult | None = None, *, 
 
 
 def _tasks(node: Any) -> set[str]:
-    """Return the tasks that a module's description names in its plans or in its submodules' options."""
+    """Return the tasks named in a module's description: in its plans or its submodules' options."""
     if isinstance(node, list):
         return set().union(*map(_tasks, node))
     if not isinstance(node, dict):

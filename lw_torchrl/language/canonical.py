@@ -233,7 +233,7 @@ def _manner(each: ParsedStep) -> Manner:
 
 
 def _at_points(condition: Query, task: Task) -> Query:
-    """Replace the task's first object with the point to touch, in clauses about the gripper."""
+    """In clauses about the gripper, replace the task's first object with the point to touch."""
     first = first_object(task)
 
     def at(name: str) -> str:

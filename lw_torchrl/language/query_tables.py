@@ -129,7 +129,9 @@ def compile_queries(queries: Mapping[Task, Sequence[Query]]) -> QueryTables:
 
 
 def _task_atoms(task: Task, queries: Sequence[Query], steps: int, width: int) -> tuple[list[Atom], list, list]:
-    """Return a task's distinct atoms, the atom indices of each clause (steps, width, J), and each clause's negation."""
+    """Return a task's distinct atoms, the atom indices of each clause (steps, width, J), and whether each clause is
+    negated.
+    """
     clauses = [[(clause_atoms(clause, task), clause.negated) for clause in query.clauses] for query in queries]
     clauses += [[([_NEVER], False)]] * (steps - len(queries))
     padded = [[*listed, *[([], False)] * (width - len(listed))] for listed in clauses]

@@ -42,7 +42,7 @@ def _predicates(kind: str) -> dict[str, tuple[Comparison, ...]]:
 
 TOUCHING = "touching the table"
 PREDICATES = ChainMap[str, tuple[Comparison, ...]]()
-"""All predicates of clauses: the states, the other predicates of one object, and the relations."""
+"""All predicates of clauses: object states, other unary predicates, and relations."""
 
 
 def _check_predicate(name: str, parts: Any, others: Iterable[str]) -> tuple[Comparison, ...]:

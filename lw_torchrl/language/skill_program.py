@@ -14,7 +14,7 @@ from lw_torchrl.language.tasks import Task, get_task, one_layout, task_ids
 
 
 class _Tables(NamedTuple):
-    """The skills (S) of each task; the first dimension is the tasks (T), or the rows of a batch after selection."""
+    """The skills (S) of each task; the first dimension is tasks (T) or, after indexing by task, rows of a batch."""
 
     target: Tensor  # (T, 3*S) int64, index of each coordinate of the target
     moved: Tensor  # (T, 3*S) int64, index of each coordinate of the moved object

@@ -122,7 +122,7 @@ class QueryEvaluator(TensorDictModuleBase):
         return write(tensordict, self, [qaf, logits])
 
     def transform(self) -> Transform | None:
-        """Return a new transform that writes the keys that the module reads but an environment lacks, or None."""
+        """Return a new transform that writes the module's in_keys that environments lack, or None if there are none."""
         return None
 
     def with_plans(self, plans: AnyPlans) -> QueryEvaluator:
@@ -352,9 +352,8 @@ class StateQueryEvaluator(ClauseEvaluator):
     only learns the meaning of predicates.
 
     Args:
-        plans, answers, predicates: see :class:`~lw_torchrl.modules.query_evaluator.ClauseEvaluator`, also for the
-            errors.
-        width, depth: units per hidden layer and number of hidden layers.
+        plans, answers, predicates: see :class:`~lw_torchrl.modules.query_evaluator.ClauseEvaluator`, which also lists
+        the errors. width, depth: units per hidden layer and number of hidden layers.
 
     Example:
         >>> import lw_torchrl as lw

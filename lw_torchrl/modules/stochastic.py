@@ -127,7 +127,8 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
         return {"trunk": self.trunk, "decoder": self.module["decoder"], **options}
 
     def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
-        raise TypeError(f"{name} of a StochasticActor cannot be replaced; replace the part of the actor first")
+        raise TypeError(f"{name} of a StochasticActor cannot be replaced; replace it in the actor before wrapping the
+        actor")
 
     @property
     def spec(self) -> Composite:

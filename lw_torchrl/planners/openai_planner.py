@@ -197,7 +197,9 @@ class OpenAIPlanner:
         formats = {answer.format for answer in before}
         if len(formats) != 1 or len(reports) != len(before):
             what = f"{counted(len(before), 'answer')} in {', '.join(sorted(formats)) or 'no format'}"
-            raise ValueError(f"answers must have one format and one report each, got {what} and {len(reports)} facts")
+            raise ValueError(
+                f"answers must have one format, and facts one report per answer, got {what} and {len(reports)} reports"
+            )
         (format,) = formats
         questions = []
         for answer, report in zip(before, reports, strict=True):

@@ -29,7 +29,7 @@ _EXAMPLES = 3
 def prompt_examples(task: str | Task, plans: AnyPlans | None = None) -> tuple[ConditionalPlan, ...]:
     """Return the example plans for a prompt: the pick-place plan, and those for tasks with similar descriptions.
 
-    There are up to three examples, never the task's own plan. The task whose description is nearest by edit distance
+    Up to three plans are returned, never the task's own. The task whose description is nearest by edit distance
     comes last, right before the request.
 
     Args:

@@ -44,7 +44,7 @@ def step_color(step: int) -> Color:
 
 
 def entity_path(*parts: str) -> str:
-    """Join parts, which may contain any character, to an absolute entity path."""
+    """Join parts, which may contain any character, into an absolute entity path."""
     return "".join("/" + rr.escape_entity_path_part(part) for part in parts)
 
 

@@ -61,7 +61,7 @@ def log_rollout(
 
     If ``seed`` is given, the episode is re-simulated from the task, ``seed``, ``episode`` and actions to show the
     robot's motion. If the simulated observations are not bit-identical to the recorded ones, a warning is issued, and a
-    simple hand over a table is drawn instead of the robot, as without a seed.
+    simple hand over a table is drawn instead of the robot, as when no ``seed`` is given.
 
     Args:
         logger: the logger of the recording.

@@ -66,7 +66,8 @@ class Heading:
 def decisive_step(heading: Heading, episode: RecordedEpisode, ghost: Ghost | None = None) -> int:
     """Return the time step at which a page opens: the failure, otherwise the first success, otherwise the last step.
 
-    If that time step is not shown, or the ghost has not diverged by then, return the ghost's first success instead.
+    If that time step is not shown, or the ghost (the re-run episode) has not diverged by then, return the ghost's first
+    success instead.
     """
     (_, last), step = shown_steps(heading, episode, ghost), _own_decisive_step(heading, episode)
     if ghost is None or ghost.episode.first_success is None or ghost.parts_at(episode) < step <= last:

@@ -200,7 +200,9 @@ def _connect(process: subprocess.Popen[bytes], port: str, recordings: int) -> An
 
 
 def _go_to(client: Any, openings: dict[str, Opening]) -> None:
-    """Select tabs, set time cursors, and show the last recording. The default is the last step of a timeline."""
+    """Select tabs, set time cursors, and show the last recording. By default, a cursor is set to its timeline's last
+    step.
+    """
     recordings = {recording.store_id.rpartition(":")[2]: recording for recording in client.get_state().recordings}
     for recording_id, (tab, name, step) in openings.items():
         recording = recordings[recording_id]

@@ -61,7 +61,8 @@ class QueryEvaluatorConfig:
 @typed_fields
 @dataclass(frozen=True)
 class ImageQueryEvaluatorConfig(QueryEvaluatorConfig):
-    """Hyperparameters for training an :class:`ImageQueryEvaluator`, in addition to :class:`QueryEvaluatorConfig`.
+    """Hyperparameters for training an :class:`ImageQueryEvaluator`, in addition to those of
+    :class:`QueryEvaluatorConfig`.
 
     Attributes:
         batch_size: number of states per minibatch, each with all clauses of its task.

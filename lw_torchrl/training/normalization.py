@@ -82,7 +82,7 @@ def share_contacts(module: nn.Module) -> None:
 
 def statistics_of(module: nn.Module) -> dict[str, Tensor]:
     """Return the buffers that :func:`fit_normalization` fits, by name; for a loss, this includes the buffers of its
-    copies and target networks.
+    target networks and of other copies of its networks.
     """
     names = [f"{path}.{name}".lstrip(".") for path, part in _features_of(module) for name in part.state_dict()]
     buffers = dict(module.named_buffers())
@@ -110,7 +110,7 @@ def check_contacts(module: nn.Module) -> None:
     """Raise :class:`ValueError` if role features were not yet fitted to the points where objects are touched."""
     if any(name.endswith("fitted") and not fitted.all() for name, fitted in statistics_of(module).items()):
         raise ValueError(
-            "RoleFeatures need the points where demonstrations touch objects; use normalize=True, or call "
+            "RoleFeatures needs contact points from demonstrations; use normalize=True, or call "
             "lw.training.fit_normalization(actor, replay)"
         )
 

@@ -245,7 +245,7 @@ class JitterTarget(PlanAugmentation):
 
 
 def mentioned(plans: Plans, tables: PlanTables) -> Tensor:
-    """Return whether each plan step mentions each object of the layout and, last, the goal, (T, S, P) bool."""
+    """Return whether each plan step mentions each object of the layout and the goal (last), (T, S, P) bool."""
     numbers = [{number for part in parts for number in places(part)} for parts in plans.layout.parts]
     table = torch.zeros(*tables.mask.shape, len(numbers), dtype=torch.bool)
     for task, plan in plans.items():

@@ -42,7 +42,7 @@ _ITEM = re.compile(r"\s*\[?(\d{1,4})[.):\]]\s*(\S.*)")
 
 @dataclass(frozen=True)
 class Note:
-    """A remark on a line (from 1) that was left out or changed while parsing a text."""
+    """A note on a line (1-based) that was dropped or changed while parsing a text."""
 
     line: int
     text: str
