@@ -127,8 +127,7 @@ class StochasticActor(NamedParts, ProbabilisticTensorDictSequential):
         return {"trunk": self.trunk, "decoder": self.module["decoder"], **options}
 
     def as_part(self, name: str, module: nn.Module) -> TensorDictModuleBase:
-        raise TypeError(f"{name} of a StochasticActor cannot be replaced; replace it in the actor before wrapping the
-        actor")
+        raise TypeError(f"{name} of a StochasticActor cannot be replaced; replace it in the actor before you wrap it")
 
     @property
     def spec(self) -> Composite:
