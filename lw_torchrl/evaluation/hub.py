@@ -41,9 +41,8 @@ def policy_card(policy: AnyPath, result: EvaluationResult | None = None, *, repo
 
     Args:
         policy: the policy's file, or the name of a shipped policy.
-        result: an evaluation of the policy; None for a shipped policy's stored result (other policies: no success
-        rates). repo: the Hub repository that the card loads the policy from, such as "me/my-policy"; "" to load from
-        the file.
+        result: an evaluation of the policy; None for a shipped policy's stored result (other policies: no rates).
+        repo: the Hub repository that the card loads the policy from, such as "me/my-policy"; "" to load from the file.
 
     Returns:
         A ``huggingface_hub.ModelCard``; ``str(card)`` is Markdown, and ``card.save("README.md")`` writes a file.

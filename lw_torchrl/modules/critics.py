@@ -27,8 +27,8 @@ class Value(RenamedInputs):
 
     Args:
         trunk: the layers before the heads, such as :func:`plan_trunk`, or ``actor.trunk``, which actor and critic then
-        share. The last two keys that the trunk writes are a latent (B, D) and features (B, F). ensemble: E, the number
-        of heads. TorchRL's losses make ``num_qvalue_nets`` copies of the whole critic
+            share. The last two keys that the trunk writes are a latent (B, D) and features (B, F).
+        ensemble: E, the number of heads. TorchRL's losses make ``num_qvalue_nets`` copies of the whole critic
             themselves, each with newly initialized weights.
         width, depth: units per hidden layer and number of hidden layers, each followed by a LayerNorm; a sequence of
             widths sets both.

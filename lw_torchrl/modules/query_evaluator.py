@@ -353,7 +353,8 @@ class StateQueryEvaluator(ClauseEvaluator):
 
     Args:
         plans, answers, predicates: see :class:`~lw_torchrl.modules.query_evaluator.ClauseEvaluator`, which also lists
-        the errors. width, depth: units per hidden layer and number of hidden layers.
+            the errors.
+        width, depth: units per hidden layer and number of hidden layers.
 
     Example:
         >>> import lw_torchrl as lw
