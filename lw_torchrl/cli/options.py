@@ -83,7 +83,7 @@ class Output:
             print(f"{counted(times, 'answer')}: {note}")
 
     def finish(self) -> None:
-        """Print the JSON document, if requested, and raise a :class:`ValueError` if there is an error."""
+        """Print the JSON document, if requested, and raise a :class:`ValueError` if it reports an error."""
         if self.as_json:
             print(json.dumps(_plain(self._document), indent=2, allow_nan=False))
         if self.fault:

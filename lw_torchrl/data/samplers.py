@@ -447,7 +447,7 @@ class CoLearningSampler(GroupSampler):
         return super().state_dict() | self._identity()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore a state; raise ValueError if it is invalid or has another target or target fraction."""
+        """Restore a state; raise ValueError if it is invalid or has a different target or target fraction."""
         for name, own in self._identity().items():
             stored = state_dict.get(name)
             if not isinstance(stored, Tensor) or not torch.equal(stored.cpu(), own):

@@ -223,7 +223,7 @@ class JoinedConfig:
 
 @dataclass(frozen=True)
 class JoinedDemonstrations:
-    """The chosen episodes of one or more datasets in a replay buffer; ``parts`` are the datasets' descriptions."""
+    """The episodes that a replay buffer selects from one or more datasets; ``parts`` describes each dataset."""
 
     parts: tuple[Demonstrations, ...]
 

@@ -75,7 +75,8 @@ class PlanUse:
 
 
 def where_stuck(active: Tensor, window: int) -> tuple[int, int]:
-    """Return the plan step active most often in the last ``window`` states, and the last plan step active for 5 states.
+    """Return the plan step active most often in the last ``window`` states, and the latest step of the plan that was
+    active in at least 5 states.
 
     ``active`` (T, S) is 1 where a plan step is active.
     """

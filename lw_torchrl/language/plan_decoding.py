@@ -190,7 +190,7 @@ def _mapped(clause: Clause, mapper: StepMapper, notes: list[Note]) -> DecodedSte
 
 
 def _section_notes(reading: Reading, section: Section, task: Task) -> list[Note]:
-    """Return the reader's notes on the chosen section, and one note for each other section with clauses."""
+    """Return the parser's notes on the chosen section, and one note for each other section with clauses."""
     ends = [later.line for later in reading.sections[1:]]
     notes = []
     for other, end in zip(reading.sections, [*ends, float("inf")], strict=True):

@@ -222,7 +222,7 @@ class Plans(Mapping[str, ConditionalPlan]):
 
     @cached_property
     def has_roles(self) -> bool:
-        """Whether every step has a role, as in the plans that :func:`~lw_torchrl.canonical_plans` returns."""
+        """True if every step has a role, as in the plans that :func:`~lw_torchrl.canonical_plans` returns."""
         return all(step.role is not None for plan in self.values() for step in plan.steps)
 
     @property

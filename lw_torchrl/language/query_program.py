@@ -34,7 +34,7 @@ def find_kernel() -> Callable[..., bool] | None:
 class QueryProgram(nn.Module):
     """A module that compiles queries once and answers them for any batch of mixed tasks in one call.
 
-    The compiled tables are buffers that are not saved and keep their precision. With Numba (``lw_torchrl[fast]``) a
+    The compiled tables are non-persistent buffers whose dtype never changes. With Numba (``lw_torchrl[fast]``) a
     compiled loop answers batches on the CPU, with identical results; the first call compiles for about a second.
 
     Args:

@@ -111,7 +111,7 @@ def load_skills(path: AnyPath | None = None, *, tasks: Tasks = TASKS) -> Skills:
     Args:
         path: a file in the format of data/skills.toml, whose skills are added to the shipped skills and replace those
             with the same text; None for the shipped skills only.
-        tasks: the tasks that the file's ``for`` tables may name, as from :func:`~lw_torchrl.load_tasks`.
+        tasks: the tasks that the file's ``for`` tables may name, as returned by :func:`~lw_torchrl.load_tasks`.
 
     Raises:
         SkillError: the file is malformed; the message names the skill.

@@ -76,7 +76,7 @@ class Task:
 
     @cached_property
     def openings(self) -> dict[str, int]:
-        """The observation index of each opening, by the name of the object that can open; the gripper comes first."""
+        """The observation index of each object's opening, keyed by object name; the gripper comes first."""
         openings = {named.name: named.opening for named in self.objects if named.opening is not None}
         return {GRIPPER: self.layout.opening, **openings}
 
@@ -105,7 +105,9 @@ class Task:
 
     @classmethod
     def from_json(cls, name: str, row: Any, layout: Layout = METAWORLD) -> Task:
-        """Build a task from a row of tasks.toml (default ``layout``); raise a TaskError for any other value."""
+        """Build a task from an entry of tasks.toml, by default with ``layout``; raise a TaskError if the entry is
+        invalid.
+        """
         try:
             if not isinstance(row, Mapping):
                 raise ValueError(f"the task must be a table, got {shown(row)}")
@@ -293,7 +295,7 @@ def one_layout(tasks: Iterable[Task]) -> Layout:
 
 @typed
 def load_tasks(path: AnyPath) -> Tasks:
-    """Load tasks from a file and add them to the 50 Meta-World tasks, replacing those with the same name.
+    """Return the 50 Meta-World tasks by name, with the tasks of a file added or replacing those of the same name.
 
     Pass one of the returned tasks wherever a task is accepted, or the whole mapping as the ``tasks`` of
     :func:`~lw_torchrl.load_plans` and :func:`~lw_torchrl.resolve_tasks`.

@@ -25,7 +25,7 @@ _LARGEST = 512  # maximum height and width of a picture, in pixels
 
 
 class SmallImageEncoder(nn.Module):
-    """A CNN that maps pictures (n, 3, H, W) float32 in [0, 1] to features (n, 32, H/2, W/2) by five convolutions."""
+    """A CNN with five convolutions that maps images (n, 3, H, W) float32 in [0, 1] to features (n, 32, H/2, W/2)."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -179,7 +179,7 @@ def conjunction(logits: Tensor, mask: Tensor) -> Tensor:
     """Return the logit (...) of the conjunction of statements with logits (..., K) where ``mask`` (..., K) is true.
 
     The statements are assumed to be independent, so p is the product of their probabilities sigmoid(l), and its logit
-    is -log(expm1(sum(softplus(-l)))). The result is at most 30, and is 30 without any statement.
+    is -log(expm1(sum(softplus(-l)))). The result is at most 30, and is 30 if ``mask`` is all false.
     """
     doubt = torch.where(mask, nn.functional.softplus(-logits), 0.0).sum(-1).clamp(min=1e-13)
     return -(doubt + torch.log(-torch.expm1(-doubt)))

@@ -86,9 +86,10 @@ class _RelativePositions(Features):
         return type(self)(**{**self.config, "plans": plans}).to(self.offset.device).train(self.training)
 
     def positions(self, observation: Tensor, weights: Tensor, rows: Tensor, yaw: Tensor | None = None) -> Tensor:
-        """Return relative positions (..., P, 3) in metres, mixed by the attention ``weights`` (..., S) over plan steps.
+        """Average relative positions (..., P, 3) in metres over plan steps, with the attention ``weights`` (..., S).
 
-        ``rows`` (...) index the tables; :class:`RandomYaw` turned the observation (..., D) by ``yaw`` (...) radians.
+        ``rows`` (...) are task indices; ``yaw`` (...) is the angle in radians by which :class:`RandomYaw` rotated the
+        observation (..., D).
         """
         if yaw is not None:  # fixed places and offsets belong to the scene before it was turned
             observation = turn_observation(observation, -yaw, self.layout)

@@ -1,4 +1,4 @@
-"""Wrappers of actors: an ensemble, a binary gripper, a separate policy for demonstrated tasks, another robot."""
+"""Actor wrappers: ensembling, a binary gripper, a separate policy for demonstrated tasks, transfer to another robot."""
 
 from __future__ import annotations
 

@@ -158,7 +158,7 @@ def _write_query(query: Query) -> list[dict[str, str]]:
 
 
 def read_structured(text: str) -> Reading:
-    """Parse the steps of a plan in JSON up to the first fault, and never raise. Conditions may also be sentences."""
+    """Parse the steps of a JSON plan up to the first error, without raising. Conditions may also be sentences."""
     reading = Reading()
     match = _STEPS.search(text)
     if match is None:

@@ -25,8 +25,10 @@ class EngineStep(NamedTuple):
 
 @runtime_checkable
 class Engine(Protocol):
-    """A simulator of N rows. To support camera images, an engine also implements ``render`` as in
-    :class:`~lw_torchrl.suites.cameras.SeenRows`; to support recordings of the scene, ``model`` and ``poses``."""
+    """A simulator of N parallel environments, called rows. To support camera images, an engine also implements
+    ``render`` as in :class:`~lw_torchrl.suites.cameras.SeenRows`; to support recordings of the scene, ``model`` and
+    ``poses``.
+    """
 
     def reset(self, rows: Sequence[int], seeds: Sequence[int]) -> NDArray[np.float64]:
         """Start an episode in each of ``rows`` and return the first observations (len(rows), D) float64. The initial

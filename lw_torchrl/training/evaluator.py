@@ -68,7 +68,7 @@ class _StateQueries:
 
 
 class _PictureQueries:
-    """A source of minibatches of pictures, equally many of each task, with the task's clauses and object positions."""
+    """A source of minibatches of images, equally many per task, with each image's clauses and object positions."""
 
     def __init__(self, evaluator: ImageQueryEvaluator, tasks: list[TaskQueries]) -> None:
         for task in tasks:

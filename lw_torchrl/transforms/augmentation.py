@@ -159,7 +159,7 @@ class SwapUnmentioned(PlanAugmentation):
 
 
 class HideOpening(Augmentation):
-    """An augmentation that replaces the gripper's opening by the opening in another row.
+    """An augmentation that replaces the gripper's opening with that of another row.
 
     The opening often reveals the task of a demonstration. For replay buffers. Changes ``observation`` (B, D), not
     ``("next", "observation")``. Draws from PyTorch's global generator.

@@ -69,7 +69,7 @@ def _flat(transform: Transform) -> list[Transform]:
 
 
 class EpisodeTransform(Transform):
-    """A base class of transforms with a state for each row's episode; cloning or loading them requires a reset."""
+    """A base class for transforms that keep per-episode state; reset the environment after cloning or loading them."""
 
     def _forget_episodes(self) -> None:
         """Delete the state of all episodes, so that a reset is required."""

@@ -162,15 +162,15 @@ class _Row:
 class FetchEngine(ThreadedEngine):
     """An engine for FetchReach-v4, FetchPush-v4, FetchSlide-v4 and FetchPickAndPlace-v4.
 
-    For any number of threads, states, goals and success flags are bit-identical to those of ``gymnasium.make(id)``
-    after ``reset(seed=seed)`` and the same actions. An action (right, away, up, effort) becomes gymnasium-robotics'
-    (away, -right, up, -effort) of the same dtype. A displacement of 1 requests 5 cm, but the hand moves only 3.2 cm per
-    time step. The gripper effort is relative to the current finger positions, so an effort of 0 does not hold the puck.
+    States, goals and success flags are bit-identical to those of ``gymnasium.make(id)`` after ``reset(seed=seed)`` and
+    the same actions, for any number of threads. An action (right, away, up, effort) becomes gymnasium-robotics' (away,
+    -right, up, -effort) of the same dtype. A displacement of 1 requests 5 cm, but the hand moves only 3.2 cm per time
+    step. The gripper effort is relative to the current finger positions, so an effort of 0 does not hold the puck.
     Reach, push and slide keep the fingers closed.
 
     Observations (25 values, :data:`~lw_torchrl.suites.fetch.FETCH`) are in metres and in Meta-World's axes. In reach,
-    the missing object is zeros, and the goal is a hand position, 3 cm above the grip site's goal. Rows fault as in
-    :class:`~lw_torchrl.suites.metaworld.vectorized_engine.VectorizedEngine`.
+    the missing object is zeros, and the goal is a hand position, 3 cm above the grip site's goal. Errors in a row are
+    handled as in :class:`~lw_torchrl.suites.metaworld.vectorized_engine.VectorizedEngine`.
 
     Args:
         tasks: the task of each row.

@@ -160,7 +160,7 @@ def sweep(s: StepState, rows: Index, cast: Cast) -> Any:
 
 
 def soccer(s: StepState, rows: Index, cast: Cast) -> Any:
-    """Reward gripping and placing the ball, with a deduction if the ball crosses the goal line outside the goal."""
+    """Reward gripping and placing the ball, with a penalty if the ball crosses the goal line outside the goal."""
     ball, goal = s.features[rows, at.OBJECT], s.features[rows, terms.GOAL]
     placed, line = s.placed[rows], goal[:, 1] - 0.1
     missed = (ball[:, 1] > line) & (np.abs(ball[:, 0] - goal[:, 0]) > 0.1)

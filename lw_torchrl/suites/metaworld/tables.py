@@ -86,7 +86,7 @@ class Cage:
 
 @dataclass(frozen=True)
 class Funnel:
-    """A reward term that keeps a point above a funnel-shaped floor; data/rewards.toml explains the fields."""
+    """A reward term for keeping a point above a funnel-shaped floor; data/rewards.toml explains the fields."""
 
     over: str
     about: tuple[str, ...]

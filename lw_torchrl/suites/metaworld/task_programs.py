@@ -46,7 +46,7 @@ _idle: dict[str, SharedModel] = {}
 
 
 def borrow_model(path: str) -> SharedModel:
-    """Return a model of an XML file that no other engine is using; each process compiles a file only once."""
+    """For an XML file, return a model that no other engine is using; each process compiles a file only once."""
     with _lock:
         if (idle := _idle.pop(path, None)) is not None:
             return idle
@@ -68,8 +68,9 @@ def return_models(models: Iterable[SharedModel]) -> None:
 
 
 WARNED_ALREADY = 1000
-"""The initial value of MuJoCo's warning counts. MuJoCo prints a warning and writes MUJOCO_LOG.TXT only if the count for
-that warning is zero, so nothing is written, and any other value means that a warning occurred."""
+"""A nonzero initial value for MuJoCo's warning counts. MuJoCo prints and logs (MUJOCO_LOG.TXT) a warning only if its
+count is zero, so this value silences it; a count that differs from this value means that a warning occurred.
+"""
 
 
 class TaskProgram:
