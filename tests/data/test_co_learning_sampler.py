@@ -136,7 +136,7 @@ def test_a_restored_state_gives_the_same_batches(base, target, seed, before):
 def test_the_state_of_another_target_or_ratio_is_an_error(other, name):
     replay = make_replay(make_rows([3, 3], 3), 4)
     drawn(replay, 1)
-    with pytest.raises(ValueError, match=f"state_dict has another {name}"):
+    with pytest.raises(ValueError, match=f"state_dict has a different {name}"):
         other.load_state_dict(replay.sampler.state_dict())
 
 

@@ -74,7 +74,7 @@ PUSH = '["push it"]\ntarget = "puck"\n'
         (PUSH + "gain = -1", "'push it': gain"),
         (PUSH + 'gain = "much"', "'push it': gain"),
         (PUSH + "goal = 3", "'push it': goal"),
-        (PUSH + "for = 3", "'push it': for"),
+        (PUSH + "for = 3", "'push it': 'for'"),
         ('["push it".for.pusch]\ntarget = "puck"\n', "did you mean 'push'"),
         ('"push it" = 3\n', "'push it': .*table, got 3"),
         ('["push it"]\ntarget = 3\n', "'push it': target"),

@@ -135,7 +135,7 @@ def test_role_features_in_a_loss_are_fitted_with_their_contact_points():
     expected.fit(rows)
     actor = lw.PlanConditionedActor(plans, features=RoleFeatures(plans))
     loss = TD3Loss(actor, lw.PlanConditionedQValue(plans, features=RoleFeatures(plans)), bounds=(-1.0, 1.0))
-    with pytest.raises(ValueError, match="RoleFeatures need the points"):
+    with pytest.raises(ValueError, match="RoleFeatures needs contact points"):
         check_contacts(loss)
     fit_normalization(loss, buffer)
     check_contacts(loss)
