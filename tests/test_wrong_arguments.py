@@ -51,10 +51,12 @@ def arguments_of(name):
 
 
 def hints_of(name):
-    if is_typed(name):
-        return inspect.getclosurevars(function_of(name)).nonlocals["read_hints"]()
+    """Return the type hints of a public name's arguments, also of those that its function checks itself."""
     function = function_of(name)
-    return get_type_hints(function, NAMESPACE | function.__globals__, include_extras=True)
+    if not is_typed(name):
+        return get_type_hints(function, NAMESPACE | function.__globals__, include_extras=True)
+    known = NAMESPACE | vars(lw.language.plans) | inspect.unwrap(function).__globals__
+    return get_type_hints(inspect.unwrap(function), known, include_extras=True)
 
 
 @pytest.fixture(scope="module")

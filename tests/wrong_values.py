@@ -89,6 +89,7 @@ def good_calls(folder: Any) -> dict[str, dict[str, Any]]:
     keys = ["observation", "task_id", "qaf", "skill_weights"]
     lw.evaluate(actor, **run, also_record=keys, on_episode=episodes.append)
     return {
+        "ActionMixer": {"plans": plans, "decoder": lw.modules.MLPDecoder()},
         "ActorEnsemble": {"members": [actor]},
         "AdvantageWeightedLoss": {"actor_network": actor},
         "BehavioralCloningTrainer": {"actor": actor, "replay": replay, "progress": False},

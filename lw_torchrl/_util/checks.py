@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import suppress
 from difflib import get_close_matches
 from functools import cache, wraps
 from math import inf
@@ -61,12 +62,18 @@ def typed(function: Function) -> Function:
     first invalid argument.
 
     NumPy scalars are converted to Python numbers. Annotations are evaluated at the first call, so all names in them
-    must be imported at run time, not only for type checkers. ``*args`` and ``**kwargs`` are not checked.
+    must be imported at run time: an argument whose type is imported only for type checkers is not checked here, as
+    ``plans``, which :func:`as_plans` checks. ``*args`` and ``**kwargs`` are not checked.
     """
 
     def read_hints() -> dict[str, Any]:  # skip the return type, which may come from a package that is not installed
-        arguments = {name: hint for name, hint in function.__annotations__.items() if name != "return"}
-        return get_type_hints(SimpleNamespace(__annotations__=arguments), function.__globals__, include_extras=True)
+        hints: dict[str, Any] = {}
+        for name, hint in function.__annotations__.items():
+            if name != "return":
+                argument = SimpleNamespace(__annotations__={name: hint})
+                with suppress(NameError):
+                    hints |= get_type_hints(argument, function.__globals__, include_extras=True)
+        return hints
 
     return _checked(function, read_hints)
 

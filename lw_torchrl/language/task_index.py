@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from lw_torchrl._util.devices import asserted, plain, readable, waits
-from lw_torchrl.language.plans import Plans
-from lw_torchrl.language.tasks import MT50
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.plans import AnyPlans, Plans
 
 _Kind = tuple[torch.device, torch.dtype, bool]
 _KEPT_ROWS = 4096  # maximum batch size for which the selected rows are cached
 Tables = TypeVar("Tables", bound=tuple[Tensor, ...])
+
+
+def as_plans(plans: AnyPlans, argument: str = "plans") -> Plans:
+    """Convert a mapping to :class:`Plans`; the parts of a policy need nothing else of the language side."""
+    from lw_torchrl.language.plans import as_plans as convert  # here, so that parts do not import the parsers
+
+    return convert(plans, argument)
 
 
 def one_per_row(task_id: Tensor, values: Tensor) -> Tensor:
@@ -65,6 +73,8 @@ class TaskIndex:
             if torch.equal(nearest, wanted):
                 return rows
             wrong = wanted[nearest != wanted].unique().tolist()[:5]
+            from lw_torchrl.language.tasks import MT50
+
             names = (MT50[i] if 0 <= i < len(MT50) else f"{i} (not a Meta-World task)" for i in wrong)
             raise ValueError(f"task_id contains {problem}: {', '.join(names)}")
         if asserted(task_id):

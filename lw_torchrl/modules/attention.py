@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -10,9 +12,11 @@ from torch import Tensor
 from lw_torchrl._util.checks import typed
 from lw_torchrl._util.devices import check_values
 from lw_torchrl._util.keys import Keys, dispatched, key_beside, read, write
-from lw_torchrl.language.plans import AnyPlans, as_plans
-from lw_torchrl.language.task_index import PlanTables, answers_of, pick
+from lw_torchrl.language.task_index import PlanTables, answers_of, as_plans, pick
 from lw_torchrl.modules.parts import Part, in_mode_of
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.plans import AnyPlans
 
 TRUE_LOGIT = 5.0  # logit of a true condition; a false condition has -5 (paper, section "Plan Conditioning")
 ACTIVE_WEIGHT = 0.01  # a plan step with more attention is active; a false step has about 1e-4 if another step is true

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import combinations
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -13,12 +13,15 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import add_random_module
 
-from lw_torchrl._util.checks import Scale, typed
+from lw_torchrl._util.checks import Scale, check_value, typed
 from lw_torchrl._util.devices import check_finite
 from lw_torchrl._util.keys import Keys, as_keys, check_apart, dispatched, read, write
-from lw_torchrl.language.layout import METAWORLD, Layout
-from lw_torchrl.language.plans import AnyPlans, as_plans
+from lw_torchrl.language.task_index import as_plans
 from lw_torchrl.modules.parts import follow, in_mode_of, probe, written_key
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.layout import Layout
+    from lw_torchrl.language.plans import AnyPlans
 
 Kind = Literal["raw", "differences", "relative", "opening", "none", "both"]
 _FINE, _COARSE = 0.02, 0.1  # metres, the scales at which tanh squashes each difference
@@ -106,7 +109,10 @@ class ObservationFeatures(Features):
         out_keys: Keys | None = None,
     ) -> None:
         super().__init__(noise, as_keys("in_keys", in_keys, ("observation",)), out_keys)
-        self.kind, self.layout = kind, layout or METAWORLD
+        from lw_torchrl.language.layout import METAWORLD, Layout
+
+        self.kind = kind
+        self.layout: Layout = METAWORLD if layout is None else check_value("layout", layout, Layout)
         self.width = _KINDS[kind](torch.zeros(self.layout.size), self.layout).shape[-1]
         self.register_buffer("mean", torch.zeros(self.width))
         self.register_buffer("std", torch.ones(self.width))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import torch
 from tensordict import TensorDictBase
@@ -10,11 +10,12 @@ from torch import Tensor, nn
 
 from lw_torchrl._util.checks import Count, Natural, typed
 from lw_torchrl._util.keys import Keys, dispatched, read, write
-from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
-from lw_torchrl.language.roles import role_vectors
-from lw_torchrl.language.task_index import PlanTables, one_per_row, pick
+from lw_torchrl.language.task_index import PlanTables, as_plans, one_per_row, pick
 from lw_torchrl.language.text import TextEncoder, encoded
 from lw_torchrl.modules.parts import MLP, Part, Width, in_mode_of, materialize, probe
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.plans import AnyPlans, Plans
 
 
 def unit_scale(vectors: Tensor) -> Tensor:
@@ -189,6 +190,8 @@ class ActionMixer(_Mixer):
 
 def _vectors_of_roles(plans: Plans, tables: PlanTables) -> tuple[Tensor, Tensor]:
     """Return the index (T, S) int64 of each plan step's vector, and the distinct vectors (K, E) float32."""
+    from lw_torchrl.language.roles import role_vectors
+
     index, numbers = torch.zeros_like(tables.skill_index), dict[tuple[float, ...], int]()
     for task, plan in sorted(plans.items()):
         for step, vector in enumerate(role_vectors([step.role for step in plan.steps if step.role is not None])):

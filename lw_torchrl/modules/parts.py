@@ -6,7 +6,7 @@ import copy
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import torch
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
@@ -17,8 +17,10 @@ from torchrl.modules import MLP as TorchRLMLP
 
 from lw_torchrl._util.checks import Count
 from lw_torchrl._util.keys import Keys, any_arguments, as_keys, check_apart, last_name
-from lw_torchrl.language.layout import Layout
-from lw_torchrl.language.plans import AnyPlans
+
+if TYPE_CHECKING:
+    from lw_torchrl.language.layout import Layout
+    from lw_torchrl.language.plans import AnyPlans
 
 Module = TypeVar("Module", bound=nn.Module)
 Width = Count | Sequence[Count]

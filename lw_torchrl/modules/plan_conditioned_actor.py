@@ -11,7 +11,7 @@ from torchrl.data import Composite
 
 from lw_torchrl._util.checks import typed
 from lw_torchrl._util.keys import Keys
-from lw_torchrl.language.plans import AnyPlans, as_plans
+from lw_torchrl.language.task_index import as_plans
 from lw_torchrl.language.text import TextEncoder
 from lw_torchrl.modules.attention import PlanAttention
 from lw_torchrl.modules.decoder import MLPDecoder, as_decoder
@@ -20,6 +20,7 @@ from lw_torchrl.modules.mixer import SkillMixer
 from lw_torchrl.modules.parts import NamedParts, action_spec, check_same_plans, follow, in_mode_of, trunk_attributes
 
 if TYPE_CHECKING:
+    from lw_torchrl.language.plans import AnyPlans
     from lw_torchrl.modules.stochastic import DistributionName, StochasticActor
 
 
