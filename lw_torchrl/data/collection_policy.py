@@ -84,7 +84,7 @@ BEHAVIOURS: Mapping[str, Behaviour] = MappingProxyType(
     {behaviour.name: behaviour for behaviour in (EXPERT, *_SEGMENTS)}
 )
 """The shipped collection policies by name: "expert" (Meta-World's script), "scripted" (scripted skills that follow the
-plan), "spoilt-60" and "spoilt-30" (scripted skills in 60 % or 30 % of the segments, random skills of the plan in the
+plan), "noisy-60" and "noisy-30" (scripted skills in 60 % or 30 % of the segments, random skills of the plan in the
 others), "wrong" (only random skills of the plan) and "random" (random actions in [-1, 1])."""
 
 

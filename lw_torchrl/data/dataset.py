@@ -53,7 +53,7 @@ class DatasetError(ValueError):
 class CollectConfig:
     """The arguments of :func:`collect_demonstrations` that determine the dataset: equal configs give equal datasets.
 
-    ``tasks`` are sorted names. Episode k has the noise scale ``noise_scale[k % len(noise_scale)]``; (0.0,) is no noise.
+    ``tasks`` are sorted names. Episode k uses ``noise_scale[k % len(noise_scale)]``; (0.0,) adds no noise.
     """
 
     tasks: tuple[str, ...]
