@@ -58,7 +58,7 @@ def draw_rates(
         axes.barh(place, mean, color=color, height=0.68, alpha=0.4)
         if ends:
             axes.plot(ends, [place, place], color=color, linewidth=3, solid_capstyle="butt")
-        axes.plot(mean, place, "o", color=color, markersize=9)
+        axes.plot(mean, place, "o", color=color, markersize=7)
         axes.text(1.05, place, f"{mean + 1e-9:.2f}", va="center", fontweight="bold")  # 0.835 is 0.84
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.5, -0.5)
@@ -96,18 +96,18 @@ Panel = tuple[str, Sequence[str], Mapping[str, Sequence[Sequence[float] | None]]
 
 
 def plot_panels(panels: Sequence[Panel], path: AnyPath | None = None, *, xlabel: str = "") -> Figure:
-    """Draw success over ordered places in panels side by side, with one legend below."""
+    """Draw success over ordered places in panels side by side, with one legend above."""
     check_image(path)
     with rc_context(NEUTRAL_STYLE):
-        figure = new_figure(max(6.0, 4.8 * len(panels)), 4.2)
+        figure = new_figure(max(6.0, 3.8 * len(panels)), 4.0)
         columns = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
         for axes, (title, places, methods) in zip(columns, panels, strict=True):
             draw_points(axes, places, methods)
             axes.set_title(title)
-            axes.set_xlabel(xlabel)
+        figure.supxlabel(xlabel, fontsize=13)
         columns[0].set_ylabel("success")
         handles, labels = columns[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+        figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
         return saved(figure, path)
 
 
