@@ -1,4 +1,4 @@
-"""Draw the README's moving picture: the shipped policy at work, beside its plan with the active step lit.
+"""Draw the README's moving picture: the shipped policy, next to its plan with the active step lit.
 
     python docs/hooks/plan_gif.py --out docs/plan.gif
 
@@ -20,12 +20,13 @@ from PIL import Image, ImageDraw, ImageFont
 from torchrl.envs import TransformedEnv
 
 import lw_torchrl as lw
+from lw_torchrl.record.recorded_episode import short_condition
 
-SIZE = (900, 420)
-SCENE_WIDTH = 380
+SIZE = (820, 450)  # legible at half size, on a telephone
+SCENE_WIDTH = 310
 MARGIN = 16
 PANEL, LIT, DIM, TEXT, SUCCESS = (30, 36, 46), (0, 105, 100), (150, 160, 172), (240, 244, 248), (255, 202, 88)
-LINE_LETTERS = 58  # letters of a condition that fit into one line
+CONDITION_LETTERS, SKILL_LETTERS = 46, 36  # letters that fit into one line
 
 
 @dataclass(frozen=True)
@@ -82,21 +83,22 @@ def draw(task: str, plan: lw.ConditionalPlan, image: Any, weights: Any, succeede
     frame.paste(scene.crop((left, 0, left + SCENE_WIDTH, SIZE[1])), (0, 0))
     pen = ImageDraw.Draw(frame)
     x, y = SCENE_WIDTH + MARGIN, MARGIN
-    pen.text((x, y), task, font=font(22, bold=True), fill=TEXT)
+    pen.text((x, y), task, font=font(24, bold=True), fill=TEXT)
     if succeeded:
-        pen.text((SIZE[0] - MARGIN, y), "success", font=font(22, bold=True), fill=SUCCESS, anchor="ra")
-    y += 38
+        pen.text((SIZE[0] - MARGIN, y), "success", font=font(24, bold=True), fill=SUCCESS, anchor="ra")
+    y += 42
     for step, weight in zip(plan.steps, weights, strict=False):
-        lines = textwrap.wrap(f"if {step.condition}:", LINE_LETTERS)
-        height = 19 * len(lines) + 40
+        conditions = textwrap.wrap(f"if {short_condition(step.condition)}:", CONDITION_LETTERS)
+        skills = textwrap.wrap(step.skill, SKILL_LETTERS)
+        height = 23 * len(conditions) + 27 * len(skills) + 16
         color = tuple(round(a + (b - a) * float(weight)) for a, b in zip(PANEL, LIT, strict=True))
         pen.rounded_rectangle((x - 8, y, SIZE[0] - 8, y + height), 8, fill=color)
-        active = weight > 0.5
-        for number, line in enumerate(lines):
-            pen.text((x, y + 6 + 19 * number), line, font=font(15), fill=TEXT if active else DIM)
-        skill = font(18, bold=True)
-        pen.text((x, y + 9 + 19 * len(lines)), step.skill, font=skill, fill=TEXT if active else DIM)
-        y += height + 4
+        fill = TEXT if weight > 0.5 else DIM
+        for number, line in enumerate(conditions):
+            pen.text((x, y + 6 + 23 * number), line, font=font(18), fill=fill)
+        for number, line in enumerate(skills):
+            pen.text((x, y + 8 + 23 * len(conditions) + 27 * number), line, font=font(22, bold=True), fill=fill)
+        y += height + 6
     return frame
 
 
