@@ -5,6 +5,7 @@ from __future__ import annotations
 import doctest
 import importlib
 import inspect
+import json
 import os
 import pkgutil
 import re
@@ -171,6 +172,30 @@ def test_site_is_built_without_warnings_and_its_links_lead_somewhere(tmp_path):
             if not target.is_file() or (parts.fragment and unquote(parts.fragment) not in pages[target].names):
                 lost.append(f"{path.relative_to(site)}: {link}")
     assert lost == []
+    entries = json.loads((site / "search" / "search_index.json").read_text("utf-8"))["docs"]
+    assert {words: found(words, entries) for words in SEARCHES} == SEARCHES
+
+
+SEARCHES = {
+    "GPU": "scaling/",
+    "SLURM": "scaling/",
+    "wandb": "logging/",
+    "cite": "",
+    "custom network": "custom-networks/",
+}
+"""What a user searches for, and the page that must come first; "" is the first page."""
+
+
+def found(words, entries):
+    """Return the page of the search entry that has all words, most of them in its title and at the highest boost."""
+    words = words.lower().split()
+    hits = [entry for entry in entries if all(word in f"{entry['title']} {entry['text']}".lower() for word in words)]
+
+    def score(entry):
+        title, text = entry["title"].lower(), entry["text"].lower()
+        return entry.get("boost", 1) * sum(10 * (word in title) + text.count(word) for word in words)
+
+    return max(hits, key=score)["location"].partition("#")[0]
 
 
 def test_code_blocks_are_found_numbered_and_skipped(tmp_path):

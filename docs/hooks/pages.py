@@ -40,7 +40,8 @@ def on_files(files: Files, config: Any) -> Files:
         if path.is_file():
             name = path.relative_to(ROOT).as_posix()
             code = f"````{LANGUAGES.get(path.suffix, 'text')}\n{path.read_text('utf-8')}````"
-            made[place(name)] = f"# {path.name}\n\n`{name}`\n\n{code}\n"
+            title = path.name.replace("_", r"\_")
+            made[place(name)] = f"# {title}\n\n`{name}`\n\n{code}\n"
     for page, text in {**made, **reference.pages()}.items():
         files.append(File.generated(config, page, content=text))
     return files
@@ -49,6 +50,8 @@ def on_files(files: Files, config: Any) -> Files:
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
     """Turn links for GitHub into links of the site; a link to a folder becomes plain text."""
     here = page.file.src_uri
+    if here.startswith(("api/", "code/", "results/")):
+        page.meta["search"] = {"boost": 0.3}  # a search finds the how-to pages first
     name = next((name for name, its_page in PAGES.items() if its_page == here), f"docs/{here}")
 
     def moved(match: re.Match[str]) -> str:
@@ -106,7 +109,7 @@ def notebook(text: str) -> str:
             data = output.get("data", {})
             if "image/png" in data:
                 picture = "".join(data["image/png"]).replace("\n", "")
-                parts.append(f'<img alt="what the cell draws" src="data:image/png;base64,{picture}">')
+                parts.append(f'<img alt="Figure of the cell above" src="data:image/png;base64,{picture}">')
             elif printed := "".join(output.get("text", data.get("text/plain", ""))).rstrip():
                 parts.append(f"``` {{.text .wrap}}\n{printed}\n```")
     return "\n\n".join(parts) + "\n"

@@ -7,16 +7,16 @@ work=$(mktemp -d)
 cd "$work"
 : "${LW:=lw-torchrl}" "${PYTHON:=python}"
 
-picture() { # RECORDING NAME WINDOW [OPTIONS of view]
-    recording=$1 name=$2 window=$3
-    shift 3
-    $LW view $recording --screenshot "$name.png" --window-size "$window" "$@"
+picture() { # RECORDING NAME [OPTIONS of view]
+    recording=$1 name=$2
+    shift 2
+    $LW view $recording --screenshot "$name.png" --window-size 1100x700 "$@"
     $PYTHON -c 'import sys; from PIL import Image
 Image.open(sys.argv[1]).convert("RGB").quantize(256).save(sys.argv[2], optimize=True)' "$name.png" "$docs/$name.png"
 }
 
 $LW record pick-place --policy scripted --out success.rrd
-picture success.rrd rerun-success 1600x1000
+picture success.rrd rerun-success
 
 # A plan that closes the gripper only after the puck has left the table, which never happens.
 mkdir mine
@@ -33,11 +33,10 @@ def pick_place(robot):
         robot.move("the puck to the target location")
 PLAN
 $LW record pick-place --policy scripted --plans mine/pick-place.plan --attribute --reference MT50 --out plan.rrd
-picture plan.rrd rerun-plan 1600x1000
-picture plan.rrd rerun-plan-small 1100x700
+picture plan.rrd rerun-plan
 
 $LW record pick-place --policy few-shot-mt50 --episodes 2 --max-steps 150 --noise 0.3 --attribute --out gripper.rrd
-picture gripper.rrd rerun-gripper 1100x700
+picture gripper.rrd rerun-gripper
 
 # An evaluator that inverts the second condition.
 $PYTHON - <<'CODE'
@@ -68,24 +67,25 @@ rollout = TransformedEnv(base, Compose(lw.QAFTransform(plans), Invert())).rollou
     [rollout], plans, actor=actor, evaluator=invert, seed=1_000, noise_scale=0.0, max_steps=200
 )
 with lw.RerunLogger("query.rrd") as logger:
-    lw.log_rollout(logger, rollout, plans, seed=1_000, policy="a wrong evaluator", failure=failure)
+    lw.log_rollout(logger, rollout, plans, seed=1_000, policy="inverted condition", failure=failure)
 CODE
-picture query.rrd rerun-query 1100x700
+picture query.rrd rerun-query
 
 $LW train-evaluator drawer-open --cameras corner corner3 --episodes 4 --steps 200 --out eyes
 $LW record drawer-open --policy scripted --evaluator eyes/evaluator.safetensors --max-steps 150 --attribute --out eyes.rrd
-picture eyes.rrd rerun-pictures 1100x700
+picture eyes.rrd rerun-pictures
 
 $LW record pick-place push door-open drawer-open peg-insert-side window-open assembly shelf-place \
     --policy few-shot-mt50 --episodes 0 1 2 --max-steps 150 --noise 0.3 --attribute --out many.rrd
-picture many.rrd rerun-overview 1600x1000
-picture many.rrd rerun-overview-small 1100x700
+picture many.rrd rerun-overview
 
 $LW record drawer-open --policy noisy-30 --compare scripted --max-steps 200 --out compare.rrd
-picture compare.rrd rerun-compare 1600x1000
-picture compare.rrd rerun-compare-small 1100x700
+picture compare.rrd rerun-compare
 
 for number in 1 5; do
     $PYTHON "$docs/../examples/rerun_training.py" --demonstrations $number --rollouts 2 --out runs/$number/training.rrd
 done
-picture "runs/1 runs/5" rerun-runs 1100x700 --episode metrics
+picture "runs/1 runs/5" rerun-runs --episode metrics
+
+$PYTHON "$docs/../examples/your_robot/your_robot.py"
+picture runs/arm/arm.rrd your-robot
