@@ -11,7 +11,7 @@ import matplotlib
 import tyro
 
 from benchmarks.figures import METHOD_COLORS, NEUTRAL_STYLE, draw_rates, plot_panels
-from lw_torchrl.evaluation.figures import new_figure, saved
+from lw_torchrl.evaluation.figures import new_figure
 from lw_torchrl.evaluation.result import wilson_interval
 
 NUMBERS = Path(__file__).parent / "data" / "published_results.json"
@@ -26,7 +26,7 @@ class Arguments:
 
 
 WIDTH = 7.2
-"""Inches. With text of 13 points, a picture is legible at half the width of a page."""
+"""Inches, of 100 pixels. With text of 13 points, a picture is legible at half this width."""
 
 
 def experiments(numbers: Any) -> Any:
@@ -110,7 +110,7 @@ def main(arguments: Arguments) -> None:
     numbers = json.loads(NUMBERS.read_text("utf-8"))
     with matplotlib.rc_context(NEUTRAL_STYLE):
         for name, (key, draw) in FIGURES.items():
-            saved(draw(numbers[key]), arguments.out / name)
+            draw(numbers[key]).savefig(arguments.out / name, dpi=100)
             print(f"written to {arguments.out / name}")
 
 
