@@ -89,9 +89,7 @@ def scripted(numbers: Any) -> Any:
     rates = [[hits / episodes, *wilson_interval(hits, episodes)] for hits in successes.values()]
     draw_rates(axes, [*successes], rates, [METHOD_COLORS["scripted skills"]] * len(rates))
     figure.suptitle("Plans with scripted skills, without training", fontsize=16, fontweight="bold")
-    figure.supxlabel(
-        f"success in {episodes} episodes of each of 50 tasks; lines: 95 % intervals", fontsize=13
-    )
+    figure.supxlabel(f"success in {episodes} episodes of each of 50 tasks; lines: 95 % intervals", fontsize=13)
     return figure
 
 

@@ -207,9 +207,7 @@ def _unknown_task(argument: str, name: str, tasks: Tasks) -> ValueError:
     if tasks is not TASKS:
         return error
     message = str(error) if str(error).endswith("?") else f"{error}."
-    return ValueError(
-        f"{message} For a custom task, pass a Task and an engine=; see docs/your-robot.md#a-custom-task"
-    )
+    return ValueError(f"{message} For a custom task, pass a Task and an engine=; see docs/your-robot.md#a-custom-task")
 
 
 @typed
