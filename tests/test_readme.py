@@ -21,7 +21,9 @@ def test_pictures_of_the_readme_are_small():
 
 def test_citation_names_the_paper():
     (identifier,) = re.findall(r"arXiv:([\d.]+)", (ROOT / "CITATION.cff").read_text("utf-8"))
-    assert f"eprint = {{{identifier}}}" in README
+    entry = (ROOT / "lw_torchrl" / "evaluation" / "data" / "citation.bib").read_text("utf-8")
+    assert f"eprint = {{{identifier}}}" in entry
+    assert f"```bibtex\n{entry}```" in README
 
 
 def test_every_picture_of_docs_is_used():

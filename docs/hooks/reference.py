@@ -1,4 +1,4 @@
-"""Generated pages of the reference: the API by room, the commands, and tables of the package's data files."""
+"""Generated pages of the reference: the API by subpackage, the commands, and tables of the package's data files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WORDS = (
     "tasks queries relations query_program plans plan_files formats plan_decoding canonical roles skills nearest "
     "text layout"
 )
-"""The modules of ``language``, a room that exports no names itself."""
+"""The modules of ``language``, a subpackage that exports no names itself."""
 
 
 def pages() -> dict[str, str]:
@@ -62,8 +62,8 @@ def top_level() -> str:
         if module != "lw_torchrl"
         for room in [module.split(".")[1]]
     ]
-    about = "`import lw_torchrl as lw` gives these names, and the rooms: `lw.data`, for example."
-    return "\n".join(["# API", "", about, "", "| name | room |", "|---|---|", *rows, ""])
+    about = "`import lw_torchrl as lw` gives these names and the subpackages, for example `lw.data`."
+    return "\n".join(["# API", "", about, "", "| name | subpackage |", "|---|---|", *rows, ""])
 
 
 RELATIONS = """# Relations, layouts, tasks
