@@ -68,6 +68,11 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
     return outside_code(markdown, lambda text: LINK.sub(moved, text))
 
 
+def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
+    """Link each picture to its file: on a narrow screen, a recording is legible only at full size."""
+    return re.sub(r'<img [^>]*src="([^":]+)"[^>]*>', r'<a href="\1">\g<0></a>', html)
+
+
 def place(name: str) -> str:
     """Return the page of a file of the repository."""
     return name.removeprefix("docs/") if name.startswith("docs/") else PAGES.get(name, f"code/{name}.md")

@@ -188,6 +188,7 @@ TASKS: Tasks = ReadOnlyDict(_Shipped((name, Task.from_json(name, row)) for name,
 MT10: tuple[str, ...] = tuple(name for name, row in _TABLE.items() if row.get("mt10"))
 """The names of the ten MT10 tasks."""
 MT50: tuple[str, ...] = tuple(TASKS)
+"""The names of Meta-World's 50 tasks, sorted."""
 _SETS = {"MT10": MT10, "MT50": MT50}
 _RANK = {name: rank for rank, name in enumerate(MT50)}
 
