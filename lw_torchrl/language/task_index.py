@@ -133,7 +133,7 @@ class PlanTables:
         if not torch.equal(own, number) and (wrong := (own != number) & (number != 0)).any():
             tasks = ", ".join(self.index.tasks[row] for row in rows[wrong].unique().tolist()[:5])
             hint = "pass the actor's plans to the transform: QAFTransform(actor.plans)"
-            raise ValueError(f"qaf belongs to plans other than the actor's, for {tasks}; {hint}")
+            raise ValueError(f"qaf was computed with plans that differ from the actor's plans for {tasks}; {hint}")
 
 
 def answers_of(qaf: Tensor, task_id: Tensor, number: Tensor | None, tables: PlanTables) -> tuple[Tensor, Tensor]:
