@@ -19,7 +19,8 @@ from lw_torchrl.language.tasks import MT50, Task, one_layout, task_id
 class Atom(NamedTuple):
     """A comparison of two positions in the form "value < threshold".
 
-    For the senses ">" and "<=" the positions are swapped, which negates the value, and the threshold is negated too.
+    For the operators ">" and "<=", the positions are swapped, which negates the value; the threshold is also
+    negated.
     """
 
     first: TypedPosition
@@ -171,7 +172,7 @@ class QueryFacts(NamedTuple):
 
 
 def _task_facts(task: Task, queries: Sequence[Query]) -> tuple[dict[Atom, int], dict[int, int], list[tuple[int, int]]]:
-    """Return the bit number of each atom, the bit of each conjunction, and each query's (care, want) bits."""
+    """Return each atom's bit number, each conjunction's bit, and each query's (care, want) bit masks."""
     places: dict[Atom, int] = {}
 
     def bits(clause: Clause) -> int:
