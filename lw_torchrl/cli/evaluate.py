@@ -134,6 +134,7 @@ class Evaluate:
     tasks: Annotated[tuple[str, ...], options.OPTIONAL, arg(metavar="TASKS", help=_TASKS)] = ()
     episodes: Count = 20  # number of episodes of each task
     out: Maybe[Path] = None  # folder for results.json, success.png, rollout.rrd, failures.png and plan_use.json
+    workers: options.Workers = None
     json: options.Json = False
     rollout: OmitArgPrefixes[Rollout] = field(default_factory=Rollout)
 
@@ -153,6 +154,7 @@ class Evaluate:
         more: dict[str, Any] = {"also_record": ["qaf", "skill_weights"], "on_episode": use} if use else {}
         more |= {"attribute": rollout.attribute, "reference": rollout.trusted_plans, "evaluator": evaluator}
         more |= {"episodes_per_task": self.episodes, "stop_at_success": rollout.stop_at_success}
+        more["workers"] = self.workers
         result = lw.evaluate(policy, tasks=tasks, **rollout.arguments, **more)
         output = Output(self.json)
         _show_plan_use(output, result, use, plans) if use and plans else output.result(result)
