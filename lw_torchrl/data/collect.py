@@ -162,10 +162,10 @@ def run_missing_episodes(
         scales = np.array(config.noise_scale)[:, None].repeat(config.layout.action_size, 1)
         scales[:, config.layout.effort] *= config.gripper_noise_factor
         noise = (lambda n: scales[n % len(scales)]) if any(config.noise_scale) else None
-        how: dict[str, Any] = {"noise": noise, "noise_hold": config.noise_hold, "on_progress": on_steps}
+        how: dict[str, Any] = {"noise": noise, "noise_hold": config.noise_hold, "clean_action": "expert_action"}
         mode = evaluating(policy) if isinstance(policy, nn.Module) else nullcontext()
         with closing(env), mode, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            for task, episode, steps in run_episodes(env, actor, part, keys=_RECORDED, clean_action="expert_action", **how):
+            for task, episode, steps in run_episodes(env, actor, part, keys=_RECORDED, on_progress=on_steps, **how):
                 keep = not config.redraw_failures or bool(steps.get(("next", "success")).any())
                 steps.rename_key_(("next", "reward"), ("next", "reward_dense"))
                 steps.set(("next", "reward_sparse"), steps.get(("next", "success")).float())

@@ -14,7 +14,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -61,7 +61,7 @@ def spread(
     workers: int | None,
     max_steps: int,
     alone: bool = False,
-) -> Iterator[T]:
+) -> Generator[T]:
     """Yield the items of ``run(episodes, on_steps)``, computed for parts of the episodes in worker processes.
 
     Errors of a worker are raised here, with a note that lists the part's episodes; warnings are issued here.

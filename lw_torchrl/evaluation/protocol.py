@@ -51,8 +51,9 @@ def evaluate(
     """Run episodes 0 to k - 1 of each task and return their results.
 
     The actor runs in eval mode with deterministic exploration. The executed action is the actor's action plus
-    N(0, noise_scale²) noise on each entry, clipped. A task's results do not depend on ``num_envs``, ``workers`` or the
-    other tasks: the actor runs on blocks of a fixed number of rows, and all randomness comes from (task, seed, episode).
+    N(0, noise_scale²) noise on each entry, clipped. A task's results depend neither on ``num_envs`` or ``workers`` nor
+    on the other tasks: the actor runs on blocks of a fixed number of rows, and all randomness comes from (task, seed,
+    episode).
 
     Args:
         actor: a policy that reads ``observation``, ``task_id`` and, if it has plans, ``qaf``, and writes ``action``
