@@ -135,7 +135,7 @@ class Evaluate:
     episodes: Count = 20  # number of episodes of each task
     out: Maybe[Path] = None
     """folder for results.json, success.png, failures.png, plan_use.json and rollout.rrd, which shows the first failed
-    episode of up to three tasks, lowest success rate first (without failures, episode 0 of up to three tasks)"""
+    episode of the three tasks with most failures (without failures, episode 0 of up to three tasks)"""
     workers: options.Workers = None
     json: options.Json = False
     rollout: OmitArgPrefixes[Rollout] = field(default_factory=Rollout)
