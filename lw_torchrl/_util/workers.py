@@ -18,6 +18,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection
 from types import ModuleType
 from typing import Any, TypeVar
@@ -49,10 +50,8 @@ def choose_workers(workers: int | None, time_steps: int) -> int:
 
 def start_early(workers: int | None, time_steps: int) -> None:
     """Start the server of worker processes, if they will be used, while this process still imports PyTorch."""
-    if os.name == "posix" and choose_workers(workers, time_steps) > 1:
-        from multiprocessing import forkserver
-
-        with _starting(multiprocessing.get_context("forkserver")):
+    if choose_workers(workers, time_steps) > 1:
+        with _starting():
             forkserver.ensure_running()
 
 
@@ -107,12 +106,12 @@ def spread(
 
 
 def _in_workers(pickled: bytes, parts: list[Any], workers: int, on_steps: Callable[[int], object]) -> Iterator[Any]:
-    context: Any = multiprocessing.get_context("forkserver" if os.name == "posix" else "spawn")
+    context = multiprocessing.get_context("forkserver")
     alive, end = context.Pipe(duplex=False)
     steps, report = context.Pipe(duplex=False)
     pool = ProcessPoolExecutor(min(workers, len(parts)), context, _start, (pickled, alive, report))
     try:
-        with _starting(context):
+        with _starting():
             running: dict[Future[Any], Any] = {pool.submit(_work, part): part for part in parts}
             pool.submit(int)  # the executor notices the death of a process that it started before the last submission
         while running:
@@ -132,10 +131,9 @@ def _in_workers(pickled: bytes, parts: list[Any], workers: int, on_steps: Callab
 
 
 @contextmanager
-def _starting(context: Any) -> Iterator[None]:
+def _starting() -> Iterator[None]:
     """Keep the processes that are started from importing the user's script and from reacting to Ctrl-C."""
-    if context.get_start_method() == "forkserver":
-        context.set_forkserver_preload(_PRELOAD)
+    forkserver.set_forkserver_preload(_PRELOAD)
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
     try:
@@ -168,10 +166,10 @@ _report: Connection
 def _start(pickled: bytes, alive: Connection, report: Connection) -> None:
     global _pickled, _report
     _pickled, _report = pickled, report
+    threading.Thread(target=_end_with, args=(alive,), daemon=True).start()
     import torch  # here, because start_early must not wait for it
 
     torch.set_num_threads(1)
-    threading.Thread(target=_end_with, args=(alive,), daemon=True).start()
 
 
 def _end_with(alive: Connection) -> None:
@@ -183,4 +181,5 @@ def _work(part: Episodes) -> bytes:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         items = list(pickle.loads(_pickled)(part, _report.send))
-    return pickle.dumps((items, [(str(warning.message), warning.category) for warning in caught]))
+    different = dict.fromkeys((str(warning.message), warning.category) for warning in caught)
+    return pickle.dumps((items, list(different)))

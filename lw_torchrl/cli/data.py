@@ -58,6 +58,7 @@ class Collect:
         policy: Any = self.policy
         behaviour = self.behaviour
         options.start_workers(policy, self.device, self.workers, len(tasks) * self.episodes)
+        # Imported here, because these take seconds, in which the workers start.
         from lw_torchrl._util.devices import place
         from lw_torchrl.data.collection_policy import BEHAVIOURS
 

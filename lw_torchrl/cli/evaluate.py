@@ -144,6 +144,7 @@ class Evaluate:
         rollout = self.rollout
         tasks, suite = rollout.choose(self.tasks), rollout.chosen_suite
         options.start_workers(self.policy, rollout.device, self.workers, len(tasks) * self.episodes)
+        # Imported here, because these take seconds, in which the workers start.
         from lw_torchrl.data.collection_policy import BEHAVIOURS
         from lw_torchrl.training.checkpoint import demonstrated_tasks
 

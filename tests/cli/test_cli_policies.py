@@ -88,7 +88,10 @@ def test_evaluate_writes_result_figure_and_recording(capsys, policy, tmp_path):
     again = lw.evaluate(actor, tasks=["push", "reach"], episodes_per_task=1, seed=7, max_steps=60, progress=False)
     assert again.episodes == result.episodes
     assert f"written to {out}; rollout.rrd shows the failed episodes push 0, reach 0" in printed
-    assert [row["episode"] for row in document(capsys, "info", out / "rollout.rrd")["episodes"]] == ["push-0", "reach-0"]
+    assert [row["episode"] for row in document(capsys, "info", out / "rollout.rrd")["episodes"]] == [
+        "push-0",
+        "reach-0",
+    ]
 
 
 def test_evaluate_records_the_first_failures_of_the_worst_tasks():
@@ -103,7 +106,7 @@ def test_evaluate_records_the_first_failures_of_the_worst_tasks():
     outcomes = dict(a=[True, False], b=[True, True], c=[False, False], d=[True, False], e=[False, False])
     assert recorded(**outcomes) == [("c", 0), ("e", 0), ("a", 1)]
     assert recorded(a=[True, True], b=[True, False]) == [("b", 1)]
-    assert recorded(**dict.fromkeys("abcd", [True])) == [("a", 0), ("b", 0), ("c", 0)]
+    assert recorded(a=[True], b=[True], c=[True], d=[True]) == [("a", 0), ("b", 0), ("c", 0)]
 
 
 def test_evaluate_runs_the_demonstrated_tasks_by_default(capsys, policy, tmp_path):
