@@ -28,8 +28,8 @@ import cloudpickle
 Episodes = Mapping[str, Sequence[int]]  # the indices of each task's episodes
 T = TypeVar("T")
 
-START = 20_000  # time steps that one core simulates while the workers start
-_THREADED = 0.6  # time of this process with several simulation threads, relative to one thread
+START = 40_000  # time steps that one core simulates while the workers start and compile models
+_THREADED = 0.64  # measured time of this process with several simulation threads, relative to one thread
 _LARGEST = 64  # episodes per part: enough for networks, which run on blocks of 64 rows, and little lost by Ctrl-C
 _PRELOAD = ["lw_torchrl.evaluation.rollout", "lw_torchrl.data.collect", "metaworld"]
 
@@ -44,7 +44,7 @@ def choose_workers(workers: int | None, time_steps: int) -> int:
     if workers is not None:
         return workers
     cores = available_cores()
-    pays = time_steps * (_THREADED - 1 / cores) >= START  # from 200,000 steps on two cores, from 40,000 on 16
+    pays = time_steps * (_THREADED - 1 / cores) >= START  # from 290,000 steps on two cores, from 70,000 on 16
     return cores if pays and multiprocessing.parent_process() is None else 1
 
 

@@ -69,7 +69,7 @@ def evaluate(
         reward: the reward summed in the return, "sparse" or "dense".
         max_steps, suite, engine, num_threads: see :class:`LanguageWorldEnv`.
         workers: number of processes to split the episodes over, 1 for this process only; None for one per core if that
-            saves time (from about 200,000 time steps on two cores, 40,000 on 16). A function, a stochastic policy, a
+            saves time (from about 300,000 time steps on two cores, 70,000 on 16). A function, a stochastic policy, a
             policy on a GPU or a custom engine then stays in this process.
         progress: show a progress bar if the evaluation takes longer than a second.
         also_record: more keys to pass to ``on_episode``, for example "qaf" or "skill_weights".

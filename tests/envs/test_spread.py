@@ -131,13 +131,13 @@ def run_where(workers=None, max_steps=1, run=where, **options):
 
 def test_little_work_stays_in_this_process(monkeypatch):
     monkeypatch.setattr(workers_module, "available_cores", lambda: 2)
-    assert run_where() == run_where(max_steps=50_000, alone=True) == {os.getpid()}
-    assert os.getpid() not in run_where(max_steps=50_000)
+    assert run_where() == run_where(max_steps=100_000, alone=True) == {os.getpid()}
+    assert os.getpid() not in run_where(max_steps=100_000)
 
 
 def test_a_worker_starts_no_workers():
     def run(part, on_steps):
-        pids = {item[2] for item in spread(where, {"push": range(9)}, print, workers=None, max_steps=50_000)}
+        pids = {item[2] for item in spread(where, {"push": range(9)}, print, workers=None, max_steps=100_000)}
         assert pids == {os.getpid()}
         return where(part, on_steps)
 
@@ -152,7 +152,7 @@ def test_what_cannot_be_pickled_stays_in_this_process_or_is_an_error(monkeypatch
         with lock:
             return list(where(part, on_steps))
 
-    assert run_where(max_steps=50_000, run=run) == {os.getpid()}
+    assert run_where(max_steps=100_000, run=run) == {os.getpid()}
     with pytest.raises(ValueError, match=r"workers=2 requires a policy that can be pickled \(TypeError: .*lock"):
         run_where(2, run=run)
 
