@@ -49,16 +49,19 @@ class Collect:
     task_file: options.TaskFile = None
     suite: options.SuiteName = None
     device: options.Device = "cpu"
+    workers: options.Workers = None
     json: options.Json = False
 
     def run(self) -> Output:
-        from lw_torchrl._util.devices import place
-        from lw_torchrl.data.collection_policy import BEHAVIOURS
-
         suite = options.read_suite(self.suite, self.tasks)
         tasks = options.select_tasks(self.tasks, options.read_tasks(self.task_file, self.tasks), suite)
         policy: Any = self.policy
         behaviour = self.behaviour
+        options.start_workers(policy, self.device, self.workers, len(tasks) * self.episodes)
+        # Imported here, because these take seconds, in which the workers start.
+        from lw_torchrl._util.devices import place
+        from lw_torchrl.data.collection_policy import BEHAVIOURS
+
         if policy not in BEHAVIOURS:
             options.use_one_thread()
             policy = options.read_object(policy) if options.is_object(policy) else lw.load_actor(policy)
@@ -66,6 +69,7 @@ class Collect:
             behaviour = behaviour or options.policy_name(self.policy)
         run: dict[str, Any] = {"seed": self.seed, "noise_scale": self.noise, "noise_hold": self.noise_hold}
         run |= {"policy": policy, "behaviour": behaviour, "suite": suite, "redraw_failures": self.redraw_failures}
+        run["workers"] = self.workers
         dataset = lw.collect_demonstrations(tasks, episodes_per_task=self.episodes, root=self.out, **run)
         runs = dataset.attempts
         rates = dataset.success_rate.items()
