@@ -70,6 +70,7 @@ class StackedBehavioralCloning(Training):
         if not actors or len(replays) != len(actors):
             raise ValueError(f"replays must be as many as actors, at least one, got {len(replays)} and {len(actors)}")
         options.setdefault("title", f"training {len(actors)} models")
+        options.setdefault("capture", True)
         super().__init__(config, **options)
         self.actors = list(actors)
         self.module, self.networks = actors[0], [*actors]
@@ -90,7 +91,7 @@ class StackedBehavioralCloning(Training):
         for number, (actor, replay) in enumerate(zip(actors, replays, strict=True)):
             actor.to(self.device)
             check_replay(actor, replay, config.batch_size)
-            self.minibatches.append(Minibatches(replay, config.batch_size, config.seed + number))
+            self.minibatches.append(Minibatches(replay, config.batch_size, config.seed + number, self.device))
             if config.normalize and statistics_of(actor):
                 fit_normalization(actor, replay)
             else:
@@ -112,16 +113,14 @@ class StackedBehavioralCloning(Training):
     def contents(self) -> dict[str, Tensor]:
         return {**self.parameters(), **text_vectors(self.actors[0])}
 
-    def step(self) -> Tensor:
-        """Train every actor on one minibatch and return their losses, (M,) float32, on the device."""
-        first, *others = self.minibatches
-        batches = []
-        for minibatches in others:
-            with minibatches.drawing(self.device):
-                batches.append(minibatches.draw(self.device).exclude("next"))
-        with first.drawing(self.device):  # also the noise of all actors' features
-            batches.insert(0, first.draw(self.device).exclude("next"))
-            return self.train_on(torch.stack(batches))
+    def combined(self, drawn: list[TensorDictBase]) -> TensorDictBase:
+        return torch.stack([each.exclude("next") for each in drawn])
+
+    def batch(self, drawn: TensorDictBase) -> TensorDictBase:
+        if not self.minibatches[0].draws_indices:
+            return drawn
+        rows = (each.rows(own) for each, own in zip(self.minibatches, drawn.unbind(0), strict=True))
+        return torch.stack([each.exclude("next") for each in rows])
 
     def losses(self, batch: TensorDictBase) -> Mapping[str, Tensor]:
         actions = self._act(self._parameters, self._buffers, batch.exclude("action"))

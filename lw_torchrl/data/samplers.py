@@ -213,6 +213,13 @@ class GroupSampler(Sampler):
 
     @typed
     def sample(self, storage: Storage, batch_size: Count) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
+        index, info = self.draw(storage, batch_size)
+        info = {name: to_device_of(storage, value) for name, value in info.items()}
+        index = to_device_of(storage, index)
+        return (index if storage.ndim == 1 else torch.unravel_index(index, storage.shape)), info
+
+    def draw(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+        """Draw the indices (B,) int64 of a batch, counted along the flattened storage, on the CPU."""
         worker = get_worker_info()
         if worker is not None and worker.num_workers > 1 and self._process != os.getpid():
             raise RuntimeError(
@@ -240,8 +247,7 @@ class GroupSampler(Sampler):
                 rows, ended = self._take(number, int(shares[number]))
                 index[first[number] : first[number] + len(rows)] = rows
                 self.ran_out |= ended and bool(longest[number])
-        index = to_device_of(storage, index)
-        return (index if storage.ndim == 1 else torch.unravel_index(index, storage.shape)), {}
+        return index, {}
 
     def add(self, index: Any, *, storage: Storage | None = None) -> None:
         """Register rows that were written, possibly through another buffer with the same storage."""
@@ -432,11 +438,10 @@ class CoLearningSampler(GroupSampler):
         reason = f"so that {self.target_fraction} of it is from the target and {base} base tasks share the rest equally"
         return [part * base] + [whole - part] * base, reason
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
-        index, info = super().sample(storage, batch_size)
+    def draw(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+        index, info = super().draw(storage, batch_size)
         assert self._laid_out is not None
-        info["is_target"] = to_device_of(storage, self._laid_out[2] == 0)
-        return index, info
+        return index, info | {"is_target": self._laid_out[2] == 0}
 
     def _identity(self) -> dict[str, Tensor]:
         fraction = torch.tensor([self.target_fraction.numerator, self.target_fraction.denominator])

@@ -20,6 +20,7 @@ from lw_torchrl._util.checks import Count, check_value, typed
 from lw_torchrl._util.devices import CPU
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl._util.progress import Progress
+from lw_torchrl.training.captured import CapturedFunction, foreign_class
 from lw_torchrl.training.checkpoint import CheckpointFiles, check_finite, contents_of
 from lw_torchrl.training.minibatches import Minibatches
 from lw_torchrl.training.normalization import share_contacts
@@ -118,6 +119,7 @@ class TrainingOptions(TypedDict, total=False):
     logger: Logger | None
     progress: bool
     title: str
+    capture: bool | None
 
 
 class Training:
@@ -132,6 +134,10 @@ class Training:
         evaluate_every: call ``evaluate`` every N minibatches and after the last, with the networks in eval mode.
         logger: a TorchRL logger, which receives the mean losses of every 100 minibatches as ``train/NAME``.
         progress, title: whether to show a progress bar, and the title of the progress bar.
+        capture: run the training step on a CUDA device as one CUDA graph, which repeats the kernels of the third step
+            without running Python. None captures steps of modules from torch, torchrl, tensordict and this library;
+            True also captures other classes, which must not change Python attributes from step to step. If a step
+            cannot be captured, a warning says why, and training continues without a graph.
 
     Attributes:
         module, optimizer: the module that contains all trained parameters, and their optimizer.
@@ -167,6 +173,7 @@ class Training:
         logger: Logger | None = None,
         progress: bool = True,
         title: str = "training",
+        capture: bool | None = None,
     ) -> None:
         if (evaluate is None) != (evaluate_every is None):
             raise ValueError("evaluate and evaluate_every must be given together")
@@ -176,24 +183,50 @@ class Training:
         self.steps, self.last, self.description = 0, dict[str, float](), dict[str, Any]()
         self.minibatches: list[Minibatches] = []
         self._values: deque[dict[str, Tensor]] = deque(maxlen=READ_EVERY)
+        self.capture = capture
+        self._captured: CapturedFunction | None = None
 
     def losses(self, batch: Any) -> Mapping[str, Tensor]:
         """Return a minibatch's loss terms, whose names begin with "loss" and which are added, and values to log."""
         raise NotImplementedError(f"{type(self).__name__} must implement losses")
 
     def step(self) -> Tensor:
-        """Train on one minibatch and return the loss () float32, which the device may still be computing."""
-        (minibatches,) = self.minibatches
-        with minibatches.drawing(self.device):
-            return self.train_on(minibatches.draw(self.device))
+        """Train on one minibatch; return the loss () float32, or (M,) for M models, which the device may still compute.
 
-    def train_on(self, batch: Any) -> Tensor:
-        """Train on a given minibatch and return the loss () float32, or the losses (M,) float32 of M models."""
-        values = self.update(batch)
+        The networks' random numbers are those of the first of :attr:`minibatches`.
+        """
+        first, *others = self.minibatches
+        drawn = []
+        for minibatches in others:
+            with minibatches.drawing(self.device):
+                drawn.append(minibatches.draw())
+        with first.drawing(self.device):
+            values = self._run(self.combined([first.draw(), *drawn]))
         self.steps += 1
         _set_learning_rates(self.optimizer, self.config, self.steps)
         self._values.append(values)
         return values["loss"]
+
+    def _run(self, drawn: Any) -> dict[str, Tensor]:
+        """Run :meth:`update` on what was drawn, on a CUDA device as one CUDA graph."""
+        if self._captured is None:
+            captured = CapturedFunction(lambda each: self.update(self.batch(each)), self.device, self.capture is not False)
+            parts = [self, self.module, *self.networks]
+            parts += [getattr(each.source, "transform", None) for each in self.minibatches]
+            if self.capture is None and captured.tries and (kind := foreign_class(parts)) is not None:
+                name = f"{kind.__module__}.{kind.__qualname__}"
+                captured.give_up(f"{name} may change its attributes from step to step; if it does not, use capture=True")
+            self._captured = captured
+        return self._captured(drawn, tuple(network.training for network in self.networks))
+
+    def combined(self, drawn: list[Any]) -> Any:
+        """Combine what was drawn from each of :attr:`minibatches`."""
+        (only,) = drawn
+        return only
+
+    def batch(self, drawn: Any) -> Any:
+        """Return the minibatch for what :meth:`combined` returned, now on the device."""
+        return self.minibatches[0].rows(drawn)
 
     def update(self, batch: Any) -> dict[str, Tensor]:
         """Run one optimizer step and return the detached values to log.
@@ -335,5 +368,6 @@ class Training:
         for minibatches, stored in zip(self.minibatches, state["minibatches"], strict=True):
             minibatches.load_state_dict(stored)
         self.optimizer.load_state_dict(state["optimizer"])
+        self._captured = None  # a CUDA graph would use the old state
         self.steps = state["step"]
         _set_learning_rates(self.optimizer, self.config, self.steps)

@@ -1,0 +1,144 @@
+"""CapturedFunction: run a training step on a GPU as one CUDA graph."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Hashable, Iterable
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+PACKAGES = ("torch", "torchrl", "tensordict", "lw_torchrl")
+"""The packages whose modules do not change their Python attributes from step to step."""
+_WARM_UP = 2  # number of calls before the capture; the first call creates tables and the optimizer's state
+
+
+def foreign_class(objects: Iterable[Any]) -> type | None:
+    """Return the first class, among the objects and their submodules, that is not from :data:`PACKAGES`; else None."""
+    for item in objects:
+        for part in item.modules() if isinstance(item, nn.Module) else [item]:
+            if type(part).__module__.partition(".")[0] not in PACKAGES:
+                return type(part)
+    return None
+
+
+class CapturedFunction:
+    """A function of a minibatch that runs on a CUDA device as one CUDA graph, and on other devices as it is.
+
+    A graph repeats the function's kernels on the same memory without running Python, so the function may depend only on
+    the minibatch and on tensors. The first two calls run the function. If the second call waits for the device, or the
+    capture fails, a warning says why, and all later calls run the function.
+
+    Args:
+        function: a function of a TensorDict on the device, which returns tensors by name.
+        device: the device.
+        capture: False to run the function as it is on every device.
+
+    Attributes:
+        tries: whether the function is, or will be, captured.
+        is_captured: whether the function runs as a graph.
+    """
+
+    def __init__(
+        self, function: Callable[[Any], dict[str, Tensor]], device: torch.device, capture: bool = True
+    ) -> None:
+        self._function, self._device = function, device
+        self._module = None if device.type == "cpu" else torch.get_device_module(device)
+        self.tries = capture and hasattr(self._module, "CUDAGraph")
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard the graph, for example because tensors were replaced; later calls capture the function again."""
+        self._kind: Hashable = None
+        self._calls, self.is_captured = 0, False
+        self._graph = self._inputs = self._outputs = None
+
+    def __call__(self, minibatch: Any, mode: Hashable = None) -> dict[str, Tensor]:
+        """Run the function on a minibatch on the CPU or on the device.
+
+        A new ``mode``, or tensors with other keys, shapes or dtypes, discard the graph.
+        """
+        if self._module is None:
+            return self._function(minibatch)
+        if not self.tries or not isinstance(minibatch, TensorDictBase):
+            return self._function(_moved(minibatch, self._device))
+        kind = mode, *((key, each.shape, each.dtype) for key, each in minibatch.items(True, True))
+        if kind != self._kind:
+            self.reset()
+            self._kind, self._stream = kind, self._module.Stream(self._device)
+        self._calls += 1
+        if self._calls > _WARM_UP and not self.is_captured:
+            self._capture(_moved(minibatch, self._device))
+        if not self.is_captured:
+            return self._warm_up(_moved(minibatch, self._device))
+        for own, key in self._inputs:
+            own.copy_(_pinned(minibatch.get(key), self._device), non_blocking=True)
+        self._graph.replay()
+        return {name: value.clone() for name, value in self._outputs.items()}  # the next replay overwrites the values
+
+    def _warm_up(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
+        """Run the function on the graph's stream; in the last call before the capture, look for waits."""
+        assert self._module is not None
+        current = self._module.current_stream(self._device)
+        self._stream.wait_stream(current)
+        with self._module.stream(self._stream):
+            if self._calls < _WARM_UP:
+                values = self._function(minibatch)
+            else:
+                values, wait = _watched(lambda: self._function(minibatch), self._module)
+                if wait:
+                    self.give_up(f"{wait} waits for the device")
+        current.wait_stream(self._stream)
+        return values
+
+    def _capture(self, minibatch: TensorDictBase) -> None:
+        assert self._module is not None
+        kept = minibatch.clone()
+        graph = self._module.CUDAGraph()
+        try:
+            with self._module.graph(graph, stream=self._stream):
+                self._outputs = self._function(kept.copy())
+        except Exception as error:  # PyTorch and CUDA raise several types
+            self.give_up(f"CUDA cannot capture the step ({type(error).__name__}: {str(error).splitlines()[0]:.200})")
+            return
+        self._inputs = [(each, key) for key, each in kept.items(True, True)]
+        self._graph, self.is_captured = graph, True
+
+    def give_up(self, reason: str) -> None:
+        """Run the function without a graph from now on, and warn that this is for ``reason``."""
+        self.tries = False
+        warnings.warn(f"training steps run without a CUDA graph, and therefore slower: {reason}", stacklevel=2)
+
+
+def _watched(call: Callable[[], Any], module: Any) -> tuple[Any, str]:
+    """Return the result of a call, and the first place where it waited for the device ("" for none)."""
+    before, places = module.get_sync_debug_mode(), list[str]()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        module.set_sync_debug_mode("warn")
+        try:
+            result = call()
+        finally:
+            module.set_sync_debug_mode(before)
+    for each in caught:
+        if "called a synchronizing" in str(each.message):
+            places.append(f"{each.filename}:{each.lineno}")
+        elif "Synchronization debug mode" not in str(each.message):
+            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+    return result, next(iter(places), "")
+
+
+def _pinned(tensor: Tensor, device: torch.device) -> Tensor:
+    """Return a tensor that can be copied to the device without waiting: a copy in pinned memory if on the CPU."""
+    return tensor.pin_memory() if tensor.is_cpu and device.type == "cuda" else tensor
+
+
+def _moved(minibatch: Any, device: torch.device) -> Any:
+    """Copy a minibatch to the device without waiting."""
+    if not isinstance(minibatch, TensorDictBase):
+        return minibatch.to(device, non_blocking=True)
+    if minibatch.device == device:
+        return minibatch
+    return minibatch.apply(lambda each: _pinned(each, device).to(device, non_blocking=True), device=device)
