@@ -24,6 +24,11 @@ def foreign_class(objects: Iterable[Any]) -> type | None:
     return None
 
 
+def captures(device: torch.device) -> bool:
+    """Return whether PyTorch can capture work on a device as a graph."""
+    return device.type != "cpu" and hasattr(torch.get_device_module(device), "CUDAGraph")
+
+
 class CapturedFunction:
     """A function of a minibatch that runs on a CUDA device as one CUDA graph, and on other devices as it is.
 
@@ -46,7 +51,7 @@ class CapturedFunction:
     ) -> None:
         self._function, self._device = function, device
         self._module = None if device.type == "cpu" else torch.get_device_module(device)
-        self.tries = capture and hasattr(self._module, "CUDAGraph")
+        self.tries = capture and captures(device)
         self.reset()
 
     def reset(self) -> None:
@@ -69,10 +74,12 @@ class CapturedFunction:
             self.reset()
             self._kind, self._stream = kind, self._module.Stream(self._device)
         self._calls += 1
-        if self._calls > _WARM_UP and not self.is_captured:
-            self._capture(_moved(minibatch, self._device))
         if not self.is_captured:
-            return self._warm_up(_moved(minibatch, self._device))
+            minibatch = _moved(minibatch, self._device)
+            if self._calls > _WARM_UP:
+                self._capture(minibatch)
+        if not self.is_captured:
+            return self._warm_up(minibatch)
         for own, key in self._inputs:
             own.copy_(_pinned(minibatch.get(key), self._device), non_blocking=True)
         self._graph.replay()

@@ -20,7 +20,7 @@ from lw_torchrl._util.checks import Count, check_value, typed
 from lw_torchrl._util.devices import CPU
 from lw_torchrl._util.files import AnyPath
 from lw_torchrl._util.progress import Progress
-from lw_torchrl.training.captured import CapturedFunction, foreign_class
+from lw_torchrl.training.captured import CapturedFunction, captures, foreign_class
 from lw_torchrl.training.checkpoint import CheckpointFiles, check_finite, contents_of
 from lw_torchrl.training.minibatches import Minibatches
 from lw_torchrl.training.normalization import share_contacts
@@ -36,7 +36,7 @@ def make_optimizer(
 
     On a CUDA device the learning rates are tensors, so that a CUDA graph can capture the optimizer step.
     """
-    on_gpu = device.type == "cuda"
+    on_gpu = captures(device)
     groups: list[dict[str, Any]] = []
     for parameters, rate in rates:
         initial = float(rate)
@@ -48,14 +48,16 @@ def make_optimizer(
     return torch.optim.AdamW(groups, weight_decay=config.weight_decay, fused=True, capturable=on_gpu)
 
 
-def _set_learning_rates(optimizer: torch.optim.Optimizer, config: Any, step: int) -> None:
-    """Set the learning rates after ``step`` optimizer steps: a cosine schedule from the initial value to 0, or
-    constant.
-    """
+def _rate_factor(config: Any, step: int) -> float:
+    """Return the fraction of the initial learning rate after ``step`` optimizer steps: a cosine to 0, or 1."""
     is_constant = getattr(config, "schedule", "cosine") == "constant"
-    factor = 1.0 if is_constant else 0.5 * (1.0 + math.cos(math.pi * step / config.steps))
+    return 1.0 if is_constant else 0.5 * (1.0 + math.cos(math.pi * step / config.steps))
+
+
+def _set_learning_rates(optimizer: torch.optim.Optimizer, config: Any, step: int) -> None:
+    """Set the learning rates after ``step`` optimizer steps."""
     for group in optimizer.param_groups:
-        rate = group["initial_lr"] * factor
+        rate = group["initial_lr"] * _rate_factor(config, step)
         if isinstance(group["lr"], Tensor):
             group["lr"].fill_(rate)
         else:
@@ -308,7 +310,8 @@ class Training:
         if logs or saves:
             self._read_losses()
         if logs:
-            self._log("train", {**self.last, "learning_rate": float(self.optimizer.param_groups[0]["lr"])})
+            rate = self.optimizer.param_groups[0]["initial_lr"] * _rate_factor(self.config, self.steps)
+            self._log("train", {**self.last, "learning_rate": rate})
             bar.note(**{name: f"{value:.4f}" for name, value in self.last.items() if "loss" in name})
         if saves:
             self.save()

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer, TensorStorage
-from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler, Sampler
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler, RandomSampler
 from torchrl.data.replay_buffers.storages import Storage
 from torchrl.envs import Compose, Transform
 from torchrl.objectives import BCLoss, LossModule
@@ -107,7 +107,7 @@ class IndexedReplay:
             self.replay._sampler = sampler
 
 
-class _GivenRows(Sampler):
+class _GivenRows(RandomSampler):
     """A sampler that returns given indices."""
 
     rows: TensorDictBase

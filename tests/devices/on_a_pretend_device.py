@@ -72,6 +72,7 @@ def quiet_steps(trainer, number=3):
     COPIES.clear()
     losses += [trainer.step() for _ in range(number)]
     assert WAITS == []
+    assert trainer._captured.is_captured
     return losses
 
 
@@ -100,8 +101,9 @@ def test_waits_are_recorded():
         WAITS.clear()
         wait()
         assert WAITS
-    with pytest.raises(RuntimeError, match="same device"):
-        there + here
+    for mixed in (lambda: there + here, lambda: here[torch.tensor([1, 2]).to(PRETEND)]):
+        with pytest.raises(RuntimeError, match="same device"):
+            mixed()
 
 
 @pytest.mark.parametrize(
@@ -163,7 +165,7 @@ def make_stack(demos, device, checkpoint=None, actor="plan", **config):
 def test_stacked_trainings_wait_for_nothing(demos):
     stack = make_stack(demos, "pretend")
     losses = quiet_steps(stack)
-    assert len(COPIES) == 3 * 3
+    assert len(COPIES) == 3, "one copy a step"
     cpu = make_stack(demos, "cpu")
     for loss in losses:
         assert torch.equal(loss.cpu(), cpu.step())
