@@ -49,6 +49,7 @@ class Collect:
     task_file: options.TaskFile = None
     suite: options.SuiteName = None
     device: options.Device = "cpu"
+    workers: options.Workers = None
     json: options.Json = False
 
     def run(self) -> Output:
@@ -66,6 +67,7 @@ class Collect:
             behaviour = behaviour or options.policy_name(self.policy)
         run: dict[str, Any] = {"seed": self.seed, "noise_scale": self.noise, "noise_hold": self.noise_hold}
         run |= {"policy": policy, "behaviour": behaviour, "suite": suite, "redraw_failures": self.redraw_failures}
+        run["workers"] = self.workers
         dataset = lw.collect_demonstrations(tasks, episodes_per_task=self.episodes, root=self.out, **run)
         runs = dataset.attempts
         rates = dataset.success_rate.items()

@@ -133,7 +133,10 @@ class Evaluate:
     policy: Positional[options.Who]
     tasks: Annotated[tuple[str, ...], options.OPTIONAL, arg(metavar="TASKS", help=_TASKS)] = ()
     episodes: Count = 20  # number of episodes of each task
-    out: Maybe[Path] = None  # folder for results.json, success.png, rollout.rrd, failures.png and plan_use.json
+    out: Maybe[Path] = None
+    """folder for results.json, success.png, failures.png, plan_use.json and rollout.rrd, which shows the first failed
+    episode of up to three tasks, lowest success rate first (without failures, episode 0 of up to three tasks)"""
+    workers: options.Workers = None
     json: options.Json = False
     rollout: OmitArgPrefixes[Rollout] = field(default_factory=Rollout)
 
@@ -153,6 +156,7 @@ class Evaluate:
         more: dict[str, Any] = {"also_record": ["qaf", "skill_weights"], "on_episode": use} if use else {}
         more |= {"attribute": rollout.attribute, "reference": rollout.trusted_plans, "evaluator": evaluator}
         more |= {"episodes_per_task": self.episodes, "stop_at_success": rollout.stop_at_success}
+        more["workers"] = self.workers
         result = lw.evaluate(policy, tasks=tasks, **rollout.arguments, **more)
         output = Output(self.json)
         _show_plan_use(output, result, use, plans) if use and plans else output.result(result)
@@ -160,13 +164,24 @@ class Evaluate:
             failures = [failure.to_json() for failure in result.failures or ()]
             output.show("failures", failures, f"\n{result.failure_table()}")
         if self.out is not None:
+            recorded = _episodes_to_record(result)
             with locked(self.out, "out", folder=True, wait=True):
-                self._write(self.out, result, policy, use, evaluator)
-            print(f"written to {self.out}")
+                self._write(self.out, result, policy, use, evaluator, recorded)
+            names = ", ".join(f"{task} {episode}" for task, episode in recorded)
+            kind = "failed" if result.mean_success < 1 else "successful"
+            print(f"written to {self.out}; rollout.rrd shows the {kind} episodes {names}")
         return output
 
-    def _write(self, out: Path, result: lw.EvaluationResult, policy: Any, use: Any, evaluator: Any) -> None:
-        from lw_torchrl.record.rollouts import run_recorded, write_recording
+    def _write(
+        self,
+        out: Path,
+        result: lw.EvaluationResult,
+        policy: Any,
+        use: Any,
+        evaluator: Any,
+        recorded: list[tuple[str, int]],
+    ) -> None:
+        from lw_torchrl.record.rollouts import new_recording, run_recorded
         from lw_torchrl.training.checkpoint import policy_file
 
         rollout, plans = self.rollout, lw.modules.plans_of(policy)
@@ -181,9 +196,29 @@ class Evaluate:
             write_json(out / "plan_use.json", {task: counts.to_json() for task, counts in use.tasks().items()})
         if rollout.attribute:
             lw.evaluation.plot_failures(result, out / "failures.png", title=self.policy)
-        episodes = run_recorded(policy, result.config["tasks"][:3], evaluator=evaluator, **rollout.arguments)
-        labels: dict[str, Any] = {"seed": rollout.seed, "policy": options.policy_name(self.policy)}
-        write_recording(out / "rollout.rrd", episodes, plans, suite=rollout.chosen_suite, **labels)
+        page: dict[str, Any] = {"seed": rollout.seed, "policy": options.policy_name(self.policy)}
+        failures = {(failure.task, failure.episode): failure for failure in result.failures or ()}
+        with new_recording(out / "rollout.rrd") as logger:
+            if failures:
+                logger.show_causes(result)
+            for task, number in recorded:
+                run: dict[str, Any] = {"episodes": [number], "evaluator": evaluator, **rollout.arguments}
+                (episode,) = run_recorded(policy, task, **run)
+                page |= {"suite": rollout.chosen_suite, "failure": failures.get((task, number))}
+                lw.log_rollout(logger, episode.steps, plans, **page)
+
+
+def _episodes_to_record(result: lw.EvaluationResult) -> list[tuple[str, int]]:
+    """Return the first failed episode of the three tasks that failed most, or episode 0 of three tasks if none failed.
+
+    Episodes are pairs of task and index.
+    """
+    failed: dict[str, list[int]] = {}
+    for episode in result.episodes:
+        if not episode.success:
+            failed.setdefault(episode.task, []).append(episode.episode)
+    worst = sorted(failed, key=lambda task: -len(failed[task]))
+    return [(task, failed[task][0]) for task in worst[:3]] or [(task, 0) for task in result.config["tasks"][:3]]
 
 
 def _show_plan_use(output: Output, result: lw.EvaluationResult, use: lw.evaluation.PlanUse, plans: Plans) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from tyro.conf import Positional, arg
 
 import lw_torchrl as lw
-from lw_torchrl._util.checks import counted
+from lw_torchrl._util.checks import Count, counted
 from lw_torchrl._util.files import read_text
 from lw_torchrl.language.plan_files import load_plans
 from lw_torchrl.language.plans import ConditionalPlan, PlanError, Plans
@@ -132,6 +132,7 @@ WHO = (
 )
 _DEVICE = "device of the networks: cpu, cuda, cuda:1, mps, or auto for a GPU if there is one (the simulation uses CPUs)"
 _SUITE = "suite of the tasks, for example fetch, or a Python object my_module:suite"
+_WORKERS = "number of processes that share the episodes (default: one per core, or 1 for little work)"
 _ENCODER = "custom text encoder: a Python function my_module:function that maps N texts to an N x D tensor"
 _TASKS = "MT10, MT50, a suite, or names of tasks"
 _EVALUATOR = (
@@ -155,6 +156,7 @@ SuiteName = Annotated[Maybe[str], arg(metavar="SUITE", help=_SUITE)]
 PlanSources = Annotated[tuple[str, ...], arg(metavar="SOURCES", help=f"{PLANS}; the last plan for each task is used")]
 Evaluator = Annotated[Maybe[str], arg(metavar="FILE", help=_EVALUATOR)]
 Device = Annotated[str, arg(metavar="DEVICE", help=_DEVICE)]
+Workers = Annotated[Maybe[Count], arg(metavar="N", help=_WORKERS)]
 
 _PLAN_TASK = re.compile(r"^def[ \t]+([a-z]\w*)[ \t]*\(", re.MULTILINE)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, nullcontext
 from numbers import Real
 from pathlib import Path
@@ -23,14 +23,16 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lw_torchrl._util.checks import Count, Scale, differences, typed
+from lw_torchrl._util.devices import CPU, device_of
 from lw_torchrl._util.files import AnyPath, flush, locked, read_json, replacing, write_json
 from lw_torchrl._util.progress import Progress
 from lw_torchrl._util.reproducibility import SIMULATORS, package_versions, version_changes
 from lw_torchrl.data import dataset
 from lw_torchrl.data.collection_policy import Behaviour, SegmentActor, behaviour_of, segment_plans
 from lw_torchrl.data.dataset import COLUMNS, TRAJECTORY, CollectConfig, DatasetError, Demonstrations
-from lw_torchrl.envs.episodes import policy_of, read_action, run_episodes
+from lw_torchrl.envs.episodes import num_rows, policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.envs.workers import Episodes, spread
 from lw_torchrl.language.tasks import task_id
 from lw_torchrl.modules.parts import evaluating
 from lw_torchrl.modules.policy import plans_of, tasks_of, transform_of
@@ -41,6 +43,7 @@ from lw_torchrl.transforms.qaf import QAFTransform
 _STORED = [key for key in COLUMNS if key != TRAJECTORY]
 _RECORDED = [key for key in _STORED if not key[-1].startswith("reward")] + [("next", "reward")]
 _FAILED = b"FAILED"  # the file content that marks a failed episode, which is replaced by another episode
+_ROWS = 64  # environments stepped together; with more, an interruption would lose more work
 _MAX_ATTEMPTS = 20  # number of episodes to run per kept episode before redrawing gives up
 
 _Actor = Callable[[TensorDictBase], TensorDictBase]
@@ -98,7 +101,8 @@ def _kept_and_missing(config: CollectConfig, files: EpisodeFiles) -> tuple[dict[
                 "lower noise_scale, or set redraw_failures=False"
             )
         ahead = range(candidate, candidate + missing)
-        wanted[task] = [episode for episode in ahead if not files.has(task, episode)]
+        if listed := [episode for episode in ahead if not files.has(task, episode)]:
+            wanted[task] = listed
     return kept, wanted
 
 
@@ -139,50 +143,48 @@ def suite_expert(suite: Suite, tasks: Sequence[str]) -> Any:
 
 
 def run_missing_episodes(
-    config: CollectConfig, policy: Any, files: EpisodeFiles, num_envs: int | None, suite: Suite, progress: bool
+    config: CollectConfig,
+    policy: Any,
+    files: EpisodeFiles,
+    num_envs: int | None,
+    suite: Suite,
+    progress: bool,
+    workers: int | None = 1,
 ) -> dict[str, list[int]]:
     """Run episodes until all are in the files, and return the indices of the kept episodes of each task."""
-    kept, wanted = _kept_and_missing(config, files)
-    missing = sum(map(len, wanted.values()))
-    if not missing:
-        return kept
-    # Record only the dense reward, because the sparse reward follows from success.
-    base = LanguageWorldEnv(
-        config.tasks,
-        suite=suite,
-        num_envs=max(len(config.tasks), min(50, missing)) if num_envs is None else num_envs,
-        seed=config.seed,
-        reward="dense",
-        max_steps=config.max_steps,
-        strict=policy is not None,
-    )
-    env, actor = _env_and_actor(config, policy, base)
-    scales = np.array(config.noise_scale)[:, None].repeat(base.layout.action_size, 1)
-    scales[:, base.layout.effort] *= config.gripper_noise_factor
-    total = config.episodes_per_task * len(config.tasks)
-    before = (total - missing) * config.max_steps
-    bar = Progress("collecting", total * config.max_steps, "step", initial=before, show=progress)
-    deterministic = set_exploration_type(ExplorationType.DETERMINISTIC)
-    with bar, closing(env), torch.no_grad(), deterministic:
-        while missing:
-            bar.set_done((total - missing) * config.max_steps)  # moves back by the failures that are redrawn
-            episodes = run_episodes(
-                env,
-                actor,
-                wanted,
-                keys=_RECORDED,
-                noise=(lambda n: scales[n % len(scales)]) if any(config.noise_scale) else None,
-                noise_hold=config.noise_hold,
-                clean_action="expert_action",
-                on_progress=bar.update,
-            )
-            for task, episode, steps in episodes:
+
+    def run(part: Episodes, on_steps: Callable[[int], object]) -> Iterator[None]:
+        """Run episodes and write each to its file."""
+        # Record only the dense reward, because the sparse reward follows from success.
+        options: dict[str, Any] = {"suite": suite, "seed": config.seed, "max_steps": config.max_steps}
+        options |= {"num_envs": num_rows(part, _ROWS, num_envs), "reward": "dense", "strict": policy is not None}
+        env, actor = _env_and_actor(config, policy, LanguageWorldEnv(list(part), **options))
+        scales = np.array(config.noise_scale)[:, None].repeat(config.layout.action_size, 1)
+        scales[:, config.layout.effort] *= config.gripper_noise_factor
+        noise = (lambda n: scales[n % len(scales)]) if any(config.noise_scale) else None
+        how: dict[str, Any] = {"noise": noise, "noise_hold": config.noise_hold, "clean_action": "expert_action"}
+        mode = evaluating(policy) if isinstance(policy, nn.Module) else nullcontext()
+        with closing(env), mode, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            for task, episode, steps in run_episodes(env, actor, part, keys=_RECORDED, on_progress=on_steps, **how):
                 keep = not config.redraw_failures or bool(steps.get(("next", "success")).any())
                 steps.rename_key_(("next", "reward"), ("next", "reward_dense"))
                 steps.set(("next", "reward_sparse"), steps.get(("next", "success")).float())
                 files.put(task, episode, steps if keep else None)
+                yield
+
+    total = config.episodes_per_task * len(config.tasks)
+    kept, wanted = _kept_and_missing(config, files)
+    before = (total - sum(map(len, wanted.values()))) * config.max_steps
+    alone = not isinstance(policy, nn.Module | None) or device_of(policy) != CPU
+    with Progress("collecting", total * config.max_steps, "step", initial=before, show=progress) as bar:
+        while wanted:
+            how: dict[str, Any] = {"workers": workers, "max_steps": config.max_steps, "alone": alone}
+            with closing(spread(run, wanted, bar.update, **how)) as written:
+                for _ in written:
+                    pass
             kept, wanted = _kept_and_missing(config, files)
-            missing = sum(map(len, wanted.values()))
+            # Move back by the failures that are redrawn.
+            bar.set_done((total - sum(map(len, wanted.values()))) * config.max_steps)
     return kept
 
 
@@ -255,12 +257,14 @@ def collect_demonstrations(
     redraw_failures: bool = False,
     max_steps: Count | None = None,
     num_envs: Count | None = None,
+    workers: Count | None = None,
     progress: bool = True,
 ) -> Demonstrations:
     """Run Meta-World's scripted experts, or other policies, and write their episodes to a dataset.
 
     If a call was killed or ran out of disk space, repeat the call to resume. If a finished dataset with the same config
-    exists, the call only verifies its checksums. The dataset depends neither on ``num_envs`` nor on interruptions.
+    exists, the call only verifies its checksums. The dataset does not depend on ``num_envs``, ``workers`` or
+    interruptions.
 
     Each row is one time step, in TorchRL's TED layout (R rows):
         observation, next/observation: (R, 39) float32, meters.
@@ -291,6 +295,8 @@ def collect_demonstrations(
         redraw_failures: keep only successful episodes, and replace failed ones.
         max_steps: number of time steps per episode; None for the suite's default.
         num_envs: number of environments stepped together; None to choose the number automatically.
+        workers: number of processes to split the episodes over, 1 for this process only; None for one per core if the
+            episodes have at least 60,000 time steps. A function, or a policy on a GPU, then stays in this process.
         progress: show a progress bar if the collection takes longer than a second.
 
     Raises:
@@ -334,10 +340,10 @@ def collect_demonstrations(
     if is_new and {path.name for path in folder.iterdir()} - {dataset.LOCK}:
         raise DatasetError(f"root: {str(folder)!r} is not empty, but holds no dataset; choose another folder")
     lock = locked(folder, "root", "collect_demonstrations", folder=True, error=DatasetError)
-    with lock, evaluating(actor) if isinstance(actor, nn.Module) else nullcontext():
+    with lock:
         if _finished(folder, config) is None:  # another process may have finished the dataset in the meantime
             versions, files = _begin(folder, config), EpisodeFiles(partial)
-            kept = run_missing_episodes(config, actor, files, num_envs, suite, progress)
+            kept = run_missing_episodes(config, actor, files, num_envs, suite, progress, workers)
             _assemble(folder, config, versions, files, kept)
         for left in (partial, *folder.glob(".metadata.*.tmp.json")):  # a killed process may have left the latter
             shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)

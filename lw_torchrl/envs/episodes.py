@@ -39,6 +39,13 @@ class FinishedEpisode(NamedTuple):
         return first_success(self.steps.get(("next", "success")))
 
 
+def num_rows(episodes: Mapping[str, Sequence[int]], most: int, num_envs: int | None = None) -> int:
+    """Return the number of environments to step together: ``num_envs``, or equally many for each task and about
+    ``most``, but no more than can be busy."""
+    tasks, longest = len(episodes), max(map(len, episodes.values()))
+    return min(tasks * longest, tasks * max(1, most // tasks) if num_envs is None else num_envs)
+
+
 def policy_of(actor: Any, device: str | torch.device | None = None) -> Callable[[TensorDictBase], TensorDictBase]:
     """Return the actor on a device; networks run on blocks of a fixed size, so that rows do not affect each other."""
     actor_device = place(actor, device)

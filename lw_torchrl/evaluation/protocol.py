@@ -39,6 +39,7 @@ def evaluate(
     suite: str | Suite | None = None,
     engine: Any = None,
     num_threads: int | None = None,
+    workers: Count | None = None,
     progress: bool = True,
     also_record: Sequence[NestedKey] = (),
     on_episode: Callable[[FinishedEpisode], object] | None = None,
@@ -50,8 +51,9 @@ def evaluate(
     """Run episodes 0 to k - 1 of each task and return their results.
 
     The actor runs in eval mode with deterministic exploration. The executed action is the actor's action plus
-    N(0, noise_scale²) noise on each entry, clipped. A task's results depend neither on ``num_envs`` nor on the other
-    tasks: the actor runs on blocks of a fixed number of rows, and all randomness comes from (task, seed, episode).
+    N(0, noise_scale²) noise on each entry, clipped. A task's results depend neither on ``num_envs`` or ``workers`` nor
+    on the other tasks: the actor runs on blocks of a fixed number of rows, and all randomness comes from (task, seed,
+    episode).
 
     Args:
         actor: a policy that reads ``observation``, ``task_id`` and, if it has plans, ``qaf``, and writes ``action``
@@ -66,6 +68,9 @@ def evaluate(
         record_actions: keep the executed actions of each episode, (T, 4) float32.
         reward: the reward summed in the return, "sparse" or "dense".
         max_steps, suite, engine, num_threads: see :class:`LanguageWorldEnv`.
+        workers: number of processes to split the episodes over, 1 for this process only; None for one per core if the
+            episodes have at least 60,000 time steps. A function, a stochastic policy, a policy on a GPU or a custom
+            engine then stays in this process.
         progress: show a progress bar if the evaluation takes longer than a second.
         also_record: more keys to pass to ``on_episode``, for example "qaf" or "skill_weights".
         on_episode: called with each finished episode, a named tuple of ``task``, ``episode`` (index) and ``steps``, a
@@ -137,6 +142,7 @@ def evaluate(
         keys=["action", ("next", "success"), ("next", "reward"), *also_record],
         optional=(lambda env: keys_to_attribute(actor, env)) if attribute else (),
         after_success=0 if stop_at_success else None,
+        workers=workers,
         **run,
     )
     config = {"tasks": list(names), "episodes_per_task": episodes_per_task, "noise_scale": noise_scale, **shared}

@@ -1,6 +1,6 @@
 """The episode runner: run exactly the requested episodes with an actor, for evaluation, re-runs and recordings."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext
 from typing import Any
 
@@ -12,13 +12,15 @@ from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from lw_torchrl._util.checks import unknown_name
+from lw_torchrl._util.devices import CPU, check_device, device_of
 from lw_torchrl._util.progress import Progress
-from lw_torchrl.envs.episodes import FinishedEpisode, policy_of, read_action, run_episodes
+from lw_torchrl.envs.episodes import FinishedEpisode, num_rows, policy_of, read_action, run_episodes
 from lw_torchrl.envs.language_world_env import LanguageWorldEnv
+from lw_torchrl.envs.workers import Episodes, spread
 from lw_torchrl.language.plans import AnyPlans, Plans, as_plans
 from lw_torchrl.language.tasks import Task, TaskList
 from lw_torchrl.modules.parts import evaluating
-from lw_torchrl.modules.policy import plans_of, transform_of
+from lw_torchrl.modules.policy import draws, plans_of, transform_of
 from lw_torchrl.modules.query_evaluator import QueryEvaluator
 from lw_torchrl.suites.suite import Suite, find_suite, listed_tasks
 
@@ -46,6 +48,7 @@ def rollout(
     wrap: Callable[[Any], Any] | None = None,
     device: str | torch.device | None = None,
     progress: bool = False,
+    workers: int | None = 1,
 ) -> None:
     """Run each listed episode once, in eval mode and without exploration, and pass each one to ``on_episode``.
 
@@ -62,32 +65,45 @@ def rollout(
         place: a key under which to write the position of each row's episode in ``episodes[task]``.
         first: a transform that runs before all others.
         wrap: a function that maps the actor to the policy that acts instead.
+        workers: number of processes, see :func:`spread`; side effects of the policy are lost in other processes.
     """
-    most = len(tasks) * max(map(len, episodes.values()))  # additional rows would be idle
-    rows = min(most, len(tasks) * max(1, ROWS // len(tasks))) if num_envs is None else min(num_envs, most)
-    base = LanguageWorldEnv(list(tasks.values()), num_envs=rows, strict=True, **env_options)
-    env = _with_transforms(base, first, transform_of(actor, plans), _transform_of_evaluator(evaluator))
-    more = [unravel_key(key) for key in (optional(env) if callable(optional) else optional)]
-    written = {unravel_key(key) for part in (actor, evaluator) for key in getattr(part, "out_keys", ())} | _written(env)
-    recorded = list(dict.fromkeys([*map(unravel_key, keys), *(key for key in more if key in written)]))
-    acting = actor if wrap is None else wrap(actor)
-    if evaluator is not None and not isinstance(evaluator, Transform):
-        acting = EvaluatorInFront(evaluator, acting)
-    noise = (noise_scale,) * env.action_spec.shape[-1]
-    bar = Progress(label, sum(map(len, episodes.values())) * env.max_steps, "step", show=progress)
-    mode = evaluating(acting) if isinstance(acting, nn.Module) else nullcontext()
-    with closing(env), mode, bar, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        for episode in run_episodes(
-            env,
-            _checked(policy_of(acting, device), env, recorded),
-            episodes,
-            keys=recorded,
-            noise=(lambda _: noise) if noise_scale else None,
-            after_success=after_success,
-            place=place,
-            on_progress=bar.update,
-        ):
-            on_episode(episode)
+    suite: Suite = env_options["suite"]
+    max_steps = env_options.get("max_steps") or suite.max_steps
+
+    def run(part: Episodes, on_steps: Callable[[int], object]) -> Iterator[FinishedEpisode]:
+        chosen = [tasks[task] for task in part]
+        base = LanguageWorldEnv(chosen, num_envs=num_rows(part, ROWS, num_envs), strict=True, **env_options)
+        env = _with_transforms(base, first, transform_of(actor, plans), _transform_of_evaluator(evaluator))
+        more = [unravel_key(key) for key in (optional(env) if callable(optional) else optional)]
+        keys_of_parts = {unravel_key(key) for each in (actor, evaluator) for key in getattr(each, "out_keys", ())}
+        written = keys_of_parts | _written(env)
+        recorded = list(dict.fromkeys([*map(unravel_key, keys), *(key for key in more if key in written)]))
+        acting = actor if wrap is None else wrap(actor)
+        if evaluator is not None and not isinstance(evaluator, Transform):
+            acting = EvaluatorInFront(evaluator, acting)
+        noise = (noise_scale,) * env.action_spec.shape[-1]
+        mode = evaluating(acting) if isinstance(acting, nn.Module) else nullcontext()
+        with closing(env), mode, torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            yield from run_episodes(
+                env,
+                _checked(policy_of(acting, device), env, recorded),
+                part,
+                keys=recorded,
+                noise=(lambda _: noise) if noise_scale else None,
+                after_success=after_success,
+                place=place,
+                on_progress=on_steps,
+            )
+
+    on_cpu = (device_of(actor) if device is None else check_device("device", device)) == CPU
+    modules = isinstance(actor, nn.Module) and isinstance(evaluator, nn.Module | None)
+    # Functions and custom engines may have side effects, which would be lost in worker processes.
+    alone = not modules or callable(env_options.get("engine")) or not on_cpu or draws(actor)
+    with Progress(label, sum(map(len, episodes.values())) * max_steps, "step", show=progress) as bar:
+        how: dict[str, Any] = {"workers": workers, "max_steps": max_steps, "alone": alone}
+        with closing(spread(run, episodes, bar.update, **how)) as finished:
+            for episode in finished:
+                on_episode(episode)
 
 
 def _with_transforms(base: EnvBase, *transforms: Transform | None) -> EnvBase:
