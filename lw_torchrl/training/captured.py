@@ -19,7 +19,7 @@ def foreign_class(objects: Iterable[Any]) -> type | None:
     """Return the first class, among the objects and their submodules, that is not from :data:`PACKAGES`; else None."""
     for item in objects:
         for part in item.modules() if isinstance(item, nn.Module) else [item]:
-            if type(part).__module__.partition(".")[0] not in PACKAGES:
+            if part is not None and type(part).__module__.partition(".")[0] not in PACKAGES:
                 return type(part)
     return None
 

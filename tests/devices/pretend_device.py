@@ -88,7 +88,8 @@ class Module(_DummyBackendModule):
         finally:
             self.state, Graph.recording = state, None
             for one, before in graph.before.values():
-                one.copy_(before)
+                if one.shape == before.shape:  # otherwise it is the output of an operation, which resized it
+                    one.copy_(before)
             graph.before.clear()
 
     def get_rng_state(self, device=None):
